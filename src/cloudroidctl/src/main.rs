@@ -1,0 +1,3 @@
+//! cloudroidctl
+
+fn main() {}

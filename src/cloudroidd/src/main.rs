@@ -1,0 +1,3 @@
+//! cloudroidd
+
+fn main() {}

@@ -1,0 +1,243 @@
+//! The seam behind which a ROS version hides: ROS 1 (Master, TCPROS) now, ROS 2 (DDS) next.
+//!
+//! Messages cross it serialized, reference-counted and never copied per subscriber.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use tokio::sync::{mpsc, watch};
+
+/// What nodes have registered, seen at one moment.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Graph {
+    /// Grows by one with every change.
+    pub generation: u64,
+    /// Topic → its type and the nodes at both ends.
+    pub topics: BTreeMap<String, TopicNodes>,
+    /// Service → the node that serves it.
+    pub services: BTreeMap<String, String>,
+    /// Node → its XML-RPC address (ROS 1) or GUID (ROS 2).
+    pub nodes: BTreeMap<String, String>,
+    /// Every parameter key that a node asked for or wrote, with the nodes that did.
+    pub parameters: BTreeMap<String, ParameterUse>,
+}
+
+/// The ends of one topic.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TopicNodes {
+    /// `package/Type`, or `*` where nobody has said yet.
+    pub type_name: String,
+    /// Names of publishing nodes.
+    pub publishers: Vec<String>,
+    /// Names of subscribing nodes.
+    pub subscribers: Vec<String>,
+}
+
+/// Who touched a parameter.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ParameterUse {
+    /// Nodes that asked for it (`getParam`, `hasParam`, `searchParam`, `subscribeParam`).
+    pub read_by: Vec<String>,
+    /// Nodes that set it.
+    pub written_by: Vec<String>,
+}
+
+/// A type as a peer announced it on the wire.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct WireType {
+    /// `package/Type`.
+    pub name: String,
+    /// MD5 of the definition (ROS 1) or the type hash (ROS 2), lower-case hex; `*` accepts all.
+    pub md5: String,
+    /// The full text with dependencies, where the peer sent one (ROS 1 publishers do), else empty.
+    pub definition: String,
+}
+
+/// One serialized message from one publisher.
+#[derive(Debug, Clone)]
+pub struct Message {
+    /// The message without any length prefix.
+    pub bytes: Bytes,
+    /// What the publisher said it is.
+    pub wire_type: Arc<WireType>,
+    /// Name of the publishing node.
+    pub publisher: Arc<str>,
+    /// Whether the publisher's connection is latching: a newcomer must be given the last one per publisher.
+    pub latching: bool,
+}
+
+/// How to subscribe.
+#[derive(Debug, Clone)]
+pub struct SubscribeOptions {
+    /// `package/Type` where the caller knows it; the publisher's otherwise.
+    pub wire_type: Option<WireType>,
+    /// Messages kept while the receiver is busy; the oldest is dropped (and counted) beyond.
+    pub queue: usize,
+}
+
+/// A live subscription; dropping it unsubscribes.
+pub struct Subscription {
+    /// Messages in the order received per publisher.
+    pub messages: mpsc::Receiver<Message>,
+    /// Messages dropped so far because `messages` was full.
+    pub dropped: Arc<std::sync::atomic::AtomicU64>,
+    /// Keeps the subscription alive.
+    pub guard: Box<dyn Send + Sync>,
+}
+
+/// How to advertise.
+#[derive(Debug, Clone)]
+pub struct AdvertiseOptions {
+    /// Name, md5 and full definition of what will be published.
+    pub wire_type: WireType,
+    /// Newcomers are given the last message.
+    pub latch: bool,
+    /// Messages kept per slow subscriber; the oldest is dropped beyond.
+    pub queue: usize,
+}
+
+/// A topic that this side publishes; dropping it unadvertises.
+pub trait Publisher: Send + Sync {
+    /// Sends one serialized message (without length prefix) to every subscriber; never blocks.
+    fn publish(&self, bytes: Bytes);
+    /// How many subscribers are connected now, and later.
+    fn subscribers(&self) -> watch::Receiver<usize>;
+}
+
+/// Answers the calls to one service that this side serves.
+#[async_trait]
+pub trait ServiceHandler: Send + Sync + 'static {
+    /// Takes a serialized request, gives a serialized response or the reason why not.
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String>;
+}
+
+/// A service's types as its server announced them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServiceType {
+    /// `package/Type`.
+    pub name: String,
+    /// MD5 of request and response together.
+    pub md5: String,
+}
+
+/// A ROS parameter value.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(untagged)]
+pub enum ParamValue {
+    /// `true` or `false`.
+    Bool(bool),
+    /// 32-bit on the XML-RPC wire; wider values are refused there.
+    Int(i64),
+    /// A double.
+    Double(f64),
+    /// UTF-8 text.
+    String(String),
+    /// A list.
+    List(Vec<ParamValue>),
+    /// A dictionary.
+    Map(BTreeMap<String, ParamValue>),
+}
+
+/// What can go wrong on a bus.
+#[derive(Debug, thiserror::Error)]
+pub enum BusError {
+    /// Nobody serves it.
+    #[error("service {0} has no server")]
+    NoService(String),
+    /// Both sides mean different definitions.
+    #[error("{what} is {theirs} there and {ours} here")]
+    TypeMismatch {
+        /// Topic or service.
+        what: String,
+        /// `name md5` as the peer has it.
+        theirs: String,
+        /// `name md5` as we have it.
+        ours: String,
+    },
+    /// The server said no.
+    #[error("service {service} failed: {reason}")]
+    CallFailed {
+        /// The service's name.
+        service: String,
+        /// What the server said.
+        reason: String,
+    },
+    /// No answer in time.
+    #[error("{what} did not answer within {after:?}")]
+    Timeout {
+        /// Topic, service or Master.
+        what: String,
+        /// How long was waited.
+        after: Duration,
+    },
+    /// The Master refused.
+    #[error("the ROS Master refused {call}: {reason}")]
+    Master {
+        /// Method called.
+        call: String,
+        /// Its status message.
+        reason: String,
+    },
+    /// No such parameter.
+    #[error("parameter {0} is not set")]
+    NoParam(String),
+    /// A name that ROS does not allow.
+    #[error("{0} is not a valid ROS name")]
+    BadName(String),
+    /// The connection failed.
+    #[error("{what}: {source}")]
+    Io {
+        /// What was being done.
+        what: String,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The peer does not speak the protocol.
+    #[error("{what} broke the protocol: {reason}")]
+    Protocol {
+        /// Who.
+        what: String,
+        /// How.
+        reason: String,
+    },
+}
+
+/// One servant's (or one robot's) ROS, reached from outside. Names are resolved, absolute ones (`/image`).
+#[async_trait]
+pub trait Bus: Send + Sync + 'static {
+    /// The graph now and as it changes.
+    fn graph(&self) -> watch::Receiver<Arc<Graph>>;
+    /// Subscribes; publishers that come later are connected as they register.
+    async fn subscribe(&self, topic: &str, options: SubscribeOptions) -> Result<Subscription, BusError>;
+    /// Advertises.
+    async fn advertise(&self, topic: &str, options: AdvertiseOptions) -> Result<Box<dyn Publisher>, BusError>;
+    /// Calls a service once; the connection is kept for the next call.
+    async fn call(&self, service: &str, request: Bytes, timeout: Duration) -> Result<Bytes, BusError>;
+    /// Asks a server for its type without calling it (ROS 1: `probe=1`).
+    async fn service_type(&self, service: &str) -> Result<ServiceType, BusError>;
+    /// Asks a topic's peers for their type without subscribing: a publisher's header, or, for a topic that is
+    /// only subscribed to, what the subscribers announce when connected to.
+    async fn topic_type(&self, topic: &str) -> Result<WireType, BusError>;
+    /// Serves a service until the returned guard is dropped.
+    async fn serve(
+        &self,
+        service: &str,
+        service_type: ServiceType,
+        handler: Arc<dyn ServiceHandler>,
+    ) -> Result<Box<dyn Send + Sync>, BusError>;
+    /// Reads a parameter or a whole namespace (`/` for all).
+    async fn get_param(&self, key: &str) -> Result<ParamValue, BusError>;
+    /// Sets a parameter; a map replaces the namespace below `key`.
+    async fn set_param(&self, key: &str, value: ParamValue) -> Result<(), BusError>;
+    /// Removes a parameter.
+    async fn delete_param(&self, key: &str) -> Result<(), BusError>;
+    /// Whether it is set.
+    async fn has_param(&self, key: &str) -> Result<bool, BusError>;
+    /// Searches upwards from `namespace`, as ROS does.
+    async fn search_param(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
+    /// All keys that are set.
+    async fn param_names(&self) -> Result<Vec<String>, BusError>;
+}

@@ -1,0 +1,8 @@
+//! What ROS speaks, with nothing of containers in it: schemas of messages, codecs between serialized
+//! messages and JSON or CBOR, and the buses that carry them.
+//!
+//! In: definitions (`.msg`, `.srv`, `.action` texts) and sockets from a [`net::Sockets`].
+//! Out: a [`bus::Bus`] on which serialized messages are published, received and answered.
+
+pub mod bus;
+pub mod net;

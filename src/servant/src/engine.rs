@@ -1,0 +1,162 @@
+//! The seam to whoever starts servants.
+
+use std::path::PathBuf;
+use std::time::SystemTime;
+
+use async_trait::async_trait;
+use serde::{Deserialize, Serialize};
+use tokio::sync::{broadcast, mpsc, watch};
+
+use crate::endpoint::Endpoint;
+use crate::spec::{Limits, NodeSpec, Spec};
+
+/// Where a servant's container is in its life. (Admission and readiness, which need more knowledge than the
+/// engine has, are the choreographer's.)
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "state")]
+pub enum ContainerState {
+    /// Directories, namespaces and cgroup are being made.
+    Creating,
+    /// Init runs; nodes are started or starting.
+    Running {
+        /// Init's pid on the host.
+        init_pid: i32,
+    },
+    /// Ended as asked, or because its nodes did.
+    Stopped {
+        /// Why it ended.
+        reason: String,
+    },
+    /// Could not be started, or died of something that was not asked for (out of memory, init killed).
+    Failed {
+        /// What happened and what to do.
+        reason: String,
+    },
+}
+
+/// What happened to one process of a servant.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "event")]
+pub enum NodeEvent {
+    /// It was forked and its program executed.
+    Started {
+        /// The node's name.
+        node: String,
+        /// Pid on the host.
+        pid: i32,
+    },
+    /// Its program could not be executed.
+    ExecFailed {
+        /// The node's name.
+        node: String,
+        /// Why.
+        reason: String,
+    },
+    /// It ended.
+    Exited {
+        /// The node's name.
+        node: String,
+        /// Exit code, when it exited.
+        code: Option<i32>,
+        /// Signal number, when it was killed.
+        signal: Option<i32>,
+        /// The kernel killed it for exceeding the memory limit.
+        out_of_memory: bool,
+    },
+    /// It will be started again after its delay.
+    Respawning {
+        /// The node's name.
+        node: String,
+    },
+}
+
+/// How a node ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct NodeExit {
+    /// Exit code, when it exited.
+    pub code: Option<i32>,
+    /// Signal number, when it was killed.
+    pub signal: Option<i32>,
+    /// The kernel killed it for exceeding the memory limit.
+    pub out_of_memory: bool,
+    /// Why its program could not be executed, when so.
+    pub exec_error: Option<String>,
+}
+
+/// Which limits are in force, as read back from the kernel.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Enforced {
+    /// 1 or 2; 0 where no controller could be used.
+    pub cgroup_version: u8,
+    /// The values in force; none: this host cannot limit it.
+    pub limits: Limits,
+}
+
+/// Usage as the kernel counts it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Usage {
+    /// Microseconds of CPU so far.
+    pub cpu_usec: u64,
+    /// Bytes of memory now.
+    pub memory: u64,
+    /// Processes and threads now.
+    pub pids: u64,
+    /// Processes killed for want of memory so far.
+    pub oom_kills: u64,
+}
+
+/// One line that a process printed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LogLine {
+    /// When the shim read it.
+    pub time: SystemTime,
+    /// Which node printed it.
+    pub node: String,
+    /// `stdout` or `stderr`.
+    pub stream: String,
+    /// Without the line end.
+    pub line: String,
+}
+
+/// A servant that an engine runs. Cheap to share; dropping it does not end the servant.
+#[async_trait]
+pub trait Servant: Send + Sync + 'static {
+    /// The spec's id.
+    fn id(&self) -> &str;
+    /// Its state now and as it changes.
+    fn state(&self) -> watch::Receiver<ContainerState>;
+    /// Node events from now on.
+    fn events(&self) -> broadcast::Receiver<NodeEvent>;
+    /// How to reach it; valid while it runs.
+    fn endpoint(&self) -> Endpoint;
+    /// Limits read back from the kernel.
+    fn enforced(&self) -> Enforced;
+    /// Host pids of the node processes and all their children (not of init).
+    async fn processes(&self) -> Result<Vec<i32>, crate::Error>;
+    /// Usage now.
+    async fn usage(&self) -> Result<Usage, crate::Error>;
+    /// Starts one more node.
+    async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
+    /// Sends a signal to a node.
+    async fn signal_node(&self, node: &str, signal: i32) -> Result<(), crate::Error>;
+    /// Waits for a node to end and tells how; answers at once when it has ended already.
+    async fn wait_node(&self, node: &str) -> Result<NodeExit, crate::Error>;
+    /// Every line printed, from the first or from now on, none lost; ends when the container has ended.
+    fn follow_log(&self, from_start: bool) -> mpsc::Receiver<LogLine>;
+    /// First host uid (= gid) of its range and how many; uid 0 inside is the first.
+    fn uid_range(&self) -> (u32, u32);
+    /// Where its log is: JSON lines of [`LogLine`], rotated once to `.1`.
+    fn log_path(&self) -> PathBuf;
+    /// Ends it: SIGINT to the nodes, SIGTERM, then SIGKILL to all; returns when nothing is left
+    /// (process, mount, cgroup, directory).
+    async fn stop(&self) -> Result<(), crate::Error>;
+}
+
+/// Starts and finds servants.
+#[async_trait]
+pub trait Engine: Send + Sync + 'static {
+    /// Starts one; returns once its init runs and its endpoint can be used.
+    async fn start(&self, spec: Spec) -> Result<std::sync::Arc<dyn Servant>, crate::Error>;
+    /// Those that an earlier daemon left running, adopted; leftovers of dead ones are swept.
+    async fn adopt(&self) -> Result<Vec<std::sync::Arc<dyn Servant>>, crate::Error>;
+}

@@ -1,0 +1,101 @@
+//! What a servant is to be: layers, limits, nodes. Serializable, because the shim that runs it is another
+//! process and must be able to outlive the daemon.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// Everything the engine needs to know.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Spec {
+    /// Unique on this host; `[a-z0-9-]`, at most 48 characters. Becomes the host name, the cgroup's and the
+    /// state directory's name.
+    pub id: String,
+    /// Extracted layer trees, lowest first.
+    pub layers: Vec<PathBuf>,
+    /// Where changes go. A servant has none (read-only root); a build has a directory that becomes a layer.
+    #[serde(default)]
+    pub writable: Option<PathBuf>,
+    /// Which rights its processes have.
+    pub profile: Profile,
+    /// Hard limits.
+    #[serde(default)]
+    pub limits: Limits,
+    /// Environment of every process.
+    #[serde(default)]
+    pub environment: BTreeMap<String, String>,
+    /// Processes to start, in order, once the container runs.
+    #[serde(default)]
+    pub nodes: Vec<NodeSpec>,
+    /// Directories made in `writable` before the first process runs, owned by the compile user (1000:1000).
+    #[serde(default)]
+    pub owned_directories: Vec<PathBuf>,
+    /// Extra mounts, such as model files.
+    #[serde(default)]
+    pub mounts: Vec<Mount>,
+    /// Handed as it is to the shim's resident (the composed ROS Master): initial parameters and the like.
+    #[serde(default)]
+    pub resident: serde_json::Value,
+}
+
+/// Which rights a container has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Profile {
+    /// Other people's code for a robot: no capabilities, seccomp allow-list, read-only root, tmpfs scratch.
+    Servant,
+    /// Compiling other people's code: as a servant, with a writable root, as uid 1000, without network.
+    Compile,
+    /// Installing packages (dpkg): CHOWN, DAC_OVERRIDE, FOWNER, FSETID, SETUID, SETGID, SETFCAP; without network.
+    Install,
+}
+
+/// Hard limits; none means the engine's default.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Limits {
+    /// Cores, such as 1.5.
+    pub cpus: Option<f64>,
+    /// Relative share when cores are scarce, 1..10000, 100 by default (`cpu.weight`).
+    pub cpu_weight: Option<u64>,
+    /// Bytes of memory, swap not included.
+    pub memory: Option<u64>,
+    /// Processes and threads.
+    pub pids: Option<u64>,
+}
+
+/// One process to run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct NodeSpec {
+    /// Its name in logs and events, such as `/people_detect`. Unique within the servant.
+    pub name: String,
+    /// Absolute path of the executable inside, then its arguments.
+    pub argv: Vec<String>,
+    /// Added to the servant's environment.
+    #[serde(default)]
+    pub environment: BTreeMap<String, String>,
+    /// Working directory inside; `/` when empty.
+    #[serde(default)]
+    pub directory: String,
+    /// Start it again when it ends, whatever its status (roslaunch's `respawn`).
+    #[serde(default)]
+    pub respawn: bool,
+    /// Seconds before that.
+    #[serde(default)]
+    pub respawn_delay: f64,
+    /// When it ends the whole servant ends (roslaunch's `required`).
+    #[serde(default)]
+    pub required: bool,
+}
+
+/// A bind mount.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Mount {
+    /// On the host.
+    pub source: PathBuf,
+    /// Inside; absolute.
+    pub target: PathBuf,
+    /// Whether processes may write there.
+    pub writable: bool,
+}
