@@ -5,4 +5,7 @@
 //! Out: a [`bus::Bus`] on which serialized messages are published, received and answered.
 
 pub mod bus;
+pub mod codec;
 pub mod net;
+pub mod ros1;
+pub mod schema;

@@ -1,0 +1,1 @@
+//! Serialized messages ⇄ JSON and CBOR.
