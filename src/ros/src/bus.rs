@@ -4,11 +4,16 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::watch;
+
+mod queue;
+
+pub use queue::{MessageReceiver, MessageSender, message_queue};
 
 /// What nodes have registered, seen at one moment.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -74,16 +79,16 @@ pub struct Message {
 pub struct SubscribeOptions {
     /// `package/Type` where the caller knows it; the publisher's otherwise.
     pub wire_type: Option<WireType>,
-    /// Messages kept while the receiver is busy; the oldest is dropped (and counted) beyond.
+    /// Messages kept while the receiver is busy (0 counts as 1); the oldest is dropped (and counted) beyond.
     pub queue: usize,
 }
 
 /// A live subscription; dropping it unsubscribes.
 pub struct Subscription {
-    /// Messages in the order received per publisher.
-    pub messages: mpsc::Receiver<Message>,
+    /// Messages in the order received per publisher. What this bus itself published is not among them.
+    pub messages: MessageReceiver,
     /// Messages dropped so far because `messages` was full.
-    pub dropped: Arc<std::sync::atomic::AtomicU64>,
+    pub dropped: Arc<AtomicU64>,
     /// Keeps the subscription alive.
     pub guard: Box<dyn Send + Sync>,
 }
@@ -93,18 +98,23 @@ pub struct Subscription {
 pub struct AdvertiseOptions {
     /// Name, md5 and full definition of what will be published.
     pub wire_type: WireType,
-    /// Newcomers are given the last message.
+    /// Newcomers are given the last message of this publisher. Each advertisement keeps its own, so whoever
+    /// relays several latching publishers of one topic advertises once for each.
     pub latch: bool,
-    /// Messages kept per slow subscriber; the oldest is dropped beyond.
+    /// Messages kept per slow subscriber (0 counts as 1); the oldest is dropped beyond.
     pub queue: usize,
 }
 
-/// A topic that this side publishes; dropping it unadvertises.
+/// A topic that this side publishes; dropping it unadvertises, after what is queued was sent.
 pub trait Publisher: Send + Sync {
     /// Sends one serialized message (without length prefix) to every subscriber; never blocks.
     fn publish(&self, bytes: Bytes);
     /// How many subscribers are connected now, and later.
     fn subscribers(&self) -> watch::Receiver<usize>;
+    /// Messages dropped so far because a subscriber of this topic was too slow, summed over subscribers.
+    fn dropped(&self) -> u64 {
+        0
+    }
 }
 
 /// Answers the calls to one service that this side serves.
@@ -147,6 +157,12 @@ pub enum BusError {
     /// Nobody serves it.
     #[error("service {0} has no server")]
     NoService(String),
+    /// Nobody publishes or subscribes to it.
+    #[error("topic {0} has neither publisher nor subscriber")]
+    NoTopic(String),
+    /// This side serves it already.
+    #[error("service {0} is already served by this side; drop the earlier guard first")]
+    AlreadyServed(String),
     /// Both sides mean different definitions.
     #[error("{what} is {theirs} there and {ours} here")]
     TypeMismatch {
@@ -187,6 +203,17 @@ pub enum BusError {
     /// A name that ROS does not allow.
     #[error("{0} is not a valid ROS name")]
     BadName(String),
+    /// A value that does not fit the wire.
+    #[error("parameter {key} cannot be sent: {reason}")]
+    BadParam {
+        /// The parameter's key.
+        key: String,
+        /// What is wrong with its value.
+        reason: String,
+    },
+    /// The bus was closed.
+    #[error("the connection to this ROS system was closed")]
+    Closed,
     /// The connection failed.
     #[error("{what}: {source}")]
     Io {
@@ -211,11 +238,24 @@ pub trait Bus: Send + Sync + 'static {
     /// The graph now and as it changes.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Subscribes; publishers that come later are connected as they register.
-    async fn subscribe(&self, topic: &str, options: SubscribeOptions) -> Result<Subscription, BusError>;
+    async fn subscribe(
+        &self,
+        topic: &str,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BusError>;
     /// Advertises.
-    async fn advertise(&self, topic: &str, options: AdvertiseOptions) -> Result<Box<dyn Publisher>, BusError>;
+    async fn advertise(
+        &self,
+        topic: &str,
+        options: AdvertiseOptions,
+    ) -> Result<Box<dyn Publisher>, BusError>;
     /// Calls a service once; the connection is kept for the next call.
-    async fn call(&self, service: &str, request: Bytes, timeout: Duration) -> Result<Bytes, BusError>;
+    async fn call(
+        &self,
+        service: &str,
+        request: Bytes,
+        timeout: Duration,
+    ) -> Result<Bytes, BusError>;
     /// Asks a server for its type without calling it (ROS 1: `probe=1`).
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError>;
     /// Asks a topic's peers for their type without subscribing: a publisher's header, or, for a topic that is
@@ -240,4 +280,7 @@ pub trait Bus: Send + Sync + 'static {
     async fn search_param(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
     /// All keys that are set.
     async fn param_names(&self) -> Result<Vec<String>, BusError>;
+    /// Takes back everything registered and closes all connections. What is still held (subscriptions,
+    /// publishers, guards) becomes inert.
+    async fn close(&self) {}
 }

@@ -1,0 +1,234 @@
+//! The queue of one subscription: bounded, newest wins, never blocks its sender.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use parking_lot::Mutex;
+use tokio::sync::Notify;
+
+use super::Message;
+
+/// However long a queue is, it holds no more bytes than this (but always one message).
+const MAX_BYTES: usize = 64 << 20;
+
+/// Makes the two ends of a queue for at most `capacity` messages (0 counts as 1).
+///
+/// Beyond that, or beyond 64 MiB, the oldest messages are dropped and counted.
+pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
+    let shared = Arc::new(Shared {
+        ring: Mutex::new(Ring::default()),
+        capacity: capacity.max(1),
+        ready: Notify::new(),
+        dropped: Arc::new(AtomicU64::new(0)),
+    });
+    (
+        MessageSender {
+            shared: shared.clone(),
+        },
+        MessageReceiver { shared },
+    )
+}
+
+#[derive(Default)]
+struct Ring {
+    messages: VecDeque<Message>,
+    bytes: usize,
+    senders_gone: bool,
+    receiver_gone: bool,
+}
+
+struct Shared {
+    ring: Mutex<Ring>,
+    capacity: usize,
+    ready: Notify,
+    dropped: Arc<AtomicU64>,
+}
+
+/// Where messages go in. There is one; dropping it ends the queue once it has been read empty.
+pub struct MessageSender {
+    shared: Arc<Shared>,
+}
+
+impl MessageSender {
+    /// Queues a message, dropping the oldest ones if there is no room.
+    pub fn send(&self, message: Message) {
+        let mut lost = 0;
+        {
+            let mut ring = self.shared.ring.lock();
+            if ring.receiver_gone {
+                return;
+            }
+            let size = message.bytes.len();
+            while ring.messages.len() >= self.shared.capacity
+                || (ring.bytes + size > MAX_BYTES && !ring.messages.is_empty())
+            {
+                let Some(oldest) = ring.messages.pop_front() else {
+                    break;
+                };
+                ring.bytes -= oldest.bytes.len();
+                lost += 1;
+            }
+            ring.bytes += size;
+            ring.messages.push_back(message);
+        }
+        if lost > 0 {
+            self.shared.dropped.fetch_add(lost, Ordering::Relaxed);
+        }
+        self.shared.ready.notify_one();
+    }
+
+    /// Whether nobody will ever receive from this queue again.
+    pub fn is_closed(&self) -> bool {
+        self.shared.ring.lock().receiver_gone
+    }
+}
+
+impl Drop for MessageSender {
+    fn drop(&mut self) {
+        self.shared.ring.lock().senders_gone = true;
+        self.shared.ready.notify_one();
+    }
+}
+
+/// Where messages come out, in the order received per publisher.
+pub struct MessageReceiver {
+    shared: Arc<Shared>,
+}
+
+impl MessageReceiver {
+    /// The next message; `None` when the subscription has ended and everything was read. Safe to cancel.
+    pub async fn recv(&mut self) -> Option<Message> {
+        loop {
+            // A queue that never runs empty must not starve the task's neighbours.
+            tokio::task::consume_budget().await;
+            {
+                let mut ring = self.shared.ring.lock();
+                if let Some(message) = ring.messages.pop_front() {
+                    ring.bytes -= message.bytes.len();
+                    return Some(message);
+                }
+                if ring.senders_gone {
+                    return None;
+                }
+            }
+            self.shared.ready.notified().await;
+        }
+    }
+
+    /// The next message if one is already there.
+    pub fn try_recv(&mut self) -> Option<Message> {
+        let mut ring = self.shared.ring.lock();
+        let message = ring.messages.pop_front()?;
+        ring.bytes -= message.bytes.len();
+        Some(message)
+    }
+
+    /// How many messages are waiting.
+    pub fn len(&self) -> usize {
+        self.shared.ring.lock().messages.len()
+    }
+
+    /// Whether none is waiting.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The counter of messages dropped for want of room; it lives on after the queue.
+    pub fn dropped(&self) -> Arc<AtomicU64> {
+        self.shared.dropped.clone()
+    }
+}
+
+impl Drop for MessageReceiver {
+    fn drop(&mut self) {
+        let mut ring = self.shared.ring.lock();
+        ring.receiver_gone = true;
+        ring.messages.clear();
+        ring.bytes = 0;
+    }
+}
+
+impl fmt::Debug for MessageReceiver {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("MessageReceiver")
+            .field("waiting", &self.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for MessageSender {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("MessageSender")
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+
+    use super::*;
+    use crate::bus::WireType;
+
+    fn message(bytes: Bytes) -> Message {
+        let wire_type = WireType {
+            name: "p/T".into(),
+            md5: "*".into(),
+            definition: String::new(),
+        };
+        Message {
+            bytes,
+            wire_type: Arc::new(wire_type),
+            publisher: "/p".into(),
+            latching: false,
+        }
+    }
+
+    #[tokio::test]
+    async fn newest_win_and_drops_are_counted() {
+        let (sender, mut receiver) = message_queue(2);
+        let dropped = receiver.dropped();
+        for n in 0..5u8 {
+            sender.send(message(Bytes::copy_from_slice(&[n])));
+        }
+        assert_eq!(dropped.load(Ordering::Relaxed), 3);
+        assert_eq!(receiver.recv().await.unwrap().bytes[0], 3);
+        assert_eq!(receiver.try_recv().unwrap().bytes[0], 4);
+        assert!(receiver.try_recv().is_none());
+    }
+
+    #[tokio::test]
+    async fn bytes_are_bounded_but_one_message_always_fits() {
+        let (sender, mut receiver) = message_queue(1000);
+        let big = Bytes::from(vec![0; MAX_BYTES / 2 + 1]);
+        sender.send(message(big.clone()));
+        sender.send(message(big));
+        assert_eq!(receiver.len(), 1);
+        sender.send(message(Bytes::from(vec![0; MAX_BYTES + 1])));
+        assert_eq!(receiver.len(), 1);
+        assert_eq!(receiver.try_recv().unwrap().bytes.len(), MAX_BYTES + 1);
+    }
+
+    #[tokio::test]
+    async fn ends_after_everything_was_read() {
+        let (sender, mut receiver) = message_queue(4);
+        sender.send(message(Bytes::from_static(b"x")));
+        drop(sender);
+        assert!(receiver.recv().await.is_some());
+        assert!(receiver.recv().await.is_none());
+    }
+
+    #[tokio::test]
+    async fn a_waiting_receiver_is_woken() {
+        let (sender, mut receiver) = message_queue(4);
+        let waiting = tokio::spawn(async move { receiver.recv().await });
+        tokio::task::yield_now().await;
+        sender.send(message(Bytes::from_static(b"x")));
+        assert!(waiting.await.unwrap().is_some());
+        assert!(sender.is_closed());
+    }
+}
