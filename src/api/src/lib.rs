@@ -1,1 +1,33 @@
-//! api
+//! What daemon, command line and web page say to each other under `/api/v1`: plain serde types, no behaviour
+//! beyond parsing and printing sizes. Every time is in milliseconds since 1970; every size in bytes.
+//!
+//! A request is answered by one of these types as JSON, by a stream of them as JSON lines ([`NDJSON`]), or by
+//! a [`problem::Problem`] with the HTTP status that it names.
+
+pub mod doctor;
+pub mod event;
+pub mod interface;
+pub mod limits;
+pub mod problem;
+pub mod push;
+pub mod servant;
+pub mod service;
+pub mod size;
+pub mod status;
+
+pub use doctor::{Check, CheckStatus, Doctor};
+pub use event::{Event, Level};
+pub use interface::Interface;
+pub use limits::{Limits, Usage};
+pub use problem::Problem;
+pub use push::{PushEvent, PushOptions};
+pub use servant::{LogLine, Phase, Servant, Stopped};
+pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
+pub use size::Size;
+pub use status::{Capacity, Isolation, Status};
+
+/// Media type of streams: one JSON value per line.
+pub const NDJSON: &str = "application/x-ndjson";
+
+/// Milliseconds since 1970-01-01 UTC.
+pub type Millis = u64;

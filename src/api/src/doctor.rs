@@ -1,0 +1,43 @@
+//! What the host needs, and whether it is there.
+
+use serde::{Deserialize, Serialize};
+
+/// The result of all checks.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Doctor {
+    /// Every check, in the order in which a person would mend them.
+    pub checks: Vec<Check>,
+}
+
+impl Doctor {
+    /// Nothing that is needed is missing.
+    pub fn well(&self) -> bool {
+        self.checks.iter().all(|check| check.status != CheckStatus::Missing)
+    }
+}
+
+/// One need.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Check {
+    /// What is needed.
+    pub name: String,
+    /// Whether it is there.
+    pub status: CheckStatus,
+    /// What was found.
+    pub found: String,
+    /// The command or the setting that mends it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mend: Option<String>,
+}
+
+/// Whether a need is met.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CheckStatus {
+    /// It is there.
+    Ok,
+    /// It works without, but less well.
+    Warning,
+    /// It does not work without.
+    Missing,
+}

@@ -1,0 +1,80 @@
+//! What a robot sees of a service: names and types. (The definitions' texts are served apart, at
+//! `/api/v1/services/NAME/interface`.)
+
+use serde::{Deserialize, Serialize};
+
+/// Topics, services, actions and parameters.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Interface {
+    /// Topics, by name.
+    pub topics: Vec<Topic>,
+    /// ROS services, by name.
+    pub services: Vec<Service>,
+    /// Actions, by name.
+    pub actions: Vec<Action>,
+    /// Parameters, by name.
+    pub parameters: Vec<Parameter>,
+}
+
+/// From the package's point of view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Direction {
+    /// The package subscribes: a robot publishes.
+    Input,
+    /// The package publishes: a robot subscribes.
+    Output,
+}
+
+/// One end of a topic.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Topic {
+    /// Absolute name, such as `/image`.
+    pub name: String,
+    /// `package/Type`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// MD5 of the type.
+    pub md5: String,
+    /// Which end the package holds.
+    pub direction: Direction,
+    /// Newcomers get the last message.
+    pub latched: bool,
+    /// Registered only while an output is subscribed to.
+    pub lazy: bool,
+}
+
+/// A ROS service.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Service {
+    /// Absolute name.
+    pub name: String,
+    /// `package/Type`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// The serving node.
+    pub node: String,
+}
+
+/// An action.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Action {
+    /// Absolute name.
+    pub name: String,
+    /// `package/Name`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// The serving node.
+    pub node: String,
+}
+
+/// A parameter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Parameter {
+    /// Absolute name.
+    pub name: String,
+    /// Its value when the interface was found.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub value: Option<serde_json::Value>,
+}

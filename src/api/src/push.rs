@@ -1,0 +1,142 @@
+//! Pushing a package: options in the query, an archive in the body, a stream of events back.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::limits::Limits;
+use crate::problem::Problem;
+use crate::service::ServiceDetail;
+
+/// What to make of the archive (`POST /api/v1/push?options=JSON`; the body is a tar, gzipped or not, and empty
+/// with `apt`).
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PushOptions {
+    /// The service's name; the package's by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// A packaged ROS package instead of an archive.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub apt: Option<String>,
+    /// Name of the base image definition.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub base: Option<String>,
+    /// Launch file, relative to the package, or its bare name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub launch: Option<String>,
+    /// Executables to run, instead of a launch file.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub nodes: Vec<String>,
+    /// Private parameters of the nodes (`~K`), or global ones when they begin with `/`.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub params: BTreeMap<String, serde_json::Value>,
+    /// Arguments of the launch file.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub args: BTreeMap<String, String>,
+    /// Names to remap, from → to.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub remaps: BTreeMap<String, String>,
+    /// Supplement to the interface where a node cannot be woken at push.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub interface: Option<serde_json::Value>,
+    /// Dependencies by hand: rosdep key or ROS package → Debian package.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub map: BTreeMap<String, String>,
+    /// Debian packages to add.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub with: Vec<String>,
+    /// Limits of a servant; those given are also reserved for it.
+    pub limits: Limits,
+    /// What was pushed, in words, kept with the revision.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub source: String,
+}
+
+/// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum PushEvent {
+    /// A new step begins.
+    Step {
+        /// What is done now.
+        title: String,
+    },
+    /// One line of the build log.
+    Log {
+        /// Without the line end.
+        line: String,
+    },
+    /// How far the step is.
+    Progress {
+        /// What is counted, such as `packages`, or `bytes`.
+        unit: String,
+        /// So many are done.
+        done: u64,
+        /// Of so many, where known.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        total: Option<u64>,
+    },
+    /// Something to know that is no failure.
+    Warning {
+        /// What.
+        message: String,
+    },
+    /// Published.
+    Done {
+        /// The service as it is now.
+        service: Box<ServiceDetail>,
+        /// How its layers came to be.
+        layers: Vec<Layer>,
+        /// Milliseconds from the first byte to here.
+        took: u64,
+    },
+    /// Not published; an earlier revision keeps serving.
+    Error {
+        /// Why, and what to do.
+        problem: Problem,
+    },
+}
+
+/// A layer of the pushed image.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Layer {
+    /// `base`, `dependencies` or `package`.
+    pub name: String,
+    /// Digest of the compressed layer.
+    pub digest: String,
+    /// Compressed size.
+    pub size: u64,
+    /// Not made anew: it was known already.
+    pub cached: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_say_only_what_was_asked_for() {
+        let options = PushOptions {
+            apt: Some("opencv_apps".into()),
+            nodes: vec!["people_detect".into()],
+            ..PushOptions::default()
+        };
+        let text = serde_json::to_string(&options).expect("plain data");
+        assert_eq!(text, r#"{"apt":"opencv_apps","nodes":["people_detect"],"limits":{}}"#);
+        assert_eq!(serde_json::from_str::<PushOptions>(&text).expect("its own output"), options);
+    }
+
+    #[test]
+    fn an_unknown_option_is_named() {
+        let refused = serde_json::from_str::<PushOptions>(r#"{"nmae":"x"}"#).expect_err("misspelt");
+        assert!(refused.to_string().contains("`nmae`"), "{refused}");
+    }
+
+    #[test]
+    fn events_carry_their_type() {
+        let text = serde_json::to_string(&PushEvent::Progress { unit: "packages".into(), done: 3, total: Some(60) })
+            .expect("plain data");
+        assert_eq!(text, r#"{"type":"progress","unit":"packages","done":3,"total":60}"#);
+    }
+}

@@ -1,0 +1,107 @@
+//! Servants: containers at work for one robot.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::Millis;
+use crate::limits::{Limits, Usage};
+
+/// Where a servant is in its life; the choreographer draws the machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// A robot asked for it.
+    Requested,
+    /// The machine has room for it.
+    Admitted,
+    /// Its container runs.
+    Created,
+    /// Its nodes run; their interface is awaited.
+    Starting,
+    /// Its interface is there.
+    Ready,
+    /// It is being ended.
+    Draining,
+    /// It ended as it should.
+    Stopped,
+    /// It ended otherwise.
+    Failed,
+}
+
+impl fmt::Display for Phase {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.pad(match self {
+            Phase::Requested => "requested",
+            Phase::Admitted => "admitted",
+            Phase::Created => "created",
+            Phase::Starting => "starting",
+            Phase::Ready => "ready",
+            Phase::Draining => "draining",
+            Phase::Stopped => "stopped",
+            Phase::Failed => "failed",
+        })
+    }
+}
+
+/// A servant.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Servant {
+    /// Its id, also its container's and its cgroup's name.
+    pub id: String,
+    /// The service it serves.
+    pub service: String,
+    /// The revision it was started from.
+    pub revision: u64,
+    /// The robot it serves.
+    pub robot: String,
+    /// Where it is in its life.
+    pub phase: Phase,
+    /// Why it failed or stopped.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// When it was asked for.
+    pub created: Millis,
+    /// Connections that use it now.
+    pub connections: usize,
+    /// When it is ended if nobody connects before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub idle_until: Option<Millis>,
+    /// Limits asked for.
+    pub limits: Limits,
+    /// Limits in force, read back from the kernel; none while it is not running.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub enforced: Option<Limits>,
+    /// Version of the cgroup controllers that enforce them; 0: none could be used.
+    #[serde(default)]
+    pub cgroup_version: u8,
+    /// Usage now; none while it is not running.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub usage: Option<Usage>,
+    /// Host process ids of its nodes and their children.
+    #[serde(default)]
+    pub pids: Vec<i32>,
+    /// Messages dropped because its clients or nodes were slow.
+    #[serde(default)]
+    pub dropped: u64,
+}
+
+/// Which servants were ended.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stopped {
+    /// Their ids.
+    pub stopped: Vec<String>,
+}
+
+/// One line that a node printed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LogLine {
+    /// When.
+    pub time: Millis,
+    /// Which node.
+    pub node: String,
+    /// `stdout` or `stderr`.
+    pub stream: String,
+    /// Without the line end.
+    pub line: String,
+}
