@@ -1,1 +1,96 @@
-//! stories
+//! The whole system, told as stories: each a user's errand from end to end with real parts. Run by
+//! `make stories`, as root.
+
+use std::process::ExitCode;
+
+use libtest_mimic::{Arguments, Trial};
+use support::Told;
+
+#[path = "stories/answer.rs"]
+mod answer;
+#[path = "stories/house.rs"]
+mod house;
+#[path = "stories/images.rs"]
+mod images;
+#[path = "stories/isolation.rs"]
+mod isolation;
+#[path = "stories/portal.rs"]
+mod portal;
+#[path = "stories/push.rs"]
+mod push;
+#[path = "stories/refusals.rs"]
+mod refusals;
+
+/// A story under its function's name.
+fn story(name: &str, tell: fn() -> Told) -> Trial {
+    Trial::test(name, move || tell().map_err(|error| format!("{error:#}").into()))
+}
+
+/// Names functions once.
+macro_rules! stories {
+    ($module:ident: $($name:ident),+ $(,)?) => {
+        vec![$(story(concat!(stringify!($module), "::", stringify!($name)), $module::$name)),+]
+    };
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::from_args();
+    let trials = [
+        stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
+        stories![house:
+            a_second_daemon_on_the_same_home_is_refused,
+            a_taken_port_is_named,
+            the_demo_ends_by_itself_and_leaves_nothing,
+            doctor_names_each_need,
+            a_robot_that_stays_away_loses_its_servant_after_the_grace_time,
+        ],
+        stories![images:
+            skopeo_and_umoci_read_the_store,
+            what_nobody_refers_to_is_collected,
+        ],
+        stories![isolation:
+            every_node_process_is_confined,
+            nothing_of_ours_but_init_runs_inside,
+            limits_are_set_and_read_back,
+            a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
+            two_robots_see_nothing_of_each_other,
+        ],
+        stories![portal:
+            topics_and_services_cross_both_ways,
+            cbor_is_spoken_too,
+            a_robot_serves_and_a_node_side_caller_is_answered,
+            bad_frames_are_answered_by_status,
+            a_frame_over_the_limit_closes_with_1009,
+            unknown_services_are_404_and_name_what_exists,
+            beyond_loopback_only_with_a_token,
+            health_and_metrics_are_told,
+        ],
+        stories![push:
+            a_cpp_package_is_compiled_and_greets,
+            a_python_package_adds,
+            a_launch_file_is_resolved_by_roslaunch,
+            a_workspace_is_built_in_order,
+            a_prebuilt_space_is_served,
+            an_unchanged_push_builds_no_layer,
+            a_failed_build_leaves_the_earlier_revision_serving,
+            a_revision_is_rolled_back,
+            five_packaged_nodes_answer,
+        ],
+        stories![refusals:
+            a_directory_without_a_package,
+            malformed_xml,
+            dependencies_that_nothing_provides_are_listed_at_once,
+            a_node_that_leaves_at_once,
+            archives_that_reach_out_of_their_tree,
+            reserved_and_taken_names,
+            a_disk_with_no_room,
+        ],
+    ]
+    .concat();
+    let conclusion = libtest_mimic::run(&arguments, trials);
+    let left = support::world::end();
+    for thing in &left {
+        eprintln!("left behind: {thing}");
+    }
+    if conclusion.has_failed() || !left.is_empty() { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+}

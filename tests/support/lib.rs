@@ -1,1 +1,13 @@
-//! stories
+//! What stories are told with: a daemon of their own or the one they share, a deployer who types commands, a
+//! robot on a WebSocket, and an eye for what is left behind.
+
+pub mod binaries;
+pub mod daemon;
+pub mod deployer;
+pub mod leftovers;
+pub mod procfs;
+pub mod robot;
+pub mod world;
+
+/// What a story ends with: an error is told with all its causes.
+pub type Told = anyhow::Result<()>;

@@ -1,0 +1,82 @@
+# The whole user and developer surface. `make help` lists it.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+MAKEFLAGS += --no-print-directory
+
+CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cloudroid
+export CARGO_TARGET_DIR ?= $(CACHE)/cargo
+# Python clients (the demo's robot, the stories' roslibpy) live outside the clone, one environment per list of versions.
+VENV := $(CACHE)/python-$(shell sha256sum demo/requirements.txt | cut -c1-12)
+export CLOUDROID_PYTHON := $(VENV)/bin/python
+HOST := x86_64-unknown-linux-gnu
+PREFIX ?= /usr/local
+
+.PHONY: help
+help: ## what can be asked for
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+.PHONY: deps
+deps: ## install the Debian packages that building, running and testing need (as root)
+	@scripts/deps build run demo test
+
+.PHONY: demo-deps
+demo-deps:
+	@scripts/deps build run demo
+	@scripts/python "$(VENV)" demo/requirements.txt
+
+.PHONY: test-deps
+test-deps: deps
+	@scripts/python "$(VENV)" demo/requirements.txt
+
+# PID 1 of every servant is static: it runs on whatever root file system a service has.
+INIT_FLAGS := --locked -p init --profile init --target $(HOST)
+.PHONY: init
+init:
+	@RUSTFLAGS="-C target-feature=+crt-static" cargo build -q $(INIT_FLAGS)
+
+.PHONY: build
+build: ## build the daemon, the command line tool and the servants' init, optimised
+	@scripts/deps build
+	@echo "== building cloudroidd and cloudroidctl (release; the first time takes some minutes)"
+	@$(MAKE) init
+	@cargo build --locked --release -p cloudroidd -p cloudroidctl
+	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
+
+.PHONY: build-dev
+build-dev:
+	@$(MAKE) init
+	@cargo build --locked -p cloudroidd -p cloudroidctl
+	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/debug/cloudroid-init"
+
+.PHONY: demo
+demo: demo-deps build ## push Debian's people_detect and find people in real pictures; CHECK=1 ends by itself
+	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/release" demo/demo
+
+.PHONY: test
+test: test-deps lint unit stories ## format, lints, unit tests, stories
+
+.PHONY: lint
+lint:
+	@echo "== format"
+	@cargo fmt --all --check
+	@echo "== clippy, warnings denied"
+	@cargo clippy --locked --workspace --all-targets -- -D warnings
+
+.PHONY: unit
+unit: build-dev
+	@echo "== unit tests"
+	@cargo test --locked --workspace --exclude stories
+
+.PHONY: stories
+stories: build-dev ## the whole system, told as stories; ONLY=name runs those whose name contains it
+	@echo "== stories"
+	@cargo test --locked -p stories -- $(ONLY)
+
+.PHONY: bench
+bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
+	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
+
+.PHONY: install
+install: build ## install binaries, units and the example configuration below PREFIX
+	@scripts/install "$(CARGO_TARGET_DIR)/release" "$(DESTDIR)" "$(PREFIX)"

@@ -1,0 +1,152 @@
+//! The port, as clients of rosbridge and HTTP meet it.
+
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::Told;
+use support::robot::Robot;
+use support::world::{ADDER, GREETER, world};
+use tokio_tungstenite::tungstenite::{Bytes, Message};
+
+pub fn topics_and_services_cross_both_ways() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut robot = daemon.robot("greeter_cpp?robot=crossing")?;
+    robot.says(json!({"op": "advertise", "id": "a1", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    robot.says(json!({"op": "subscribe", "id": "s1", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}))?;
+    robot.awaits_subscriber("/greeter/name")?;
+    robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Ada"}}))?;
+    ensure!(robot.hears_on("/greeter/greeting")?["text"] == "hi Ada");
+    let answer = robot.calls("/greeter/count", json!([false]))?;
+    ensure!(answer["values"]["count"] == 1, "arguments may be a list: {answer}");
+    // A second subscriber of the same robot is given the latched greeting.
+    let mut viewer = daemon.robot("greeter_cpp?robot=crossing")?;
+    viewer.subscribes("/greeter/greeting")?;
+    ensure!(viewer.hears_on("/greeter/greeting")?["text"] == "hi Ada", "latched");
+    // After unsubscribing nothing more comes.
+    robot.says(json!({"op": "unsubscribe", "id": "s1", "topic": "/greeter/greeting"}))?;
+    robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Bob"}}))?;
+    ensure!(viewer.hears_on("/greeter/greeting")?["text"] == "hi Bob");
+    ensure!(robot.has_not_heard(|value| value["msg"]["text"] == "hi Bob")?);
+    robot.says(json!({"op": "unadvertise", "topic": "/greeter/name"}))?;
+    let failed = robot.calls("/greeter/no_such_service", json!({}))?;
+    ensure!(failed["result"] == false && failed["values"].to_string().contains("no_such_service"), "{failed}");
+    Ok(())
+}
+
+pub fn cbor_is_spoken_too() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut robot = daemon.robot("greeter_cpp?robot=binary")?;
+    robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    robot.says(json!({"op": "subscribe", "topic": "/greeter/greeting", "compression": "cbor"}))?;
+    robot.awaits_subscriber("/greeter/name")?;
+    let mut frame = Vec::new();
+    let publish = json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Ada"}});
+    ciborium::into_writer(&publish, &mut frame)?;
+    robot.sends(Message::Binary(Bytes::from(frame)))?;
+    loop {
+        if let Message::Binary(bytes) = robot.frame(support::robot::PATIENCE)? {
+            let value: Value = ciborium::from_reader(bytes.as_ref())?;
+            ensure!(value["op"] == "publish" && value["msg"]["text"] == "hi Ada", "{value}");
+            return Ok(());
+        }
+    }
+}
+
+pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut server = daemon.robot("greeter_cpp?robot=server")?;
+    server.says(json!({"op": "advertise_service", "service": "/lamp", "type": "std_srvs/SetBool"}))?;
+    // A second connection of the same robot asks through the servant's own ROS graph.
+    let mut caller = daemon.robot("greeter_cpp?robot=server")?;
+    while caller.calls("/rosapi/service_type", json!({"service": "/lamp"}))?["values"]["type"] != "std_srvs/SetBool" {}
+    caller.says(json!({"op": "call_service", "id": "q", "service": "/lamp", "args": {"data": true}}))?;
+    let request = server.hears("the call", |value| value["op"] == "call_service" && value["service"] == "/lamp")?;
+    ensure!(request["args"]["data"] == true, "{request}");
+    server.says(json!({
+        "op": "service_response", "id": request["id"], "service": "/lamp", "result": true,
+        "values": {"success": true, "message": "lit"}
+    }))?;
+    let answer = caller.hears("the answer", |value| value["op"] == "service_response" && value["id"] == "q")?;
+    ensure!(answer["result"] == true && answer["values"]["message"] == "lit", "{answer}");
+    Ok(())
+}
+
+pub fn bad_frames_are_answered_by_status() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut robot = daemon.robot("greeter_cpp?robot=clumsy")?;
+    robot.sends(Message::text("{\"op\": \"publish\", "))?;
+    robot.hears_status("JSON")?;
+    robot.says(json!({"op": "dance"}))?;
+    robot.hears_status("dance")?;
+    robot.says(json!({"op": "subscribe"}))?;
+    robot.hears_status("topic")?;
+    robot.says(json!({"op": "advertise", "topic": "/nowhere", "type": "no_such_msgs/Thing"}))?;
+    robot.hears_status("no_such_msgs/Thing")?;
+    robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": 7}}))?;
+    robot.hears_status("data")?;
+    robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x", "colour": "red"}}))?;
+    robot.hears_status("colour")?;
+    // The level is honoured, and the connection lives on through all of it.
+    robot.says(json!({"op": "set_level", "level": "none"}))?;
+    robot.says(json!({"op": "dance again"}))?;
+    ensure!(robot.has_not_heard(|value| value["op"] == "status")?);
+    Ok(())
+}
+
+pub fn a_frame_over_the_limit_closes_with_1009() -> Told {
+    let daemon = world().own("small-frames").config("[portal]\nmax_frame = \"64K\"\n").start()?;
+    daemon.deployer().pushes("adder_py", &["--node", "adder.py"])?.succeeded()?;
+    let mut robot = daemon.robot("adder_py")?;
+    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"] == 2);
+    let huge = "x".repeat(100_000);
+    robot.says(json!({"op": "publish", "topic": "/x", "msg": {"data": huge}}))?;
+    let close = robot.hears_close()?;
+    ensure!(u16::from(close.code) == 1009, "{close:?}");
+    ensure!(close.reason.contains("65536") || close.reason.contains("64"), "the limit is named: {close:?}");
+    Ok(())
+}
+
+pub fn unknown_services_are_404_and_name_what_exists() -> Told {
+    let daemon = world().with(ADDER)?;
+    let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service")) else {
+        anyhow::bail!("an unknown service accepted a robot")
+    };
+    ensure!(refusal.status == 404, "{refusal}");
+    ensure!(refusal.body.contains("no_such_service") && refusal.body.contains("adder_py"), "{refusal}");
+    Ok(())
+}
+
+pub fn beyond_loopback_only_with_a_token() -> Told {
+    let said = world().own("open").listen("0.0.0.0:0").refuses_to_start()?;
+    ensure!(said.contains("token"), "{said}");
+    let daemon = world().own("guarded").config("tokens = [\"open sesame\"]\n").listen("0.0.0.0:0").start()?;
+    let port = daemon.address.rsplit(':').next().context("a port")?.to_owned();
+    let ask = |headers: &[(&str, &str)]| -> anyhow::Result<u16> {
+        let local = format!("127.0.0.1:{port}");
+        let mut all = vec![("Host", local.as_str())];
+        all.extend_from_slice(headers);
+        Ok(daemon.request("GET", "/api/v1/services", &all)?.0)
+    };
+    ensure!(ask(&[])? == 401);
+    ensure!(ask(&[("Authorization", "Bearer wrong")])? == 401);
+    ensure!(ask(&[("Authorization", "Bearer open sesame")])? == 200);
+    Ok(())
+}
+
+pub fn health_and_metrics_are_told() -> Told {
+    let daemon = world().with(ADDER)?;
+    ensure!(daemon.get("/healthz")?.0 == 200);
+    let mut robot = daemon.robot("adder_py?robot=measured")?;
+    robot.subscribes("/sums")?;
+    robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
+    robot.hears_on("/sums")?;
+    let (status, metrics) = daemon.get("/metrics")?;
+    ensure!(status == 200);
+    for name in ["cloudroid_servants", "cloudroid_connections", "cloudroid_messages", "cloudroid_dropped"] {
+        ensure!(metrics.contains(name), "{name} in:\n{metrics}");
+    }
+    ensure!(robot.frame(Duration::from_millis(1)).is_err(), "nothing unasked was sent");
+    Ok(())
+}

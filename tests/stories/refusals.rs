@@ -1,0 +1,141 @@
+//! What bad input gets: an error that names the thing and the next step, and nothing half-made.
+
+use std::path::Path;
+
+use anyhow::ensure;
+use support::Told;
+use support::daemon::Daemon;
+use support::deployer::path_str;
+use support::world::{ADDER, world};
+
+/// No service of this name, no build directory, no servant of it.
+fn nothing_half_made(daemon: &Daemon, service: &str) -> Told {
+    ensure!(daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404, "{service} was published");
+    ensure!(daemon.servants_of(service)?.is_empty(), "{service} has servants");
+    Ok(())
+}
+
+pub fn a_directory_without_a_package() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let empty = place.path().join("empty_thing");
+    std::fs::create_dir(&empty)?;
+    daemon.deployer().types(&["push", path_str(&empty)])?.failed_saying(&["package.xml", "empty_thing"])?;
+    let missing = place.path().join("not_there");
+    daemon.deployer().types(&["push", path_str(&missing)])?.failed_saying(&["not_there"])?;
+    nothing_half_made(&daemon, "empty_thing")
+}
+
+pub fn malformed_xml() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let package = place.path().join("torn");
+    std::fs::create_dir(&package)?;
+    std::fs::write(package.join("package.xml"), "<package>\n  <name>torn</name>\n  <version>1.0.0\n</package>\n")?;
+    daemon.deployer().types(&["push", path_str(&package)])?.failed_saying(&["package.xml", "4:"])?;
+    nothing_half_made(&daemon, "torn")
+}
+
+pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Told {
+    let daemon = world().shared()?;
+    daemon
+        .deployer()
+        .pushes("wants_the_impossible", &["--node", "any"])?
+        .failed_saying(&["warp_drive", "flux_capacitor_msgs", "--map"])?;
+    nothing_half_made(&daemon, "wants_the_impossible")
+}
+
+pub fn a_node_that_leaves_at_once() -> Told {
+    let daemon = world().shared()?;
+    daemon
+        .deployer()
+        .pushes("leaver_py", &["--node", "leaver.py"])?
+        .failed_saying(&["leaver", "3", "the map file is missing"])?;
+    nothing_half_made(&daemon, "leaver_py")
+}
+
+/// One entry of an archive, with a header as hostile as wanted.
+fn archive_with(entry: impl Fn(&mut tar::Builder<Vec<u8>>)) -> anyhow::Result<Vec<u8>> {
+    let mut builder = tar::Builder::new(Vec::new());
+    let manifest = b"<package><name>sly</name><version>1.0.0</version><description>x</description>\
+        <maintainer email=\"a@b.org\">a</maintainer><license>x</license></package>";
+    let mut header = tar::Header::new_gnu();
+    header.set_size(manifest.len() as u64);
+    header.set_mode(0o644);
+    header.set_cksum();
+    builder.append_data(&mut header, "package.xml", &manifest[..])?;
+    entry(&mut builder);
+    Ok(builder.into_inner()?)
+}
+
+fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, link: &str) {
+    let mut header = tar::Header::new_ustar();
+    let bytes = header.as_mut_bytes();
+    bytes[..name.len()].copy_from_slice(name.as_bytes());
+    bytes[157..157 + link.len()].copy_from_slice(link.as_bytes());
+    header.set_entry_type(kind);
+    header.set_mode(0o644);
+    header.set_size(0);
+    header.set_cksum();
+    builder.append(&header, std::io::empty()).expect("into memory");
+}
+
+pub fn archives_that_reach_out_of_their_tree() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    use tar::EntryType;
+    let cases: [(&str, EntryType, &str); 6] = [
+        ("../escape", EntryType::Regular, ""),
+        ("/etc/escape", EntryType::Regular, ""),
+        ("dev_null", EntryType::Char, ""),
+        ("pipe", EntryType::Fifo, ""),
+        ("out", EntryType::Symlink, "../../etc/passwd"),
+        ("hard", EntryType::Link, "../../etc/passwd"),
+    ];
+    for (index, (name, kind, link)) in cases.into_iter().enumerate() {
+        let archive = place.path().join(format!("sly{index}.tar"));
+        std::fs::write(&archive, archive_with(|builder| raw(builder, name, kind, link))?)?;
+        daemon
+            .deployer()
+            .types(&["push", path_str(&archive), "--name", "sly", "--node", "x"])?
+            .failed_saying(&[name])?;
+    }
+    ensure!(!Path::new("/etc/escape").exists());
+    nothing_half_made(&daemon, "sly")
+}
+
+pub fn reserved_and_taken_names() -> Told {
+    let daemon = world().with(ADDER)?;
+    for name in ["api", "v2", "stubs", "metrics", "healthz", "assets"] {
+        daemon.deployer().pushes("adder_py", &["--name", name, "--node", "adder.py"])?.failed_saying(&[name, "reserved"])?;
+    }
+    for name in ["../up", "a b", "", "Ümlaut"] {
+        daemon.deployer().pushes("adder_py", &["--name", name, "--node", "adder.py"])?.failed_saying(&["name"])?;
+    }
+    // A service of another package does not lose its name to a newcomer unawares.
+    daemon
+        .deployer()
+        .pushes("leaver_py", &["--name", "adder_py", "--node", "leaver.py"])?
+        .failed_saying(&["adder_py", "taken"])?;
+    Ok(())
+}
+
+pub fn a_disk_with_no_room() -> Told {
+    let place = tempfile::Builder::new().prefix("cloudroid-stories-small-").tempdir()?;
+    nix::mount::mount(
+        Some("tmpfs"),
+        place.path(),
+        Some("tmpfs"),
+        nix::mount::MsFlags::empty(),
+        Some("size=24M"),
+    )?;
+    let told = (|| {
+        let daemon = support::daemon::Setup::new(&place.path().join("home")).start()?;
+        daemon.deployer().pushes("adder_py", &["--node", "adder.py"])?.failed_saying(&["room"])?;
+        nothing_half_made(&daemon, "adder_py")?;
+        ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
+        Ok(())
+    })();
+    nix::mount::umount2(place.path(), nix::mount::MntFlags::MNT_DETACH)?;
+    told
+}

@@ -1,0 +1,29 @@
+//! Where the programs under test are: beside this test binary, as cargo and make built them.
+
+use std::path::PathBuf;
+
+/// `name` in the directory that cargo builds into.
+pub fn path(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("the path of the running test");
+    let directory = test.parent().and_then(|deps| deps.parent()).expect("target/PROFILE/deps");
+    let path = directory.join(name);
+    assert!(path.exists(), "{} is missing; run make build-dev", path.display());
+    path
+}
+
+/// The checkout that these stories stand in.
+pub fn checkout() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the checkout").to_owned()
+}
+
+/// A package below `tests/packages`.
+pub fn package(name: &str) -> PathBuf {
+    checkout().join("tests/packages").join(name)
+}
+
+/// The Python that has roslibpy (see scripts/python).
+pub fn python() -> PathBuf {
+    std::env::var_os("CLOUDROID_PYTHON")
+        .map(PathBuf::from)
+        .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
+}

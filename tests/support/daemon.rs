@@ -1,0 +1,263 @@
+//! A daemon under test, with a home of its own.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::Value;
+
+use crate::binaries;
+use crate::deployer::Deployer;
+use crate::robot::{PATIENCE, Robot};
+
+/// A running `cloudroidd`.
+pub struct Daemon {
+    /// Its state directory.
+    pub home: PathBuf,
+    /// Where it listens, such as `127.0.0.1:40123`.
+    pub address: String,
+    child: Child,
+}
+
+/// How to start one.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    home: PathBuf,
+    config: String,
+    listen: String,
+    environment: Vec<(String, String)>,
+}
+
+impl Setup {
+    /// A daemon with its state in `home`, on a free port of loopback.
+    pub fn new(home: &Path) -> Setup {
+        Setup {
+            home: home.to_owned(),
+            config: String::new(),
+            listen: "127.0.0.1:0".to_owned(),
+            environment: Vec::new(),
+        }
+    }
+
+    /// With these lines of configuration.
+    pub fn config(mut self, toml: &str) -> Setup {
+        self.config.push_str(toml);
+        self
+    }
+
+    /// Listening there.
+    pub fn listen(mut self, address: &str) -> Setup {
+        self.listen = address.to_owned();
+        self
+    }
+
+    /// With this variable in its environment.
+    pub fn environment(mut self, key: &str, value: &str) -> Setup {
+        self.environment.push((key.to_owned(), value.to_owned()));
+        self
+    }
+
+    fn command(&self) -> anyhow::Result<Command> {
+        std::fs::create_dir_all(&self.home)?;
+        let mut command = Command::new(binaries::path("cloudroidd"));
+        command.arg("--home").arg(&self.home).args(["--listen", &self.listen]);
+        if !self.config.is_empty() {
+            let path = self.home.join("test-config.toml");
+            std::fs::write(&path, &self.config)?;
+            command.arg("--config").arg(path);
+        }
+        command.env_remove("CLOUDROID_HOME");
+        command.envs(self.environment.iter().map(|(key, value)| (key, value)));
+        command.stdin(Stdio::null());
+        Ok(command)
+    }
+
+    /// Starts it and waits until it answers.
+    pub fn start(&self) -> anyhow::Result<Daemon> {
+        let log = File::options().create(true).append(true).open(self.home.join("daemon.log")).or_else(|_| {
+            std::fs::create_dir_all(&self.home)?;
+            File::options().create(true).append(true).open(self.home.join("daemon.log"))
+        })?;
+        let mut child = self.command()?.stdout(log.try_clone()?).stderr(log).spawn()?;
+        let deployer = Deployer { home: self.home.clone() };
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Ok(status) = deployer.asks(&["status"])
+                && status["pid"] == child.id()
+            {
+                let address = status["listen"].as_str().context("status says where it listens")?.to_owned();
+                return Ok(Daemon { home: self.home.clone(), address, child });
+            }
+            if let Some(status) = child.try_wait()? {
+                bail!("cloudroidd ended with {status}:\n{}", read_log(&self.home));
+            }
+            if Instant::now() > deadline {
+                let _ = child.kill();
+                bail!("cloudroidd did not answer within {PATIENCE:?}:\n{}", read_log(&self.home));
+            }
+        }
+    }
+
+    /// Starts it where it must refuse, and gives its status and words.
+    pub fn refuses_to_start(&self) -> anyhow::Result<String> {
+        let output = self.command()?.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+        let output = wait_with_output_within(output, PATIENCE)?;
+        let said = format!(
+            "{}{}",
+            String::from_utf8_lossy(&output.1),
+            String::from_utf8_lossy(&output.2)
+        );
+        ensure!(!output.0.success(), "cloudroidd started and ended well:\n{said}");
+        ensure!(!said.contains("panicked"), "cloudroidd panicked:\n{said}");
+        Ok(said)
+    }
+}
+
+fn wait_with_output_within(mut child: Child, limit: Duration) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
+    let pid = Pid::from_raw(child.id() as i32);
+    let (mut out, mut err) = (child.stdout.take().expect("piped"), child.stderr.take().expect("piped"));
+    let (done, ended) = std::sync::mpsc::channel::<()>();
+    let watchdog = std::thread::spawn(move || {
+        if ended.recv_timeout(limit).is_err() {
+            let _ = kill(pid, Signal::SIGKILL);
+        }
+    });
+    let errors = std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        let _ = err.read_to_end(&mut bytes);
+        bytes
+    });
+    let mut bytes = Vec::new();
+    out.read_to_end(&mut bytes)?;
+    let status = child.wait()?;
+    let _ = done.send(());
+    let _ = watchdog.join();
+    Ok((status, bytes, errors.join().unwrap_or_default()))
+}
+
+fn read_log(home: &Path) -> String {
+    std::fs::read_to_string(home.join("daemon.log")).unwrap_or_default()
+}
+
+impl Daemon {
+    /// A deployer at a shell of this machine.
+    pub fn deployer(&self) -> Deployer {
+        Deployer { home: self.home.clone() }
+    }
+
+    /// A robot that connects to `path`, such as `opencv_apps?robot=r2`.
+    pub fn robot(&self, path: &str) -> anyhow::Result<Robot> {
+        Robot::connect(&self.url(path)).with_context(|| format!("the daemon said:\n{}", self.last_words()))
+    }
+
+    /// The WebSocket address of `path`.
+    pub fn url(&self, path: &str) -> String {
+        format!("ws://{}/{path}", self.address)
+    }
+
+    /// `GET PATH`: status and body.
+    pub fn get(&self, path: &str) -> anyhow::Result<(u16, String)> {
+        self.request("GET", path, &[])
+    }
+
+    /// `GET PATH` of JSON.
+    pub fn get_json(&self, path: &str) -> anyhow::Result<Value> {
+        let (status, body) = self.get(path)?;
+        ensure!(status == 200, "GET {path}: {status} {body}");
+        Ok(serde_json::from_str(&body)?)
+    }
+
+    /// An HTTP/1.1 request by hand, so that headers are what the story says.
+    pub fn request(&self, method: &str, path: &str, headers: &[(&str, &str)]) -> anyhow::Result<(u16, String)> {
+        let mut stream = TcpStream::connect(&self.address)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
+        if !headers.iter().any(|(name, _)| name.eq_ignore_ascii_case("host")) {
+            text.push_str(&format!("Host: {}\r\n", self.address));
+        }
+        for (name, value) in headers {
+            text.push_str(&format!("{name}: {value}\r\n"));
+        }
+        text.push_str("\r\n");
+        stream.write_all(text.as_bytes())?;
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer)?;
+        let answer = String::from_utf8_lossy(&answer).into_owned();
+        let (head, body) = answer.split_once("\r\n\r\n").context("an HTTP answer")?;
+        let status = head.split(' ').nth(1).context("a status line")?.parse()?;
+        let body = if head.to_ascii_lowercase().contains("transfer-encoding: chunked") {
+            dechunk(body)
+        } else {
+            body.to_owned()
+        };
+        Ok((status, body))
+    }
+
+    /// The servants of a service, as the API tells.
+    pub fn servants_of(&self, service: &str) -> anyhow::Result<Vec<Value>> {
+        let all = self.deployer().asks(&["servants"])?;
+        let list = all.as_array().context("servants is a list")?;
+        Ok(list.iter().filter(|servant| servant["service"] == service).cloned().collect())
+    }
+
+    /// The servant of one robot.
+    pub fn servant_of(&self, service: &str, robot: &str) -> anyhow::Result<Value> {
+        self.servants_of(service)?
+            .into_iter()
+            .find(|servant| servant["robot"] == robot)
+            .with_context(|| format!("{robot} has no servant of {service}"))
+    }
+
+    /// What it printed last.
+    pub fn last_words(&self) -> String {
+        let log = read_log(&self.home);
+        let lines: Vec<&str> = log.lines().collect();
+        lines[lines.len().saturating_sub(30)..].join("\n")
+    }
+
+    /// Its process id.
+    pub fn pid(&self) -> i32 {
+        self.child.id() as i32
+    }
+
+    /// Ends it as an operator would and waits.
+    pub fn ends(mut self) -> anyhow::Result<ExitStatus> {
+        kill(Pid::from_raw(self.pid()), Signal::SIGTERM)?;
+        Ok(self.child.wait()?)
+    }
+
+    /// Ends it as a crash would and waits.
+    pub fn is_killed(mut self) -> anyhow::Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        Ok(())
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        if let Ok(None) = self.child.try_wait() {
+            let _ = kill(Pid::from_raw(self.pid()), Signal::SIGTERM);
+            let _ = self.child.wait();
+        }
+    }
+}
+
+fn dechunk(mut body: &str) -> String {
+    let mut whole = String::new();
+    while let Some((size, rest)) = body.split_once("\r\n") {
+        let Ok(size) = usize::from_str_radix(size.trim(), 16) else { break };
+        if size == 0 || rest.len() < size {
+            break;
+        }
+        whole.push_str(&rest[..size]);
+        body = rest[size..].trim_start_matches("\r\n");
+    }
+    whole
+}

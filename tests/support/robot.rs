@@ -1,0 +1,177 @@
+//! A robot: a WebSocket client that speaks rosbridge as its protocol document says, with nothing of ours in it.
+
+use std::collections::VecDeque;
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use serde_json::{Value, json};
+use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+
+/// How long a story waits for what must come. Long: these machines are slow and shared.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// One connection.
+pub struct Robot {
+    socket: WebSocket<TcpStream>,
+    backlog: VecDeque<Value>,
+    calls: u64,
+}
+
+impl Robot {
+    /// Connects to `ws://ADDRESS/PATH`.
+    pub fn connect(url: &str) -> anyhow::Result<Robot> {
+        Robot::try_connect(url).map_err(|refusal| anyhow::anyhow!("{url}: {refusal}"))
+    }
+
+    /// Connects, or says with which HTTP status and body it was refused.
+    pub fn try_connect(url: &str) -> Result<Robot, Refusal> {
+        let address = url
+            .strip_prefix("ws://")
+            .and_then(|rest| rest.split('/').next())
+            .ok_or_else(|| Refusal::other("not a ws:// address"))?;
+        let stream = TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
+        let _ = stream.set_nodelay(true);
+        match tungstenite::client(url, stream) {
+            Ok((socket, _)) => Ok(Robot { socket, backlog: VecDeque::new(), calls: 0 }),
+            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => Err(Refusal {
+                status: response.status().as_u16(),
+                body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default()).into_owned(),
+            }),
+            Err(error) => Err(Refusal::other(&error.to_string())),
+        }
+    }
+
+    /// Sends one operation.
+    pub fn says(&mut self, operation: Value) -> anyhow::Result<()> {
+        self.sends(Message::text(operation.to_string()))
+    }
+
+    /// Sends a frame as it is.
+    pub fn sends(&mut self, frame: Message) -> anyhow::Result<()> {
+        self.socket.send(frame).context("the connection is gone")
+    }
+
+    /// The next frame, whatever it is.
+    pub fn frame(&mut self, within: Duration) -> anyhow::Result<Message> {
+        self.socket.get_ref().set_read_timeout(Some(within.max(Duration::from_millis(1))))?;
+        Ok(self.socket.read()?)
+    }
+
+    /// The first message that `wanted` accepts; others are kept for later.
+    pub fn hears(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+        if let Some(index) = self.backlog.iter().position(&wanted) {
+            return Ok(self.backlog.remove(index).expect("just found"));
+        }
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let remaining = deadline.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
+                bail!("{what} did not come within {PATIENCE:?}; heard instead: {:?}", self.backlog);
+            }
+            let frame = self
+                .frame(remaining)
+                .with_context(|| format!("waiting for {what}; heard so far: {:?}", self.backlog))?;
+            let value = match frame {
+                Message::Text(text) => serde_json::from_str(text.as_str())?,
+                Message::Binary(bytes) => ciborium::from_reader::<Value, _>(bytes.as_ref())?,
+                Message::Close(frame) => bail!("closed while waiting for {what}: {frame:?}; heard {:?}", self.backlog),
+                _ => continue,
+            };
+            if wanted(&value) {
+                return Ok(value);
+            }
+            self.backlog.push_back(value);
+        }
+    }
+
+    /// Whether nothing that `unwanted` accepts comes before the answer to a call made now: messages keep their
+    /// order, so what has not come before that answer was not under way.
+    pub fn has_not_heard(&mut self, unwanted: impl Fn(&Value) -> bool) -> anyhow::Result<bool> {
+        self.calls("/rosapi/get_time", json!({}))?;
+        Ok(!self.backlog.iter().any(unwanted))
+    }
+
+    /// The message of the next publication on a topic.
+    pub fn hears_on(&mut self, topic: &str) -> anyhow::Result<Value> {
+        let heard = self.hears(&format!("a message on {topic}"), |value| {
+            value["op"] == "publish" && value["topic"] == topic
+        })?;
+        Ok(heard["msg"].clone())
+    }
+
+    /// The next status message that mentions `word`.
+    pub fn hears_status(&mut self, word: &str) -> anyhow::Result<Value> {
+        self.hears(&format!("a status that mentions {word:?}"), |value| {
+            value["op"] == "status" && value["msg"].as_str().is_some_and(|text| text.contains(word))
+        })
+    }
+
+    /// Calls a service and gives the whole response.
+    pub fn calls(&mut self, service: &str, arguments: Value) -> anyhow::Result<Value> {
+        self.calls += 1;
+        let id = format!("call:{}", self.calls);
+        self.says(json!({"op": "call_service", "id": id, "service": service, "args": arguments}))?;
+        self.hears(&format!("the answer of {service}"), |value| {
+            value["op"] == "service_response" && value["id"] == id.as_str()
+        })
+    }
+
+    /// Waits until a node listens to `topic`, by asking rosapi again and again.
+    pub fn awaits_subscriber(&mut self, topic: &str) -> anyhow::Result<()> {
+        let deadline = Instant::now() + PATIENCE;
+        while Instant::now() < deadline {
+            let answer = self.calls("/rosapi/subscribers", json!({"topic": topic}))?;
+            if answer["values"]["subscribers"].as_array().is_some_and(|nodes| !nodes.is_empty()) {
+                return Ok(());
+            }
+        }
+        bail!("nobody subscribed to {topic} within {PATIENCE:?}")
+    }
+
+    /// Subscribes and says so by nothing, as the protocol has it.
+    pub fn subscribes(&mut self, topic: &str) -> anyhow::Result<()> {
+        self.says(json!({"op": "subscribe", "topic": topic}))
+    }
+
+    /// Waits for the other side to close, and gives code and reason.
+    pub fn hears_close(&mut self) -> anyhow::Result<CloseFrame> {
+        loop {
+            match self.frame(PATIENCE) {
+                Ok(Message::Close(Some(frame))) => return Ok(frame),
+                Ok(Message::Close(None)) => bail!("closed without a reason"),
+                Ok(_) => {}
+                Err(error) => return Err(error.context("the connection ended without a close frame")),
+            }
+        }
+    }
+
+    /// Says goodbye and waits for the answer.
+    pub fn leaves(mut self) -> anyhow::Result<()> {
+        self.socket.close(None)?;
+        while self.frame(PATIENCE).is_ok() {}
+        Ok(())
+    }
+}
+
+/// Why a connection was refused.
+#[derive(Debug)]
+pub struct Refusal {
+    /// HTTP status; 0 when it did not come to HTTP.
+    pub status: u16,
+    /// The body.
+    pub body: String,
+}
+
+impl Refusal {
+    fn other(text: &str) -> Refusal {
+        Refusal { status: 0, body: text.to_owned() }
+    }
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "refused with {}: {}", self.status, self.body)
+    }
+}

@@ -1,0 +1,123 @@
+//! What stories share: a place for homes, and one daemon with services that are pushed when the first story
+//! needs them. A robot's servant is its own, so stories that only use services do not meet.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, OnceLock};
+
+use tempfile::TempDir;
+
+use crate::daemon::{Daemon, Setup};
+use crate::leftovers;
+
+static WORLD: OnceLock<World> = OnceLock::new();
+
+/// The stories' place on this machine.
+pub struct World {
+    place: TempDir,
+    shared: Mutex<Option<Arc<Daemon>>>,
+    services: Mutex<HashMap<&'static str, Arc<OnceLock<Result<(), String>>>>>,
+}
+
+/// A service of the shared daemon.
+#[derive(Debug, Clone, Copy)]
+pub struct Service {
+    /// Its name.
+    pub name: &'static str,
+    /// What is pushed: a package below `tests/packages`, or none for `--apt`.
+    pub package: Option<&'static str>,
+    /// More arguments of the push.
+    pub arguments: &'static [&'static str],
+}
+
+/// Debian's `people_detect`.
+pub const PEOPLE: Service = Service {
+    name: "opencv_apps",
+    package: None,
+    arguments: &["--apt", "opencv_apps", "--node", "people_detect", "--param", "debug_view=false"],
+};
+
+/// Our C++ package, compiled at push.
+pub const GREETER: Service =
+    Service { name: "greeter_cpp", package: Some("greeter_cpp"), arguments: &["--node", "greeter", "--param", "word=hi"] };
+
+/// Our Python package.
+pub const ADDER: Service = Service { name: "adder_py", package: Some("adder_py"), arguments: &["--node", "adder.py"] };
+
+/// The world of this run.
+pub fn world() -> &'static World {
+    WORLD.get_or_init(|| {
+        assert!(nix::unistd::geteuid().is_root(), "the stories start servants, which needs root: sudo make test");
+        World {
+            place: tempfile::Builder::new().prefix("cloudroid-stories-").tempdir().expect("a temporary directory"),
+            shared: Mutex::new(None),
+            services: Mutex::default(),
+        }
+    })
+}
+
+impl World {
+    /// A new, empty home.
+    pub fn home(&self, name: &str) -> PathBuf {
+        self.place.path().join(name)
+    }
+
+    /// A daemon of one's own.
+    pub fn own(&self, name: &str) -> Setup {
+        Setup::new(&self.home(name))
+    }
+
+    /// The daemon that most stories use.
+    pub fn shared(&self) -> anyhow::Result<Arc<Daemon>> {
+        let mut shared = self.shared.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some(daemon) = &*shared {
+            return Ok(daemon.clone());
+        }
+        let daemon = Arc::new(self.own("shared").start()?);
+        *shared = Some(daemon.clone());
+        Ok(daemon)
+    }
+
+    /// The shared daemon, once it has this service: pushed by the first story that asks.
+    pub fn with(&self, service: Service) -> anyhow::Result<Arc<Daemon>> {
+        let daemon = self.shared()?;
+        let once = self
+            .services
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .entry(service.name)
+            .or_default()
+            .clone();
+        once.get_or_init(|| {
+            let deployer = daemon.deployer();
+            let pushed = match service.package {
+                Some(package) => deployer.pushes(package, service.arguments),
+                None => deployer.types(&[&["push"], service.arguments].concat()),
+            };
+            pushed.and_then(|outcome| outcome.succeeded()).map(|_| ()).map_err(|error| format!("{error:#}"))
+        })
+        .clone()
+        .map_err(|error| anyhow::anyhow!("{} could not be pushed: {error}", service.name))?;
+        Ok(daemon)
+    }
+}
+
+/// Ends what is shared and tells what stayed behind.
+pub fn end() -> Vec<String> {
+    let Some(world) = WORLD.get() else { return Vec::new() };
+    let daemon = world.shared.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take();
+    let mut left = Vec::new();
+    if let Some(daemon) = daemon {
+        match Arc::try_unwrap(daemon).map(Daemon::ends) {
+            Ok(Ok(_)) => {}
+            Ok(Err(error)) => left.push(format!("the shared daemon did not end: {error:#}")),
+            Err(_) => left.push("the shared daemon is still in use".to_owned()),
+        }
+    }
+    left.extend(leftovers::of(world.place.path()));
+    left.extend(leftovers::cgroups().into_iter().map(|path| format!("cgroup {}", path.display())));
+    if left.is_empty() {
+        let _ = std::fs::remove_dir_all(world.place.path());
+    }
+    left
+}
