@@ -23,7 +23,9 @@ mod refusals;
 
 /// A story under its function's name.
 fn story(name: &str, tell: fn() -> Told) -> Trial {
-    Trial::test(name, move || tell().map_err(|error| format!("{error:#}").into()))
+    Trial::test(name, move || {
+        tell().map_err(|error| format!("{error:#}").into())
+    })
 }
 
 /// Names functions once.
@@ -35,7 +37,7 @@ macro_rules! stories {
 
 fn main() -> ExitCode {
     let arguments = Arguments::from_args();
-    let trials = [
+    let trials: Vec<Trial> = [
         stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,
@@ -86,11 +88,17 @@ fn main() -> ExitCode {
             a_disk_with_no_room,
         ],
     ]
-    .concat();
+    .into_iter()
+    .flatten()
+    .collect();
     let conclusion = libtest_mimic::run(&arguments, trials);
     let left = support::world::end();
     for thing in &left {
         eprintln!("left behind: {thing}");
     }
-    if conclusion.has_failed() || !left.is_empty() { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+    if conclusion.has_failed() || !left.is_empty() {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    }
 }

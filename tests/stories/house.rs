@@ -13,15 +13,24 @@ use support::{Told, binaries, leftovers};
 pub fn a_second_daemon_on_the_same_home_is_refused() -> Told {
     let daemon = world().own("one").start()?;
     let said = world().own("one").refuses_to_start()?;
-    ensure!(said.contains(&daemon.pid().to_string()), "the first is named: {said}");
+    ensure!(
+        said.contains(&daemon.pid().to_string()),
+        "the first is named: {said}"
+    );
     ensure!(daemon.get("/healthz")?.0 == 200, "and is not disturbed");
     Ok(())
 }
 
 pub fn a_taken_port_is_named() -> Told {
     let daemon = world().own("port-owner").start()?;
-    let said = world().own("port-wanter").listen(&daemon.address).refuses_to_start()?;
-    ensure!(said.contains(&daemon.address) && said.contains("--listen"), "{said}");
+    let said = world()
+        .own("port-wanter")
+        .listen(&daemon.address)
+        .refuses_to_start()?;
+    ensure!(
+        said.contains(&daemon.address) && said.contains("--listen"),
+        "{said}"
+    );
     Ok(())
 }
 
@@ -29,14 +38,21 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Told {
     // The demo's daemon fetches nothing that the shared one has not left in the cache.
     world().with(PEOPLE)?;
     let home = world().home("demo");
-    let binaries = binaries::path("cloudroidd").parent().map(ToOwned::to_owned).unwrap_or_default();
+    let binaries = binaries::path("cloudroidd")
+        .parent()
+        .map(ToOwned::to_owned)
+        .unwrap_or_default();
     let outcome = run(Command::new(binaries::checkout().join("demo/demo"))
         .env("BIN", binaries)
         .env("CHECK", "1")
         .env("CLOUDROID_HOME", &home)
         .env("CLOUDROID_LISTEN", "127.0.0.1:19090"))?
     .succeeded()?;
-    ensure!(outcome.stdout.contains("people found"), "{}", outcome.said());
+    ensure!(
+        outcome.stdout.contains("people found"),
+        "{}",
+        outcome.said()
+    );
     ensure!(home.join("people.png").exists());
     let left = leftovers::of(&home);
     ensure!(left.is_empty(), "left behind: {left:#?}");
@@ -46,8 +62,21 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Told {
 pub fn doctor_names_each_need() -> Told {
     let daemon = world().shared()?;
     let outcome = daemon.deployer().types(&["doctor"])?;
-    for need in ["root", "overlay", "idmap", "user namespace", "seccomp", "cgroup", "mmdebstrap", "cloudroid-init"] {
-        ensure!(outcome.said().to_lowercase().contains(need), "{need} in:\n{}", outcome.said());
+    for need in [
+        "root",
+        "overlay",
+        "idmap",
+        "user namespace",
+        "seccomp",
+        "cgroup",
+        "mmdebstrap",
+        "cloudroid-init",
+    ] {
+        ensure!(
+            outcome.said().to_lowercase().contains(need),
+            "{need} in:\n{}",
+            outcome.said()
+        );
     }
     let answer: Value = daemon.deployer().asks(&["doctor"])?;
     ensure!(answer.to_string().contains("mmdebstrap"), "{answer}");
@@ -55,17 +84,32 @@ pub fn doctor_names_each_need() -> Told {
 }
 
 pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Told {
-    let daemon = world().own("impatient").config("[servant]\ngrace = \"1s\"\n").start()?;
-    daemon.deployer().pushes("adder_py", &["--node", "adder.py"])?.succeeded()?;
+    let daemon = world()
+        .own("impatient")
+        .config("[times]\ngrace = \"1s\"\n")
+        .start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
     let mut robot = daemon.robot("adder_py?robot=guest")?;
     robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
-    let id = daemon.servant_of("adder_py", "guest")?["id"].as_str().unwrap_or_default().to_owned();
+    let id = daemon.servant_of("adder_py", "guest")?["id"]
+        .as_str()
+        .unwrap_or_default()
+        .to_owned();
     robot.leaves()?;
     let deadline = Instant::now() + PATIENCE;
     while !daemon.servants_of("adder_py")?.is_empty() {
-        ensure!(Instant::now() < deadline, "the servant is still there after {PATIENCE:?}");
+        ensure!(
+            Instant::now() < deadline,
+            "the servant is still there after {PATIENCE:?}"
+        );
     }
-    ensure!(leftovers::cgroups(&[id.clone()]).is_empty(), "{id} left a cgroup");
+    ensure!(
+        leftovers::cgroups(&[id.clone()]).is_empty(),
+        "{id} left a cgroup"
+    );
     // And a robot that comes back is given a new one.
     let mut robot = daemon.robot("adder_py?robot=guest")?;
     robot.calls("/add_two", json!({"a": 1, "b": 1}))?;

@@ -9,31 +9,64 @@ use support::{Told, procfs};
 /// The host pids of a robot's node processes.
 fn pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>> {
     let servant = daemon.servant_of(service, robot)?;
-    let pids: Vec<i32> =
-        servant["pids"].as_array().context("pids")?.iter().filter_map(|pid| Some(pid.as_i64()? as i32)).collect();
-    ensure!(!pids.is_empty(), "a ready servant has node processes: {servant:#}");
+    let pids: Vec<i32> = servant["pids"]
+        .as_array()
+        .context("pids")?
+        .iter()
+        .filter_map(|pid| Some(pid.as_i64()? as i32))
+        .collect();
+    ensure!(
+        !pids.is_empty(),
+        "a ready servant has node processes: {servant:#}"
+    );
     Ok(pids)
 }
 
 pub fn every_node_process_is_confined() -> Told {
     for service in [PEOPLE, GREETER, ADDER] {
         let daemon = world().with(service)?;
-        let _robot = daemon.robot(&format!("{}?robot=confined", service.name))?.calls("/rosapi/get_time", json!({}))?;
+        let _robot = daemon
+            .robot(&format!("{}?robot=confined", service.name))?
+            .calls("/rosapi/get_time", json!({}))?;
         for pid in pids(&daemon, service.name, "confined")? {
             let status = procfs::status(pid).with_context(|| format!("process {pid}"))?;
             let field = |name: &str| status.get(name).map_or("missing", String::as_str);
             let who = format!("{} ({pid}) of {}", field("Name"), service.name);
-            ensure!(field("Seccomp") == "2", "{who}: Seccomp {}", field("Seccomp"));
-            ensure!(field("NoNewPrivs") == "1", "{who}: NoNewPrivs {}", field("NoNewPrivs"));
+            ensure!(
+                field("Seccomp") == "2",
+                "{who}: Seccomp {}",
+                field("Seccomp")
+            );
+            ensure!(
+                field("NoNewPrivs") == "1",
+                "{who}: NoNewPrivs {}",
+                field("NoNewPrivs")
+            );
             for set in ["CapEff", "CapPrm", "CapInh", "CapBnd", "CapAmb"] {
-                ensure!(field(set) == "0000000000000000", "{who}: {set} {}", field(set));
+                ensure!(
+                    field(set) == "0000000000000000",
+                    "{who}: {set} {}",
+                    field(set)
+                );
             }
             let map = std::fs::read_to_string(format!("/proc/{pid}/uid_map"))?;
-            let numbers: Vec<u64> = map.split_whitespace().filter_map(|number| number.parse().ok()).collect();
-            ensure!(matches!(numbers[..], [0, first, 65536] if first >= 65536), "{who}: uid_map {map}");
+            let numbers: Vec<u64> = map
+                .split_whitespace()
+                .filter_map(|number| number.parse().ok())
+                .collect();
+            ensure!(
+                matches!(numbers[..], [0, first, 65536] if first >= 65536),
+                "{who}: uid_map {map}"
+            );
             for kind in ["user", "mnt", "pid", "net", "ipc", "uts", "cgroup"] {
-                let (theirs, ours) = (procfs::namespace(pid, kind), procfs::namespace(std::process::id() as i32, kind));
-                ensure!(theirs.is_some() && theirs != ours, "{who} shares our {kind} namespace");
+                let (theirs, ours) = (
+                    procfs::namespace(pid, kind),
+                    procfs::namespace(std::process::id() as i32, kind),
+                );
+                ensure!(
+                    theirs.is_some() && theirs != ours,
+                    "{who} shares our {kind} namespace"
+                );
             }
         }
     }
@@ -42,7 +75,9 @@ pub fn every_node_process_is_confined() -> Told {
 
 pub fn nothing_of_ours_but_init_runs_inside() -> Told {
     let daemon = world().with(PEOPLE)?;
-    let _answer = daemon.robot("opencv_apps?robot=counted")?.calls("/rosapi/get_time", json!({}))?;
+    let _answer = daemon
+        .robot("opencv_apps?robot=counted")?
+        .calls("/rosapi/get_time", json!({}))?;
     let node = pids(&daemon, "opencv_apps", "counted")?[0];
     let inside = procfs::namespace(node, "pid").context("the node's pid namespace")?;
     let mut commands: Vec<String> = procfs::pids()
@@ -52,40 +87,77 @@ pub fn nothing_of_ours_but_init_runs_inside() -> Told {
         .collect();
     commands.sort();
     ensure!(commands.len() == 2, "init and one node: {commands:#?}");
-    ensure!(commands.iter().any(|command| command.contains("init")), "{commands:#?}");
-    ensure!(commands.iter().any(|command| command.contains("/usr/lib/opencv_apps/people_detect")), "{commands:#?}");
+    ensure!(
+        commands.iter().any(|command| command.contains("init")),
+        "{commands:#?}"
+    );
+    ensure!(
+        commands
+            .iter()
+            .any(|command| command.contains("/usr/lib/opencv_apps/people_detect")),
+        "{commands:#?}"
+    );
     for word in ["roscore", "rosmaster", "rosbridge"] {
-        ensure!(!commands.iter().any(|command| command.contains(word)), "{word} runs inside: {commands:#?}");
+        ensure!(
+            !commands.iter().any(|command| command.contains(word)),
+            "{word} runs inside: {commands:#?}"
+        );
     }
     Ok(())
 }
 
 pub fn limits_are_set_and_read_back() -> Told {
     let daemon = world().with(GREETER)?;
-    let _answer = daemon.robot("greeter_cpp?robot=limited")?.calls("/rosapi/get_time", json!({}))?;
+    let _answer = daemon
+        .robot("greeter_cpp?robot=limited")?
+        .calls("/rosapi/get_time", json!({}))?;
     let servant = daemon.servant_of("greeter_cpp", "limited")?;
-    let version = servant["cgroup_version"].as_i64().context("the cgroup version is told")?;
-    ensure!(version == 1 || version == 2, "this host has cgroup controllers: {servant:#}");
+    let version = servant["cgroup_version"]
+        .as_i64()
+        .context("the cgroup version is told")?;
+    ensure!(
+        version == 1 || version == 2,
+        "this host has cgroup controllers: {servant:#}"
+    );
     for limit in ["cpus", "memory", "pids"] {
-        ensure!(servant["enforced"][limit].is_number(), "{limit} is read back: {servant:#}");
-        ensure!(servant["enforced"][limit] == servant["limits"][limit], "{limit} is what was asked: {servant:#}");
+        ensure!(
+            servant["enforced"][limit].is_number(),
+            "{limit} is read back: {servant:#}"
+        );
+        ensure!(
+            servant["enforced"][limit] == servant["limits"][limit],
+            "{limit} is what was asked: {servant:#}"
+        );
     }
     // The kernel's own files say the same.
     let pid = pids(&daemon, "greeter_cpp", "limited")?[0];
     let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup"))?;
     let memory = if version == 1 {
-        let path = groups.lines().find_map(|line| line.split_once(":memory:")).context("a memory cgroup")?.1;
+        let path = groups
+            .lines()
+            .find_map(|line| line.split_once(":memory:"))
+            .context("a memory cgroup")?
+            .1;
         std::fs::read_to_string(format!("/sys/fs/cgroup/memory{path}/memory.limit_in_bytes"))?
     } else {
-        let path = groups.lines().find_map(|line| line.strip_prefix("0::")).context("a cgroup")?;
+        let path = groups
+            .lines()
+            .find_map(|line| line.strip_prefix("0::"))
+            .context("a cgroup")?;
         std::fs::read_to_string(format!("/sys/fs/cgroup{path}/memory.max"))?
     };
-    ensure!(memory.trim() == servant["enforced"]["memory"].to_string(), "{memory} against {servant:#}");
+    ensure!(
+        memory.trim() == servant["enforced"]["memory"].to_string(),
+        "{memory} against {servant:#}"
+    );
     Ok(())
 }
 
-const HOG: Service =
-    Service { name: "hog_py", package: Some("hog_py"), arguments: &["--node", "hog.py", "--memory", "128M"] };
+const HOG: Service = Service {
+    name: "hog_py",
+    package: Some("hog_py"),
+    arguments: &["--node", "hog.py", "--memory", "128M"],
+};
 
 pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Told {
     let daemon = world().with(HOG)?;
@@ -95,25 +167,44 @@ pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Told 
     robot.awaits_subscriber("/take")?;
     robot.says(json!({"op": "publish", "topic": "/take", "msg": {"data": 400}}))?;
     let status = robot.hears_status("memory")?;
-    ensure!(status["msg"].as_str().is_some_and(|text| text.contains("128")), "the limit is named: {status}");
+    ensure!(
+        status["msg"]
+            .as_str()
+            .is_some_and(|text| text.contains("128")),
+        "the limit is named: {status}"
+    );
     Ok(())
 }
 
 pub fn two_robots_see_nothing_of_each_other() -> Told {
     let daemon = world().with(GREETER)?;
-    let (mut anna, mut bert) = (daemon.robot("greeter_cpp?robot=anna")?, daemon.robot("greeter_cpp?robot=bert")?);
+    let (mut anna, mut bert) = (
+        daemon.robot("greeter_cpp?robot=anna")?,
+        daemon.robot("greeter_cpp?robot=bert")?,
+    );
     for robot in [&mut anna, &mut bert] {
         robot.subscribes("/greeter/greeting")?;
-        robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+        robot.says(
+            json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}),
+        )?;
         robot.awaits_subscriber("/greeter/name")?;
     }
     anna.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Anna"}}))?;
     ensure!(anna.hears_on("/greeter/greeting")?["text"] == "hi Anna");
     bert.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Bert"}}))?;
     let greeting = bert.hears_on("/greeter/greeting")?;
-    ensure!(greeting["text"] == "hi Bert" && greeting["count"] == 1, "Bert's node has greeted Bert alone: {greeting}");
-    ensure!(anna.has_not_heard(|value| value["msg"]["text"] == "hi Bert")?, "Anna heard what was meant for Bert");
-    let (first, second) = (daemon.servant_of("greeter_cpp", "anna")?, daemon.servant_of("greeter_cpp", "bert")?);
+    ensure!(
+        greeting["text"] == "hi Bert" && greeting["count"] == 1,
+        "Bert's node has greeted Bert alone: {greeting}"
+    );
+    ensure!(
+        anna.has_not_heard(|value| value["msg"]["text"] == "hi Bert")?,
+        "Anna heard what was meant for Bert"
+    );
+    let (first, second) = (
+        daemon.servant_of("greeter_cpp", "anna")?,
+        daemon.servant_of("greeter_cpp", "bert")?,
+    );
     ensure!(first["id"] != second["id"], "each has a servant of its own");
     let nets: Vec<_> = [&first, &second]
         .iter()
@@ -124,7 +215,10 @@ pub fn two_robots_see_nothing_of_each_other() -> Told {
     anna.leaves()?;
     let mut anna = daemon.robot("greeter_cpp?robot=anna")?;
     let answer = anna.calls("/greeter/count", json!({"reset": false}))?;
-    ensure!(answer["values"]["count"] == 1, "the servant remembers: {answer}");
+    ensure!(
+        answer["values"]["count"] == 1,
+        "the servant remembers: {answer}"
+    );
     ensure!(daemon.servant_of("greeter_cpp", "anna")?["id"] == first["id"]);
     Ok(())
 }

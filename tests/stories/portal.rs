@@ -12,17 +12,25 @@ use tokio_tungstenite::tungstenite::{Bytes, Message};
 pub fn topics_and_services_cross_both_ways() -> Told {
     let daemon = world().with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=crossing")?;
-    robot.says(json!({"op": "advertise", "id": "a1", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    robot.says(
+        json!({"op": "advertise", "id": "a1", "topic": "/greeter/name", "type": "std_msgs/String"}),
+    )?;
     robot.says(json!({"op": "subscribe", "id": "s1", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}))?;
     robot.awaits_subscriber("/greeter/name")?;
     robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Ada"}}))?;
     ensure!(robot.hears_on("/greeter/greeting")?["text"] == "hi Ada");
     let answer = robot.calls("/greeter/count", json!([false]))?;
-    ensure!(answer["values"]["count"] == 1, "arguments may be a list: {answer}");
+    ensure!(
+        answer["values"]["count"] == 1,
+        "arguments may be a list: {answer}"
+    );
     // A second subscriber of the same robot is given the latched greeting.
     let mut viewer = daemon.robot("greeter_cpp?robot=crossing")?;
     viewer.subscribes("/greeter/greeting")?;
-    ensure!(viewer.hears_on("/greeter/greeting")?["text"] == "hi Ada", "latched");
+    ensure!(
+        viewer.hears_on("/greeter/greeting")?["text"] == "hi Ada",
+        "latched"
+    );
     // After unsubscribing nothing more comes.
     robot.says(json!({"op": "unsubscribe", "id": "s1", "topic": "/greeter/greeting"}))?;
     robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Bob"}}))?;
@@ -30,7 +38,10 @@ pub fn topics_and_services_cross_both_ways() -> Told {
     ensure!(robot.has_not_heard(|value| value["msg"]["text"] == "hi Bob")?);
     robot.says(json!({"op": "unadvertise", "topic": "/greeter/name"}))?;
     let failed = robot.calls("/greeter/no_such_service", json!({}))?;
-    ensure!(failed["result"] == false && failed["values"].to_string().contains("no_such_service"), "{failed}");
+    ensure!(
+        failed["result"] == false && failed["values"].to_string().contains("no_such_service"),
+        "{failed}"
+    );
     Ok(())
 }
 
@@ -47,7 +58,10 @@ pub fn cbor_is_spoken_too() -> Told {
     loop {
         if let Message::Binary(bytes) = robot.frame(support::robot::PATIENCE)? {
             let value: Value = ciborium::from_reader(bytes.as_ref())?;
-            ensure!(value["op"] == "publish" && value["msg"]["text"] == "hi Ada", "{value}");
+            ensure!(
+                value["op"] == "publish" && value["msg"]["text"] == "hi Ada",
+                "{value}"
+            );
             return Ok(());
         }
     }
@@ -56,19 +70,31 @@ pub fn cbor_is_spoken_too() -> Told {
 pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Told {
     let daemon = world().with(GREETER)?;
     let mut server = daemon.robot("greeter_cpp?robot=server")?;
-    server.says(json!({"op": "advertise_service", "service": "/lamp", "type": "std_srvs/SetBool"}))?;
+    server
+        .says(json!({"op": "advertise_service", "service": "/lamp", "type": "std_srvs/SetBool"}))?;
     // A second connection of the same robot asks through the servant's own ROS graph.
     let mut caller = daemon.robot("greeter_cpp?robot=server")?;
-    while caller.calls("/rosapi/service_type", json!({"service": "/lamp"}))?["values"]["type"] != "std_srvs/SetBool" {}
-    caller.says(json!({"op": "call_service", "id": "q", "service": "/lamp", "args": {"data": true}}))?;
-    let request = server.hears("the call", |value| value["op"] == "call_service" && value["service"] == "/lamp")?;
+    while caller.calls("/rosapi/service_type", json!({"service": "/lamp"}))?["values"]["type"]
+        != "std_srvs/SetBool"
+    {}
+    caller.says(
+        json!({"op": "call_service", "id": "q", "service": "/lamp", "args": {"data": true}}),
+    )?;
+    let request = server.hears("the call", |value| {
+        value["op"] == "call_service" && value["service"] == "/lamp"
+    })?;
     ensure!(request["args"]["data"] == true, "{request}");
     server.says(json!({
         "op": "service_response", "id": request["id"], "service": "/lamp", "result": true,
         "values": {"success": true, "message": "lit"}
     }))?;
-    let answer = caller.hears("the answer", |value| value["op"] == "service_response" && value["id"] == "q")?;
-    ensure!(answer["result"] == true && answer["values"]["message"] == "lit", "{answer}");
+    let answer = caller.hears("the answer", |value| {
+        value["op"] == "service_response" && value["id"] == "q"
+    })?;
+    ensure!(
+        answer["result"] == true && answer["values"]["message"] == "lit",
+        "{answer}"
+    );
     Ok(())
 }
 
@@ -86,7 +112,9 @@ pub fn bad_frames_are_answered_by_status() -> Told {
     robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
     robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": 7}}))?;
     robot.hears_status("data")?;
-    robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x", "colour": "red"}}))?;
+    robot.says(
+        json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x", "colour": "red"}}),
+    )?;
     robot.hears_status("colour")?;
     // The level is honoured, and the connection lives on through all of it.
     robot.says(json!({"op": "set_level", "level": "none"}))?;
@@ -96,15 +124,24 @@ pub fn bad_frames_are_answered_by_status() -> Told {
 }
 
 pub fn a_frame_over_the_limit_closes_with_1009() -> Told {
-    let daemon = world().own("small-frames").config("[portal]\nmax_frame = \"64K\"\n").start()?;
-    daemon.deployer().pushes("adder_py", &["--node", "adder.py"])?.succeeded()?;
+    let daemon = world()
+        .own("small-frames")
+        .config("[frames]\nmessage = \"64K\"\nframe = \"64K\"\n")
+        .start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
     let mut robot = daemon.robot("adder_py")?;
     ensure!(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"] == 2);
     let huge = "x".repeat(100_000);
     robot.says(json!({"op": "publish", "topic": "/x", "msg": {"data": huge}}))?;
     let close = robot.hears_close()?;
     ensure!(u16::from(close.code) == 1009, "{close:?}");
-    ensure!(close.reason.contains("65536") || close.reason.contains("64"), "the limit is named: {close:?}");
+    ensure!(
+        close.reason.contains("65536") || close.reason.contains("64"),
+        "the limit is named: {close:?}"
+    );
     Ok(())
 }
 
@@ -114,15 +151,27 @@ pub fn unknown_services_are_404_and_name_what_exists() -> Told {
         anyhow::bail!("an unknown service accepted a robot")
     };
     ensure!(refusal.status == 404, "{refusal}");
-    ensure!(refusal.body.contains("no_such_service") && refusal.body.contains("adder_py"), "{refusal}");
+    ensure!(
+        refusal.body.contains("no_such_service") && refusal.body.contains("adder_py"),
+        "{refusal}"
+    );
     Ok(())
 }
 
 pub fn beyond_loopback_only_with_a_token() -> Told {
     let said = world().own("open").listen("0.0.0.0:0").refuses_to_start()?;
     ensure!(said.contains("token"), "{said}");
-    let daemon = world().own("guarded").config("tokens = [\"open sesame\"]\n").listen("0.0.0.0:0").start()?;
-    let port = daemon.address.rsplit(':').next().context("a port")?.to_owned();
+    let daemon = world()
+        .own("guarded")
+        .config("tokens = [\"open sesame\"]\n")
+        .listen("0.0.0.0:0")
+        .start()?;
+    let port = daemon
+        .address
+        .rsplit(':')
+        .next()
+        .context("a port")?
+        .to_owned();
     let ask = |headers: &[(&str, &str)]| -> anyhow::Result<u16> {
         let local = format!("127.0.0.1:{port}");
         let mut all = vec![("Host", local.as_str())];
@@ -144,9 +193,17 @@ pub fn health_and_metrics_are_told() -> Told {
     robot.hears_on("/sums")?;
     let (status, metrics) = daemon.get("/metrics")?;
     ensure!(status == 200);
-    for name in ["cloudroid_servants", "cloudroid_connections", "cloudroid_messages", "cloudroid_dropped"] {
+    for name in [
+        "cloudroid_servants",
+        "cloudroid_connections",
+        "cloudroid_messages",
+        "cloudroid_dropped",
+    ] {
         ensure!(metrics.contains(name), "{name} in:\n{metrics}");
     }
-    ensure!(robot.frame(Duration::from_millis(1)).is_err(), "nothing unasked was sent");
+    ensure!(
+        robot.frame(Duration::from_millis(1)).is_err(),
+        "nothing unasked was sent"
+    );
     Ok(())
 }

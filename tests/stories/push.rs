@@ -23,8 +23,13 @@ pub fn a_cpp_package_is_compiled_and_greets() -> Told {
     let daemon = world().with(GREETER)?;
     let heard = greeting(&daemon, "greeter_cpp", "/greeter/name", "/greeter/greeting")?;
     ensure!(heard["text"] == "hi Ada" && heard["count"] == 1, "{heard}");
-    let answer = daemon.robot("greeter_cpp")?.calls("/greeter/count", json!({}))?;
-    ensure!(answer["result"] == true && answer["values"]["style"] == "plain", "yaml-cpp was found: {answer}");
+    let answer = daemon
+        .robot("greeter_cpp")?
+        .calls("/greeter/count", json!({}))?;
+    ensure!(
+        answer["result"] == true && answer["values"]["style"] == "plain",
+        "yaml-cpp was found: {answer}"
+    );
     Ok(())
 }
 
@@ -33,7 +38,10 @@ pub fn a_python_package_adds() -> Told {
     let mut robot = daemon.robot("adder_py")?;
     robot.subscribes("/sums")?;
     let answer = robot.calls("/add_two", json!({"a": 20, "b": 22}))?;
-    ensure!(answer["result"] == true && answer["values"]["sum"] == 42, "{answer}");
+    ensure!(
+        answer["result"] == true && answer["values"]["sum"] == 42,
+        "{answer}"
+    );
     Ok(())
 }
 
@@ -41,14 +49,45 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Told {
     let daemon = world().shared()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("greeter_cpp", &["--name", "launched", "--launch", "two.launch", "--arg", "word:=bonjour"])?
+        .pushes(
+            "greeter_cpp",
+            &[
+                "--name",
+                "launched",
+                "--launch",
+                "two.launch",
+                "--arg",
+                "word:=bonjour",
+            ],
+        )?
         .succeeded()?;
-    let heard = greeting(&daemon, "launched", "/left/first/name", "/left/first/greeting")?;
-    ensure!(heard["text"] == "bonjour Ada", "the argument and the private parameter arrived: {heard}");
+    let heard = greeting(
+        &daemon,
+        "launched",
+        "/left/first/name",
+        "/left/first/greeting",
+    )?;
+    ensure!(
+        heard["text"] == "bonjour Ada",
+        "the argument and the private parameter arrived: {heard}"
+    );
     let heard = greeting(&daemon, "launched", "/names", "/second/greeting")?;
-    ensure!(heard["text"] == "hello Ada", "the remapping arrived: {heard}");
+    ensure!(
+        heard["text"] == "hello Ada",
+        "the remapping arrived: {heard}"
+    );
     deployer
-        .pushes("greeter_cpp", &["--name", "launched", "--launch", "two.launch", "--arg", "no_such:=1"])?
+        .pushes(
+            "greeter_cpp",
+            &[
+                "--name",
+                "launched",
+                "--launch",
+                "two.launch",
+                "--arg",
+                "no_such:=1",
+            ],
+        )?
         .failed_saying(&["no_such"])?;
     Ok(())
 }
@@ -59,12 +98,25 @@ pub fn a_workspace_is_built_in_order() -> Told {
     let source = place.path().join("lab_ws/src");
     std::fs::create_dir_all(&source)?;
     for package in ["greeter_cpp", "adder_py"] {
-        run(Command::new("cp").arg("-r").arg(binaries::package(package)).arg(&source))?.succeeded()?;
+        run(Command::new("cp")
+            .arg("-r")
+            .arg(binaries::package(package))
+            .arg(&source))?
+        .succeeded()?;
     }
     let workspace = place.path().join("lab_ws");
     daemon
         .deployer()
-        .types(&["push", path_str(&workspace), "--name", "lab", "--node", "greeter_cpp/greeter", "--node", "adder_py/adder.py"])?
+        .types(&[
+            "push",
+            path_str(&workspace),
+            "--name",
+            "lab",
+            "--node",
+            "greeter_cpp/greeter",
+            "--node",
+            "adder_py/adder.py",
+        ])?
         .succeeded()?;
     let mut robot = daemon.robot("lab?robot=both")?;
     ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
@@ -77,24 +129,57 @@ pub fn a_prebuilt_space_is_served() -> Told {
     let place = tempfile::tempdir()?;
     // The install space that the push of the source package made, taken out of its image.
     let space = extract_install_space(&daemon, "adder_py", place.path())?;
-    daemon.deployer().types(&["push", path_str(&space), "--name", "prebuilt", "--node", "adder.py"])?.succeeded()?;
-    let answer = daemon.robot("prebuilt")?.calls("/add_two", json!({"a": 2, "b": 3}))?;
+    daemon
+        .deployer()
+        .types(&[
+            "push",
+            path_str(&space),
+            "--name",
+            "prebuilt",
+            "--node",
+            "adder.py",
+        ])?
+        .succeeded()?;
+    let answer = daemon
+        .robot("prebuilt")?
+        .calls("/add_two", json!({"a": 2, "b": 3}))?;
     ensure!(answer["values"]["sum"] == 5, "{answer}");
     Ok(())
 }
 
-fn extract_install_space(daemon: &Daemon, service: &str, to: &std::path::Path) -> anyhow::Result<std::path::PathBuf> {
+fn extract_install_space(
+    daemon: &Daemon,
+    service: &str,
+    to: &std::path::Path,
+) -> anyhow::Result<std::path::PathBuf> {
     let bundle = to.join("bundle");
     let image = format!("{}:{service}", daemon.home.join("images").display());
-    run(Command::new("umoci").args(["unpack", "--image", &image]).arg(&bundle))?.succeeded()?;
-    let marker = run(Command::new("find").arg(bundle.join("rootfs/opt")).args(["-name", ".catkin"]))?.succeeded()?;
-    let marker = marker.stdout.lines().next().context("an install space in the image")?.to_owned();
-    Ok(std::path::Path::new(&marker).parent().context("its directory")?.to_owned())
+    run(Command::new("umoci")
+        .args(["unpack", "--image", &image])
+        .arg(&bundle))?
+    .succeeded()?;
+    let marker = run(Command::new("find")
+        .arg(bundle.join("rootfs/opt"))
+        .args(["-name", ".catkin"]))?
+    .succeeded()?;
+    let marker = marker
+        .stdout
+        .lines()
+        .next()
+        .context("an install space in the image")?
+        .to_owned();
+    Ok(std::path::Path::new(&marker)
+        .parent()
+        .context("its directory")?
+        .to_owned())
 }
 
 pub fn an_unchanged_push_builds_no_layer() -> Told {
     let daemon = world().with(GREETER)?;
-    let outcome = daemon.deployer().pushes("greeter_cpp", &["--name", "again", "--node", "greeter"])?.succeeded()?;
+    let outcome = daemon
+        .deployer()
+        .pushes("greeter_cpp", &["--name", "again", "--node", "greeter"])?
+        .succeeded()?;
     ensure!(outcome.stdout.contains("again"), "{}", outcome.said());
     let first = daemon.get_json("/api/v1/services/again")?;
     let answer = daemon.deployer().types(&[
@@ -115,20 +200,30 @@ pub fn an_unchanged_push_builds_no_layer() -> Told {
         .find(|event| event["type"] == "done")
         .with_context(|| format!("a done event in {}", answer.stdout))?;
     let layers = done["layers"].as_array().context("layers")?;
-    ensure!(!layers.is_empty() && layers.iter().all(|layer| layer["cached"] == true), "{layers:#?}");
+    ensure!(
+        !layers.is_empty() && layers.iter().all(|layer| layer["cached"] == true),
+        "{layers:#?}"
+    );
     let second = daemon.get_json("/api/v1/services/again")?;
-    ensure!(first["image"] == second["image"], "the same inputs give the same digest");
+    ensure!(
+        first["image"] == second["image"],
+        "the same inputs give the same digest"
+    );
     Ok(())
 }
 
 pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
     let daemon = world().with(ADDER)?;
     let deployer = daemon.deployer();
-    deployer.pushes("adder_py", &["--name", "steady", "--node", "adder.py"])?.succeeded()?;
+    deployer
+        .pushes("adder_py", &["--name", "steady", "--node", "adder.py"])?
+        .succeeded()?;
     deployer
         .pushes("broken_cpp", &["--name", "steady", "--node", "broken"])?
         .failed_saying(&["no_such_function", "broken.cpp:2"])?;
-    let answer = daemon.robot("steady")?.calls("/add_two", json!({"a": 1, "b": 1}))?;
+    let answer = daemon
+        .robot("steady")?
+        .calls("/add_two", json!({"a": 1, "b": 1}))?;
     ensure!(answer["values"]["sum"] == 2, "{answer}");
     ensure!(daemon.get_json("/api/v1/services/steady")?["revision"] == 1);
     Ok(())
@@ -137,8 +232,27 @@ pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
 pub fn a_revision_is_rolled_back() -> Told {
     let daemon = world().with(ADDER)?;
     let deployer = daemon.deployer();
-    deployer.pushes("adder_py", &["--name", "moody", "--node", "adder.py", "--param", "offset=1"])?.succeeded()?;
-    deployer.pushes("adder_py", &["--name", "moody", "--node", "adder.py", "--param", "offset=100"])?.succeeded()?;
+    deployer
+        .pushes(
+            "adder_py",
+            &[
+                "--name", "moody", "--node", "adder.py", "--param", "offset=1",
+            ],
+        )?
+        .succeeded()?;
+    deployer
+        .pushes(
+            "adder_py",
+            &[
+                "--name",
+                "moody",
+                "--node",
+                "adder.py",
+                "--param",
+                "offset=100",
+            ],
+        )?
+        .succeeded()?;
     let sum = |robot: &str| -> anyhow::Result<Value> {
         let mut robot = daemon.robot(&format!("moody?robot={robot}"))?;
         Ok(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"].clone())
@@ -147,7 +261,10 @@ pub fn a_revision_is_rolled_back() -> Told {
     deployer.types(&["rollback", "moody"])?.succeeded()?;
     ensure!(sum("old")? == 3);
     deployer.types(&["rm", "moody"])?.succeeded()?;
-    ensure!(daemon.servants_of("moody")?.is_empty(), "its servants went with it");
+    ensure!(
+        daemon.servants_of("moody")?.is_empty(),
+        "its servants went with it"
+    );
     ensure!(daemon.get("/api/v1/services/moody")?.0 == 404);
     Ok(())
 }
@@ -160,8 +277,18 @@ pub fn five_packaged_nodes_answer() -> Told {
         .arg(binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home))?;
     let outcome = outcome.succeeded()?;
-    for node in ["people_detect", "face_detection", "fback_flow", "image_proc", "stereo_image_proc"] {
-        ensure!(outcome.stdout.contains(&format!("{node}: answered")), "{}", outcome.said());
+    for node in [
+        "people_detect",
+        "face_detection",
+        "fback_flow",
+        "image_proc",
+        "stereo_image_proc",
+    ] {
+        ensure!(
+            outcome.stdout.contains(&format!("{node}: answered")),
+            "{}",
+            outcome.said()
+        );
     }
     Ok(())
 }

@@ -10,8 +10,14 @@ use support::world::{ADDER, world};
 
 /// No service of this name, no build directory, no servant of it.
 fn nothing_half_made(daemon: &Daemon, service: &str) -> Told {
-    ensure!(daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404, "{service} was published");
-    ensure!(daemon.servants_of(service)?.is_empty(), "{service} has servants");
+    ensure!(
+        daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404,
+        "{service} was published"
+    );
+    ensure!(
+        daemon.servants_of(service)?.is_empty(),
+        "{service} has servants"
+    );
     Ok(())
 }
 
@@ -20,9 +26,15 @@ pub fn a_directory_without_a_package() -> Told {
     let place = tempfile::tempdir()?;
     let empty = place.path().join("empty_thing");
     std::fs::create_dir(&empty)?;
-    daemon.deployer().types(&["push", path_str(&empty)])?.failed_saying(&["package.xml", "empty_thing"])?;
+    daemon
+        .deployer()
+        .types(&["push", path_str(&empty)])?
+        .failed_saying(&["package.xml", "empty_thing"])?;
     let missing = place.path().join("not_there");
-    daemon.deployer().types(&["push", path_str(&missing)])?.failed_saying(&["not_there"])?;
+    daemon
+        .deployer()
+        .types(&["push", path_str(&missing)])?
+        .failed_saying(&["not_there"])?;
     nothing_half_made(&daemon, "empty_thing")
 }
 
@@ -31,8 +43,14 @@ pub fn malformed_xml() -> Told {
     let place = tempfile::tempdir()?;
     let package = place.path().join("torn");
     std::fs::create_dir(&package)?;
-    std::fs::write(package.join("package.xml"), "<package>\n  <name>torn</name>\n  <version>1.0.0\n</package>\n")?;
-    daemon.deployer().types(&["push", path_str(&package)])?.failed_saying(&["package.xml", "4:"])?;
+    std::fs::write(
+        package.join("package.xml"),
+        "<package>\n  <name>torn</name>\n  <version>1.0.0\n</package>\n",
+    )?;
+    daemon
+        .deployer()
+        .types(&["push", path_str(&package)])?
+        .failed_saying(&["package.xml", "4:"])?;
     nothing_half_made(&daemon, "torn")
 }
 
@@ -77,7 +95,9 @@ fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, li
     header.set_mode(0o644);
     header.set_size(0);
     header.set_cksum();
-    builder.append(&header, std::io::empty()).expect("into memory");
+    builder
+        .append(&header, std::io::empty())
+        .expect("into memory");
 }
 
 pub fn archives_that_reach_out_of_their_tree() -> Told {
@@ -94,7 +114,10 @@ pub fn archives_that_reach_out_of_their_tree() -> Told {
     ];
     for (index, (name, kind, link)) in cases.into_iter().enumerate() {
         let archive = place.path().join(format!("sly{index}.tar"));
-        std::fs::write(&archive, archive_with(|builder| raw(builder, name, kind, link))?)?;
+        std::fs::write(
+            &archive,
+            archive_with(|builder| raw(builder, name, kind, link))?,
+        )?;
         daemon
             .deployer()
             .types(&["push", path_str(&archive), "--name", "sly", "--node", "x"])?
@@ -107,10 +130,16 @@ pub fn archives_that_reach_out_of_their_tree() -> Told {
 pub fn reserved_and_taken_names() -> Told {
     let daemon = world().with(ADDER)?;
     for name in ["api", "v2", "stubs", "metrics", "healthz", "assets"] {
-        daemon.deployer().pushes("adder_py", &["--name", name, "--node", "adder.py"])?.failed_saying(&[name, "reserved"])?;
+        daemon
+            .deployer()
+            .pushes("adder_py", &["--name", name, "--node", "adder.py"])?
+            .failed_saying(&[name, "reserved"])?;
     }
     for name in ["../up", "a b", "", "Ümlaut"] {
-        daemon.deployer().pushes("adder_py", &["--name", name, "--node", "adder.py"])?.failed_saying(&["name"])?;
+        daemon
+            .deployer()
+            .pushes("adder_py", &["--name", name, "--node", "adder.py"])?
+            .failed_saying(&["name"])?;
     }
     // A service of another package does not lose its name to a newcomer unawares.
     daemon
@@ -121,7 +150,9 @@ pub fn reserved_and_taken_names() -> Told {
 }
 
 pub fn a_disk_with_no_room() -> Told {
-    let place = tempfile::Builder::new().prefix("cloudroid-stories-small-").tempdir()?;
+    let place = tempfile::Builder::new()
+        .prefix("cloudroid-stories-small-")
+        .tempdir()?;
     nix::mount::mount(
         Some("tmpfs"),
         place.path(),
@@ -131,7 +162,10 @@ pub fn a_disk_with_no_room() -> Told {
     )?;
     let told = (|| {
         let daemon = support::daemon::Setup::new(&place.path().join("home")).start()?;
-        daemon.deployer().pushes("adder_py", &["--node", "adder.py"])?.failed_saying(&["room"])?;
+        daemon
+            .deployer()
+            .pushes("adder_py", &["--node", "adder.py"])?
+            .failed_saying(&["room"])?;
         nothing_half_made(&daemon, "adder_py")?;
         ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
         Ok(())

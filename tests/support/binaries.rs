@@ -5,15 +5,25 @@ use std::path::PathBuf;
 /// `name` in the directory that cargo builds into.
 pub fn path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("the path of the running test");
-    let directory = test.parent().and_then(|deps| deps.parent()).expect("target/PROFILE/deps");
+    let directory = test
+        .parent()
+        .and_then(|deps| deps.parent())
+        .expect("target/PROFILE/deps");
     let path = directory.join(name);
-    assert!(path.exists(), "{} is missing; run make build-dev", path.display());
+    assert!(
+        path.exists(),
+        "{} is missing; run make build-dev",
+        path.display()
+    );
     path
 }
 
 /// The checkout that these stories stand in.
 pub fn checkout() -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the checkout").to_owned()
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .expect("tests/ lies in the checkout")
+        .to_owned()
 }
 
 /// A package below `tests/packages`.

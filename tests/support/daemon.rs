@@ -66,7 +66,10 @@ impl Setup {
     fn command(&self) -> anyhow::Result<Command> {
         std::fs::create_dir_all(&self.home)?;
         let mut command = Command::new(binaries::path("cloudroidd"));
-        command.arg("--home").arg(&self.home).args(["--listen", &self.listen]);
+        command
+            .arg("--home")
+            .arg(&self.home)
+            .args(["--listen", &self.listen]);
         if !self.config.is_empty() {
             let path = self.home.join("test-config.toml");
             std::fs::write(&path, &self.config)?;
@@ -80,48 +83,84 @@ impl Setup {
 
     /// Starts it and waits until it answers.
     pub fn start(&self) -> anyhow::Result<Daemon> {
-        let log = File::options().create(true).append(true).open(self.home.join("daemon.log")).or_else(|_| {
-            std::fs::create_dir_all(&self.home)?;
-            File::options().create(true).append(true).open(self.home.join("daemon.log"))
-        })?;
-        let mut child = self.command()?.stdout(log.try_clone()?).stderr(log).spawn()?;
-        let deployer = Deployer { home: self.home.clone() };
+        let log = File::options()
+            .create(true)
+            .append(true)
+            .open(self.home.join("daemon.log"))
+            .or_else(|_| {
+                std::fs::create_dir_all(&self.home)?;
+                File::options()
+                    .create(true)
+                    .append(true)
+                    .open(self.home.join("daemon.log"))
+            })?;
+        let mut child = self
+            .command()?
+            .stdout(log.try_clone()?)
+            .stderr(log)
+            .spawn()?;
+        let deployer = Deployer {
+            home: self.home.clone(),
+        };
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Ok(status) = deployer.asks(&["status"])
                 && status["pid"] == child.id()
             {
-                let address = status["listen"].as_str().context("status says where it listens")?.to_owned();
-                return Ok(Daemon { home: self.home.clone(), address, child });
+                let address = status["listen"]
+                    .as_str()
+                    .context("status says where it listens")?
+                    .to_owned();
+                return Ok(Daemon {
+                    home: self.home.clone(),
+                    address,
+                    child,
+                });
             }
             if let Some(status) = child.try_wait()? {
                 bail!("cloudroidd ended with {status}:\n{}", read_log(&self.home));
             }
             if Instant::now() > deadline {
                 let _ = child.kill();
-                bail!("cloudroidd did not answer within {PATIENCE:?}:\n{}", read_log(&self.home));
+                bail!(
+                    "cloudroidd did not answer within {PATIENCE:?}:\n{}",
+                    read_log(&self.home)
+                );
             }
         }
     }
 
     /// Starts it where it must refuse, and gives its status and words.
     pub fn refuses_to_start(&self) -> anyhow::Result<String> {
-        let output = self.command()?.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+        let output = self
+            .command()?
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()?;
         let output = wait_with_output_within(output, PATIENCE)?;
         let said = format!(
             "{}{}",
             String::from_utf8_lossy(&output.1),
             String::from_utf8_lossy(&output.2)
         );
-        ensure!(!output.0.success(), "cloudroidd started and ended well:\n{said}");
+        ensure!(
+            !output.0.success(),
+            "cloudroidd started and ended well:\n{said}"
+        );
         ensure!(!said.contains("panicked"), "cloudroidd panicked:\n{said}");
         Ok(said)
     }
 }
 
-fn wait_with_output_within(mut child: Child, limit: Duration) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
+fn wait_with_output_within(
+    mut child: Child,
+    limit: Duration,
+) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
     let pid = Pid::from_raw(child.id() as i32);
-    let (mut out, mut err) = (child.stdout.take().expect("piped"), child.stderr.take().expect("piped"));
+    let (mut out, mut err) = (
+        child.stdout.take().expect("piped"),
+        child.stderr.take().expect("piped"),
+    );
     let (done, ended) = std::sync::mpsc::channel::<()>();
     let watchdog = std::thread::spawn(move || {
         if ended.recv_timeout(limit).is_err() {
@@ -148,12 +187,15 @@ fn read_log(home: &Path) -> String {
 impl Daemon {
     /// A deployer at a shell of this machine.
     pub fn deployer(&self) -> Deployer {
-        Deployer { home: self.home.clone() }
+        Deployer {
+            home: self.home.clone(),
+        }
     }
 
     /// A robot that connects to `path`, such as `opencv_apps?robot=r2`.
     pub fn robot(&self, path: &str) -> anyhow::Result<Robot> {
-        Robot::connect(&self.url(path)).with_context(|| format!("the daemon said:\n{}", self.last_words()))
+        Robot::connect(&self.url(path))
+            .with_context(|| format!("the daemon said:\n{}", self.last_words()))
     }
 
     /// The WebSocket address of `path`.
@@ -174,11 +216,19 @@ impl Daemon {
     }
 
     /// An HTTP/1.1 request by hand, so that headers are what the story says.
-    pub fn request(&self, method: &str, path: &str, headers: &[(&str, &str)]) -> anyhow::Result<(u16, String)> {
+    pub fn request(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+    ) -> anyhow::Result<(u16, String)> {
         let mut stream = TcpStream::connect(&self.address)?;
         stream.set_read_timeout(Some(PATIENCE))?;
         let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
-        if !headers.iter().any(|(name, _)| name.eq_ignore_ascii_case("host")) {
+        if !headers
+            .iter()
+            .any(|(name, _)| name.eq_ignore_ascii_case("host"))
+        {
             text.push_str(&format!("Host: {}\r\n", self.address));
         }
         for (name, value) in headers {
@@ -191,7 +241,10 @@ impl Daemon {
         let answer = String::from_utf8_lossy(&answer).into_owned();
         let (head, body) = answer.split_once("\r\n\r\n").context("an HTTP answer")?;
         let status = head.split(' ').nth(1).context("a status line")?.parse()?;
-        let body = if head.to_ascii_lowercase().contains("transfer-encoding: chunked") {
+        let body = if head
+            .to_ascii_lowercase()
+            .contains("transfer-encoding: chunked")
+        {
             dechunk(body)
         } else {
             body.to_owned()
@@ -203,7 +256,11 @@ impl Daemon {
     pub fn servants_of(&self, service: &str) -> anyhow::Result<Vec<Value>> {
         let all = self.deployer().asks(&["servants"])?;
         let list = all.as_array().context("servants is a list")?;
-        Ok(list.iter().filter(|servant| servant["service"] == service).cloned().collect())
+        Ok(list
+            .iter()
+            .filter(|servant| servant["service"] == service)
+            .cloned()
+            .collect())
     }
 
     /// The servant of one robot.
@@ -252,7 +309,9 @@ impl Drop for Daemon {
 fn dechunk(mut body: &str) -> String {
     let mut whole = String::new();
     while let Some((size, rest)) = body.split_once("\r\n") {
-        let Ok(size) = usize::from_str_radix(size.trim(), 16) else { break };
+        let Ok(size) = usize::from_str_radix(size.trim(), 16) else {
+            break;
+        };
         if size == 0 || rest.len() < size {
             break;
         }

@@ -36,18 +36,37 @@ impl Outcome {
 
     /// The same, if it went well.
     pub fn succeeded(self) -> anyhow::Result<Outcome> {
-        ensure!(self.status == 0, "{} ended with {}:\n{}", self.command, self.status, self.said());
+        ensure!(
+            self.status == 0,
+            "{} ended with {}:\n{}",
+            self.command,
+            self.status,
+            self.said()
+        );
         Ok(self)
     }
 
     /// The same, if it failed and said all of `words` in doing so.
     pub fn failed_saying(self, words: &[&str]) -> anyhow::Result<Outcome> {
-        ensure!(self.status != 0, "{} succeeded:\n{}", self.command, self.said());
+        ensure!(
+            self.status != 0,
+            "{} succeeded:\n{}",
+            self.command,
+            self.said()
+        );
         let said = self.said();
         for word in words {
-            ensure!(said.contains(word), "{} did not say {word:?}; it said:\n{said}", self.command);
+            ensure!(
+                said.contains(word),
+                "{} did not say {word:?}; it said:\n{said}",
+                self.command
+            );
         }
-        ensure!(!said.contains("panicked"), "{} panicked:\n{said}", self.command);
+        ensure!(
+            !said.contains("panicked"),
+            "{} panicked:\n{said}",
+            self.command
+        );
         Ok(self)
     }
 }
@@ -64,7 +83,9 @@ impl Deployer {
 
     /// Types it with `--format json` and reads the answer.
     pub fn asks(&self, arguments: &[&str]) -> anyhow::Result<Value> {
-        let outcome = self.types(&[&["--format", "json"], arguments].concat())?.succeeded()?;
+        let outcome = self
+            .types(&[&["--format", "json"], arguments].concat())?
+            .succeeded()?;
         serde_json::from_str(&outcome.stdout)
             .with_context(|| format!("{} printed no JSON: {}", outcome.command, outcome.stdout))
     }
@@ -79,7 +100,10 @@ impl Deployer {
 /// Runs a command to its end.
 pub fn run(command: &mut Command) -> anyhow::Result<Outcome> {
     let typed = format!("{command:?}");
-    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {typed}"))?;
+    let output = command
+        .stdin(Stdio::null())
+        .output()
+        .with_context(|| format!("cannot run {typed}"))?;
     Ok(Outcome {
         command: typed,
         status: output.status.code().unwrap_or(-1),

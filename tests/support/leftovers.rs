@@ -16,12 +16,20 @@ pub fn of(home: &Path) -> Vec<String> {
         let command = procfs::command_line(pid).unwrap_or_default();
         let directory = fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
         let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
-        if command.contains(&home) || directory.starts_with(&home) || mounted.contains(&format!("{home}/")) {
+        if command.contains(&home)
+            || directory.starts_with(&home)
+            || mounted.contains(&format!("{home}/"))
+        {
             found.push(format!("process {pid}: {command}"));
         }
     }
     let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
-    found.extend(mounts.lines().filter(|line| line.contains(&home)).map(|line| format!("mount {line}")));
+    found.extend(
+        mounts
+            .lines()
+            .filter(|line| line.contains(&home))
+            .map(|line| format!("mount {line}")),
+    );
     found
 }
 
@@ -30,7 +38,9 @@ pub fn cgroups(ids: &[String]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut pending = vec![PathBuf::from("/sys/fs/cgroup")];
     while let Some(directory) = pending.pop() {
-        let Ok(entries) = fs::read_dir(&directory) else { continue };
+        let Ok(entries) = fs::read_dir(&directory) else {
+            continue;
+        };
         for entry in entries.flatten() {
             if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
                 continue;

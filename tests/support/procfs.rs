@@ -17,7 +17,12 @@ pub fn status(pid: i32) -> Option<BTreeMap<String, String>> {
 /// The command line, arguments separated by spaces.
 pub fn command_line(pid: i32) -> Option<String> {
     let bytes = fs::read(format!("/proc/{pid}/cmdline")).ok()?;
-    Some(String::from_utf8_lossy(&bytes).replace('\0', " ").trim().to_owned())
+    Some(
+        String::from_utf8_lossy(&bytes)
+            .replace('\0', " ")
+            .trim()
+            .to_owned(),
+    )
 }
 
 /// All processes, by pid.
@@ -30,5 +35,10 @@ pub fn pids() -> Vec<i32> {
 
 /// The identity of a namespace of a process, such as `net:[4026531840]`.
 pub fn namespace(pid: i32, kind: &str) -> Option<String> {
-    Some(fs::read_link(format!("/proc/{pid}/ns/{kind}")).ok()?.to_string_lossy().into_owned())
+    Some(
+        fs::read_link(format!("/proc/{pid}/ns/{kind}"))
+            .ok()?
+            .to_string_lossy()
+            .into_owned(),
+    )
 }

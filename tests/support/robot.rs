@@ -31,14 +31,22 @@ impl Robot {
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
             .ok_or_else(|| Refusal::other("not a ws:// address"))?;
-        let stream = TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
+        let stream =
+            TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
         let _ = stream.set_nodelay(true);
         match tungstenite::client(url, stream) {
-            Ok((socket, _)) => Ok(Robot { socket, backlog: VecDeque::new(), calls: 0 }),
-            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => Err(Refusal {
-                status: response.status().as_u16(),
-                body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default()).into_owned(),
+            Ok((socket, _)) => Ok(Robot {
+                socket,
+                backlog: VecDeque::new(),
+                calls: 0,
             }),
+            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => {
+                Err(Refusal {
+                    status: response.status().as_u16(),
+                    body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default())
+                        .into_owned(),
+                })
+            }
             Err(error) => Err(Refusal::other(&error.to_string())),
         }
     }
@@ -55,7 +63,9 @@ impl Robot {
 
     /// The next frame, whatever it is.
     pub fn frame(&mut self, within: Duration) -> anyhow::Result<Message> {
-        self.socket.get_ref().set_read_timeout(Some(within.max(Duration::from_millis(1))))?;
+        self.socket
+            .get_ref()
+            .set_read_timeout(Some(within.max(Duration::from_millis(1))))?;
         Ok(self.socket.read()?)
     }
 
@@ -68,7 +78,10 @@ impl Robot {
         loop {
             let remaining = deadline.saturating_duration_since(Instant::now());
             if remaining.is_zero() {
-                bail!("{what} did not come within {PATIENCE:?}; heard instead: {:?}", self.backlog);
+                bail!(
+                    "{what} did not come within {PATIENCE:?}; heard instead: {:?}",
+                    self.backlog
+                );
             }
             let frame = self
                 .frame(remaining)
@@ -76,7 +89,10 @@ impl Robot {
             let value = match frame {
                 Message::Text(text) => serde_json::from_str(text.as_str())?,
                 Message::Binary(bytes) => ciborium::from_reader::<Value, _>(bytes.as_ref())?,
-                Message::Close(frame) => bail!("closed while waiting for {what}: {frame:?}; heard {:?}", self.backlog),
+                Message::Close(frame) => bail!(
+                    "closed while waiting for {what}: {frame:?}; heard {:?}",
+                    self.backlog
+                ),
                 _ => continue,
             };
             if wanted(&value) {
@@ -104,7 +120,10 @@ impl Robot {
     /// The next status message that mentions `word`.
     pub fn hears_status(&mut self, word: &str) -> anyhow::Result<Value> {
         self.hears(&format!("a status that mentions {word:?}"), |value| {
-            value["op"] == "status" && value["msg"].as_str().is_some_and(|text| text.contains(word))
+            value["op"] == "status"
+                && value["msg"]
+                    .as_str()
+                    .is_some_and(|text| text.contains(word))
         })
     }
 
@@ -123,7 +142,10 @@ impl Robot {
         let deadline = Instant::now() + PATIENCE;
         while Instant::now() < deadline {
             let answer = self.calls("/rosapi/subscribers", json!({"topic": topic}))?;
-            if answer["values"]["subscribers"].as_array().is_some_and(|nodes| !nodes.is_empty()) {
+            if answer["values"]["subscribers"]
+                .as_array()
+                .is_some_and(|nodes| !nodes.is_empty())
+            {
                 return Ok(());
             }
         }
@@ -142,7 +164,9 @@ impl Robot {
                 Ok(Message::Close(Some(frame))) => return Ok(frame),
                 Ok(Message::Close(None)) => bail!("closed without a reason"),
                 Ok(_) => {}
-                Err(error) => return Err(error.context("the connection ended without a close frame")),
+                Err(error) => {
+                    return Err(error.context("the connection ended without a close frame"));
+                }
             }
         }
     }
@@ -166,7 +190,10 @@ pub struct Refusal {
 
 impl Refusal {
     fn other(text: &str) -> Refusal {
-        Refusal { status: 0, body: text.to_owned() }
+        Refusal {
+            status: 0,
+            body: text.to_owned(),
+        }
     }
 }
 

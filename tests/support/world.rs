@@ -34,22 +34,42 @@ pub struct Service {
 pub const PEOPLE: Service = Service {
     name: "opencv_apps",
     package: None,
-    arguments: &["--apt", "opencv_apps", "--node", "people_detect", "--param", "debug_view=false"],
+    arguments: &[
+        "--apt",
+        "opencv_apps",
+        "--node",
+        "people_detect",
+        "--param",
+        "debug_view=false",
+    ],
 };
 
 /// Our C++ package, compiled at push.
-pub const GREETER: Service =
-    Service { name: "greeter_cpp", package: Some("greeter_cpp"), arguments: &["--node", "greeter", "--param", "word=hi"] };
+pub const GREETER: Service = Service {
+    name: "greeter_cpp",
+    package: Some("greeter_cpp"),
+    arguments: &["--node", "greeter", "--param", "word=hi"],
+};
 
 /// Our Python package.
-pub const ADDER: Service = Service { name: "adder_py", package: Some("adder_py"), arguments: &["--node", "adder.py"] };
+pub const ADDER: Service = Service {
+    name: "adder_py",
+    package: Some("adder_py"),
+    arguments: &["--node", "adder.py"],
+};
 
 /// The world of this run.
 pub fn world() -> &'static World {
     WORLD.get_or_init(|| {
-        assert!(nix::unistd::geteuid().is_root(), "the stories start servants, which needs root: sudo make test");
+        assert!(
+            nix::unistd::geteuid().is_root(),
+            "the stories start servants, which needs root: sudo make test"
+        );
         World {
-            place: tempfile::Builder::new().prefix("cloudroid-stories-").tempdir().expect("a temporary directory"),
+            place: tempfile::Builder::new()
+                .prefix("cloudroid-stories-")
+                .tempdir()
+                .expect("a temporary directory"),
             shared: Mutex::new(None),
             services: Mutex::default(),
         }
@@ -69,7 +89,10 @@ impl World {
 
     /// The daemon that most stories use.
     pub fn shared(&self) -> anyhow::Result<Arc<Daemon>> {
-        let mut shared = self.shared.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut shared = self
+            .shared
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
         if let Some(daemon) = &*shared {
             return Ok(daemon.clone());
         }
@@ -94,7 +117,10 @@ impl World {
                 Some(package) => deployer.pushes(package, service.arguments),
                 None => deployer.types(&[&["push"], service.arguments].concat()),
             };
-            pushed.and_then(|outcome| outcome.succeeded()).map(|_| ()).map_err(|error| format!("{error:#}"))
+            pushed
+                .and_then(|outcome| outcome.succeeded())
+                .map(|_| ())
+                .map_err(|error| format!("{error:#}"))
         })
         .clone()
         .map_err(|error| anyhow::anyhow!("{} could not be pushed: {error}", service.name))?;
@@ -104,10 +130,23 @@ impl World {
 
 /// Ends what is shared and tells what stayed behind.
 pub fn end() -> Vec<String> {
-    let Some(world) = WORLD.get() else { return Vec::new() };
-    let daemon = world.shared.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take();
+    let Some(world) = WORLD.get() else {
+        return Vec::new();
+    };
+    let daemon = world
+        .shared
+        .lock()
+        .unwrap_or_else(std::sync::PoisonError::into_inner)
+        .take();
     let mut left = Vec::new();
+    let mut servants = Vec::new();
     if let Some(daemon) = daemon {
+        if let Ok(serde_json::Value::Array(list)) = daemon.deployer().asks(&["servants"]) {
+            servants.extend(
+                list.iter()
+                    .filter_map(|servant| Some(servant["id"].as_str()?.to_owned())),
+            );
+        }
         match Arc::try_unwrap(daemon).map(Daemon::ends) {
             Ok(Ok(_)) => {}
             Ok(Err(error)) => left.push(format!("the shared daemon did not end: {error:#}")),
@@ -115,7 +154,11 @@ pub fn end() -> Vec<String> {
         }
     }
     left.extend(leftovers::of(world.place.path()));
-    left.extend(leftovers::cgroups().into_iter().map(|path| format!("cgroup {}", path.display())));
+    left.extend(
+        leftovers::cgroups(&servants)
+            .into_iter()
+            .map(|path| format!("cgroup {}", path.display())),
+    );
     if left.is_empty() {
         let _ = std::fs::remove_dir_all(world.place.path());
     }
