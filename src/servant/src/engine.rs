@@ -131,6 +131,8 @@ pub trait Servant: Send + Sync + 'static {
     fn endpoint(&self) -> Endpoint;
     /// Limits read back from the kernel.
     fn enforced(&self) -> Enforced;
+    /// Changes the limits that are given and leaves the others; answers what is in force then.
+    async fn set_limits(&self, limits: Limits) -> Result<Enforced, crate::Error>;
     /// Host pids of the node processes and all their children (not of init).
     async fn processes(&self) -> Result<Vec<i32>, crate::Error>;
     /// Usage now.

@@ -3,4 +3,10 @@
 
 pub mod endpoint;
 pub mod engine;
+mod error;
+pub mod local;
+pub mod netns;
+pub mod shim;
 pub mod spec;
+
+pub use error::Error;

@@ -1,0 +1,302 @@
+//! PID 1 of a servant. Static, allocates nothing, knows nothing but how to start, signal and reap.
+//!
+//! Its standard input is the socket to the shim; when that closes, every process of the servant ends. The state it
+//! keeps is none: the shim remembers. It runs under the servant's own seccomp filter, user and limits, which its
+//! children inherit; nothing here could grant them more.
+#![no_main]
+
+use std::ffi::{c_char, c_int};
+use std::os::fd::RawFd;
+use std::ptr;
+
+use init::socket::{self, MAX_FDS};
+use init::wire::{MAX_MESSAGE, Reply, Request, Scope, Stage, Start};
+
+/// Exit statuses, for whoever reads init's own.
+const NOT_PID_ONE: c_int = 64;
+const BROKEN: c_int = 70;
+
+/// Arguments and variables of one program.
+const MAX_STRINGS: usize = 8192;
+
+static mut MESSAGE: [u8; MAX_MESSAGE] = [0; MAX_MESSAGE];
+static mut POINTERS: [*const c_char; MAX_STRINGS] = [ptr::null(); MAX_STRINGS];
+
+/// The socket and the signal descriptor sit above the standard streams.
+const FIRST_FREE: c_int = 3;
+
+#[unsafe(no_mangle)]
+extern "C" fn main(_count: c_int, _arguments: *const *const c_char) -> c_int {
+    // SAFETY: plain calls without pointers.
+    unsafe {
+        // `kill(-1)` below must never run among the host's processes.
+        if libc::getpid() != 1 {
+            return NOT_PID_ONE;
+        }
+        // Nodes share init's user: without this they could open its descriptors through /proc/1/fd.
+        libc::prctl(libc::PR_SET_DUMPABLE, 0);
+    }
+    let (Some(shim), Some(children)) = (take_socket(), watch_children()) else {
+        return BROKEN;
+    };
+    if !tell(shim, Reply::Ready, &[]) {
+        return BROKEN;
+    }
+    serve(shim, children);
+    // SAFETY: pid 1: this reaches the processes of this pid namespace only.
+    unsafe { libc::kill(-1, libc::SIGKILL) };
+    0
+}
+
+/// Moves the socket away from standard input, so that no node inherits it, and gives the standard streams to
+/// /dev/null.
+fn take_socket() -> Option<RawFd> {
+    // SAFETY: calls on descriptors only; the path is a literal.
+    unsafe {
+        let shim = libc::fcntl(0, libc::F_DUPFD_CLOEXEC, FIRST_FREE);
+        let null = libc::open(c"/dev/null".as_ptr(), libc::O_RDWR | libc::O_CLOEXEC);
+        if shim < 0 || null < 0 {
+            return None;
+        }
+        for stream in 0..3 {
+            libc::dup2(null, stream);
+        }
+        libc::close(null);
+        Some(shim)
+    }
+}
+
+/// A descriptor that becomes readable when a child has ended.
+fn watch_children() -> Option<RawFd> {
+    // SAFETY: the set is initialised before it is used.
+    unsafe {
+        let mut set: libc::sigset_t = std::mem::zeroed();
+        libc::sigfillset(&mut set);
+        libc::sigprocmask(libc::SIG_BLOCK, &set, ptr::null_mut());
+        libc::sigemptyset(&mut set);
+        libc::sigaddset(&mut set, libc::SIGCHLD);
+        let fd = libc::signalfd(-1, &set, libc::SFD_CLOEXEC | libc::SFD_NONBLOCK);
+        (fd >= 0).then_some(fd)
+    }
+}
+
+/// Until the shim is gone.
+fn serve(shim: RawFd, children: RawFd) {
+    let mut watched = [
+        libc::pollfd {
+            fd: shim,
+            events: libc::POLLIN,
+            revents: 0,
+        },
+        libc::pollfd {
+            fd: children,
+            events: libc::POLLIN,
+            revents: 0,
+        },
+    ];
+    loop {
+        // SAFETY: two initialised entries.
+        let ready = unsafe { libc::poll(watched.as_mut_ptr(), 2, -1) };
+        if ready < 0 {
+            continue;
+        }
+        if watched[1].revents != 0 && !reap(shim, children) {
+            return;
+        }
+        if watched[0].revents != 0 && !obey(shim) {
+            return;
+        }
+    }
+}
+
+/// Tells the end of every process that has ended; false when nobody listens any more.
+fn reap(shim: RawFd, children: RawFd) -> bool {
+    let mut info = [0_u8; size_of::<libc::signalfd_siginfo>()];
+    // SAFETY: the buffer has the length given. What is read is not needed: SIGCHLDs merge, waitpid knows all.
+    unsafe { libc::read(children, info.as_mut_ptr().cast(), info.len()) };
+    loop {
+        let mut status = 0;
+        // SAFETY: `status` is a valid place.
+        let pid = unsafe { libc::waitpid(-1, &mut status, libc::WNOHANG) };
+        if pid <= 0 {
+            return true;
+        }
+        if !tell(shim, Reply::Exited { pid, status }, &[]) {
+            return false;
+        }
+    }
+}
+
+/// Takes one request; false when the shim is gone.
+fn obey(shim: RawFd) -> bool {
+    let mut fds = [-1; MAX_FDS];
+    // SAFETY: init has one thread and this is the only use of the buffer at a time.
+    let buffer = unsafe { &mut *ptr::addr_of_mut!(MESSAGE) };
+    let (length, count) = match socket::receive(shim, buffer, &mut fds) {
+        Ok((0, 0)) | Err(_) => return false,
+        Ok(received) => received,
+    };
+    let alive = match Request::decode(&buffer[..length]) {
+        Some(Request::Start(request)) => start(shim, &request, &fds[..count]),
+        Some(Request::Signal { pid, signal, scope }) => {
+            let target = match scope {
+                Scope::Process => pid,
+                Scope::Group => -pid,
+                Scope::All => -1,
+            };
+            // 0, 1 and their negatives would mean init itself or its own group.
+            if scope == Scope::All || pid > 1 {
+                // SAFETY: no pointers.
+                unsafe { libc::kill(target, signal) };
+            }
+            true
+        }
+        None => true,
+    };
+    for fd in &fds[..count] {
+        // SAFETY: received for this request only.
+        unsafe { libc::close(*fd) };
+    }
+    alive
+}
+
+/// Forks and executes; the answer says which of the two failed, if any.
+fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
+    let failed = |errno, stage| {
+        tell(
+            shim,
+            Reply::Failed {
+                id: request.id,
+                errno,
+                stage,
+            },
+            &[],
+        )
+    };
+    if streams.len() != 2
+        || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS
+    {
+        return failed(libc::E2BIG, Stage::Request);
+    }
+    let mut report = [-1; 2];
+    // SAFETY: two places for two descriptors.
+    if unsafe { libc::pipe2(report.as_mut_ptr(), libc::O_CLOEXEC) } != 0 {
+        return failed(errno(), Stage::Fork);
+    }
+    // SAFETY: one thread; the child goes straight to exec or _exit.
+    let pid = unsafe { libc::fork() };
+    if pid == 0 {
+        let (stage, error) = become_program(request, streams);
+        let bytes = [stage as u8, error as u8, (error >> 8) as u8];
+        // SAFETY: a live buffer of the length given; then the process ends.
+        unsafe {
+            libc::write(report[1], bytes.as_ptr().cast(), bytes.len());
+            libc::_exit(127);
+        }
+    }
+    let fork_error = errno();
+    let mut bytes = [0_u8; 3];
+    // SAFETY: `report` is ours; the read ends when exec closes the other end, or with the child's three bytes.
+    let read = unsafe {
+        libc::close(report[1]);
+        let read = if pid < 0 {
+            0
+        } else {
+            libc::read(report[0], bytes.as_mut_ptr().cast(), bytes.len())
+        };
+        libc::close(report[0]);
+        read
+    };
+    if pid < 0 {
+        return failed(fork_error, Stage::Fork);
+    }
+    if read == 3 {
+        // SAFETY: our child, which is about to end: it must not be told of as a process that ran.
+        unsafe { libc::waitpid(pid, ptr::null_mut(), 0) };
+        return failed(
+            i32::from(bytes[1]) | i32::from(bytes[2]) << 8,
+            Stage::from_byte(bytes[0]),
+        );
+    }
+    // The child is unreaped, so that the pid is surely its own.
+    // SAFETY: no pointers.
+    let pidfd = unsafe { libc::syscall(libc::SYS_pidfd_open, pid, 0) } as RawFd;
+    let beside = [pidfd];
+    let told = tell(
+        shim,
+        Reply::Started {
+            id: request.id,
+            pid,
+        },
+        if pidfd < 0 { &[] } else { &beside },
+    );
+    // SAFETY: opened above.
+    unsafe { libc::close(pidfd) };
+    told
+}
+
+/// In the child: returns only when it could not execute.
+fn become_program(request: &Start<'_>, streams: &[RawFd]) -> (Stage, c_int) {
+    // SAFETY: after fork in a process with one thread. The strings end in zero bytes and their number was checked
+    // when the request was decoded; the pointer table is large enough and each of its two lists ends in null.
+    unsafe {
+        let mut none: libc::sigset_t = std::mem::zeroed();
+        libc::sigemptyset(&mut none);
+        for signal in 1..=64 {
+            libc::signal(signal, libc::SIG_DFL);
+        }
+        libc::sigprocmask(libc::SIG_SETMASK, &none, ptr::null_mut());
+        if libc::setsid() < 0 || libc::dup2(streams[0], 1) < 0 || libc::dup2(streams[1], 2) < 0 {
+            return (Stage::Prepare, errno());
+        }
+        libc::umask(0o022);
+        let table = ptr::addr_of_mut!(POINTERS).cast::<*const c_char>();
+        let mut at = 0;
+        let mut slot = 0;
+        let mut next = || {
+            let text = request.strings[at..].as_ptr();
+            at += request.strings[at..]
+                .iter()
+                .position(|byte| *byte == 0)
+                .unwrap_or(0)
+                + 1;
+            text.cast::<c_char>()
+        };
+        let directory = next();
+        let mut list = |count: u16, table: *mut *const c_char, slot: &mut usize| {
+            let start = table.add(*slot);
+            for _ in 0..count {
+                *table.add(*slot) = next();
+                *slot += 1;
+            }
+            *table.add(*slot) = ptr::null();
+            *slot += 1;
+            start
+        };
+        let arguments = list(request.arguments, table, &mut slot);
+        let variables = list(request.variables, table, &mut slot);
+        if libc::chdir(directory) != 0 {
+            return (Stage::Directory, errno());
+        }
+        if let Some((user, group)) = request.identity {
+            if libc::setgroups(0, ptr::null()) != 0
+                || libc::setgid(group) != 0
+                || libc::setuid(user) != 0
+            {
+                return (Stage::Identity, errno());
+            }
+        }
+        libc::execve(*arguments, arguments, variables);
+        (Stage::Execute, errno())
+    }
+}
+
+/// False when nobody listens any more.
+fn tell(shim: RawFd, reply: Reply, fds: &[RawFd]) -> bool {
+    socket::send(shim, &reply.encode(), fds).is_ok()
+}
+
+fn errno() -> c_int {
+    // SAFETY: always a valid place in this thread.
+    unsafe { *libc::__errno_location() }
+}

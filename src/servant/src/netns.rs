@@ -1,0 +1,246 @@
+//! Network namespaces as values. A servant's holds nothing but `lo`; whoever talks to its nodes opens sockets *in*
+//! it and uses them outside, because a socket belongs for ever to the namespace it was made in.
+
+use std::fs::File;
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
+use std::os::unix::fs::MetadataExt;
+use std::sync::{Arc, OnceLock, mpsc};
+
+use nix::sched::{CloneFlags, setns, unshare};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::sync::oneshot;
+
+use crate::Error;
+
+/// A network namespace, kept alive by this value. Two are equal when they are the same namespace.
+#[derive(Debug)]
+pub struct NetNs {
+    file: Arc<OwnedFd>,
+    device: u64,
+    inode: u64,
+}
+
+impl PartialEq for NetNs {
+    fn eq(&self, other: &Self) -> bool {
+        (self.device, self.inode) == (other.device, other.inode)
+    }
+}
+
+impl Eq for NetNs {}
+
+impl AsFd for NetNs {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.file.as_fd()
+    }
+}
+
+impl NetNs {
+    /// A new one with `lo` up. It belongs to the host's user namespace, so that not even a container's root may
+    /// configure it.
+    pub fn create() -> Result<Self, Error> {
+        in_own_thread(|| {
+            unshare(CloneFlags::CLONE_NEWNET)
+                .map_err(Error::nix("unshare of a network namespace"))?;
+            bring_lo_up()?;
+            Self::current()
+        })
+    }
+
+    /// The one that the calling thread is in.
+    pub fn current() -> Result<Self, Error> {
+        Self::from_path("/proc/thread-self/ns/net")
+    }
+
+    /// That of a process. The caller makes sure that the pid is still the process it means (by a pidfd).
+    pub fn from_pid(pid: i32) -> Result<Self, Error> {
+        Self::from_path(&format!("/proc/{pid}/ns/net"))
+    }
+
+    /// From an open file of the nsfs.
+    pub fn from_fd(fd: OwnedFd) -> Result<Self, Error> {
+        let file = File::from(fd);
+        let metadata = file
+            .metadata()
+            .map_err(Error::call("fstat of a network namespace"))?;
+        Ok(Self {
+            device: metadata.dev(),
+            inode: metadata.ino(),
+            file: Arc::new(file.into()),
+        })
+    }
+
+    fn from_path(path: &str) -> Result<Self, Error> {
+        Self::from_fd(File::open(path).map_err(Error::file("open", path))?.into())
+    }
+
+    /// Runs `work` on a thread of its own inside.
+    pub fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> Result<T, Error> {
+        in_own_thread(|| {
+            setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
+                .map_err(Error::nix("setns to a network namespace"))?;
+            Ok(work())
+        })
+    }
+
+    /// Puts the calling thread into it for good.
+    pub fn enter(&self) -> Result<(), Error> {
+        setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
+            .map_err(Error::nix("setns to a network namespace"))
+    }
+
+    /// Connects to `address` as seen from inside. Only the socket is made there; the connecting is awaited here.
+    pub async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
+        let stream = self.socket(address).await?.connect(address).await?;
+        stream.set_nodelay(true)?;
+        Ok(stream)
+    }
+
+    /// Listens on `address` as seen from inside; port 0 picks a free one.
+    pub async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
+        let socket = self.socket(address).await?;
+        socket.set_reuseaddr(true)?;
+        socket.bind(address)?;
+        socket.listen(1024)
+    }
+
+    /// A TCP socket made inside, for addresses of the family of `address`.
+    async fn socket(&self, address: SocketAddr) -> io::Result<TcpSocket> {
+        let family = if address.is_ipv4() {
+            libc::AF_INET
+        } else {
+            libc::AF_INET6
+        };
+        let (answer, answered) = oneshot::channel();
+        let order = Order {
+            namespace: self.file.clone(),
+            family,
+            answer,
+        };
+        let gone = || io::Error::other("the thread that opens sockets in namespaces has ended");
+        opener().send(order).map_err(|_| gone())?;
+        let fd = answered.await.map_err(|_| gone())??;
+        Ok(TcpSocket::from_std_stream(std::net::TcpStream::from(fd)))
+    }
+}
+
+struct Order {
+    namespace: Arc<OwnedFd>,
+    family: i32,
+    answer: oneshot::Sender<io::Result<OwnedFd>>,
+}
+
+/// One thread of the process does nothing but enter namespaces and open sockets there. It never goes back, so that
+/// there is no way back that could fail and leave a shared thread in a stranger's network.
+fn opener() -> &'static mpsc::Sender<Order> {
+    static OPENER: OnceLock<mpsc::Sender<Order>> = OnceLock::new();
+    OPENER.get_or_init(|| {
+        let (sender, orders) = mpsc::channel::<Order>();
+        let work = move || {
+            for order in orders {
+                // Nobody waits any more when the asker was cancelled; the socket then closes.
+                let _ = order
+                    .answer
+                    .send(open_socket(order.namespace.as_fd(), order.family));
+            }
+        };
+        // Where no thread can be started the receiver is dropped and every order is answered with an error.
+        let _ = std::thread::Builder::new()
+            .name("netns-sockets".into())
+            .stack_size(64 * 1024)
+            .spawn(work);
+        sender
+    })
+}
+
+fn open_socket(namespace: BorrowedFd<'_>, family: i32) -> io::Result<OwnedFd> {
+    setns(namespace, CloneFlags::CLONE_NEWNET)?;
+    let kind = libc::SOCK_STREAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
+    // SAFETY: no pointers.
+    let fd = unsafe { libc::socket(family, kind, 0) };
+    if fd < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: opened just now, owned by nobody else.
+    Ok(unsafe { OwnedFd::from_raw_fd(fd) })
+}
+
+fn in_own_thread<T: Send>(work: impl FnOnce() -> Result<T, Error> + Send) -> Result<T, Error> {
+    std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new()
+            .name("netns".into())
+            .stack_size(256 * 1024)
+            .spawn_scoped(scope, work)
+            .map_err(Error::call("starting a thread"))?;
+        thread
+            .join()
+            .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    })
+}
+
+/// Sets `IFF_UP` on `lo` of the calling thread's namespace (netdevice(7)).
+fn bring_lo_up() -> Result<(), Error> {
+    // SAFETY: no pointers.
+    let fd = unsafe { libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
+    if fd < 0 {
+        return Err(Error::call("opening a socket to bring lo up")(
+            io::Error::last_os_error(),
+        ));
+    }
+    // SAFETY: opened just now, owned by nobody else.
+    let socket = unsafe { OwnedFd::from_raw_fd(fd) };
+    // SAFETY: an all-zero ifreq is valid.
+    let mut request: libc::ifreq = unsafe { std::mem::zeroed() };
+    request.ifr_name[0] = b'l' as libc::c_char;
+    request.ifr_name[1] = b'o' as libc::c_char;
+    request.ifr_ifru.ifru_flags = (libc::IFF_UP | libc::IFF_RUNNING) as libc::c_short;
+    // SAFETY: the request is a live ifreq, which is what SIOCSIFFLAGS reads.
+    if unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCSIFFLAGS, &request) } != 0 {
+        return Err(Error::call("bringing lo up")(io::Error::last_os_error()));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    use super::*;
+
+    #[tokio::test]
+    async fn sockets_made_inside_meet_there_and_nowhere_else() {
+        let (one, two) = (NetNs::create().unwrap(), NetNs::create().unwrap());
+        let listener = one.listen((Ipv4Addr::LOCALHOST, 0).into()).await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let mut near = one.connect(address).await.unwrap();
+        let (mut far, _) = listener.accept().await.unwrap();
+        near.write_all(b"hello").await.unwrap();
+        let mut text = [0; 5];
+        far.read_exact(&mut text).await.unwrap();
+        assert_eq!(&text, b"hello");
+        assert!(near.nodelay().unwrap());
+        let refused = two.connect(address).await.unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::ConnectionRefused);
+        assert!(
+            TcpStream::connect(address).await.is_err(),
+            "the host must not see it"
+        );
+    }
+
+    #[test]
+    fn namespaces_are_compared_by_what_they_are() {
+        let (one, two) = (NetNs::create().unwrap(), NetNs::create().unwrap());
+        let own = NetNs::current().unwrap();
+        assert_eq!(one.run(|| NetNs::current().unwrap()).unwrap(), one);
+        assert_ne!(one, two);
+        assert_ne!(one, own);
+        assert_eq!(
+            NetNs::current().unwrap(),
+            own,
+            "the calling thread stays where it was"
+        );
+    }
+}
