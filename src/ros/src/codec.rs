@@ -1,1 +1,242 @@
-//! Serialized messages ⇄ JSON and CBOR.
+//! Serialized ROS 1 messages ⇄ JSON and CBOR, in one pass from input bytes to output buffer.
+//!
+//! Each [`MessageType`] carries a plan compiled when it was resolved: the literals between values are already
+//! written out, nested messages are flattened, arrays of numbers move as blocks. No tree of values is built.
+//!
+//! ```text
+//! ROS bytes ── walk (plan, bounds) ──▶ Format: json_out │ cbor_out │ validate
+//! JSON, CBOR ─ Input: json_in │ cbor_in ──▶ fill (order, defaults, stamps) ──▶ ROS bytes
+//! ```
+//!
+//! What the values look like is rosbridge's: bytes (`uint8[]`, `char[]`) are base64 in JSON and a byte string in
+//! CBOR, times are `{"secs", "nsecs"}`, other numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
+//!
+//! On an error the output buffer is left as it was.
+
+mod cbor_in;
+mod cbor_item;
+mod cbor_out;
+mod fault;
+mod fill;
+mod float;
+mod json_in;
+mod json_out;
+mod json_text;
+mod number;
+pub(crate) mod plan;
+mod typed_array;
+mod walk;
+
+#[cfg(test)]
+mod tests;
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::schema::MessageType;
+
+pub use cbor_item::cbor_item_len;
+pub use fault::{CodecError, CodecErrorKind};
+pub use json_text::json_value_len;
+
+/// Output beyond which a conversion is given up, unless options say otherwise: 256 MiB.
+pub const DEFAULT_MAX_BYTES: usize = 256 << 20;
+
+/// A ROS time since the epoch (or since the start of simulated time).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub struct Time {
+    /// Whole seconds.
+    pub secs: u32,
+    /// Nanoseconds beyond, below 1e9.
+    pub nsecs: u32,
+}
+
+impl Time {
+    /// Wall-clock time as ROS counts it.
+    pub fn now() -> Time {
+        Time::from(SystemTime::now())
+    }
+}
+
+impl From<SystemTime> for Time {
+    fn from(time: SystemTime) -> Time {
+        let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
+        Time {
+            secs: u32::try_from(since.as_secs()).unwrap_or(u32::MAX),
+            nsecs: since.subsec_nanos(),
+        }
+    }
+}
+
+/// How NaN and infinities are written in JSON, which has no word for them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum NonFinite {
+    /// `null`, as rosbridge does.
+    #[default]
+    Null,
+    /// `"NaN"`, `"Infinity"`, `"-Infinity"`.
+    String,
+    /// `NaN`, `Infinity`, `-Infinity`: Python's way, refused by strict parsers.
+    Bare,
+}
+
+/// What to do with a ROS string that is not UTF-8.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum InvalidUtf8 {
+    /// U+FFFD in place of each bad sequence.
+    #[default]
+    Replace,
+    /// An error that names the field.
+    Refuse,
+}
+
+/// How to write JSON.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct JsonOptions {
+    /// NaN and infinities.
+    pub non_finite: NonFinite,
+    /// Strings that are not UTF-8.
+    pub invalid_utf8: InvalidUtf8,
+    /// Most bytes to write.
+    pub max_bytes: usize,
+}
+
+impl Default for JsonOptions {
+    fn default() -> JsonOptions {
+        JsonOptions {
+            non_finite: NonFinite::default(),
+            invalid_utf8: InvalidUtf8::default(),
+            max_bytes: DEFAULT_MAX_BYTES,
+        }
+    }
+}
+
+/// How to write CBOR.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CborOptions {
+    /// Numeric arrays as RFC 8746 typed arrays, little endian; plain arrays otherwise.
+    pub typed_arrays: bool,
+    /// Strings that are not UTF-8.
+    pub invalid_utf8: InvalidUtf8,
+    /// Most bytes to write.
+    pub max_bytes: usize,
+}
+
+impl Default for CborOptions {
+    fn default() -> CborOptions {
+        CborOptions {
+            typed_arrays: true,
+            invalid_utf8: InvalidUtf8::default(),
+            max_bytes: DEFAULT_MAX_BYTES,
+        }
+    }
+}
+
+/// How to complete what a client left out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FillOptions {
+    /// The current time: for `"now"` in place of a time, and for a `std_msgs/Header` that is missing from its
+    /// message or has no stamp. Without it both are zero.
+    pub now: Option<Time>,
+    /// Most bytes to write.
+    pub max_bytes: usize,
+}
+
+impl Default for FillOptions {
+    fn default() -> FillOptions {
+        FillOptions {
+            now: None,
+            max_bytes: DEFAULT_MAX_BYTES,
+        }
+    }
+}
+
+/// Appends the message as a JSON object.
+pub fn to_json(
+    message: &MessageType,
+    bytes: &[u8],
+    out: &mut Vec<u8>,
+    options: &JsonOptions,
+) -> Result<(), CodecError> {
+    undo_on_error(message, out, |out| {
+        json_out::write(message, bytes, out, options)
+    })
+}
+
+/// Appends the message that a JSON object describes, serialized. The whole of `json` must be that one object.
+pub fn from_json(
+    message: &MessageType,
+    json: &[u8],
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+) -> Result<(), CodecError> {
+    undo_on_error(message, out, |out| {
+        json_in::read(message, json, out, options)
+    })
+}
+
+/// Appends the message as a CBOR map.
+pub fn to_cbor(
+    message: &MessageType,
+    bytes: &[u8],
+    out: &mut Vec<u8>,
+    options: &CborOptions,
+) -> Result<(), CodecError> {
+    undo_on_error(message, out, |out| {
+        cbor_out::write(message, bytes, out, options)
+    })
+}
+
+/// Appends the message that a CBOR map describes, serialized. The whole of `cbor` must be that one map.
+pub fn from_cbor(
+    message: &MessageType,
+    cbor: &[u8],
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+) -> Result<(), CodecError> {
+    undo_on_error(message, out, |out| {
+        cbor_in::read(message, cbor, out, options)
+    })
+}
+
+/// Checks that the bytes are exactly one message of this type.
+pub fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), CodecError> {
+    walk::validate(message, bytes).map_err(|fault| fault.of(message))
+}
+
+/// The default message: zeros, empty strings and arrays.
+pub fn default_json(message: &MessageType) -> String {
+    let mut out = Vec::new();
+    let unlimited = JsonOptions {
+        max_bytes: usize::MAX,
+        ..JsonOptions::default()
+    };
+    // Zeros are a valid message of any type, so there is nothing to go wrong.
+    match to_json(message, &vec![0; message.min_size()], &mut out, &unlimited) {
+        Ok(()) => String::from_utf8(out).unwrap_or_default(),
+        Err(_) => "{}".to_owned(),
+    }
+}
+
+/// The stamp of a message whose first field is a `std_msgs/Header`.
+pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
+    if !message.has_header() {
+        return None;
+    }
+    let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?));
+    Some(Time {
+        secs: word(4)?,
+        nsecs: word(8)?,
+    })
+}
+
+fn undo_on_error(
+    message: &MessageType,
+    out: &mut Vec<u8>,
+    convert: impl FnOnce(&mut Vec<u8>) -> Result<(), fault::Fault>,
+) -> Result<(), CodecError> {
+    let before = out.len();
+    convert(out).map_err(|fault| {
+        out.truncate(before);
+        fault.of(message)
+    })
+}

@@ -1,0 +1,185 @@
+//! What goes wrong, and where: the place is put together on the way out, so the way in pays nothing for it.
+
+use std::fmt;
+
+use crate::schema::MessageType;
+
+/// Why a conversion failed, and at which field.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CodecError {
+    /// The message type being converted.
+    pub type_name: String,
+    /// The field, from the message's top: `header.stamp`, `poses[3].position.x`; empty for the message itself.
+    pub path: String,
+    /// What is wrong with it.
+    pub kind: CodecErrorKind,
+}
+
+impl fmt::Display for CodecError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.path.is_empty() {
+            write!(f, "{}: {}", self.type_name, self.kind)
+        } else {
+            write!(
+                f,
+                "field {} of {}: {}",
+                self.path, self.type_name, self.kind
+            )
+        }
+    }
+}
+
+impl std::error::Error for CodecError {}
+
+/// What can be wrong with a field, or with the whole input.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CodecErrorKind {
+    /// The serialized message ends inside a value.
+    #[error("the serialized message ends here, {missing} bytes too early")]
+    Truncated {
+        /// How many more there would have to be.
+        missing: usize,
+    },
+    /// The serialized message goes on after its last field.
+    #[error("{0} bytes follow the end of the message")]
+    Trailing(
+        /// How many.
+        usize,
+    ),
+    /// An array's length cannot be true.
+    #[error("an array of {count} elements cannot fit into the {left} bytes that follow")]
+    LengthBeyondEnd {
+        /// Its declared length.
+        count: u64,
+        /// Bytes after the length.
+        left: usize,
+    },
+    /// A string is not UTF-8.
+    #[error("the text is not UTF-8")]
+    InvalidUtf8,
+    /// A value of another kind than the field's.
+    #[error("takes {expected}, got {found}")]
+    Mismatch {
+        /// What the field takes.
+        expected: &'static str,
+        /// What was there.
+        found: &'static str,
+    },
+    /// A number that the field cannot hold.
+    #[error("{found} does not fit into {expected}")]
+    OutOfRange {
+        /// The field's type.
+        expected: &'static str,
+        /// The number.
+        found: String,
+    },
+    /// The path names a field that the type does not have.
+    #[error("there is no such field")]
+    NoSuchField,
+    /// A fixed array with another number of elements.
+    #[error("takes exactly {expected} elements, got {found}")]
+    WrongLength {
+        /// As defined.
+        expected: usize,
+        /// As given; at least, where counting stopped there.
+        found: usize,
+    },
+    /// Bytes given as text that is not base64.
+    #[error("the text is not base64")]
+    Base64,
+    /// The input is not JSON.
+    #[error("invalid JSON at byte {at}: {reason}")]
+    Json {
+        /// From the beginning of the input.
+        at: usize,
+        /// What was expected or found.
+        reason: &'static str,
+    },
+    /// The input is not CBOR.
+    #[error("invalid CBOR at byte {at}: {reason}")]
+    Cbor {
+        /// From the beginning of the input.
+        at: usize,
+        /// What was expected or found.
+        reason: &'static str,
+    },
+    /// The input nests too deeply.
+    #[error("nested deeper than {0} levels")]
+    TooDeep(
+        /// The limit.
+        usize,
+    ),
+    /// The output would grow beyond what was allowed.
+    #[error("the converted message is larger than the limit of {0} bytes")]
+    TooLarge(
+        /// The limit.
+        usize,
+    ),
+}
+
+/// An error on its way out, gathering its place. Boxed: results on the hot path stay one word.
+#[derive(Debug)]
+pub(crate) struct Fault(Box<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    kind: CodecErrorKind,
+    /// Innermost first.
+    place: Vec<Segment>,
+}
+
+#[derive(Debug)]
+enum Segment {
+    Field(String),
+    Index(usize),
+}
+
+impl From<CodecErrorKind> for Fault {
+    #[cold]
+    fn from(kind: CodecErrorKind) -> Fault {
+        Fault(Box::new(Inner {
+            kind,
+            place: Vec::new(),
+        }))
+    }
+}
+
+impl Fault {
+    #[cold]
+    pub(crate) fn in_field(mut self, name: &str) -> Fault {
+        self.0.place.push(Segment::Field(name.to_owned()));
+        self
+    }
+
+    #[cold]
+    pub(crate) fn at_index(mut self, index: usize) -> Fault {
+        self.0.place.push(Segment::Index(index));
+        self
+    }
+
+    #[cold]
+    pub(crate) fn of(self, message: &MessageType) -> CodecError {
+        let mut path = String::new();
+        for segment in self.0.place.iter().rev() {
+            match segment {
+                Segment::Field(name) if path.is_empty() => path.push_str(name),
+                Segment::Field(name) => {
+                    path.push('.');
+                    path.push_str(name);
+                }
+                Segment::Index(index) => path.push_str(&format!("[{index}]")),
+            }
+        }
+        CodecError {
+            type_name: message.name().to_owned(),
+            path,
+            kind: self.0.kind,
+        }
+    }
+}
+
+/// A value of the wrong kind.
+#[cold]
+pub(crate) fn mismatch(expected: &'static str, found: &'static str) -> Fault {
+    CodecErrorKind::Mismatch { expected, found }.into()
+}

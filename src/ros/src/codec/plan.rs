@@ -1,0 +1,288 @@
+//! What a message's codec does, worked out once per type.
+//!
+//! For output ([`Plan::steps`]) nested messages are flattened and everything between two values (`,"stamp":`) is
+//! written out beforehand, in JSON and in CBOR. For input ([`Plan::members`]) fields stay by message, since they may
+//! come in any order.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use crate::codec::cbor_out::{MAP, TEXT, head};
+use crate::schema::{Arity, Base, Field, MessageType, Primitive};
+
+/// Nested messages with more steps than this are called, not flattened, as are all once the plan has grown to
+/// `MAX_FLATTENED_JSON` bytes of literals: else a plan could grow exponentially with the depth of its definition.
+const MAX_FLATTENED: usize = 32;
+const MAX_FLATTENED_JSON: usize = 4096;
+
+/// The compiled form of a message type.
+#[derive(Debug, Default)]
+pub(crate) struct Plan {
+    /// Fewest bytes of a message; the default message is as many zeros.
+    pub(crate) min_size: usize,
+    /// Every message takes `min_size` bytes.
+    pub(crate) fixed_size: bool,
+    /// How many values an otherwise empty message holds.
+    pub(crate) values: usize,
+    /// Nesting of messages, 1 for one that contains none.
+    pub(crate) depth: usize,
+    /// This is `std_msgs/Header`.
+    pub(crate) header: bool,
+    /// For input: one per field.
+    pub(crate) members: Vec<Member>,
+    /// For output: one per value after flattening.
+    pub(crate) steps: Vec<Step>,
+    /// What follows the last value.
+    pub(crate) tail: Literal,
+    json: Vec<u8>,
+    cbor: Vec<u8>,
+    /// Names of fields and of the flattened fields they are in.
+    names: Vec<Name>,
+}
+
+/// One part of a step's path.
+#[derive(Debug)]
+struct Name {
+    outer: Option<usize>,
+    name: Box<str>,
+}
+
+/// A field, as input sees it.
+#[derive(Debug)]
+pub(crate) struct Member {
+    pub(crate) name: Box<str>,
+    /// `"name":`, as most writers put it.
+    pub(crate) json_key: Box<[u8]>,
+    pub(crate) kind: Kind,
+    pub(crate) min_size: usize,
+}
+
+/// A value, as output sees it.
+#[derive(Debug)]
+pub(crate) struct Step {
+    /// What stands between the value before and this one.
+    pub(crate) before: Literal,
+    pub(crate) kind: Kind,
+    name: usize,
+}
+
+/// Pieces of a plan's ready-made JSON and CBOR.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Literal {
+    json: Range<usize>,
+    cbor: Range<usize>,
+}
+
+/// What one field holds.
+#[derive(Debug, Clone)]
+pub(crate) enum Kind {
+    Scalar(Scalar),
+    Text,
+    /// `uint8` and `char` arrays.
+    Bytes(Count),
+    /// Arrays of all other scalars.
+    Scalars(Scalar, Count),
+    Texts(Count),
+    Struct(Arc<MessageType>),
+    Structs(Arc<MessageType>, Count),
+}
+
+/// Elements of an array.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Count {
+    Fixed(usize),
+    Variable,
+}
+
+/// Values of a fixed size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Scalar {
+    Bool,
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    I64,
+    U64,
+    F32,
+    F64,
+    Time,
+    Duration,
+}
+
+impl Scalar {
+    pub(crate) fn size(self) -> usize {
+        match self {
+            Scalar::Bool | Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::I64 | Scalar::U64 | Scalar::F64 | Scalar::Time | Scalar::Duration => 8,
+        }
+    }
+
+    fn of(primitive: Primitive) -> Option<Scalar> {
+        Some(match primitive {
+            Primitive::Bool => Scalar::Bool,
+            Primitive::Int8 => Scalar::I8,
+            Primitive::Uint8 => Scalar::U8,
+            Primitive::Int16 => Scalar::I16,
+            Primitive::Uint16 => Scalar::U16,
+            Primitive::Int32 => Scalar::I32,
+            Primitive::Uint32 => Scalar::U32,
+            Primitive::Int64 => Scalar::I64,
+            Primitive::Uint64 => Scalar::U64,
+            Primitive::Float32 => Scalar::F32,
+            Primitive::Float64 => Scalar::F64,
+            Primitive::Time => Scalar::Time,
+            Primitive::Duration => Scalar::Duration,
+            Primitive::String => return None,
+        })
+    }
+}
+
+impl Kind {
+    fn of(field: &Field) -> Kind {
+        let count = match field.arity {
+            Arity::One => None,
+            Arity::Fixed(count) => Some(Count::Fixed(count as usize)),
+            Arity::Variable => Some(Count::Variable),
+        };
+        match (&field.base, count) {
+            (Base::Message(message), None) => Kind::Struct(message.clone()),
+            (Base::Message(message), Some(count)) => Kind::Structs(message.clone(), count),
+            (Base::Primitive(primitive), count) => match (Scalar::of(*primitive), count) {
+                (None, None) => Kind::Text,
+                (None, Some(count)) => Kind::Texts(count),
+                (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
+                (Some(scalar), None) => Kind::Scalar(scalar),
+                (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
+            },
+        }
+    }
+}
+
+impl Plan {
+    /// Works out the plan of message `name`.
+    pub(crate) fn compile(name: &str, fields: &[Field]) -> Plan {
+        let depths = fields.iter().map(|field| match &field.base {
+            Base::Message(inner) => inner.plan.depth + 1,
+            Base::Primitive(_) => 1,
+        });
+        let mut plan = Plan {
+            min_size: fields.iter().map(Field::min_size).sum(),
+            fixed_size: fields.iter().all(Field::is_fixed_size),
+            values: Plan::count_values(fields),
+            depth: depths.max().unwrap_or(1),
+            header: name == "std_msgs/Header",
+            members: fields.iter().map(Member::of).collect(),
+            ..Plan::default()
+        };
+        let mut pending = Pending::default();
+        plan.flatten(fields, None, &mut pending);
+        plan.tail = plan.literal(&mut pending);
+        plan
+    }
+
+    /// Values that a message of these fields always holds; each element of a fixed array of messages counts.
+    pub(crate) fn count_values(fields: &[Field]) -> usize {
+        fields.iter().fold(0, |sum: usize, field| {
+            let values = match (&field.base, field.arity) {
+                (Base::Message(inner), Arity::One) => inner.plan.values + 1,
+                (Base::Message(inner), Arity::Fixed(count)) => {
+                    (inner.plan.values + 1).saturating_mul(count as usize)
+                }
+                _ => 1,
+            };
+            sum.saturating_add(values)
+        })
+    }
+
+    pub(crate) fn json(&self, literal: &Literal) -> &[u8] {
+        &self.json[literal.json.clone()]
+    }
+
+    pub(crate) fn cbor(&self, literal: &Literal) -> &[u8] {
+        &self.cbor[literal.cbor.clone()]
+    }
+
+    /// A step's field from the message's top: `header.stamp`.
+    #[cold]
+    pub(crate) fn path(&self, step: &Step) -> String {
+        let mut parts = Vec::new();
+        let mut next = Some(step.name);
+        while let Some(index) = next {
+            parts.push(&*self.names[index].name);
+            next = self.names[index].outer;
+        }
+        parts.reverse();
+        parts.join(".")
+    }
+
+    fn flatten(&mut self, fields: &[Field], outer: Option<usize>, pending: &mut Pending) {
+        pending.json.push(b'{');
+        head(&mut pending.cbor, MAP, fields.len() as u64);
+        for (index, field) in fields.iter().enumerate() {
+            if index > 0 {
+                pending.json.push(b',');
+            }
+            pending.json.extend_from_slice(&json_key(&field.name));
+            head(&mut pending.cbor, TEXT, field.name.len() as u64);
+            pending.cbor.extend_from_slice(field.name.as_bytes());
+            self.names.push(Name {
+                outer,
+                name: field.name.as_str().into(),
+            });
+            let name = self.names.len() - 1;
+            match Kind::of(field) {
+                Kind::Struct(inner) if self.may_flatten(&inner.plan) => {
+                    self.flatten(inner.fields(), Some(name), pending);
+                }
+                kind => {
+                    let before = self.literal(pending);
+                    self.steps.push(Step { before, kind, name });
+                }
+            }
+        }
+        pending.json.push(b'}');
+    }
+
+    fn may_flatten(&self, inner: &Plan) -> bool {
+        let small = inner.values <= MAX_FLATTENED && inner.json.len() <= MAX_FLATTENED_JSON;
+        small && self.json.len() <= MAX_FLATTENED_JSON
+    }
+
+    fn literal(&mut self, pending: &mut Pending) -> Literal {
+        let (json, cbor) = (self.json.len(), self.cbor.len());
+        self.json.append(&mut pending.json);
+        self.cbor.append(&mut pending.cbor);
+        Literal {
+            json: json..self.json.len(),
+            cbor: cbor..self.cbor.len(),
+        }
+    }
+}
+
+/// Literals gathered since the last value.
+#[derive(Default)]
+struct Pending {
+    json: Vec<u8>,
+    cbor: Vec<u8>,
+}
+
+impl Member {
+    fn of(field: &Field) -> Member {
+        Member {
+            name: field.name.as_str().into(),
+            json_key: json_key(&field.name).into(),
+            kind: Kind::of(field),
+            min_size: field.min_size(),
+        }
+    }
+}
+
+/// Field names are plain ASCII, so there is nothing to escape.
+fn json_key(name: &str) -> Vec<u8> {
+    format!("\"{name}\":").into_bytes()
+}

@@ -1,0 +1,241 @@
+//! All definitions of one place (a service, a robot's servant) by name; resolved when first asked for, then kept.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use parking_lot::RwLock;
+
+use crate::schema::action::{ACTION_ENDINGS, action_message, service_message, well_known};
+use crate::schema::limits::MAX_DEFINITIONS;
+use crate::schema::parse::check_identifier;
+use crate::schema::resolve::{build_action, build_message, build_service};
+use crate::schema::text::split_full_text;
+use crate::schema::types::{ActionDef, MessageType, ServiceDef};
+use crate::schema::{MAX_TEXT_BYTES, SchemaError};
+
+/// Definitions and what they resolve to. Share it by `Arc`; all methods take `&self`.
+#[derive(Debug, Default)]
+pub struct Registry {
+    state: RwLock<State>,
+}
+
+/// Texts as given and everything resolved so far.
+#[derive(Debug, Default)]
+pub(crate) struct State {
+    messages: HashMap<String, Arc<str>>,
+    services: HashMap<String, Arc<str>>,
+    actions: HashMap<String, Arc<str>>,
+    pub(crate) resolved_messages: HashMap<String, Arc<MessageType>>,
+    pub(crate) resolved_services: HashMap<String, Arc<ServiceDef>>,
+    pub(crate) resolved_actions: HashMap<String, Arc<ActionDef>>,
+}
+
+impl Registry {
+    /// An empty one. `std_msgs/Header` and actionlib's own messages are known even so.
+    pub fn new() -> Registry {
+        Registry::default()
+    }
+
+    /// One with these definitions, keyed as for [`insert`](Self::insert).
+    pub fn from_definitions(
+        definitions: &BTreeMap<String, String>,
+    ) -> Result<Registry, SchemaError> {
+        let registry = Registry::new();
+        for (key, text) in definitions {
+            registry.insert(key, text)?;
+        }
+        Ok(registry)
+    }
+
+    /// Adds or replaces one definition. `key` is `package/msg/Type`, `package/srv/Type`, `package/action/Name`, or
+    /// `package/Type` for a message. The text is parsed when the type is first asked for.
+    pub fn insert(&self, key: &str, text: &str) -> Result<(), SchemaError> {
+        let (kind, name) = split_key(key)?;
+        if text.len() > MAX_TEXT_BYTES {
+            return Err(too_long(&name));
+        }
+        self.state.write().insert(kind, name, text);
+        Ok(())
+    }
+
+    /// Adds a message and all it contains from the full text that a publisher sends in its connection header.
+    /// Replaces definitions that differ.
+    pub fn insert_full_text(&self, type_name: &str, text: &str) -> Result<(), SchemaError> {
+        let name = message_name(type_name)?;
+        if text.len() > MAX_TEXT_BYTES {
+            return Err(too_long(&name));
+        }
+        let (own, others) = split_full_text(text);
+        if others.len() > MAX_DEFINITIONS {
+            let reason = format!("its text holds more than {MAX_DEFINITIONS} definitions");
+            return Err(SchemaError::TooLarge { name, reason });
+        }
+        let others = others
+            .into_iter()
+            .map(|(other, part)| Ok((message_name(&other)?, part)))
+            .collect::<Result<Vec<_>, SchemaError>>()?;
+        let mut state = self.state.write();
+        state.insert(Kind::Message, name, &own);
+        for (other, part) in others {
+            state.insert(Kind::Message, other, &part);
+        }
+        Ok(())
+    }
+
+    /// The message `package/Type` (or `package/msg/Type`). Messages that come with a service (`…Request`,
+    /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are found by the service or action.
+    pub fn message(&self, name: &str) -> Result<Arc<MessageType>, SchemaError> {
+        if let Some(found) = self.state.read().resolved_messages.get(name) {
+            return Ok(found.clone());
+        }
+        let name = message_name(name)?;
+        build_message(&mut self.state.write(), &name)
+    }
+
+    /// The service `package/Type` (or `package/srv/Type`).
+    pub fn service(&self, name: &str) -> Result<Arc<ServiceDef>, SchemaError> {
+        if let Some(found) = self.state.read().resolved_services.get(name) {
+            return Ok(found.clone());
+        }
+        let name = plain_name(name, "srv")?;
+        build_service(&mut self.state.write(), &name)
+    }
+
+    /// The action `package/Name` (or `package/action/Name`).
+    pub fn action(&self, name: &str) -> Result<Arc<ActionDef>, SchemaError> {
+        if let Some(found) = self.state.read().resolved_actions.get(name) {
+            return Ok(found.clone());
+        }
+        let name = plain_name(name, "action")?;
+        build_action(&mut self.state.write(), &name)
+    }
+
+    /// Names of all messages, services and actions given, sorted, each as `package/msg/Type`, `package/srv/Type` or
+    /// `package/action/Name`.
+    pub fn keys(&self) -> Vec<String> {
+        let state = self.state.read();
+        let kinds = [
+            ("msg", &state.messages),
+            ("srv", &state.services),
+            ("action", &state.actions),
+        ];
+        let mut keys: Vec<String> = kinds
+            .into_iter()
+            .flat_map(|(kind, texts)| {
+                texts
+                    .keys()
+                    .map(move |name| name.replacen('/', &format!("/{kind}/"), 1))
+            })
+            .collect();
+        keys.sort();
+        keys
+    }
+}
+
+impl MessageType {
+    /// A message from its full text alone, as a publisher's connection header has it, whatever definitions anyone
+    /// else uses.
+    pub fn from_full_text(name: &str, text: &str) -> Result<Arc<MessageType>, SchemaError> {
+        let registry = Registry::new();
+        registry.insert_full_text(name, text)?;
+        registry.message(name)
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Message,
+    Service,
+    Action,
+}
+
+impl State {
+    fn insert(&mut self, kind: Kind, name: String, text: &str) {
+        let texts = match kind {
+            Kind::Message => &mut self.messages,
+            Kind::Service => &mut self.services,
+            Kind::Action => &mut self.actions,
+        };
+        if texts.get(&name).is_some_and(|known| **known == *text) {
+            return;
+        }
+        texts.insert(name, text.into());
+        // Anything resolved so far may contain what was just replaced.
+        self.resolved_messages.clear();
+        self.resolved_services.clear();
+        self.resolved_actions.clear();
+    }
+
+    /// The text of message `name`, given or derived.
+    pub(crate) fn message_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
+        if let Some(text) = self.messages.get(name) {
+            return Ok(Some(text.clone()));
+        }
+        for (ending, request) in [("Request", true), ("Response", false)] {
+            if let Some((service, text)) = owner(&self.services, name, ending) {
+                return Ok(Some(service_message(service, text, request)?.into()));
+            }
+        }
+        for ending in ACTION_ENDINGS {
+            if let Some((action, text)) = owner(&self.actions, name, ending) {
+                return Ok(Some(action_message(action, text, ending)?.into()));
+            }
+        }
+        Ok(well_known(name).map(Into::into))
+    }
+
+    pub(crate) fn has_service(&self, name: &str) -> bool {
+        self.services.contains_key(name)
+    }
+
+    pub(crate) fn has_action(&self, name: &str) -> bool {
+        self.actions.contains_key(name)
+    }
+}
+
+fn owner<'a>(
+    texts: &'a HashMap<String, Arc<str>>,
+    name: &str,
+    ending: &str,
+) -> Option<(&'a str, &'a str)> {
+    let (name, text) = texts.get_key_value(name.strip_suffix(ending)?)?;
+    Some((name, text))
+}
+
+fn split_key(key: &str) -> Result<(Kind, String), SchemaError> {
+    let parts: Vec<&str> = key.split('/').collect();
+    let (package, kind, short) = match parts[..] {
+        [package, short] | [package, "msg", short] => (package, Kind::Message, short),
+        [package, "srv", short] => (package, Kind::Service, short),
+        [package, "action", short] => (package, Kind::Action, short),
+        _ => return Err(SchemaError::BadName(key.to_owned())),
+    };
+    let legal = check_identifier(package).and_then(|()| check_identifier(short));
+    legal.map_err(|_| SchemaError::BadName(key.chars().take(100).collect()))?;
+    Ok((kind, format!("{package}/{short}")))
+}
+
+fn message_name(name: &str) -> Result<String, SchemaError> {
+    plain_name(name, "msg")
+}
+
+/// `package/Type` of `package/Type` or `package/<kind>/Type`.
+fn plain_name(name: &str, kind: &str) -> Result<String, SchemaError> {
+    let bad = || SchemaError::BadName(name.chars().take(100).collect());
+    let (package, rest) = name.split_once('/').ok_or_else(bad)?;
+    let short = rest
+        .strip_prefix(kind)
+        .and_then(|rest| rest.strip_prefix('/'))
+        .unwrap_or(rest);
+    check_identifier(package)
+        .and_then(|()| check_identifier(short))
+        .map_err(|_| bad())?;
+    Ok(format!("{package}/{short}"))
+}
+
+fn too_long(name: &str) -> SchemaError {
+    SchemaError::TooLarge {
+        name: name.to_owned(),
+        reason: format!("more than {MAX_TEXT_BYTES} bytes of text"),
+    }
+}

@@ -1,0 +1,214 @@
+//! Names → types: dependencies first, each once, then MD5 and the codec's plan.
+
+use std::sync::{Arc, OnceLock};
+
+use md5::{Digest, Md5};
+
+use crate::codec::plan::Plan;
+use crate::schema::limits::{MAX_DEPTH, MAX_MESSAGE_BYTES, MAX_VALUES};
+use crate::schema::parse::{Parsed, ParsedField, parse};
+use crate::schema::registry::State;
+use crate::schema::types::{ActionDef, Base, Field, MessageType, Primitive, ServiceDef};
+use crate::schema::{Arity, SchemaError};
+
+/// Resolves message `name` (`package/Type`) and all it contains.
+pub(crate) fn build_message(
+    state: &mut State,
+    name: &str,
+) -> Result<Arc<MessageType>, SchemaError> {
+    Resolver {
+        state,
+        stack: Vec::new(),
+    }
+    .message(name)
+}
+
+/// Resolves a service's request and response.
+pub(crate) fn build_service(state: &mut State, name: &str) -> Result<Arc<ServiceDef>, SchemaError> {
+    if let Some(known) = state.resolved_services.get(name) {
+        return Ok(known.clone());
+    }
+    if !state.has_service(name) {
+        return Err(SchemaError::Unknown(name.to_owned()));
+    }
+    let request = build_message(state, &format!("{name}Request"))?;
+    let response = build_message(state, &format!("{name}Response"))?;
+    let mut hash = Md5::new();
+    hash.update(md5_text(&request));
+    hash.update(md5_text(&response));
+    let service = Arc::new(ServiceDef {
+        name: name.to_owned(),
+        md5: hex::encode(hash.finalize()),
+        request,
+        response,
+    });
+    state
+        .resolved_services
+        .insert(name.to_owned(), service.clone());
+    Ok(service)
+}
+
+/// Resolves an action's seven messages; an action of which only the messages are known will do.
+pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDef>, SchemaError> {
+    if let Some(known) = state.resolved_actions.get(name) {
+        return Ok(known.clone());
+    }
+    if !state.has_action(name) && state.message_text(&format!("{name}Action"))?.is_none() {
+        return Err(SchemaError::Unknown(name.to_owned()));
+    }
+    let mut part = |ending: &str| build_message(state, &format!("{name}{ending}"));
+    let action = Arc::new(ActionDef {
+        name: name.to_owned(),
+        action: part("Action")?,
+        action_goal: part("ActionGoal")?,
+        action_result: part("ActionResult")?,
+        action_feedback: part("ActionFeedback")?,
+        goal: part("Goal")?,
+        result: part("Result")?,
+        feedback: part("Feedback")?,
+    });
+    state
+        .resolved_actions
+        .insert(name.to_owned(), action.clone());
+    Ok(action)
+}
+
+struct Resolver<'a> {
+    state: &'a mut State,
+    /// The messages being resolved, outermost first.
+    stack: Vec<String>,
+}
+
+impl Resolver<'_> {
+    fn message(&mut self, name: &str) -> Result<Arc<MessageType>, SchemaError> {
+        if let Some(known) = self.state.resolved_messages.get(name) {
+            return Ok(known.clone());
+        }
+        if let Some(start) = self.stack.iter().position(|outer| outer == name) {
+            let way: Vec<&str> = self.stack[start..]
+                .iter()
+                .map(String::as_str)
+                .chain([name])
+                .collect();
+            return Err(SchemaError::Cycle(way.join(" > ")));
+        }
+        if self.stack.len() >= MAX_DEPTH {
+            return Err(too_large(
+                &self.stack[0],
+                format!("messages nest deeper than {MAX_DEPTH}"),
+            ));
+        }
+        let Some(text) = self.state.message_text(name)? else {
+            return Err(match self.stack.last() {
+                None => SchemaError::Unknown(name.to_owned()),
+                Some(outer) => SchemaError::Missing {
+                    name: name.to_owned(),
+                    needed_by: outer.clone(),
+                },
+            });
+        };
+        self.stack.push(name.to_owned());
+        let message = self.resolve(name, text)?;
+        self.stack.pop();
+        self.state
+            .resolved_messages
+            .insert(name.to_owned(), message.clone());
+        Ok(message)
+    }
+
+    fn resolve(&mut self, name: &str, text: Arc<str>) -> Result<Arc<MessageType>, SchemaError> {
+        let Parsed {
+            constants,
+            fields: parsed,
+        } = parse(name, &text)?;
+        let fields = parsed
+            .iter()
+            .map(|field| self.field(field))
+            .collect::<Result<Vec<_>, _>>()?;
+        check_size(name, &fields)?;
+        let mut message = MessageType {
+            name: name.to_owned(),
+            text,
+            md5: String::new(),
+            plan: Plan::compile(name, &fields),
+            fields,
+            constants,
+            full_text: OnceLock::new(),
+        };
+        message.md5 = hex::encode(Md5::digest(md5_text(&message)));
+        // The depth of what is inside was checked where it was first resolved, perhaps from elsewhere.
+        if message.plan.depth > MAX_DEPTH {
+            return Err(too_large(
+                name,
+                format!("messages nest deeper than {MAX_DEPTH}"),
+            ));
+        }
+        Ok(Arc::new(message))
+    }
+
+    fn field(&mut self, parsed: &ParsedField) -> Result<Field, SchemaError> {
+        let base = match Primitive::from_name(&parsed.type_name) {
+            Some(primitive) => Base::Primitive(primitive),
+            None => Base::Message(self.message(&parsed.type_name)?),
+        };
+        Ok(Field {
+            name: parsed.name.clone(),
+            type_name: parsed.type_name.clone(),
+            base,
+            arity: parsed.arity,
+        })
+    }
+}
+
+/// What genmsg hashes: constants, then fields, with each contained message replaced by its MD5.
+fn md5_text(message: &MessageType) -> String {
+    let mut out = String::new();
+    for constant in &message.constants {
+        out.push_str(&format!(
+            "{} {}={}\n",
+            constant.type_name, constant.name, constant.value
+        ));
+    }
+    for field in &message.fields {
+        match (&field.base, field.arity) {
+            (Base::Message(inner), _) => out.push_str(inner.md5()),
+            (Base::Primitive(_), Arity::One) => out.push_str(&field.type_name),
+            (Base::Primitive(_), Arity::Variable) => {
+                out.push_str(&format!("{}[]", field.type_name))
+            }
+            (Base::Primitive(_), Arity::Fixed(count)) => {
+                out.push_str(&format!("{}[{count}]", field.type_name))
+            }
+        }
+        out.push_str(&format!(" {}\n", field.name));
+    }
+    out.trim().to_owned()
+}
+
+/// Refuses messages that are huge before they hold anything.
+fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
+    let size = fields
+        .iter()
+        .fold(0usize, |sum, field| sum.saturating_add(field.min_size()));
+    if size > MAX_MESSAGE_BYTES {
+        return Err(too_large(
+            name,
+            format!("its fixed arrays take more than {MAX_MESSAGE_BYTES} bytes"),
+        ));
+    }
+    let values = Plan::count_values(fields);
+    if values > MAX_VALUES {
+        return Err(too_large(
+            name,
+            format!("it always holds more than {MAX_VALUES} values"),
+        ));
+    }
+    Ok(())
+}
+
+fn too_large(name: &str, reason: String) -> SchemaError {
+    SchemaError::TooLarge {
+        name: name.to_owned(),
+        reason,
+    }
+}
