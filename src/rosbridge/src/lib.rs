@@ -1,1 +1,52 @@
-//! rosbridge
+//! rosbridge protocol v2 as data: frames in, [`Op`]s out, and back. No sockets, no ROS.
+//!
+//! A frame is a JSON object (text) or a CBOR map (binary). Only its envelope is read here; what a message or a
+//! service's arguments hold stays a [`Payload`]: the slice of the frame it stands in, for a codec that knows the
+//! type. So nothing is copied, and there is no tree of values.
+//!
+//! ```text
+//! frame ──parse──▶ Op { topic, id, … , msg: Payload } ──▶ the session
+//! frame ◀──print── Writer ◀── an Op, or field by field with the payload written in place
+//! ```
+//!
+//! The protocol is the union of ROSBRIDGE_PROTOCOL.md of the `ros1` and `ros2` branches of rosbridge_suite, with one
+//! extension: `"compression": "cbor-raw"` is understood upwards too (publish, services, actions). There a payload is
+//! `{"bytes": …}` with the ROS serialization in it, as downwards.
+
+#![forbid(unsafe_code)]
+
+mod action;
+mod advertise;
+mod auth;
+mod cbor;
+mod error;
+mod fields;
+mod fragment;
+mod id;
+mod json;
+mod op;
+mod payload;
+mod png;
+mod publish;
+mod service;
+mod status;
+mod subscribe;
+mod writer;
+
+pub use action::{
+    ActionFeedback, ActionResult, AdvertiseAction, CancelActionGoal, GoalStatus, SendActionGoal,
+    UnadvertiseAction,
+};
+pub use advertise::{Advertise, Unadvertise};
+pub use auth::Auth;
+pub use error::{Error, Problem};
+pub use fragment::{Fragment, FragmentError, FragmentLimits, Fragments, split_text};
+pub use id::Id;
+pub use op::{Frame, Op, is_known_op, unknown_fields};
+pub use payload::{Format, Payload, Raw};
+pub use png::{Png, PngError, decode_png, encode_png};
+pub use publish::Publish;
+pub use service::{AdvertiseService, CallService, ServiceResponse, UnadvertiseService};
+pub use status::{Level, SetLevel, Status};
+pub use subscribe::{Compression, Subscribe, Unsubscribe};
+pub use writer::Writer;

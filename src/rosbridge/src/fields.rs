@@ -1,0 +1,305 @@
+//! The fields of one message, read by name whatever the format.
+
+use std::borrow::Cow;
+use std::time::Duration;
+
+use crate::{Format, Id, Payload, Problem, cbor, json};
+
+/// No op has more than fifteen.
+const MAX_FIELDS: usize = 64;
+/// Names, types and ids are short; what is long is payload.
+const MAX_TEXT: usize = 16 * 1024;
+
+/// Names and value slices of an object.
+pub(crate) struct Fields<'a> {
+    format: Format,
+    found: Vec<(Cow<'a, str>, &'a [u8])>,
+}
+
+impl<'a> Fields<'a> {
+    pub(crate) fn of(payload: Payload<'a>) -> Result<Self, Problem> {
+        let mut found = Vec::with_capacity(8);
+        let mut keep = |key, value| {
+            if found.len() == MAX_FIELDS {
+                return Err(Problem::TooManyFields(MAX_FIELDS));
+            }
+            found.push((key, value));
+            Ok(())
+        };
+        match payload.format {
+            Format::Json => {
+                let text = std::str::from_utf8(payload.bytes).map_err(|error| Problem::Syntax {
+                    format: "JSON",
+                    at: error.valid_up_to(),
+                    reason: "the text is not UTF-8",
+                })?;
+                json::Cursor::new(text).object(|key, value| keep(key, value.as_bytes()))?;
+            }
+            Format::Cbor => cbor::Cursor::new(payload.bytes)
+                .map(|key, value| keep(Cow::Borrowed(key), value))?,
+        }
+        Ok(Self {
+            format: payload.format,
+            found,
+        })
+    }
+
+    pub(crate) fn format(&self) -> Format {
+        self.format
+    }
+
+    pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
+        self.found.iter().map(|(name, _)| name.as_ref())
+    }
+
+    fn is_null(&self, value: &[u8]) -> bool {
+        Payload {
+            format: self.format,
+            bytes: value,
+        }
+        .is_null()
+    }
+
+    /// The value of a field; the last one wins as in every JSON parser, `null` is as good as absent.
+    fn get(&self, field: &str) -> Option<&'a [u8]> {
+        let (_, value) = self.found.iter().rev().find(|(name, _)| name == field)?;
+        (!self.is_null(value)).then_some(*value)
+    }
+
+    pub(crate) fn required(
+        &self,
+        field: &'static str,
+        expected: &'static str,
+    ) -> Result<&'a [u8], Problem> {
+        self.get(field).ok_or(Problem::Missing { field, expected })
+    }
+
+    /// A value as the client wrote it, shortened.
+    pub(crate) fn shown(&self, value: &[u8]) -> String {
+        const SHOWN: usize = 48;
+        match self.format {
+            Format::Json => {
+                let text = String::from_utf8_lossy(value);
+                match text.char_indices().nth(SHOWN) {
+                    Some((at, _)) => format!("{}…", &text[..at]),
+                    None => text.into_owned(),
+                }
+            }
+            Format::Cbor => match value.first().map_or(7, |byte| byte >> 5) {
+                cbor::UNSIGNED | cbor::NEGATIVE => cbor::Cursor::new(value)
+                    .integer()
+                    .map_or("a number".to_owned(), |number| number.to_string()),
+                cbor::BYTES => "a byte string".to_owned(),
+                cbor::TEXT => match cbor::Cursor::new(value).string(cbor::TEXT) {
+                    Some(text) => format!(
+                        "{:?}",
+                        String::from_utf8_lossy(&text[..text.len().min(SHOWN)])
+                    ),
+                    None => "a text in chunks".to_owned(),
+                },
+                cbor::ARRAY => "an array".to_owned(),
+                cbor::MAP => "a map".to_owned(),
+                _ => cbor::Cursor::new(value)
+                    .number()
+                    .map_or("a simple value".to_owned(), |number| number.to_string()),
+            },
+        }
+    }
+
+    fn mistyped(&self, field: &'static str, expected: &'static str, value: &[u8]) -> Problem {
+        Problem::Mistyped {
+            field,
+            expected,
+            found: self.shown(value),
+        }
+    }
+
+    fn as_text(&self, value: &'a [u8]) -> Option<Cow<'a, str>> {
+        Payload {
+            format: self.format,
+            bytes: value,
+        }
+        .text()
+    }
+
+    fn as_number(&self, value: &[u8]) -> Option<f64> {
+        match self.format {
+            Format::Json => {
+                // Rust's parser takes "inf" and "+1" too; JSON does not.
+                let text = std::str::from_utf8(value).ok()?;
+                matches!(value.first(), Some(b'-' | b'0'..=b'9'))
+                    .then(|| text.parse().ok())
+                    .flatten()
+            }
+            Format::Cbor => cbor::Cursor::new(value).number(),
+        }
+    }
+
+    fn as_integer(&self, value: &[u8]) -> Option<i64> {
+        let exact = match self.format {
+            Format::Json => std::str::from_utf8(value)
+                .ok()
+                .and_then(|text| text.parse().ok()),
+            Format::Cbor => cbor::Cursor::new(value).integer(),
+        };
+        // JavaScript and Lua clients may write 5 as 5.0.
+        exact.or_else(|| {
+            let number = self.as_number(value)?;
+            (number.fract() == 0.0 && number.abs() < 9e15).then_some(number as i64)
+        })
+    }
+
+    /// A text of reasonable length.
+    pub(crate) fn text(
+        &self,
+        field: &'static str,
+        expected: &'static str,
+    ) -> Result<Option<Cow<'a, str>>, Problem> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        if value.len() > MAX_TEXT {
+            return Err(Problem::TooLong {
+                field,
+                length: value.len(),
+                limit: MAX_TEXT,
+            });
+        }
+        self.as_text(value)
+            .map(Some)
+            .ok_or_else(|| self.mistyped(field, expected, value))
+    }
+
+    /// A text that must be there and not be empty.
+    pub(crate) fn required_text(
+        &self,
+        field: &'static str,
+        expected: &'static str,
+    ) -> Result<Cow<'a, str>, Problem> {
+        let text = self
+            .text(field, expected)?
+            .ok_or(Problem::Missing { field, expected })?;
+        if text.is_empty() {
+            return Err(Problem::Mistyped {
+                field,
+                expected,
+                found: "empty".to_owned(),
+            });
+        }
+        Ok(text)
+    }
+
+    /// A text of any length: the data of fragments and pictures.
+    pub(crate) fn data(
+        &self,
+        field: &'static str,
+        expected: &'static str,
+    ) -> Result<Cow<'a, str>, Problem> {
+        let value = self.required(field, expected)?;
+        self.as_text(value)
+            .ok_or_else(|| self.mistyped(field, expected, value))
+    }
+
+    pub(crate) fn boolean(&self, field: &'static str) -> Result<Option<bool>, Problem> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        match (self.format, value) {
+            (Format::Json, b"true") | (Format::Cbor, [0xf5]) => Ok(Some(true)),
+            (Format::Json, b"false") | (Format::Cbor, [0xf4]) => Ok(Some(false)),
+            _ => Err(self.mistyped(field, "true or false", value)),
+        }
+    }
+
+    /// An integer not below `least`.
+    pub(crate) fn count(
+        &self,
+        field: &'static str,
+        least: i64,
+        expected: &'static str,
+    ) -> Result<Option<u64>, Problem> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        match self.as_integer(value) {
+            Some(number) if number >= least => Ok(Some(number.unsigned_abs())),
+            _ => Err(self.mistyped(field, expected, value)),
+        }
+    }
+
+    pub(crate) fn integer(&self, field: &'static str) -> Result<Option<i64>, Problem> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        self.as_integer(value)
+            .map(Some)
+            .ok_or_else(|| self.mistyped(field, "an integer", value))
+    }
+
+    /// A duration given as a number of `unit`s.
+    pub(crate) fn duration(
+        &self,
+        field: &'static str,
+        unit: Duration,
+        expected: &'static str,
+    ) -> Result<Option<Duration>, Problem> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        match self.as_number(value) {
+            Some(number) if number >= 0.0 => Ok(Some(
+                Duration::try_from_secs_f64(number * unit.as_secs_f64()).unwrap_or(Duration::MAX),
+            )),
+            _ => Err(self.mistyped(field, expected, value)),
+        }
+    }
+
+    pub(crate) fn id(&self) -> Result<Option<Id<'a>>, Problem> {
+        const EXPECTED: &str = "a string or an integer";
+        let Some(value) = self.get("id") else {
+            return Ok(None);
+        };
+        if let Some(number) = self.as_integer(value) {
+            return Ok(Some(Id::Integer(number)));
+        }
+        Ok(self.text("id", EXPECTED)?.map(Id::Text))
+    }
+
+    pub(crate) fn payload(&self, field: &'static str) -> Option<Payload<'a>> {
+        self.get(field).map(|bytes| Payload {
+            format: self.format,
+            bytes,
+        })
+    }
+
+    /// A payload that must be an object.
+    pub(crate) fn object(&self, field: &'static str) -> Result<Payload<'a>, Problem> {
+        const EXPECTED: &str = "an object with the message's fields";
+        let bytes = self.required(field, EXPECTED)?;
+        let payload = Payload {
+            format: self.format,
+            bytes,
+        };
+        if payload.is_object() {
+            Ok(payload)
+        } else {
+            Err(self.mistyped(field, EXPECTED, bytes))
+        }
+    }
+
+    /// A payload that is an object or a list of arguments, where present.
+    pub(crate) fn arguments(&self, field: &'static str) -> Result<Option<Payload<'a>>, Problem> {
+        let Some(bytes) = self.get(field) else {
+            return Ok(None);
+        };
+        let payload = Payload {
+            format: self.format,
+            bytes,
+        };
+        if payload.is_object() || payload.is_list() {
+            Ok(Some(payload))
+        } else {
+            Err(self.mistyped(field, "an object, or a list of arguments in order,", bytes))
+        }
+    }
+}

@@ -1,0 +1,269 @@
+//! `fragment`: parts of a message that was too long for one frame, put together again within bounds.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use crate::fields::Fields;
+use crate::op::Message;
+use crate::{Id, Problem, Writer};
+
+/// One part.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Fragment<'a> {
+    /// Which message it belongs to.
+    pub id: Id<'a>,
+    /// A piece of that message's JSON text.
+    pub data: Cow<'a, str>,
+    /// Which piece, from 0.
+    pub num: u64,
+    /// How many there are.
+    pub total: u64,
+}
+
+impl<'a> Message<'a> for Fragment<'a> {
+    const OP: &'static str = "fragment";
+    const FIELDS: &'static [&'static str] = &["data", "num", "total"];
+
+    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
+        let part = |field, least, expected| {
+            fields
+                .count(field, least, expected)?
+                .ok_or(Problem::Missing { field, expected })
+        };
+        Ok(Self {
+            id: id.ok_or(Problem::Missing {
+                field: "id",
+                expected: "the id common to all fragments of the message",
+            })?,
+            data: fields.data("data", "a piece of the message's text")?,
+            num: part("num", 0, "the fragment's index, from 0,")?,
+            total: part("total", 1, "the number of fragments, 1 or more,")?,
+        })
+    }
+
+    fn id(&self) -> Option<&Id<'a>> {
+        Some(&self.id)
+    }
+
+    fn write(&self, writer: &mut Writer<'_>) {
+        writer.text("data", &self.data);
+        writer.optional_count("num", Some(self.num));
+        writer.optional_count("total", Some(self.total));
+    }
+}
+
+/// How much unfinished business one client may have.
+#[derive(Debug, Clone, Copy)]
+pub struct FragmentLimits {
+    /// Messages begun and not finished.
+    pub messages: usize,
+    /// Fragments of one message.
+    pub parts: usize,
+    /// Bytes of all unfinished messages together.
+    pub bytes: usize,
+    /// Time since the last fragment of a message.
+    pub age: Duration,
+}
+
+impl Default for FragmentLimits {
+    fn default() -> Self {
+        Self {
+            messages: 16,
+            parts: 65_536,
+            bytes: 64 << 20,
+            age: Duration::from_secs(60),
+        }
+    }
+}
+
+/// Why a fragment was dropped.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FragmentError {
+    /// `num` is not below `total`.
+    #[error("fragment {num} of {total}: \"num\" must be below \"total\"")]
+    Index {
+        /// As sent.
+        num: u64,
+        /// As sent.
+        total: u64,
+    },
+    /// `total` differs from the earlier fragments'.
+    #[error("\"total\" is {total}, the earlier fragments said {earlier}; the message is dropped")]
+    Total {
+        /// As sent.
+        total: u64,
+        /// As begun.
+        earlier: usize,
+    },
+    /// The same piece again, with other data.
+    #[error("fragment {0} came twice with different data; the message is dropped")]
+    Doubled(u64),
+    /// Too many pieces.
+    #[error("\"total\" is {total}, at most {limit} fragments are allowed")]
+    Parts {
+        /// As sent.
+        total: u64,
+        /// As allowed.
+        limit: usize,
+    },
+    /// Too many bytes.
+    #[error("unfinished messages hold more than {0} bytes; the message is dropped")]
+    Bytes(usize),
+}
+
+struct Partial {
+    parts: Vec<Option<Box<str>>>,
+    missing: usize,
+    bytes: usize,
+    touched: Instant,
+}
+
+/// The unfinished messages of one client.
+pub struct Fragments {
+    limits: FragmentLimits,
+    partial: HashMap<Id<'static>, Partial>,
+    bytes: usize,
+}
+
+impl Fragments {
+    /// None yet.
+    pub fn new(limits: FragmentLimits) -> Self {
+        Self {
+            limits,
+            partial: HashMap::new(),
+            bytes: 0,
+        }
+    }
+
+    /// Takes a fragment; gives the message when it is the last that was missing. Order does not matter.
+    ///
+    /// # Errors
+    /// Why it was not taken. Where the fragments contradict one another the whole message is dropped.
+    pub fn add(
+        &mut self,
+        fragment: &Fragment<'_>,
+        now: Instant,
+    ) -> Result<Option<String>, FragmentError> {
+        let Fragment { num, total, .. } = *fragment;
+        if num >= total {
+            return Err(FragmentError::Index { num, total });
+        }
+        if total > self.limits.parts as u64 {
+            return Err(FragmentError::Parts {
+                total,
+                limit: self.limits.parts,
+            });
+        }
+        if total == 1 {
+            return Ok(Some(fragment.data.to_string()));
+        }
+        self.forget_old(now);
+        let id = fragment.id.clone().into_owned();
+        if !self.partial.contains_key(&id) {
+            self.make_room();
+        }
+        // An unfilled slot costs memory as well as a filled one.
+        let slots = total as usize * size_of::<Option<Box<str>>>();
+        let mut begun = 0;
+        let partial = self.partial.entry(id.clone()).or_insert_with(|| {
+            begun = slots;
+            Partial {
+                parts: vec![None; total as usize],
+                missing: total as usize,
+                bytes: slots,
+                touched: now,
+            }
+        });
+        self.bytes += begun;
+        partial.touched = now;
+        let earlier = partial.parts.len();
+        if earlier as u64 != total {
+            self.forget(&id);
+            return Err(FragmentError::Total { total, earlier });
+        }
+        let slot = &mut partial.parts[num as usize];
+        match slot {
+            Some(data) if **data == *fragment.data => return Ok(None),
+            Some(_) => {
+                self.forget(&id);
+                return Err(FragmentError::Doubled(num));
+            }
+            None => {}
+        }
+        if self.bytes + fragment.data.len() > self.limits.bytes {
+            self.forget(&id);
+            return Err(FragmentError::Bytes(self.limits.bytes));
+        }
+        *slot = Some(fragment.data.as_ref().into());
+        partial.missing -= 1;
+        partial.bytes += fragment.data.len();
+        self.bytes += fragment.data.len();
+        if partial.missing > 0 {
+            return Ok(None);
+        }
+        let whole = partial.parts.iter().flatten().map(AsRef::as_ref).collect();
+        self.forget(&id);
+        Ok(Some(whole))
+    }
+
+    /// Bytes held now.
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Drops messages whose last fragment is too long ago; gives how many.
+    pub fn forget_old(&mut self, now: Instant) -> usize {
+        let age = self.limits.age;
+        let old = |partial: &Partial| now.saturating_duration_since(partial.touched) > age;
+        let ids: Vec<_> = self
+            .partial
+            .iter()
+            .filter(|(_, partial)| old(partial))
+            .map(|(id, _)| id.clone())
+            .collect();
+        for id in &ids {
+            self.forget(id);
+        }
+        ids.len()
+    }
+
+    fn make_room(&mut self) {
+        while self.partial.len() >= self.limits.messages.max(1) {
+            let oldest = self
+                .partial
+                .iter()
+                .min_by_key(|(_, partial)| partial.touched)
+                .map(|(id, _)| id.clone());
+            match oldest {
+                Some(id) => self.forget(&id),
+                None => return,
+            }
+        }
+    }
+
+    fn forget(&mut self, id: &Id<'static>) {
+        if let Some(partial) = self.partial.remove(id) {
+            self.bytes -= partial.bytes;
+        }
+    }
+}
+
+/// Cuts a text into pieces of at most `size` bytes (a character wider than that is a piece of its own).
+pub fn split_text(text: &str, size: usize) -> impl Iterator<Item = &str> {
+    let mut rest = text;
+    std::iter::from_fn(move || {
+        let first = rest.chars().next()?;
+        let mut at = size.max(first.len_utf8()).min(rest.len());
+        while !rest.is_char_boundary(at) {
+            at -= 1;
+        }
+        let (piece, tail) = rest.split_at(at);
+        rest = tail;
+        Some(piece)
+    })
+}
+
+#[cfg(test)]
+#[path = "fragment_tests.rs"]
+mod tests;

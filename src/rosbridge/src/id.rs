@@ -1,0 +1,52 @@
+//! The id of an interaction.
+
+use std::borrow::Cow;
+use std::fmt;
+
+/// "An arbitrary string or integer": what answers carry so that the client can match them.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Id<'a> {
+    /// The usual kind.
+    Text(Cow<'a, str>),
+    /// What some clients count with.
+    Integer(i64),
+}
+
+impl Id<'_> {
+    /// The same, free of the frame.
+    pub fn into_owned(self) -> Id<'static> {
+        match self {
+            Id::Text(text) => Id::Text(Cow::Owned(text.into_owned())),
+            Id::Integer(number) => Id::Integer(number),
+        }
+    }
+
+    /// The same, borrowed.
+    pub fn borrowed(&self) -> Id<'_> {
+        match self {
+            Id::Text(text) => Id::Text(Cow::Borrowed(text)),
+            Id::Integer(number) => Id::Integer(*number),
+        }
+    }
+}
+
+impl fmt::Display for Id<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Id::Text(text) => f.write_str(text),
+            Id::Integer(number) => write!(f, "{number}"),
+        }
+    }
+}
+
+impl<'a> From<&'a str> for Id<'a> {
+    fn from(text: &'a str) -> Self {
+        Id::Text(Cow::Borrowed(text))
+    }
+}
+
+impl From<String> for Id<'static> {
+    fn from(text: String) -> Self {
+        Id::Text(Cow::Owned(text))
+    }
+}

@@ -1,0 +1,315 @@
+//! All ops in one place: which there are, and how a frame becomes one.
+
+use std::borrow::Cow;
+
+use crate::fields::Fields;
+use crate::{
+    ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService,
+    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, SendActionGoal,
+    ServiceResponse, SetLevel, Status, Subscribe, Unadvertise, UnadvertiseAction,
+    UnadvertiseService, Unsubscribe, Writer,
+};
+
+/// One WebSocket message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Frame<'a> {
+    /// JSON.
+    Text(&'a str),
+    /// CBOR.
+    Binary(&'a [u8]),
+}
+
+/// What every op has in common.
+pub(crate) trait Message<'a>: Sized {
+    /// The name in `op`.
+    const OP: &'static str;
+    /// Every field that the protocol gives it, apart from `op` and `id`.
+    const FIELDS: &'static [&'static str];
+    /// Reads the fields.
+    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem>;
+    /// Its id.
+    fn id(&self) -> Option<&Id<'a>>;
+    /// Writes the fields, apart from `op` and `id`.
+    fn write(&self, writer: &mut Writer<'_>);
+}
+
+macro_rules! ops {
+    ($($(#[doc = $doc:literal])* $name:ident $(<$life:lifetime>)?,)*) => {
+        /// One message of the protocol.
+        #[derive(Debug, Clone, PartialEq)]
+        pub enum Op<'a> {
+            $($(#[doc = $doc])* $name($name<'a>),)*
+        }
+
+        /// The names of all ops.
+        pub(crate) const KNOWN: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
+
+        impl<'a> Op<'a> {
+            fn read(op: &str, id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
+                $(if op == $name::OP {
+                    return $name::read(id, fields).map(Op::$name);
+                })*
+                Err(Problem::UnknownOp(op.chars().take(64).collect()))
+            }
+
+            /// The name in `op`.
+            pub fn name(&self) -> &'static str {
+                match self { $(Op::$name(_) => $name::OP,)* }
+            }
+
+            /// The id of the interaction it belongs to.
+            pub fn id(&self) -> Option<&Id<'a>> {
+                match self { $(Op::$name(message) => message.id(),)* }
+            }
+
+            /// Appends it to `out` as one frame; payloads must be in `format`.
+            pub fn print(&self, out: &mut Vec<u8>, format: Format) {
+                let mut writer = Writer::op(out, format, self.name(), self.id());
+                match self { $(Op::$name(message) => message.write(&mut writer),)* }
+                writer.end();
+            }
+        }
+
+        $(impl<'a> From<$name<'a>> for Op<'a> {
+            fn from(message: $name<'a>) -> Self {
+                Op::$name(message)
+            }
+        })*
+
+        fn fields_of(op: &str) -> Option<&'static [&'static str]> {
+            $(if op == $name::OP {
+                return Some($name::FIELDS);
+            })*
+            None
+        }
+    };
+}
+
+// The order is that of frequency: the first are compared first.
+ops! {
+    /// A message on a topic, both ways.
+    Publish,
+    /// A part of a message that was cut.
+    Fragment,
+    /// A call to a service, both ways.
+    CallService,
+    /// Its answer, both ways.
+    ServiceResponse,
+    /// The client wants a topic.
+    Subscribe,
+    /// The client wants it no longer.
+    Unsubscribe,
+    /// The client will publish.
+    Advertise,
+    /// The client will publish no longer.
+    Unadvertise,
+    /// The client serves a service.
+    AdvertiseService,
+    /// The client serves it no longer.
+    UnadvertiseService,
+    /// A goal for an action server, both ways.
+    SendActionGoal,
+    /// The goal is no longer wanted, both ways.
+    CancelActionGoal,
+    /// How a goal gets on, both ways.
+    ActionFeedback,
+    /// How a goal ended, both ways.
+    ActionResult,
+    /// The client serves an action.
+    AdvertiseAction,
+    /// The client serves it no longer.
+    UnadvertiseAction,
+    /// A message packed into a picture.
+    Png,
+    /// Which status messages the client wants.
+    SetLevel,
+    /// What the server has to say.
+    Status,
+    /// Credentials.
+    Auth,
+}
+
+impl<'a> Op<'a> {
+    /// Reads one frame.
+    ///
+    /// # Errors
+    /// What is wrong with it, with the op and id where they could be read.
+    pub fn parse(frame: Frame<'a>) -> Result<Self, Error> {
+        let fields = Fields::of(frame.payload())?;
+        let id = fields.id();
+        let known = id.as_ref().ok().cloned().flatten().map(Id::into_owned);
+        let op = match fields.text("op", "the name of an operation") {
+            Ok(Some(op)) => op,
+            Ok(None) => {
+                let hint = if fields.names().any(|name| name == "receiver") {
+                    " (this looks like rosbridge 1.0; the server speaks 2.0)"
+                } else {
+                    ""
+                };
+                return Err(Error {
+                    op: None,
+                    id: known,
+                    problem: Problem::NoOp { hint },
+                });
+            }
+            Err(problem) => {
+                return Err(Error {
+                    op: None,
+                    id: known,
+                    problem,
+                });
+            }
+        };
+        let read = id.and_then(|id| Op::read(&op, id, &fields));
+        read.map_err(|problem| {
+            let op = (!matches!(problem, Problem::UnknownOp(_))).then(|| op.into_owned());
+            Error {
+                op,
+                id: known,
+                problem,
+            }
+        })
+    }
+}
+
+impl<'a> Frame<'a> {
+    /// The frame as one value.
+    pub fn payload(self) -> Payload<'a> {
+        match self {
+            Frame::Text(text) => Payload::json(text),
+            Frame::Binary(bytes) => Payload::cbor(bytes),
+        }
+    }
+
+    /// How it is written.
+    pub fn format(self) -> Format {
+        self.payload().format
+    }
+}
+
+/// Whether the protocol has such an op.
+pub fn is_known_op(op: &str) -> bool {
+    KNOWN.contains(&op)
+}
+
+/// The fields of a frame that its op does not have: harmless, but often a misspelt one. Empty for frames that
+/// [`Op::parse`] refuses.
+pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
+    let Ok(fields) = Fields::of(frame.payload()) else {
+        return Vec::new();
+    };
+    let op: Option<Cow<'_, str>> = fields.text("op", "").ok().flatten();
+    let Some(known) = op.as_deref().and_then(fields_of) else {
+        return Vec::new();
+    };
+    fields
+        .names()
+        .filter(|name| !matches!(*name, "op" | "id") && !known.contains(name))
+        .map(str::to_owned)
+        .collect()
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// Checks that `json` is read as `op` and that `op` survives printing and reading in both formats.
+    #[track_caller]
+    pub(crate) fn reads(json: &str, op: impl Into<Op<'static>>) {
+        let op = op.into();
+        assert_eq!(Op::parse(Frame::Text(json)).as_ref(), Ok(&op), "{json}");
+        let mut printed = Vec::new();
+        op.print(&mut printed, Format::Json);
+        assert_eq!(
+            Op::parse(Frame::Text(std::str::from_utf8(&printed).unwrap())).as_ref(),
+            Ok(&op)
+        );
+        assert!(unknown_fields(Frame::Text(std::str::from_utf8(&printed).unwrap())).is_empty());
+        serde_json::from_slice::<serde_json::Value>(&printed).unwrap();
+    }
+
+    /// Checks that a message without payload survives CBOR.
+    #[track_caller]
+    pub(crate) fn survives_cbor(op: impl Into<Op<'static>>) {
+        let op = op.into();
+        let mut printed = Vec::new();
+        op.print(&mut printed, Format::Cbor);
+        assert_eq!(Op::parse(Frame::Binary(&printed)).as_ref(), Ok(&op));
+    }
+
+    /// Checks that `json` is refused with this text.
+    #[track_caller]
+    pub(crate) fn refuses(json: &str, text: &str) {
+        assert_eq!(
+            Op::parse(Frame::Text(json)).unwrap_err().to_string(),
+            text,
+            "{json}"
+        );
+    }
+
+    #[test]
+    fn mistakes_keep_op_and_id() {
+        let error = Op::parse(Frame::Text(r#"{"op":"publish","id":7,"topic":3}"#)).unwrap_err();
+        assert_eq!(error.op.as_deref(), Some("publish"));
+        assert_eq!(error.id, Some(Id::Integer(7)));
+        assert_eq!(
+            error.to_string(),
+            "publish: field \"topic\" is 3, a topic name is expected"
+        );
+        let error = Op::parse(Frame::Text(r#"{"op":"dance","id":"x"}"#)).unwrap_err();
+        assert_eq!((error.op, error.id), (None, Some(Id::from("x"))));
+    }
+
+    #[test]
+    fn frames_without_a_known_op_are_refused() {
+        let names = "publish, fragment, call_service, service_response, subscribe, unsubscribe, advertise, unadvertise, \
+                     advertise_service, unadvertise_service, send_action_goal, cancel_action_goal, action_feedback, \
+                     action_result, advertise_action, unadvertise_action, png, set_level, status, auth";
+        refuses(
+            "{}",
+            &format!("field \"op\" is missing; it must be one of {names}"),
+        );
+        refuses(
+            r#"{"op":"dance"}"#,
+            &format!("unknown op \"dance\"; known are {names}"),
+        );
+        refuses(
+            r#"{"op":5}"#,
+            "field \"op\" is 5, the name of an operation is expected",
+        );
+        refuses(
+            r#"{"receiver":"/x","msg":[]}"#,
+            &format!(
+                "field \"op\" is missing; it must be one of {names} (this looks like rosbridge 1.0; the server speaks 2.0)"
+            ),
+        );
+        refuses("hello", "invalid JSON at byte 0: an object is expected");
+        refuses("[]", "a frame must be one JSON object");
+        assert_eq!(
+            Op::parse(Frame::Binary(b"\x00")).unwrap_err().to_string(),
+            "a frame must be one CBOR map"
+        );
+        assert!(Op::parse(Frame::Binary(&[0x13, 0x37, 0xff, 0xfe])).is_err());
+        let many: String = (0..1000).map(|n| format!("\"f{n}\":0,")).collect();
+        refuses(
+            &format!("{{{many}\"op\":\"auth\"}}"),
+            "a message has at most 64 fields",
+        );
+        let long = "x".repeat(20_000);
+        refuses(
+            &format!(r#"{{"op":"unsubscribe","topic":"{long}"}}"#),
+            "unsubscribe: field \"topic\" has 20002 bytes, at most 16384 are allowed",
+        );
+        refuses(
+            r#"{"op":"unsubscribe","id":{},"topic":"/x"}"#,
+            "unsubscribe: field \"id\" is {}, a string or an integer is expected",
+        );
+    }
+
+    #[test]
+    fn unknown_fields_are_named() {
+        let frame = Frame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
+        assert!(Op::parse(frame).is_ok());
+        assert_eq!(unknown_fields(frame), ["trottle_rate"]);
+    }
+}

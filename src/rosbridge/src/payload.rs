@@ -1,0 +1,157 @@
+//! What the envelope carries: a message, a service's arguments, a goal.
+
+use std::borrow::Cow;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+
+use crate::cbor;
+use crate::fields::Fields;
+use crate::{Error, Problem};
+
+/// How a frame is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Format {
+    /// Text frames.
+    Json,
+    /// Binary frames.
+    Cbor,
+}
+
+/// The slice of a frame that holds a value for a codec that knows its type.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Payload<'a> {
+    /// What the bytes are.
+    pub format: Format,
+    /// One JSON value (valid UTF-8) or one CBOR item.
+    pub bytes: &'a [u8],
+}
+
+/// A message in ROS's own serialization: `{"secs": …, "nsecs": …, "bytes": …}` of `cbor-raw`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Raw<'a> {
+    /// The serialized message: a slice of a CBOR frame, or decoded from the base64 of a JSON frame.
+    pub bytes: Cow<'a, [u8]>,
+}
+
+impl<'a> Payload<'a> {
+    /// A JSON payload.
+    pub fn json(text: &'a str) -> Self {
+        Self {
+            format: Format::Json,
+            bytes: text.as_bytes(),
+        }
+    }
+
+    /// A CBOR payload.
+    pub fn cbor(bytes: &'a [u8]) -> Self {
+        Self {
+            format: Format::Cbor,
+            bytes,
+        }
+    }
+
+    /// Whether it is a list (positional arguments) rather than an object.
+    pub fn is_list(&self) -> bool {
+        match self.format {
+            Format::Json => self.bytes.first() == Some(&b'['),
+            Format::Cbor => self
+                .bytes
+                .first()
+                .is_some_and(|byte| byte >> 5 == cbor::ARRAY),
+        }
+    }
+
+    /// Whether it is an object.
+    pub fn is_object(&self) -> bool {
+        match self.format {
+            Format::Json => self.bytes.first() == Some(&b'{'),
+            Format::Cbor => self
+                .bytes
+                .first()
+                .is_some_and(|byte| byte >> 5 == cbor::MAP),
+        }
+    }
+
+    /// Whether it is `null`, which stands for nothing.
+    pub fn is_null(&self) -> bool {
+        match self.format {
+            Format::Json => self.bytes == b"null",
+            Format::Cbor => matches!(self.bytes, [0xf6 | 0xf7]),
+        }
+    }
+
+    /// The text, where it is a string: what a failed `service_response` says.
+    pub fn text(&self) -> Option<Cow<'a, str>> {
+        match self.format {
+            Format::Json => crate::json::unescape(std::str::from_utf8(self.bytes).ok()?),
+            Format::Cbor => {
+                let text = cbor::Cursor::new(self.bytes).string(cbor::TEXT)?;
+                std::str::from_utf8(text).ok().map(Cow::Borrowed)
+            }
+        }
+    }
+
+    /// Reads it as [`Raw`].
+    pub fn raw(&self) -> Result<Raw<'a>, Error> {
+        const EXPECTED: &str = "the ROS serialization as a byte string (base64 in JSON)";
+        let fields = Fields::of(*self)?;
+        let value = fields.required("bytes", EXPECTED)?;
+        let bytes = match self.format {
+            Format::Cbor => cbor::Cursor::new(value)
+                .string(cbor::BYTES)
+                .map(Cow::Borrowed),
+            Format::Json => std::str::from_utf8(value)
+                .ok()
+                .and_then(crate::json::unescape)
+                .and_then(|text| STANDARD.decode(text.as_bytes()).ok())
+                .map(Cow::Owned),
+        };
+        match bytes {
+            Some(bytes) => Ok(Raw { bytes }),
+            None => Err(Problem::Mistyped {
+                field: "bytes",
+                expected: EXPECTED,
+                found: fields.shown(value),
+            }
+            .into()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn raw_messages_come_in_both_formats() {
+        let cbor = b"\xa3\x64secs\x01\x65nsecs\x02\x65bytes\x43\x01\x02\x03";
+        let raw = Payload::cbor(cbor).raw().unwrap();
+        assert!(matches!(raw.bytes, Cow::Borrowed(_)));
+        assert_eq!(*raw.bytes, [1, 2, 3]);
+        assert_eq!(
+            *Payload::json(r#"{"bytes":"AQID"}"#).raw().unwrap().bytes,
+            [1, 2, 3]
+        );
+        let wrong = Payload::json(r#"{"bytes":[1,2]}"#).raw().unwrap_err();
+        assert_eq!(
+            wrong.to_string(),
+            "field \"bytes\" is [1,2], the ROS serialization as a byte string (base64 in JSON) is expected"
+        );
+        assert!(
+            Payload::json("{}")
+                .raw()
+                .unwrap_err()
+                .to_string()
+                .contains("\"bytes\" is missing")
+        );
+    }
+
+    #[test]
+    fn kinds_are_told_apart() {
+        assert!(Payload::json("[1]").is_list() && Payload::cbor(b"\x81\x01").is_list());
+        assert!(Payload::json("null").is_null() && Payload::cbor(b"\xf6").is_null());
+        assert_eq!(Payload::json("\"no\"").text().unwrap(), "no");
+        assert_eq!(Payload::cbor(b"\x62no").text().unwrap(), "no");
+    }
+}

@@ -1,0 +1,167 @@
+//! `publish`: one message on a topic, from the client or to it.
+
+use std::borrow::Cow;
+
+use crate::fields::Fields;
+use crate::op::Message;
+use crate::{Compression, Format, Id, Payload, Problem, Writer};
+
+/// "Here is a message."
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Publish<'a> {
+    /// The interaction.
+    pub id: Option<Id<'a>>,
+    /// The topic's name.
+    pub topic: Cow<'a, str>,
+    /// The message; [`Payload::raw`] where `compression` is `cbor-raw`.
+    pub msg: Payload<'a>,
+    /// What `msg` holds. Upwards `cbor-raw` must be said; downwards the client knows what it asked for.
+    pub compression: Compression,
+    /// Some clients repeat it here instead of in `advertise`.
+    pub latch: bool,
+    /// `package/Type`, where the client has not advertised (extension).
+    pub type_name: Option<Cow<'a, str>>,
+}
+
+impl<'a> Publish<'a> {
+    /// Appends a whole frame for a client, the message written in place by `msg`.
+    ///
+    /// # Errors
+    /// What `msg` returns; `out` then ends in a torn frame.
+    pub fn print_with<E>(
+        out: &mut Vec<u8>,
+        format: Format,
+        topic: &str,
+        msg: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let mut writer = Writer::op(out, format, Self::OP, None);
+        writer.text("topic", topic);
+        writer.value("msg", msg)?;
+        writer.end();
+        Ok(())
+    }
+
+    /// Appends a whole `cbor-raw` frame: a serialized message and when it was received.
+    pub fn print_raw(out: &mut Vec<u8>, topic: &str, stamp: (u32, u32), bytes: &[u8]) {
+        let mut writer = Writer::op(out, Format::Cbor, Self::OP, None);
+        writer.text("topic", topic);
+        writer.raw("msg", Some(stamp), bytes);
+        writer.end();
+    }
+}
+
+impl<'a> Message<'a> for Publish<'a> {
+    const OP: &'static str = "publish";
+    const FIELDS: &'static [&'static str] =
+        &["topic", "msg", "compression", "latch", "type", "queue_size"];
+
+    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
+        Ok(Self {
+            id,
+            topic: fields.required_text("topic", "a topic name")?,
+            msg: fields.object("msg")?,
+            compression: Compression::read(fields)?,
+            latch: fields.boolean("latch")?.unwrap_or(false),
+            type_name: fields.text("type", "a message type such as \"std_msgs/String\"")?,
+        })
+    }
+
+    fn id(&self) -> Option<&Id<'a>> {
+        self.id.as_ref()
+    }
+
+    fn write(&self, writer: &mut Writer<'_>) {
+        writer.text("topic", &self.topic);
+        writer.optional_text("type", &self.type_name);
+        self.compression.write(writer);
+        if self.latch {
+            writer.boolean("latch", true);
+        }
+        writer.payload("msg", self.msg);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::op::tests::{reads, refuses};
+    use crate::{Frame, Op};
+
+    fn hello() -> Publish<'static> {
+        Publish {
+            id: None,
+            topic: "/chatter".into(),
+            msg: Payload::json(r#"{"data":"hello"}"#),
+            compression: Compression::None,
+            latch: false,
+            type_name: None,
+        }
+    }
+
+    #[test]
+    fn publish_is_read() {
+        reads(
+            r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#,
+            hello(),
+        );
+        reads(
+            r#"{"msg":{"data":"hello"},"latch":true,"topic":"/chatter","id":"publish:/chatter:1","op":"publish"}"#,
+            Publish {
+                id: Some("publish:/chatter:1".into()),
+                latch: true,
+                ..hello()
+            },
+        );
+    }
+
+    #[test]
+    fn publish_is_checked() {
+        refuses(
+            r#"{"op":"publish","msg":{}}"#,
+            "publish: field \"topic\" is missing, a topic name is expected",
+        );
+        refuses(
+            r#"{"op":"publish","topic":"/x"}"#,
+            "publish: field \"msg\" is missing, an object with the message's fields is expected",
+        );
+        refuses(
+            r#"{"op":"publish","topic":"/x","msg":[1,2]}"#,
+            "publish: field \"msg\" is [1,2], an object with the message's fields is expected",
+        );
+        refuses(
+            &format!(
+                r#"{{"op":"publish","topic":"/x","msg":"{}"}}"#,
+                "ü".repeat(100)
+            ),
+            &format!(
+                "publish: field \"msg\" is \"{}…, an object with the message's fields is expected",
+                "ü".repeat(47)
+            ),
+        );
+    }
+
+    #[test]
+    fn frames_for_clients_are_printed_in_place() {
+        let mut out = Vec::new();
+        let msg = |out: &mut Vec<u8>| {
+            out.extend_from_slice(br#"{"data":"hello"}"#);
+            Ok::<(), std::convert::Infallible>(())
+        };
+        Publish::print_with(&mut out, Format::Json, "/chatter", msg).unwrap();
+        assert_eq!(
+            String::from_utf8(out).unwrap(),
+            r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#
+        );
+
+        let mut out = Vec::new();
+        Publish::print_raw(&mut out, "/chatter", (5, 6), b"\x01\x02");
+        let Op::Publish(read) = Op::parse(Frame::Binary(&out)).unwrap() else {
+            panic!("not a publish")
+        };
+        assert_eq!(&*read.msg.raw().unwrap().bytes, b"\x01\x02");
+        assert_eq!(
+            out,
+            b"\xa3\x62op\x67publish\x65topic\x68/chatter\x63msg\xa3\x64secs\x05\x65nsecs\x06\x65bytes\x42\x01\x02"
+        );
+    }
+}

@@ -1,0 +1,254 @@
+//! `subscribe`, `unsubscribe`, and the encodings a client can ask for.
+
+use std::borrow::Cow;
+use std::time::Duration;
+
+use crate::fields::Fields;
+use crate::op::Message;
+use crate::{Id, Problem, Writer};
+
+/// How payloads travel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub enum Compression {
+    /// JSON.
+    #[default]
+    None,
+    /// JSON packed into a picture.
+    Png,
+    /// CBOR with typed arrays (RFC 8746).
+    Cbor,
+    /// The ROS serialization inside CBOR.
+    CborRaw,
+}
+
+impl Compression {
+    /// The name in the protocol.
+    pub fn name(self) -> &'static str {
+        match self {
+            Compression::None => "none",
+            Compression::Png => "png",
+            Compression::Cbor => "cbor",
+            Compression::CborRaw => "cbor-raw",
+        }
+    }
+
+    pub(crate) fn read(fields: &Fields<'_>) -> Result<Self, Problem> {
+        Ok(Self::read_optional(fields)?.unwrap_or_default())
+    }
+
+    pub(crate) fn read_optional(fields: &Fields<'_>) -> Result<Option<Self>, Problem> {
+        const EXPECTED: &str = "none, png, cbor or cbor-raw";
+        match fields.text("compression", EXPECTED)?.as_deref() {
+            None => Ok(None),
+            Some("none" | "") => Ok(Some(Compression::None)),
+            Some("png") => Ok(Some(Compression::Png)),
+            Some("cbor") => Ok(Some(Compression::Cbor)),
+            Some("cbor-raw") => Ok(Some(Compression::CborRaw)),
+            Some(other) => {
+                let found = format!("{:?}", other.chars().take(48).collect::<String>());
+                Err(Problem::Mistyped {
+                    field: "compression",
+                    expected: EXPECTED,
+                    found,
+                })
+            }
+        }
+    }
+
+    pub(crate) fn write(self, writer: &mut Writer<'_>) {
+        if self != Compression::None {
+            writer.text("compression", self.name());
+        }
+    }
+}
+
+/// The `fragment_size` that several ops have.
+pub(crate) fn fragment_size(fields: &Fields<'_>) -> Result<Option<usize>, Problem> {
+    let size = fields.count("fragment_size", 1, "a number of bytes, 1 or more,")?;
+    Ok(size.map(|size| usize::try_from(size).unwrap_or(usize::MAX)))
+}
+
+/// "Send me this topic."
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Subscribe<'a> {
+    /// Names this subscription, for `unsubscribe`.
+    pub id: Option<Id<'a>>,
+    /// The topic's name.
+    pub topic: Cow<'a, str>,
+    /// `package/Type`; inferred where absent.
+    pub type_name: Option<Cow<'a, str>>,
+    /// Least time between two messages.
+    pub throttle_rate: Duration,
+    /// Messages kept while throttled; 0: none.
+    pub queue_length: usize,
+    /// Longer frames are cut.
+    pub fragment_size: Option<usize>,
+    /// How messages are encoded.
+    pub compression: Compression,
+}
+
+impl<'a> Message<'a> for Subscribe<'a> {
+    const OP: &'static str = "subscribe";
+    const FIELDS: &'static [&'static str] = &[
+        "topic",
+        "type",
+        "throttle_rate",
+        "queue_length",
+        "fragment_size",
+        "compression",
+    ];
+
+    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
+        let milliseconds = "a number of milliseconds, 0 or more,";
+        let length = fields.count("queue_length", 0, "a number of messages, 0 or more,")?;
+        Ok(Self {
+            id,
+            topic: fields.required_text("topic", "a topic name")?,
+            type_name: fields
+                .text("type", "a message type such as \"std_msgs/String\"")?
+                .filter(|name| !name.is_empty()),
+            throttle_rate: fields
+                .duration("throttle_rate", Duration::from_millis(1), milliseconds)?
+                .unwrap_or_default(),
+            queue_length: usize::try_from(length.unwrap_or(0)).unwrap_or(usize::MAX),
+            fragment_size: fragment_size(fields)?,
+            compression: Compression::read(fields)?,
+        })
+    }
+
+    fn id(&self) -> Option<&Id<'a>> {
+        self.id.as_ref()
+    }
+
+    fn write(&self, writer: &mut Writer<'_>) {
+        writer.text("topic", &self.topic);
+        writer.optional_text("type", &self.type_name);
+        if !self.throttle_rate.is_zero() {
+            writer.number("throttle_rate", self.throttle_rate.as_secs_f64() * 1e3);
+        }
+        if self.queue_length > 0 {
+            writer.optional_count("queue_length", Some(self.queue_length as u64));
+        }
+        writer.optional_count("fragment_size", self.fragment_size.map(|size| size as u64));
+        self.compression.write(writer);
+    }
+}
+
+/// "Send it no longer."
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unsubscribe<'a> {
+    /// Which subscription; all of the topic's where absent.
+    pub id: Option<Id<'a>>,
+    /// The topic's name.
+    pub topic: Cow<'a, str>,
+}
+
+impl<'a> Message<'a> for Unsubscribe<'a> {
+    const OP: &'static str = "unsubscribe";
+    const FIELDS: &'static [&'static str] = &["topic"];
+
+    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
+        Ok(Self {
+            id,
+            topic: fields.required_text("topic", "a topic name")?,
+        })
+    }
+
+    fn id(&self) -> Option<&Id<'a>> {
+        self.id.as_ref()
+    }
+
+    fn write(&self, writer: &mut Writer<'_>) {
+        writer.text("topic", &self.topic);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::op::tests::{reads, refuses, survives_cbor};
+
+    fn image() -> Subscribe<'static> {
+        Subscribe {
+            id: Some("subscribe:/image:1".into()),
+            topic: "/image".into(),
+            type_name: Some("sensor_msgs/Image".into()),
+            throttle_rate: Duration::from_millis(100),
+            queue_length: 2,
+            fragment_size: Some(10_000),
+            compression: Compression::CborRaw,
+        }
+    }
+
+    #[test]
+    fn subscribe_is_read() {
+        reads(
+            r#"{"op":"subscribe","id":"subscribe:/image:1","topic":"/image","type":"sensor_msgs/Image","throttle_rate":100,"queue_length":2,"fragment_size":10000,"compression":"cbor-raw"}"#,
+            image(),
+        );
+        survives_cbor(image());
+        survives_cbor(Subscribe {
+            throttle_rate: Duration::from_micros(1500),
+            ..image()
+        });
+        reads(
+            r#"{"op":"subscribe","topic":"/image","type":"","throttle_rate":0.0,"fragment_size":null}"#,
+            Subscribe {
+                id: None,
+                type_name: None,
+                throttle_rate: Duration::ZERO,
+                queue_length: 0,
+                fragment_size: None,
+                compression: Compression::None,
+                ..image()
+            },
+        );
+    }
+
+    #[test]
+    fn subscribe_is_checked() {
+        refuses(
+            r#"{"op":"subscribe"}"#,
+            "subscribe: field \"topic\" is missing, a topic name is expected",
+        );
+        for (field, value, expected) in [
+            (
+                "throttle_rate",
+                "\"fast\"",
+                "a number of milliseconds, 0 or more,",
+            ),
+            (
+                "throttle_rate",
+                "-1",
+                "a number of milliseconds, 0 or more,",
+            ),
+            ("queue_length", "1.5", "a number of messages, 0 or more,"),
+            ("fragment_size", "0", "a number of bytes, 1 or more,"),
+            ("compression", "\"zip\"", "none, png, cbor or cbor-raw"),
+            ("compression", "7", "none, png, cbor or cbor-raw"),
+            ("type", "[]", "a message type such as \"std_msgs/String\""),
+        ] {
+            refuses(
+                &format!(r#"{{"op":"subscribe","topic":"/x","{field}":{value}}}"#),
+                &format!("subscribe: field \"{field}\" is {value}, {expected} is expected"),
+            );
+        }
+    }
+
+    #[test]
+    fn unsubscribe_is_read_and_checked() {
+        let op = Unsubscribe {
+            id: Some("a".into()),
+            topic: "/image".into(),
+        };
+        reads(
+            r#"{"op":"unsubscribe","id":"a","topic":"/image"}"#,
+            op.clone(),
+        );
+        survives_cbor(op);
+        refuses(
+            r#"{"op":"unsubscribe"}"#,
+            "unsubscribe: field \"topic\" is missing, a topic name is expected",
+        );
+    }
+}
