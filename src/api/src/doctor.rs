@@ -12,7 +12,9 @@ pub struct Doctor {
 impl Doctor {
     /// Nothing that is needed is missing.
     pub fn well(&self) -> bool {
-        self.checks.iter().all(|check| check.status != CheckStatus::Missing)
+        self.checks
+            .iter()
+            .all(|check| check.status != CheckStatus::Missing)
     }
 }
 

@@ -37,9 +37,9 @@ pub struct PushOptions {
     /// Names to remap, from → to.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub remaps: BTreeMap<String, String>,
-    /// Supplement to the interface where a node cannot be woken at push.
+    /// Supplement to the interface where a node cannot be woken at push: the text of a TOML or JSON file.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub interface: Option<serde_json::Value>,
+    pub interface: Option<String>,
     /// Dependencies by hand: rosdep key or ROS package → Debian package.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
@@ -123,8 +123,14 @@ mod tests {
             ..PushOptions::default()
         };
         let text = serde_json::to_string(&options).expect("plain data");
-        assert_eq!(text, r#"{"apt":"opencv_apps","nodes":["people_detect"],"limits":{}}"#);
-        assert_eq!(serde_json::from_str::<PushOptions>(&text).expect("its own output"), options);
+        assert_eq!(
+            text,
+            r#"{"apt":"opencv_apps","nodes":["people_detect"],"limits":{}}"#
+        );
+        assert_eq!(
+            serde_json::from_str::<PushOptions>(&text).expect("its own output"),
+            options
+        );
     }
 
     #[test]
@@ -135,8 +141,15 @@ mod tests {
 
     #[test]
     fn events_carry_their_type() {
-        let text = serde_json::to_string(&PushEvent::Progress { unit: "packages".into(), done: 3, total: Some(60) })
-            .expect("plain data");
-        assert_eq!(text, r#"{"type":"progress","unit":"packages","done":3,"total":60}"#);
+        let text = serde_json::to_string(&PushEvent::Progress {
+            unit: "packages".into(),
+            done: 3,
+            total: Some(60),
+        })
+        .expect("plain data");
+        assert_eq!(
+            text,
+            r#"{"type":"progress","unit":"packages","done":3,"total":60}"#
+        );
     }
 }

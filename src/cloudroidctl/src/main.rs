@@ -1,3 +1,172 @@
-//! cloudroidctl
+//! `cloudroidctl`: what a deployer types. Every verb is one file and speaks only `/api/v1`; its doc comments are
+//! its help.
 
-fn main() {}
+#![forbid(unsafe_code)]
+
+mod client;
+mod doctor;
+mod events;
+mod logs;
+mod output;
+mod push;
+mod rm;
+mod rollback;
+mod servants;
+mod services;
+mod status;
+mod stop;
+
+use std::process::ExitCode;
+
+use api::Problem;
+use clap::{Parser, Subcommand};
+
+use client::Client;
+use output::Format;
+
+/// Robot packages as services: push them, watch them, end them.
+#[derive(Debug, Parser)]
+#[command(
+    name = "cloudroidctl",
+    version,
+    arg_required_else_help = true,
+    propagate_version = true
+)]
+struct Arguments {
+    /// The daemon: http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME,
+    /// or http://127.0.0.1:9090 where there is none.
+    #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
+    server: Option<String>,
+    /// Bearer token; needed beyond this machine.
+    #[arg(
+        long,
+        global = true,
+        env = "CLOUDROID_TOKEN",
+        value_name = "TOKEN",
+        hide_env_values = true
+    )]
+    token: Option<String>,
+    /// How to print: for people or for programs.
+    #[arg(long, global = true, value_enum, default_value_t = Format::Table)]
+    format: Format,
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    Push(Box<push::Push>),
+    Services(services::Services),
+    Servants(servants::Servants),
+    Logs(logs::Logs),
+    Events(events::Events),
+    Stop(stop::Stop),
+    Rm(rm::Rm),
+    Rollback(rollback::Rollback),
+    Status(status::Status),
+    Doctor(doctor::Doctor),
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let runtime = match tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            eprintln!("error: cannot start: {error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    let outcome = runtime.block_on(run(arguments));
+    // A read of standard input or of a directory must not hold up the end.
+    runtime.shutdown_background();
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) if output::is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            complain(&error);
+            ExitCode::FAILURE
+        }
+    }
+}
+
+async fn run(arguments: Arguments) -> anyhow::Result<()> {
+    let client = Client::new(arguments.server.as_deref(), arguments.token)?;
+    let format = arguments.format;
+    match arguments.verb {
+        Verb::Push(verb) => verb.run(&client, format).await,
+        Verb::Services(verb) => verb.run(&client, format).await,
+        Verb::Servants(verb) => verb.run(&client, format).await,
+        Verb::Logs(verb) => verb.run(&client, format).await,
+        Verb::Events(verb) => verb.run(&client, format).await,
+        Verb::Stop(verb) => verb.run(&client, format).await,
+        Verb::Rm(verb) => verb.run(&client, format).await,
+        Verb::Rollback(verb) => verb.run(&client, format).await,
+        Verb::Status(verb) => verb.run(&client, format).await,
+        Verb::Doctor(verb) => verb.run(&client, format).await,
+    }
+}
+
+/// What went wrong, what explains it, and what to do.
+fn complain(error: &anyhow::Error) {
+    let Some(problem) = error.downcast_ref::<Problem>() else {
+        eprintln!("error: {error:#}");
+        return;
+    };
+    for line in &problem.log {
+        eprintln!("  | {line}");
+    }
+    eprintln!("error: {problem}");
+    if !problem.exists.is_empty() {
+        eprintln!("there are: {}", problem.exists.join(", "));
+    }
+    if let Some(next) = &problem.next {
+        eprintln!("next: {next}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        use clap::CommandFactory;
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn every_verb_explains_itself() {
+        use clap::CommandFactory;
+        for verb in Arguments::command().get_subcommands() {
+            assert!(
+                verb.get_about().is_some(),
+                "{} has no help",
+                verb.get_name()
+            );
+            for argument in verb.get_arguments() {
+                assert!(
+                    argument.get_help().is_some(),
+                    "{} {} has no help",
+                    verb.get_name(),
+                    argument.get_id()
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn the_format_may_stand_before_or_after_the_verb() {
+        for line in [
+            ["cloudroidctl", "--format", "json", "status"],
+            ["cloudroidctl", "status", "--format", "json"],
+        ] {
+            assert_eq!(
+                Arguments::try_parse_from(line).expect("valid").format,
+                Format::Json
+            );
+        }
+    }
+}

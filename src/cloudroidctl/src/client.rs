@@ -1,0 +1,343 @@
+//! HTTP to the daemon, over TCP or its Unix socket.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow, bail};
+use api::Problem;
+use bytes::{Bytes, BytesMut};
+use futures_util::{Stream, StreamExt};
+use http_body_util::combinators::UnsyncBoxBody;
+use http_body_util::{BodyExt, Full};
+use hyper::body::Incoming;
+use hyper::{Method, Request, Response, StatusCode, header};
+use hyper_util::rt::TokioIo;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpStream, UnixStream};
+
+const FALLBACK: &str = "127.0.0.1:9090";
+
+/// What is sent.
+pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
+
+/// Where the daemon is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Server {
+    /// `HOST:PORT`.
+    Tcp(String),
+    /// Its socket.
+    Unix(PathBuf),
+}
+
+impl fmt::Display for Server {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Server::Tcp(authority) => write!(out, "http://{authority}"),
+            Server::Unix(path) => write!(out, "unix:{}", path.display()),
+        }
+    }
+}
+
+impl Server {
+    /// Reads `--server`.
+    pub fn parse(text: &str) -> anyhow::Result<Server> {
+        if let Some(path) = text.strip_prefix("unix:") {
+            let path = path.strip_prefix("//").unwrap_or(path);
+            return Ok(Server::Unix(path.into()));
+        }
+        if text.starts_with('/') {
+            return Ok(Server::Unix(text.into()));
+        }
+        let rest = match text.split_once("://") {
+            Some(("http" | "ws", rest)) => rest,
+            Some((scheme, _)) => {
+                bail!("{text}: {scheme} is not spoken here; write http://HOST:PORT or unix:PATH")
+            }
+            None => text,
+        };
+        let authority = rest.trim_end_matches('/');
+        if authority.is_empty() || authority.contains(['/', '?', ' ']) {
+            bail!("{text} names no server; write http://HOST:PORT or unix:PATH");
+        }
+        let has_port = authority.rsplit_once(':').is_some_and(|(host, port)| {
+            (!host.contains(':') || host.ends_with(']')) && port.parse::<u16>().is_ok()
+        });
+        Ok(Server::Tcp(if has_port {
+            authority.to_owned()
+        } else {
+            format!("{authority}:9090")
+        }))
+    }
+
+    /// The daemon of this machine.
+    fn default() -> Server {
+        let variable = |name| {
+            std::env::var_os(name)
+                .filter(|value| !value.is_empty())
+                .map(PathBuf::from)
+        };
+        let home = variable("CLOUDROID_HOME")
+            .or_else(|| variable("XDG_DATA_HOME").map(|data| data.join("cloudroid")))
+            .or_else(|| variable("HOME").map(|user| user.join(".local/share/cloudroid")));
+        let chosen = variable("CLOUDROID_HOME").is_some();
+        let candidates = home
+            .into_iter()
+            .chain([PathBuf::from("/var/lib/cloudroid")]);
+        let sockets: Vec<PathBuf> = candidates
+            .map(|home| home.join("run/daemon.sock"))
+            .collect();
+        match sockets.iter().find(|socket| socket.exists()) {
+            Some(socket) if !chosen || *socket == sockets[0] => Server::Unix(socket.clone()),
+            // Who names a home means its daemon and no other.
+            _ if chosen => Server::Unix(sockets[0].clone()),
+            _ => Server::Tcp(FALLBACK.to_owned()),
+        }
+    }
+}
+
+/// Speaks to one daemon.
+#[derive(Debug)]
+pub struct Client {
+    server: Server,
+    token: Option<String>,
+}
+
+/// The daemon does not answer at all.
+#[derive(Debug)]
+pub struct Unreachable {
+    server: Server,
+    source: std::io::Error,
+}
+
+impl fmt::Display for Unreachable {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            out,
+            "no daemon answers at {}: {}; start one (sudo cloudroidd), or name another with --server",
+            self.server, self.source
+        )
+    }
+}
+
+impl std::error::Error for Unreachable {}
+
+impl Client {
+    /// For the daemon that `--server` names.
+    pub fn new(server: Option<&str>, token: Option<String>) -> anyhow::Result<Client> {
+        let server = match server {
+            Some(text) => Server::parse(text)?,
+            None => Server::default(),
+        };
+        Ok(Client {
+            server,
+            token: token.filter(|token| !token.is_empty()),
+        })
+    }
+
+    /// `GET path`.
+    pub async fn get<T: DeserializeOwned>(&self, path: &str) -> anyhow::Result<T> {
+        read(self.send(Method::GET, path, empty()).await?).await
+    }
+
+    /// `DELETE path`.
+    pub async fn delete<T: DeserializeOwned>(&self, path: &str) -> anyhow::Result<T> {
+        read(self.send(Method::DELETE, path, empty()).await?).await
+    }
+
+    /// `POST path` with a JSON body.
+    pub async fn post<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &impl Serialize,
+    ) -> anyhow::Result<T> {
+        let body = Full::new(serde_json::to_vec(body)?.into())
+            .map_err(|never| match never {})
+            .boxed_unsync();
+        read(self.send(Method::POST, path, body).await?).await
+    }
+
+    /// `GET path` of JSON lines.
+    pub async fn lines<T: DeserializeOwned>(
+        &self,
+        path: &str,
+    ) -> anyhow::Result<impl Stream<Item = anyhow::Result<T>>> {
+        Ok(lines(self.send(Method::GET, path, empty()).await?))
+    }
+
+    /// Sends a request and gives the answer if it is a good one, else its [`Problem`].
+    pub async fn send(
+        &self,
+        method: Method,
+        path: &str,
+        body: Body,
+    ) -> anyhow::Result<Response<Incoming>> {
+        let unreachable = |source| Unreachable {
+            server: self.server.clone(),
+            source,
+        };
+        match &self.server {
+            Server::Tcp(authority) => {
+                let stream = TcpStream::connect(authority).await.map_err(unreachable)?;
+                let _ = stream.set_nodelay(true);
+                self.exchange(stream, authority, method, path, body).await
+            }
+            Server::Unix(socket) => {
+                let stream = UnixStream::connect(socket).await.map_err(unreachable)?;
+                self.exchange(stream, "localhost", method, path, body).await
+            }
+        }
+    }
+
+    async fn exchange(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
+        host: &str,
+        method: Method,
+        path: &str,
+        body: Body,
+    ) -> anyhow::Result<Response<Incoming>> {
+        let lost = || format!("the daemon at {} broke the connection", self.server);
+        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
+            .await
+            .with_context(lost)?;
+        tokio::spawn(connection);
+        let mut request = Request::builder()
+            .method(&method)
+            .uri(path)
+            .header(header::HOST, host)
+            .header(
+                header::USER_AGENT,
+                concat!("cloudroidctl/", env!("CARGO_PKG_VERSION")),
+            );
+        if let Some(token) = &self.token {
+            request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
+        }
+        let response = sender
+            .send_request(request.body(body)?)
+            .await
+            .with_context(lost)?;
+        if response.status().is_success() {
+            return Ok(response);
+        }
+        Err(refusal(response).await)
+    }
+}
+
+fn empty() -> Body {
+    Full::default()
+        .map_err(|never| match never {})
+        .boxed_unsync()
+}
+
+async fn refusal(response: Response<Incoming>) -> anyhow::Error {
+    let status = response.status();
+    let body = match response.into_body().collect().await {
+        Ok(collected) => collected.to_bytes(),
+        Err(error) => return anyhow!("the daemon answered {status} and broke off: {error}"),
+    };
+    match serde_json::from_slice::<Problem>(&body) {
+        Ok(mut problem) => {
+            if status == StatusCode::UNAUTHORIZED && problem.next.is_none() {
+                problem.next = Some("give a token with --token or CLOUDROID_TOKEN".to_owned());
+            }
+            problem.into()
+        }
+        Err(_) => anyhow!(
+            "the daemon answered {status}: {}",
+            String::from_utf8_lossy(&body).trim()
+        ),
+    }
+}
+
+async fn read<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
+    let body = response
+        .into_body()
+        .collect()
+        .await
+        .context("the daemon broke off its answer")?
+        .to_bytes();
+    serde_json::from_slice(&body)
+        .context("the daemon's answer is not what this version of cloudroidctl understands")
+}
+
+/// The JSON lines of an answer, as they come.
+pub fn lines<T: DeserializeOwned>(
+    response: Response<Incoming>,
+) -> impl Stream<Item = anyhow::Result<T>> {
+    let state = (response.into_body(), BytesMut::new());
+    futures_util::stream::try_unfold(state, |(mut body, mut pending)| async move {
+        loop {
+            if let Some(end) = line_end(&pending) {
+                let line = pending.split_to(end + 1);
+                if line.iter().all(u8::is_ascii_whitespace) {
+                    continue;
+                }
+                let value = serde_json::from_slice(&line).context(
+                    "the daemon's answer is not what this version of cloudroidctl understands",
+                )?;
+                return Ok(Some((value, (body, pending))));
+            }
+            match body.frame().await {
+                Some(frame) => {
+                    if let Ok(data) = frame
+                        .context("the daemon broke off its answer")?
+                        .into_data()
+                    {
+                        pending.extend_from_slice(&data);
+                    }
+                }
+                None => return Ok(None),
+            }
+        }
+    })
+    .boxed()
+}
+
+fn line_end(bytes: &[u8]) -> Option<usize> {
+    bytes.iter().position(|byte| *byte == b'\n')
+}
+
+/// A text as one segment of a path or one value of a query.
+pub fn escaped(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for byte in text.bytes() {
+        match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
+                escaped.push(char::from(byte))
+            }
+            _ => escaped.push_str(&format!("%{byte:02X}")),
+        }
+    }
+    escaped
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn servers_are_named_in_several_ways() {
+        let tcp = |text: &str| Server::Tcp(text.to_owned());
+        for (text, server) in [
+            ("http://10.0.0.1:9091", tcp("10.0.0.1:9091")),
+            ("http://robot-server/", tcp("robot-server:9090")),
+            ("robot-server:80", tcp("robot-server:80")),
+            ("http://[::1]", tcp("[::1]:9090")),
+            ("http://[::1]:80", tcp("[::1]:80")),
+            ("unix:/run/x.sock", Server::Unix("/run/x.sock".into())),
+            ("unix:///run/x.sock", Server::Unix("/run/x.sock".into())),
+        ] {
+            assert_eq!(Server::parse(text).expect(text), server);
+        }
+        for text in ["https://x", "http://", "http://x/api", ""] {
+            Server::parse(text).expect_err(text);
+        }
+    }
+
+    #[test]
+    fn names_are_escaped() {
+        assert_eq!(escaped("a/b c?ä"), "a%2Fb%20c%3F%C3%A4");
+    }
+}

@@ -1,0 +1,91 @@
+//! `doctor`: what the host needs. With a daemon, it is asked; without, its program checks on its own.
+
+use std::path::PathBuf;
+use std::process::Stdio;
+
+use anyhow::{Context, bail};
+use api::{Check, CheckStatus};
+
+use crate::client::{Client, Unreachable};
+use crate::output::{self, Format, Table};
+
+/// Check what this machine needs to run servants, and say how to mend what is missing.
+#[derive(Debug, clap::Args)]
+pub struct Doctor {}
+
+impl Doctor {
+    /// Asks and prints; fails when something is missing.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let doctor: api::Doctor = match client.get("/api/v1/doctor").await {
+            Err(error) if error.is::<Unreachable>() => without_daemon(&error).await?,
+            answer => answer?,
+        };
+        match format {
+            Format::Json => output::json(&doctor)?,
+            Format::Table => show(&doctor)?,
+        }
+        if !doctor.well() {
+            let missing: Vec<&str> = doctor
+                .checks
+                .iter()
+                .filter(|check| check.status == CheckStatus::Missing)
+                .map(|check| check.name.as_str())
+                .collect();
+            bail!("missing: {}", missing.join(", "));
+        }
+        Ok(())
+    }
+}
+
+async fn without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doctor> {
+    let beside = std::env::current_exe()
+        .ok()
+        .and_then(|path| Some(path.parent()?.join("cloudroidd")));
+    let program = beside
+        .filter(|path| path.exists())
+        .unwrap_or_else(|| PathBuf::from("cloudroidd"));
+    let output = tokio::process::Command::new(&program)
+        .args(["doctor", "--json"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit())
+        .output()
+        .await
+        .with_context(|| {
+            format!(
+                "{unreachable}; and {} cannot be run to check without it",
+                program.display()
+            )
+        })?;
+    let mut doctor: api::Doctor = serde_json::from_slice(&output.stdout)
+        .with_context(|| format!("{} doctor --json gave no answer", program.display()))?;
+    doctor.checks.push(Check {
+        name: "daemon".to_owned(),
+        status: CheckStatus::Warning,
+        found: "not running".to_owned(),
+        mend: Some(format!("sudo {}", program.display())),
+    });
+    Ok(doctor)
+}
+
+fn show(doctor: &api::Doctor) -> anyhow::Result<()> {
+    let mut table = Table::new(&["", "NEED", "FOUND"]);
+    for check in &doctor.checks {
+        let mark = match check.status {
+            CheckStatus::Ok => "ok",
+            CheckStatus::Warning => "warning",
+            CheckStatus::Missing => "MISSING",
+        };
+        table.row([mark.to_owned(), check.name.clone(), check.found.clone()]);
+    }
+    table.print()?;
+    let mendable = doctor
+        .checks
+        .iter()
+        .filter(|check| check.status != CheckStatus::Ok);
+    for check in mendable {
+        if let Some(mend) = &check.mend {
+            output::line(&format!("\nto mend {}:\n    {mend}", check.name))?;
+        }
+    }
+    Ok(())
+}

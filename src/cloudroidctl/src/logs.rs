@@ -1,0 +1,78 @@
+//! `logs`: what nodes print.
+
+use anyhow::bail;
+use api::{LogLine, Servant};
+use futures_util::StreamExt;
+
+use crate::client::{Client, escaped};
+use crate::output::{self, Format};
+
+/// Print what a servant's nodes have printed.
+#[derive(Debug, clap::Args)]
+pub struct Logs {
+    /// The servant's id, or the name of a service that has one servant.
+    servant: String,
+    /// Go on printing as lines come.
+    #[arg(short, long)]
+    follow: bool,
+    /// Only so many of the last lines.
+    #[arg(short = 'n', long, value_name = "LINES")]
+    tail: Option<usize>,
+}
+
+impl Logs {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let servant = self.find(client).await?;
+        let tail = self
+            .tail
+            .map(|lines| format!("&tail={lines}"))
+            .unwrap_or_default();
+        let path = format!(
+            "/api/v1/servants/{}/logs?follow={}{tail}",
+            escaped(&servant),
+            self.follow
+        );
+        let mut lines = client.lines::<LogLine>(&path).await?;
+        while let Some(entry) = lines.next().await {
+            let entry = entry?;
+            match format {
+                Format::Json => output::json_line(&entry)?,
+                Format::Table => {
+                    output::line(&format!(
+                        "{} {} | {}",
+                        output::clock(entry.time),
+                        entry.node,
+                        entry.line
+                    ))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    async fn find(&self, client: &Client) -> anyhow::Result<String> {
+        let servants: Vec<Servant> = client.get("/api/v1/servants").await?;
+        if servants.iter().any(|servant| servant.id == self.servant) {
+            return Ok(self.servant.clone());
+        }
+        let named: Vec<&Servant> = servants
+            .iter()
+            .filter(|servant| servant.service == self.servant)
+            .collect();
+        match named.as_slice() {
+            [only] => Ok(only.id.clone()),
+            // The daemon says what exists.
+            [] => Ok(self.servant.clone()),
+            several => {
+                let ids: Vec<&str> = several.iter().map(|servant| servant.id.as_str()).collect();
+                bail!(
+                    "{} has {} servants; name one: {}",
+                    self.servant,
+                    ids.len(),
+                    ids.join(", ")
+                )
+            }
+        }
+    }
+}

@@ -1,0 +1,266 @@
+//! `push`: a package becomes a service.
+
+mod archive;
+mod progress;
+
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use api::{Limits, PushEvent, PushOptions, Size};
+use futures_util::StreamExt;
+use hyper::Method;
+
+use crate::client::{self, Client, escaped};
+use crate::output::Format;
+use crate::services;
+use progress::Progress;
+
+/// The longest query that HTTP servers take.
+const LONGEST_QUERY: usize = 60_000;
+
+/// Push a ROS package: build an image of it, find its interface, publish it as a service.
+///
+/// PATH is a catkin package or workspace (compiled here), a prebuilt install space, or a tar archive of one.
+/// With --apt a packaged ROS package is taken instead.
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("what").required(true).args(["path", "apt"])))]
+pub struct Push {
+    /// A catkin package, workspace or install space, or a tar archive of one.
+    path: Option<PathBuf>,
+    /// A packaged ROS package instead of a PATH, such as opencv_apps.
+    #[arg(long, value_name = "NAME")]
+    apt: Option<String>,
+    /// Name of the service; the package's by default.
+    #[arg(long, value_name = "NAME")]
+    name: Option<String>,
+    /// Base image definition.
+    #[arg(long, value_name = "BASE")]
+    base: Option<String>,
+    /// Launch file to run, as roslaunch finds it in the package.
+    #[arg(long, value_name = "FILE", conflicts_with = "nodes")]
+    launch: Option<String>,
+    /// Executable to run (EXE, or PACKAGE/EXE); may be given several times.
+    #[arg(long = "node", value_name = "EXE")]
+    nodes: Vec<String>,
+    /// Private parameter of the nodes, or a global one (/K=V); may be given several times.
+    #[arg(long = "param", value_name = "K=V", value_parser = parameter)]
+    params: Vec<(String, serde_json::Value)>,
+    /// Argument of the launch file; may be given several times.
+    #[arg(long = "arg", value_name = "K:=V", value_parser = assignment)]
+    args: Vec<(String, String)>,
+    /// Name to remap; may be given several times.
+    #[arg(long = "remap", value_name = "A:=B", value_parser = assignment)]
+    remaps: Vec<(String, String)>,
+    /// What to add to the interface where a node cannot be woken at push (TOML or JSON).
+    #[arg(long, value_name = "FILE")]
+    interface: Option<PathBuf>,
+    /// Debian package that provides a dependency; may be given several times.
+    #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
+    map: Vec<(String, String)>,
+    /// Debian package to add; may be given several times.
+    #[arg(long = "with", value_name = "DEB")]
+    with: Vec<String>,
+    /// Cores that a servant may use, and is promised.
+    #[arg(long, value_name = "N", value_parser = cores)]
+    cpus: Option<f64>,
+    /// Memory that a servant may use, and is promised, such as 512M.
+    #[arg(long, value_name = "SIZE")]
+    memory: Option<Size>,
+}
+
+fn parameter(text: &str) -> Result<(String, serde_json::Value), String> {
+    let (key, value) = text.split_once('=').ok_or("write K=V")?;
+    if key.is_empty() {
+        return Err("write K=V".to_owned());
+    }
+    let value =
+        serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
+    Ok((key.to_owned(), value))
+}
+
+fn assignment(text: &str) -> Result<(String, String), String> {
+    match text.split_once(":=") {
+        Some((from, to)) if !from.is_empty() => Ok((from.to_owned(), to.to_owned())),
+        _ => Err("write A:=B".to_owned()),
+    }
+}
+
+fn mapping(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, package)) if !key.is_empty() && !package.is_empty() => {
+            Ok((key.to_owned(), package.to_owned()))
+        }
+        _ => Err("write KEY=DEB".to_owned()),
+    }
+}
+
+fn cores(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(cores) if cores.is_finite() && cores > 0.0 => Ok(cores),
+        _ => Err("write a number of cores such as 1.5".to_owned()),
+    }
+}
+
+impl Push {
+    /// Sends the package, shows what is done with it, and ends with the service's address and interface.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let options = self.options()?;
+        let query = serde_json::to_string(&options)?;
+        let uri = format!("/api/v1/push?options={}", escaped(&query));
+        if uri.len() > LONGEST_QUERY {
+            bail!(
+                "the options are {} bytes long, which is too much; shorten --interface or the parameters",
+                uri.len()
+            );
+        }
+        tokio::select! {
+            outcome = send(client, format, &uri, self.path) => outcome,
+            _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was published"),
+        }
+    }
+
+    fn options(&self) -> anyhow::Result<PushOptions> {
+        let interface = match &self.interface {
+            Some(path) => Some(
+                std::fs::read_to_string(path)
+                    .with_context(|| format!("cannot read the interface {}", path.display()))?,
+            ),
+            None => None,
+        };
+        let source = match (&self.apt, &self.path) {
+            (Some(package), _) => format!("--apt {package}"),
+            (None, Some(path)) => path.display().to_string(),
+            (None, None) => String::new(),
+        };
+        Ok(PushOptions {
+            name: self.name.clone(),
+            apt: self.apt.clone(),
+            base: self.base.clone(),
+            launch: self.launch.clone(),
+            nodes: self.nodes.clone(),
+            params: self.params.iter().cloned().collect(),
+            args: self.args.iter().cloned().collect(),
+            remaps: self.remaps.iter().cloned().collect(),
+            interface,
+            map: self.map.iter().cloned().collect(),
+            with: self.with.clone(),
+            limits: Limits {
+                cpus: self.cpus,
+                memory: self.memory,
+                ..Limits::default()
+            },
+            source,
+        })
+    }
+}
+
+async fn send(
+    client: &Client,
+    format: Format,
+    uri: &str,
+    path: Option<PathBuf>,
+) -> anyhow::Result<()> {
+    let (body, packing) = match path {
+        Some(path) => {
+            let (body, packing) = archive::of(&path)?;
+            (body, Some(packing))
+        }
+        None => (archive::nothing(), None),
+    };
+    let response = match client.send(Method::POST, uri, body).await {
+        Ok(response) => response,
+        Err(error) => return Err(packing_failed(packing).unwrap_or(error)),
+    };
+    let mut progress = Progress::new(format);
+    let mut events = client::lines::<PushEvent>(response);
+    while let Some(event) = events.next().await {
+        let event = match event {
+            Ok(event) => event,
+            Err(error) => return Err(packing_failed(packing).unwrap_or(error)),
+        };
+        progress.show(&event)?;
+        match event {
+            PushEvent::Done { service, .. } => {
+                return if format == Format::Table {
+                    services::show(&service)
+                } else {
+                    Ok(())
+                };
+            }
+            PushEvent::Error { problem } => {
+                return Err(packing_failed(packing).unwrap_or_else(|| problem.into()));
+            }
+            _ => {}
+        }
+    }
+    bail!("the daemon broke off; see its log, and cloudroidctl status")
+}
+
+/// When the archive could not be packed, that is the reason, whatever the daemon made of the torn stream.
+fn packing_failed(packing: Option<archive::Packing>) -> Option<anyhow::Error> {
+    packing.and_then(archive::Packing::error)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        push: Push,
+    }
+
+    fn parse(line: &str) -> Result<Push, clap::Error> {
+        Line::try_parse_from(std::iter::once("push").chain(line.split_whitespace()))
+            .map(|line| line.push)
+    }
+
+    #[test]
+    fn everything_that_is_typed_is_sent() {
+        let push = parse(
+            "--apt opencv_apps --name people --base b --node people_detect --node other/node --param debug_view=false \
+             --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map eigen=libeigen3-dev \
+             --with opencv-data --cpus 1.5 --memory 512M",
+        )
+        .expect("valid");
+        let options = push.options().expect("no file is read");
+        let expected = serde_json::json!({
+            "apt": "opencv_apps", "name": "people", "base": "b", "nodes": ["people_detect", "other/node"],
+            "params": {"debug_view": false, "/rate": 1.5, "word": "hi", "list": [1, 2]},
+            "remaps": {"image": "/camera/image"}, "map": {"eigen": "libeigen3-dev"}, "with": ["opencv-data"],
+            "limits": {"cpus": 1.5, "memory": 536_870_912}, "source": "--apt opencv_apps"
+        });
+        assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
+    }
+
+    #[test]
+    fn a_launch_file_takes_arguments() {
+        let push =
+            parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:=").expect("valid");
+        let options = push.options().expect("no file is read");
+        assert_eq!(options.args["word"], "bonjour");
+        assert_eq!(options.args["empty"], "");
+        assert_eq!(options.source, "./pkg");
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_a_usage_error() {
+        for line in [
+            "",
+            "./pkg --apt opencv_apps",
+            "./pkg --launch a.launch --node b",
+            "./pkg --param novalue",
+            "./pkg --param =v",
+            "./pkg --arg a=b",
+            "./pkg --remap a",
+            "./pkg --map key=",
+            "./pkg --cpus none",
+            "./pkg --cpus 0",
+            "./pkg --memory lots",
+        ] {
+            assert_eq!(parse(line).expect_err(line).exit_code(), 2, "{line}");
+        }
+    }
+}

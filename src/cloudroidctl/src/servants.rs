@@ -1,0 +1,69 @@
+//! `servants`: who works for which robot.
+
+use api::{Servant, Size};
+
+use crate::client::Client;
+use crate::output::{self, Format, Table};
+
+/// List the servants: the containers at work, each for one robot.
+#[derive(Debug, clap::Args)]
+pub struct Servants {
+    /// Only those of this service.
+    service: Option<String>,
+}
+
+impl Servants {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let mut servants: Vec<Servant> = client.get("/api/v1/servants").await?;
+        servants.retain(|servant| {
+            self.service
+                .as_ref()
+                .is_none_or(|service| *service == servant.service)
+        });
+        if format == Format::Json {
+            return output::json(&servants);
+        }
+        if servants.is_empty() {
+            return output::line("no servants; one starts when a robot connects to a service");
+        }
+        let mut table = Table::new(&[
+            "SERVANT",
+            "SERVICE",
+            "ROBOT",
+            "STATE",
+            "AGE",
+            "CONNECTIONS",
+            "MEMORY",
+            "CPU",
+            "LIMITS",
+        ]);
+        for servant in &servants {
+            let usage = servant.usage.as_ref();
+            table.row([
+                servant.id.clone(),
+                format!("{}:{}", servant.service, servant.revision),
+                servant.robot.clone(),
+                state(servant),
+                output::age(servant.created),
+                servant.connections.to_string(),
+                usage
+                    .map(|usage| Size(usage.memory).to_string())
+                    .unwrap_or_default(),
+                usage
+                    .map(|usage| format!("{:.1} s", usage.cpu_usec as f64 / 1e6))
+                    .unwrap_or_default(),
+                output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
+            ]);
+        }
+        table.print()
+    }
+}
+
+fn state(servant: &Servant) -> String {
+    match &servant.reason {
+        Some(reason) => format!("{}: {reason}", servant.phase),
+        None if servant.idle_until.is_some() => format!("{} (idle)", servant.phase),
+        None => servant.phase.to_string(),
+    }
+}

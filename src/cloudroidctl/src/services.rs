@@ -1,0 +1,144 @@
+//! `services`: what is published.
+
+use api::{ServiceDetail, ServiceSummary};
+
+use crate::client::{Client, escaped};
+use crate::output::{self, Format, Table};
+
+/// List the published services, or show one with its interface and revisions.
+#[derive(Debug, clap::Args)]
+pub struct Services {
+    /// Show this service alone, with everything known of it.
+    name: Option<String>,
+}
+
+impl Services {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        match self.name {
+            Some(name) => {
+                let service: ServiceDetail = client
+                    .get(&format!("/api/v1/services/{}", escaped(&name)))
+                    .await?;
+                match format {
+                    Format::Json => output::json(&service),
+                    Format::Table => show(&service),
+                }
+            }
+            None => {
+                let services: Vec<ServiceSummary> = client.get("/api/v1/services").await?;
+                match format {
+                    Format::Json => output::json(&services),
+                    Format::Table => list(&services),
+                }
+            }
+        }
+    }
+}
+
+fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
+    if services.is_empty() {
+        return output::line(
+            "no services; publish one with: cloudroidctl push PATH, or push --apt NAME",
+        );
+    }
+    let mut table = Table::new(&[
+        "SERVICE",
+        "REVISION",
+        "PUBLISHED",
+        "SERVANTS",
+        "LIMITS",
+        "ADDRESS",
+    ]);
+    for service in services {
+        table.row([
+            service.name.clone(),
+            service.revision.to_string(),
+            output::age(service.published) + " ago",
+            service.servants.to_string(),
+            output::limits(&service.limits),
+            service.address.clone(),
+        ]);
+    }
+    table.print()
+}
+
+/// Everything of one service; a push ends with it.
+pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
+    let summary = &service.summary;
+    output::line(&format!(
+        "{}, revision {}: {}",
+        summary.name, summary.revision, summary.address
+    ))?;
+    let mut nodes = Table::new(&["NODE", "PROGRAM"]);
+    for node in &service.nodes {
+        nodes.row([node.name.clone(), node.argv.join(" ")]);
+    }
+    let mut topics = Table::new(&["TOPIC", "TYPE", "DIRECTION", ""]);
+    for topic in &service.interface.topics {
+        let direction = match topic.direction {
+            api::interface::Direction::Input => "input",
+            api::interface::Direction::Output => "output",
+        };
+        let marks = [(topic.latched, "latched"), (topic.lazy, "lazy")];
+        let marks: Vec<&str> = marks
+            .iter()
+            .filter(|(set, _)| *set)
+            .map(|(_, mark)| *mark)
+            .collect();
+        topics.row([
+            topic.name.clone(),
+            topic.type_name.clone(),
+            direction.to_owned(),
+            marks.join(", "),
+        ]);
+    }
+    let mut services = Table::new(&["SERVICE", "TYPE"]);
+    for entry in &service.interface.services {
+        services.row([entry.name.clone(), entry.type_name.clone()]);
+    }
+    let mut actions = Table::new(&["ACTION", "TYPE"]);
+    for entry in &service.interface.actions {
+        actions.row([entry.name.clone(), entry.type_name.clone()]);
+    }
+    let mut parameters = Table::new(&["PARAMETER", "VALUE"]);
+    for entry in &service.interface.parameters {
+        parameters.row([
+            entry.name.clone(),
+            entry.value.as_ref().map(shortened).unwrap_or_default(),
+        ]);
+    }
+    let mut revisions = Table::new(&["REVISION", "PUBLISHED", "", "SOURCE", "IMAGE"]);
+    for revision in &service.revisions {
+        revisions.row([
+            revision.number.to_string(),
+            output::age(revision.published) + " ago",
+            if revision.current { "current" } else { "" }.to_owned(),
+            revision.source.clone(),
+            revision.image.chars().take("sha256:".len() + 12).collect(),
+        ]);
+    }
+    for table in [
+        &nodes,
+        &topics,
+        &services,
+        &actions,
+        &parameters,
+        &revisions,
+    ] {
+        if !table.is_empty() {
+            output::line("")?;
+            table.print()?;
+        }
+    }
+    Ok(())
+}
+
+fn shortened(value: &serde_json::Value) -> String {
+    let text = value.to_string();
+    if text.chars().count() <= 60 {
+        text
+    } else {
+        text.chars().take(57).chain("...".chars()).collect()
+    }
+}

@@ -1,0 +1,93 @@
+//! `status`: the daemon at a glance.
+
+use std::time::Duration;
+
+use api::Size;
+
+use crate::client::{Client, Unreachable};
+use crate::output::{self, Format};
+
+/// Between attempts of `--wait`.
+const RETRY: Duration = Duration::from_millis(50);
+
+/// Show the daemon: where it listens, what it holds, what does not work as it should.
+#[derive(Debug, clap::Args)]
+pub struct Status {
+    /// Wait until the daemon answers.
+    #[arg(long)]
+    wait: bool,
+}
+
+impl Status {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let status: api::Status = loop {
+            match client.get("/api/v1/status").await {
+                Err(error) if self.wait && error.is::<Unreachable>() => {
+                    tokio::time::sleep(RETRY).await
+                }
+                answer => break answer?,
+            }
+        };
+        match format {
+            Format::Json => output::json(&status),
+            Format::Table => show(&status),
+        }
+    }
+}
+
+fn show(status: &api::Status) -> anyhow::Result<()> {
+    let room = &status.capacity;
+    let isolation = match status.isolation.cgroup_version {
+        0 => format!("{}, no limits can be set", status.isolation.mode),
+        version => format!("{}, cgroup v{version}", status.isolation.mode),
+    };
+    let rows = [
+        (
+            "daemon",
+            format!(
+                "{} (pid {}), up {}",
+                status.version,
+                status.pid,
+                output::age(status.started)
+            ),
+        ),
+        ("address", format!("http://{}", status.listen)),
+        ("home", status.home.clone()),
+        (
+            "default service",
+            status
+                .default_service
+                .clone()
+                .unwrap_or_else(|| "none".to_owned()),
+        ),
+        ("services", status.services.to_string()),
+        (
+            "servants",
+            format!(
+                "{} with {} connections",
+                status.servants, status.connections
+            ),
+        ),
+        ("isolation", isolation),
+        ("limits of a servant", output::limits(&status.limits)),
+        (
+            "promised",
+            format!(
+                "{} of {} cpus, {} of {}; {} waiting",
+                room.cpus_reserved,
+                room.cpus,
+                Size(room.memory_reserved),
+                Size(room.memory),
+                room.waiting
+            ),
+        ),
+    ];
+    for (name, value) in rows {
+        output::line(&format!("{name:<20} {value}"))?;
+    }
+    for warning in &status.warnings {
+        output::line(&format!("{:<20} {warning}", "warning"))?;
+    }
+    Ok(())
+}

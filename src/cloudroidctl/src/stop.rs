@@ -1,0 +1,47 @@
+//! `stop`: ends servants.
+
+use api::Stopped;
+
+use crate::client::{Client, escaped};
+use crate::output::{self, Format};
+
+/// End servants. A robot that connects again is given a new one.
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("which").required(true).args(["servants", "service", "all"])))]
+pub struct Stop {
+    /// Ids of servants.
+    servants: Vec<String>,
+    /// All servants of this service.
+    #[arg(long, value_name = "NAME")]
+    service: Option<String>,
+    /// All servants.
+    #[arg(long)]
+    all: bool,
+}
+
+impl Stop {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let mut ended = Stopped::default();
+        let paths = if self.all {
+            vec!["/api/v1/servants".to_owned()]
+        } else if let Some(service) = &self.service {
+            vec![format!("/api/v1/servants?service={}", escaped(service))]
+        } else {
+            self.servants
+                .iter()
+                .map(|id| format!("/api/v1/servants/{}", escaped(id)))
+                .collect()
+        };
+        for path in paths {
+            ended
+                .stopped
+                .extend(client.delete::<Stopped>(&path).await?.stopped);
+        }
+        match format {
+            Format::Json => output::json(&ended),
+            Format::Table if ended.stopped.is_empty() => output::line("no servants to stop"),
+            Format::Table => output::line(&format!("stopped {}", ended.stopped.join(", "))),
+        }
+    }
+}
