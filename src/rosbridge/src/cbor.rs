@@ -127,6 +127,25 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// The slices of an array's items.
+    pub(crate) fn list(&mut self) -> Option<Vec<&'a [u8]>> {
+        let Head {
+            major: ARRAY,
+            argument,
+            ..
+        } = self.head().ok()?
+        else {
+            return None;
+        };
+        let mut items = Vec::new();
+        while argument.map_or_else(|| !self.at_break(), |count| (items.len() as u64) < count) {
+            let start = self.at;
+            self.skip(0).ok()?;
+            items.push(&self.bytes[start..self.at]);
+        }
+        Some(items)
+    }
+
     fn skip(&mut self, depth: usize) -> Result<(), Problem> {
         if depth > MAX_DEPTH {
             return Err(syntax(self.at, "nested deeper than 64 levels"));

@@ -18,34 +18,43 @@ pub(crate) struct Fields<'a> {
 
 impl<'a> Fields<'a> {
     pub(crate) fn of(payload: Payload<'a>) -> Result<Self, Problem> {
-        let mut found = Vec::with_capacity(8);
-        let mut keep = |key, value| {
-            if found.len() == MAX_FIELDS {
-                return Err(Problem::TooManyFields(MAX_FIELDS));
-            }
-            found.push((key, value));
-            Ok(())
-        };
         match payload.format {
-            Format::Json => {
-                let text = std::str::from_utf8(payload.bytes).map_err(|error| Problem::Syntax {
+            Format::Json => match std::str::from_utf8(payload.bytes) {
+                Ok(text) => Self::of_json(text),
+                Err(error) => Err(Problem::Syntax {
                     format: "JSON",
                     at: error.valid_up_to(),
                     reason: "the text is not UTF-8",
-                })?;
-                json::Cursor::new(text).object(|key, value| keep(key, value.as_bytes()))?;
-            }
-            Format::Cbor => cbor::Cursor::new(payload.bytes)
-                .map(|key, value| keep(Cow::Borrowed(key), value))?,
+                }),
+            },
+            Format::Cbor => Self::of_cbor(payload.bytes),
         }
-        Ok(Self {
-            format: payload.format,
-            found,
-        })
     }
 
-    pub(crate) fn format(&self) -> Format {
-        self.format
+    pub(crate) fn of_json(text: &'a str) -> Result<Self, Problem> {
+        let mut fields = Self {
+            format: Format::Json,
+            found: Vec::with_capacity(8),
+        };
+        json::Cursor::new(text).object(|key, value| fields.keep(key, value.as_bytes()))?;
+        Ok(fields)
+    }
+
+    pub(crate) fn of_cbor(bytes: &'a [u8]) -> Result<Self, Problem> {
+        let mut fields = Self {
+            format: Format::Cbor,
+            found: Vec::with_capacity(8),
+        };
+        cbor::Cursor::new(bytes).map(|key, value| fields.keep(Cow::Borrowed(key), value))?;
+        Ok(fields)
+    }
+
+    fn keep(&mut self, key: Cow<'a, str>, value: &'a [u8]) -> Result<(), Problem> {
+        if self.found.len() == MAX_FIELDS {
+            return Err(Problem::TooManyFields(MAX_FIELDS));
+        }
+        self.found.push((key, value));
+        Ok(())
     }
 
     pub(crate) fn names(&self) -> impl Iterator<Item = &str> {

@@ -93,6 +93,23 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// The slices of a list's values.
+    pub(crate) fn list(&mut self) -> Option<Vec<&'a [u8]>> {
+        self.expect(b'[', "a list is expected").ok()?;
+        let mut items = Vec::new();
+        if self.peek() == Some(b']') {
+            return Some(items);
+        }
+        loop {
+            items.push(self.value().ok()?.as_bytes());
+            match self.peek()? {
+                b',' => self.at += 1,
+                b']' => return Some(items),
+                _ => return None,
+            }
+        }
+    }
+
     /// The slice of the value that begins here.
     fn value(&mut self) -> Result<&'a str, Problem> {
         let first = self

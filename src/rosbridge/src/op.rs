@@ -135,7 +135,10 @@ impl<'a> Op<'a> {
     /// # Errors
     /// What is wrong with it, with the op and id where they could be read.
     pub fn parse(frame: Frame<'a>) -> Result<Self, Error> {
-        let fields = Fields::of(frame.payload())?;
+        let fields = match frame {
+            Frame::Text(text) => Fields::of_json(text)?,
+            Frame::Binary(bytes) => Fields::of_cbor(bytes)?,
+        };
         let id = fields.id();
         let known = id.as_ref().ok().cloned().flatten().map(Id::into_owned);
         let op = match fields.text("op", "the name of an operation") {

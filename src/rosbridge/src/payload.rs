@@ -92,6 +92,36 @@ impl<'a> Payload<'a> {
         }
     }
 
+    /// A list of positional arguments as an object with these names, in the same format; the names that have no
+    /// argument are left out. `None` where it is no list, or has more values than there are names.
+    pub fn named<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Option<Vec<u8>> {
+        let items = match self.format {
+            Format::Json => {
+                crate::json::Cursor::new(std::str::from_utf8(self.bytes).ok()?).list()?
+            }
+            Format::Cbor => cbor::Cursor::new(self.bytes).list()?,
+        };
+        let mut names = names.into_iter();
+        let mut out = Vec::with_capacity(self.bytes.len() + 16 * items.len());
+        let many = items.len() > crate::writer::MAX_FIELDS;
+        let mut writer = if many {
+            return None;
+        } else {
+            crate::Writer::new(&mut out, self.format)
+        };
+        for item in items {
+            writer.payload(
+                names.next()?,
+                Payload {
+                    format: self.format,
+                    bytes: item,
+                },
+            );
+        }
+        writer.end();
+        Some(out)
+    }
+
     /// Reads it as [`Raw`].
     pub fn raw(&self) -> Result<Raw<'a>, Error> {
         const EXPECTED: &str = "the ROS serialization as a byte string (base64 in JSON)";
@@ -144,6 +174,28 @@ mod tests {
                 .unwrap_err()
                 .to_string()
                 .contains("\"bytes\" is missing")
+        );
+    }
+
+    #[test]
+    fn positional_arguments_get_their_names() {
+        let named = Payload::json(r#"[1, "x", {"y":[2]}]"#)
+            .named(["a", "b", "c", "d"])
+            .unwrap();
+        assert_eq!(
+            std::str::from_utf8(&named).unwrap(),
+            r#"{"a":1,"b":"x","c":{"y":[2]}}"#
+        );
+        assert_eq!(Payload::json("[]").named(["a"]).unwrap(), b"{}");
+        assert_eq!(Payload::json("[1,2]").named(["a"]), None);
+        assert_eq!(Payload::json("{}").named(["a"]), None);
+        assert_eq!(
+            Payload::cbor(b"\x82\x01\x61x").named(["a", "b"]).unwrap(),
+            b"\xa2\x61a\x01\x61b\x61x"
+        );
+        assert_eq!(
+            Payload::cbor(b"\x9f\x01\xff").named(["a", "b"]).unwrap(),
+            b"\xa1\x61a\x01"
         );
     }
 

@@ -7,6 +7,9 @@ use base64::engine::general_purpose::STANDARD;
 
 use crate::{Format, Id, Payload, cbor, json};
 
+/// What a CBOR head of one byte can count.
+pub(crate) const MAX_FIELDS: usize = 23;
+
 /// Writes one object. At most 23 fields: more than any op has.
 pub struct Writer<'o> {
     out: &'o mut Vec<u8>,
@@ -57,7 +60,7 @@ impl<'o> Writer<'o> {
             Format::Cbor => cbor::write_text(self.out, key),
         }
         self.fields += 1;
-        debug_assert!(self.fields < 24);
+        debug_assert!(usize::from(self.fields) <= MAX_FIELDS);
     }
 
     /// A text field.
