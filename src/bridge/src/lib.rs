@@ -1,1 +1,34 @@
-//! bridge
+//! A session between one ROS system and one WebSocket that speaks rosbridge v2.
+//!
+//! One [`Bridge`] stands before each servant and is shared by all its sockets. In: a [`ros::bus::Bus`], the
+//! definitions of the servant's types, and connections behind their HTTP upgrade. Out: how each ended, and
+//! [`Metrics`].
+//!
+//! ```text
+//!               ┌ Hub per topic: one subscription, one encoding per format ┐      ┌ topic queues ┐
+//!  Bus ─────────┤                                                          ├──▶ ──┤              ├── Session ── socket
+//!   ▲  ▲        └ services, actions, rosapi: answers ──────────────────────┘      └ control queue┘       │
+//!   │  └───────── calls, goals ◀──────────────────────────────── Client ◀──── ops ◀──────────────────────┤
+//!   └──────────── topics ◀──────── ROS bytes, decoded in place ◀─────────────────────────────────────────┘
+//! ```
+//!
+//! What a client has asked for (subscriptions, advertisements, calls under way) belongs to its *client*, which can
+//! outlive the socket: with a resume token the next socket takes it over.
+//!
+//! A session's life:
+//!
+//! ```text
+//!  Open ──frame over limits, idle, control queue full, servant gone──▶ Closing ──close frame or time-out──▶ Ended
+//!   │ └──client's close frame──────────────────────────────────────────▲                                     ▲
+//!   └──socket lost────────────────────────────────────────────────────────────────────────────────────────────┘
+//! ```
+
+#![forbid(unsafe_code)]
+
+mod bridge;
+mod metrics;
+mod options;
+
+pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
+pub use metrics::{Counter, Metrics};
+pub use options::{BridgeOptions, SessionOptions};

@@ -1,0 +1,115 @@
+//! What a bridge has done, counted.
+
+use std::fmt::Write;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A number that only grows.
+#[derive(Debug, Default)]
+pub struct Counter(AtomicU64);
+
+impl Counter {
+    /// Adds to it.
+    pub fn add(&self, count: u64) {
+        self.0.fetch_add(count, Ordering::Relaxed);
+    }
+
+    /// What it is now.
+    pub fn get(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+macro_rules! metrics {
+    ($($(#[doc = $doc:literal])* $field:ident => $name:literal,)*) => {
+        /// Counters of one bridge, over all its sessions.
+        #[derive(Debug, Default)]
+        pub struct Metrics {
+            $($(#[doc = $doc])* pub $field: Counter,)*
+        }
+
+        impl Metrics {
+            /// Every counter with its Prometheus name and help text.
+            pub fn all(&self) -> Vec<(&'static str, &'static str, u64)> {
+                vec![$(($name, concat!($($doc,)*).trim_ascii(), self.$field.get()),)*]
+            }
+        }
+    };
+}
+
+metrics! {
+    /// Connections accepted.
+    sessions => "cloudroid_bridge_sessions_total",
+    /// Connections that found an earlier session again.
+    resumed => "cloudroid_bridge_sessions_resumed_total",
+    /// WebSocket messages from clients.
+    frames_in => "cloudroid_bridge_frames_in_total",
+    /// Bytes of WebSocket messages from clients.
+    bytes_in => "cloudroid_bridge_bytes_in_total",
+    /// WebSocket messages to clients.
+    frames_out => "cloudroid_bridge_frames_out_total",
+    /// Bytes of WebSocket messages to clients.
+    bytes_out => "cloudroid_bridge_bytes_out_total",
+    /// Messages that clients published.
+    published => "cloudroid_bridge_published_total",
+    /// Messages from ROS taken up for clients.
+    received => "cloudroid_bridge_received_total",
+    /// Messages that were encoded; fewer than sent where subscribers share an encoding.
+    encoded => "cloudroid_bridge_encoded_total",
+    /// Messages dropped because a client read too slowly.
+    dropped => "cloudroid_bridge_dropped_total",
+    /// Bytes of messages dropped because a client read too slowly.
+    dropped_bytes => "cloudroid_bridge_dropped_bytes_total",
+    /// Messages left out because the client asked for a throttle_rate.
+    throttled => "cloudroid_bridge_throttled_total",
+    /// Messages dropped between ROS and the bridge.
+    bus_dropped => "cloudroid_bridge_bus_dropped_total",
+    /// Service calls from clients.
+    calls => "cloudroid_bridge_calls_total",
+    /// Service calls from clients that failed.
+    calls_failed => "cloudroid_bridge_calls_failed_total",
+    /// Service calls that clients served.
+    calls_served => "cloudroid_bridge_calls_served_total",
+    /// Goals from clients.
+    goals => "cloudroid_bridge_goals_total",
+    /// Status messages at level error.
+    errors => "cloudroid_bridge_errors_total",
+}
+
+impl Metrics {
+    /// Appends all counters in Prometheus's text format; `labels` is what stands between the braces
+    /// (`service="opencv_apps",robot="r1"`), already escaped.
+    pub fn prometheus(&self, out: &mut String, labels: &str) {
+        for (name, _, value) in self.all() {
+            let braces = if labels.is_empty() {
+                String::new()
+            } else {
+                format!("{{{labels}}}")
+            };
+            // Writing to a String cannot fail.
+            let _ = writeln!(out, "{name}{braces} {value}");
+        }
+    }
+
+    /// Appends the `# HELP` and `# TYPE` lines, which must precede the values once.
+    pub fn prometheus_help(out: &mut String) {
+        for (name, help, _) in Metrics::default().all() {
+            let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} counter");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counters_come_out_as_prometheus_reads_them() {
+        let metrics = Metrics::default();
+        metrics.dropped.add(3);
+        let mut text = String::new();
+        Metrics::prometheus_help(&mut text);
+        metrics.prometheus(&mut text, "service=\"x\"");
+        assert!(text.contains("# HELP cloudroid_bridge_dropped_total Messages dropped because a client read too slowly.\n"));
+        assert!(text.contains("cloudroid_bridge_dropped_total{service=\"x\"} 3\n"));
+    }
+}
