@@ -107,7 +107,7 @@ pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Told 
         );
     }
     ensure!(
-        leftovers::cgroups(&[id.clone()]).is_empty(),
+        leftovers::cgroups(std::slice::from_ref(&id)).is_empty(),
         "{id} left a cgroup"
     );
     // And a robot that comes back is given a new one.

@@ -147,7 +147,7 @@ pub fn limits_are_set_and_read_back() -> Told {
         std::fs::read_to_string(format!("/sys/fs/cgroup{path}/memory.max"))?
     };
     ensure!(
-        memory.trim() == servant["enforced"]["memory"].to_string(),
+        memory.trim().parse().ok() == servant["enforced"]["memory"].as_u64(),
         "{memory} against {servant:#}"
     );
     Ok(())

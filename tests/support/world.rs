@@ -10,13 +10,16 @@ use tempfile::TempDir;
 use crate::daemon::{Daemon, Setup};
 use crate::leftovers;
 
+/// Set once a push has come to its end.
+type Pushed = Arc<OnceLock<Result<(), String>>>;
+
 static WORLD: OnceLock<World> = OnceLock::new();
 
 /// The stories' place on this machine.
 pub struct World {
     place: TempDir,
     shared: Mutex<Option<Arc<Daemon>>>,
-    services: Mutex<HashMap<&'static str, Arc<OnceLock<Result<(), String>>>>>,
+    services: Mutex<HashMap<&'static str, Pushed>>,
 }
 
 /// A service of the shared daemon.
