@@ -3,7 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::Digest;
+use crate::tar_reader::Stop;
+use crate::{Digest, Refusal};
 
 /// Every failure names the file, blob or entry it is about.
 #[derive(Debug, thiserror::Error)]
@@ -99,7 +100,7 @@ pub enum Error {
         archive: String,
         /// Which entry and why.
         #[source]
-        problem: crate::Refusal,
+        problem: Refusal,
     },
 }
 
@@ -166,6 +167,17 @@ impl Error {
             path: path.to_owned(),
             needed,
             free: free_bytes(path),
+        }
+    }
+
+    /// Reading an archive stopped.
+    pub(crate) fn stopped(archive: &str, path: &Path, stop: Stop) -> Self {
+        match stop {
+            Stop::Refused(problem) => Self::Archive {
+                archive: archive.to_owned(),
+                problem,
+            },
+            Stop::Source(error) => Self::file("read", path, error),
         }
     }
 

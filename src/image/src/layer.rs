@@ -1,8 +1,18 @@
-//! Layers.
+//! Layers: made from trees, imported, exported, found again by their content.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::Digest;
+use crate::digest::Hashing;
+use crate::files::{self, NewFile};
+use crate::gzip::{self, Failed};
+use crate::store::{MAX_DOCUMENT, json};
+use crate::tar_writer::TarWriter;
+use crate::tree::Packer;
+use crate::{Digest, Error, Refusal, Store};
 
 /// A layer in the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,7 +23,8 @@ pub struct LayerInfo {
     pub diff_id: Digest,
     /// Bytes of the compressed blob.
     pub size: u64,
-    /// Bytes of the tar stream inside: about what the extracted tree takes.
+    /// Bytes of the tar stream inside: about what the extracted tree takes. 0 when not known.
+    #[serde(default)]
     pub unpacked: u64,
 }
 
@@ -55,5 +66,203 @@ impl Default for TreeOptions {
             mtime: Mtime::Fixed(0),
             level: 6,
         }
+    }
+}
+
+impl Store {
+    /// Packs a file tree into a layer. The same tree with the same options gives the same layer, whoever's
+    /// directory order, inode numbers and clock it has.
+    ///
+    /// Symbolic links are packed, never followed; sockets are left out. The tree's root itself has no entry.
+    pub fn layer_from_tree(&self, tree: &Path, options: &TreeOptions) -> Result<LayerInfo, Error> {
+        let _hold = self.hold()?;
+        let blob = self.new_blob()?;
+        let packed = gzip::compress(Hashing::new(&blob), options.level, |output| {
+            let mut packer = Packer::new(TarWriter::new(Hashing::new(output)), options);
+            packer.pack(tree)?;
+            let finished = packer
+                .finish()
+                .map_err(|error| Error::file("pack", tree, error))?;
+            let (_, diff_id, unpacked) = finished.finish();
+            Ok((diff_id, unpacked))
+        });
+        let (output, (diff_id, unpacked)) = packed.map_err(|failed| match failed {
+            Failed::Output(error) => Error::file("write a layer to", self.images_dir(), error),
+            Failed::Fill(error) => error,
+        })?;
+        let (_, digest, size) = output.finish();
+        let layer = LayerInfo {
+            digest,
+            diff_id,
+            size,
+            unpacked,
+        };
+        self.publish_layer(blob, &layer)?;
+        Ok(layer)
+    }
+
+    /// Copies a `tar.gz` into the store as a layer. Its digest and diff-id are found on the way.
+    pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
+        let _hold = self.hold()?;
+        let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
+        let needed = file.metadata().map_or(0, |metadata| metadata.len());
+        check_gzip(&file, archive)?;
+        let blob = self.new_blob()?;
+        let mut copy = Tee {
+            from: file,
+            to: Hashing::new(&blob),
+            failed: None,
+        };
+        let read = gunzip_and_hash(&mut copy);
+        if let Some(error) = copy.failed.take() {
+            return Err(Error::file("write a layer to", self.images_dir(), error).needing(needed));
+        }
+        let (diff_id, unpacked) = read.map_err(|error| match error.kind() {
+            io::ErrorKind::UnexpectedEof
+            | io::ErrorKind::InvalidInput
+            | io::ErrorKind::InvalidData => malformed(archive, error),
+            _ => Error::file("read", archive, error),
+        })?;
+        let (_, digest, size) = copy.to.finish();
+        let layer = LayerInfo {
+            digest,
+            diff_id,
+            size,
+            unpacked,
+        };
+        self.publish_layer(blob, &layer)?;
+        Ok(layer)
+    }
+
+    /// Copies a layer out of the store as a `tar.gz`; appears whole or not at all.
+    pub fn export_layer(&self, diff_id: &Digest, to: &Path) -> Result<(), Error> {
+        let _hold = self.hold()?;
+        let layer = self.existing_layer(diff_id)?;
+        let from = self.blob_path(&layer.digest);
+        let mut file = File::open(&from).map_err(|error| Error::file("open", &from, error))?;
+        let new = NewFile::create(to.parent().unwrap_or(Path::new("/")))?;
+        // From file to file the kernel copies, or shares the blocks.
+        io::copy(&mut file, &mut new.file())
+            .map_err(|error| Error::file("write", to, error).needing(layer.size))?;
+        new.publish(to)
+    }
+
+    /// The layer with this content, if it is in the store.
+    pub fn layer(&self, diff_id: &Digest) -> Result<Option<LayerInfo>, Error> {
+        if let Some(layer) = self.layer_record(diff_id)? {
+            let blob = std::fs::metadata(self.blob_path(&layer.digest));
+            if blob.is_ok_and(|blob| blob.len() == layer.size) {
+                return Ok(Some(layer));
+            }
+        }
+        // The directory of layers may have been emptied, or another tool have brought the image.
+        for image in self.images()? {
+            let Some(manifest) = self.read_manifest(&image)? else {
+                continue;
+            };
+            let Some(config) = self.read_config(&manifest.config.digest)? else {
+                continue;
+            };
+            let at = config
+                .rootfs
+                .diff_ids
+                .iter()
+                .position(|found| found == diff_id);
+            if let Some(blob) = at.and_then(|at| manifest.layers.get(at)) {
+                if self.blob_path(&blob.digest).exists() {
+                    return Ok(Some(LayerInfo {
+                        digest: blob.digest,
+                        diff_id: *diff_id,
+                        size: blob.size,
+                        unpacked: 0,
+                    }));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    pub(crate) fn existing_layer(&self, diff_id: &Digest) -> Result<LayerInfo, Error> {
+        let unknown = || Error::UnknownLayer {
+            diff_id: *diff_id,
+            store: self.images_dir().to_owned(),
+        };
+        self.layer(diff_id)?.ok_or_else(unknown)
+    }
+
+    /// Where the record of which blob holds a layer is.
+    pub(crate) fn record_path(&self, diff_id: &Digest) -> PathBuf {
+        self.layers_dir().join(format!("{}.json", diff_id.hex()))
+    }
+
+    pub(crate) fn layer_record(&self, diff_id: &Digest) -> Result<Option<LayerInfo>, Error> {
+        let path = self.record_path(diff_id);
+        let Some(bytes) = files::read_whole(&path, MAX_DOCUMENT)? else {
+            return Ok(None);
+        };
+        // A record can be made again; one that does not parse is as good as none.
+        Ok(serde_json::from_slice(&bytes)
+            .ok()
+            .filter(|layer: &LayerInfo| layer.diff_id == *diff_id))
+    }
+
+    /// The blob first: a record never names a blob that is not there.
+    fn publish_layer(&self, blob: NewFile, layer: &LayerInfo) -> Result<(), Error> {
+        self.publish_blob(blob, &layer.digest)?;
+        if self.layer_record(&layer.diff_id)? == Some(*layer) {
+            return Ok(());
+        }
+        files::write_whole(&self.record_path(&layer.diff_id), &json(layer))
+    }
+}
+
+/// Reads a layer to its end: digest and bytes of the tar stream inside.
+pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, u64)> {
+    let content = gzip::decoder(archive)?;
+    gzip::reading_ahead(content, |content| {
+        let mut content = Hashing::new(content);
+        io::copy(&mut content, &mut io::sink())?;
+        let (_, diff_id, bytes) = content.finish();
+        Ok((diff_id, bytes))
+    })
+}
+
+/// The media type promises gzip, so nothing else is let in.
+fn check_gzip(file: &File, path: &Path) -> Result<(), Error> {
+    let mut start = [0; 2];
+    let read = std::os::unix::fs::FileExt::read_at(file, &mut start, 0);
+    match read.map_err(|error| Error::file("read", path, error))? {
+        2 if start == [0x1f, 0x8b] => Ok(()),
+        _ => Err(malformed(path, "it is not gzip")),
+    }
+}
+
+fn malformed(archive: &Path, problem: impl ToString) -> Error {
+    let problem = Refusal::Malformed {
+        after: String::new(),
+        problem: problem.to_string(),
+    };
+    Error::Archive {
+        archive: archive.display().to_string(),
+        problem,
+    }
+}
+
+/// Writes down all that is read from it.
+struct Tee<R, W> {
+    from: R,
+    to: W,
+    /// Writing failed, which the reader sees as a failure to read.
+    failed: Option<io::Error>,
+}
+
+impl<R: Read, W: Write> Read for Tee<R, W> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.from.read(buffer)?;
+        if let Err(error) = self.to.write_all(&buffer[..read]) {
+            self.failed = Some(error);
+            return Err(io::ErrorKind::BrokenPipe.into());
+        }
+        Ok(read)
     }
 }

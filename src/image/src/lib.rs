@@ -14,15 +14,33 @@
 
 #![forbid(unsafe_code)]
 
+mod beneath;
+mod capability;
 mod digest;
+mod entry;
 mod error;
+mod extract;
+mod files;
+mod gc;
+mod glob;
+mod gzip;
+mod images;
 mod layer;
+mod layer_writer;
+mod names;
 pub mod oci;
+mod refusal;
 mod store;
+mod tar_reader;
+mod tar_writer;
+mod tree;
 mod unpack;
 
 pub use digest::Digest;
 pub use error::Error;
+pub use gc::{Damage, Swept};
+pub use images::{Image, ImageSpec, Manifest};
 pub use layer::{LayerInfo, Mtime, TreeOptions};
-pub use store::{Blob, Damage, Hold, Image, ImageSpec, Manifest, Store, Swept};
-pub use unpack::{Limits, Refusal, Unpacked, unpack};
+pub use refusal::Refusal;
+pub use store::{Blob, Hold, Store};
+pub use unpack::{Limits, Unpacked, unpack};

@@ -1,0 +1,306 @@
+//! Files that appear whole or not at all, and locks that end with the process that took them.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rustix::fs::FlockOperation;
+use rustix::io::Errno;
+
+use crate::Error;
+
+/// How the names of half-made files and trees begin.
+pub(crate) const HALF_MADE: &str = "tmp-";
+
+/// A name no other file of this directory has.
+pub(crate) fn half_made_name() -> String {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    let time = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .unwrap_or_default();
+    let next = NEXT.fetch_add(1, Ordering::Relaxed);
+    format!(
+        "{HALF_MADE}{}-{:x}-{next}",
+        std::process::id(),
+        time.as_nanos()
+    )
+}
+
+/// A lock on a directory or file, held until it is dropped or the process ends.
+#[derive(Debug)]
+pub(crate) struct Lock {
+    _file: File,
+}
+
+impl Lock {
+    /// Waits until nobody else holds it alone.
+    pub(crate) fn shared(path: &Path) -> Result<Self, Error> {
+        Self::take(path, FlockOperation::LockShared)
+    }
+
+    /// Waits until nobody else holds it.
+    pub(crate) fn alone(path: &Path) -> Result<Self, Error> {
+        Self::take(path, FlockOperation::LockExclusive)
+    }
+
+    /// None when somebody else holds it.
+    pub(crate) fn alone_now(path: &Path) -> Result<Option<Self>, Error> {
+        let file = open(path)?;
+        match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(Some(Self { _file: file })),
+            Err(Errno::WOULDBLOCK) => Ok(None),
+            Err(error) => Err(Error::file("lock", path, error)),
+        }
+    }
+
+    fn take(path: &Path, operation: FlockOperation) -> Result<Self, Error> {
+        let file = open(path)?;
+        loop {
+            match rustix::fs::flock(&file, operation) {
+                Ok(()) => return Ok(Self { _file: file }),
+                Err(Errno::INTR) => {}
+                Err(error) => return Err(Error::file("lock", path, error)),
+            }
+        }
+    }
+}
+
+fn open(path: &Path) -> Result<File, Error> {
+    // Not blocking: a foreign fifo of this name must not stop the sweep.
+    File::options()
+        .read(true)
+        .custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32)
+        .open(path)
+        .map_err(|error| Error::file("open", path, error))
+}
+
+/// A file under a temporary name, locked so that no sweep takes it for a leftover, and removed unless published.
+#[derive(Debug)]
+pub(crate) struct NewFile {
+    file: File,
+    path: PathBuf,
+    published: bool,
+}
+
+impl NewFile {
+    /// An empty one in `directory`.
+    pub(crate) fn create(directory: &Path) -> Result<Self, Error> {
+        loop {
+            let path = directory.join(half_made_name());
+            let file = File::options()
+                .read(true)
+                .write(true)
+                .create_new(true)
+                .mode(0o644)
+                .open(&path)
+                .map_err(|error| Error::file("create", &path, error))?;
+            let new = Self {
+                file,
+                path,
+                published: false,
+            };
+            let locked = rustix::fs::flock(&new.file, FlockOperation::NonBlockingLockExclusive);
+            // A sweep may have come between creating and locking.
+            let there = rustix::fs::fstat(&new.file).is_ok_and(|stat| stat.st_nlink > 0);
+            if locked.is_ok() && there {
+                return Ok(new);
+            }
+        }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(crate) fn file(&self) -> &File {
+        &self.file
+    }
+
+    /// Flushes the content and gives it its name in `target`'s directory, which is flushed too.
+    pub(crate) fn publish(mut self, target: &Path) -> Result<(), Error> {
+        self.file
+            .sync_data()
+            .map_err(|error| Error::file("flush", target, error))?;
+        std::fs::rename(&self.path, target)
+            .map_err(|error| Error::file("create", target, error))?;
+        self.published = true;
+        sync_directory(target.parent().unwrap_or(Path::new("/")))
+    }
+}
+
+impl Drop for NewFile {
+    fn drop(&mut self) {
+        if !self.published {
+            // It may be gone already; a sweep comes for the rest.
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
+
+impl Write for &NewFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        (&self.file).write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Makes the names in a directory durable.
+pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
+    open(directory)?
+        .sync_all()
+        .map_err(|error| Error::file("flush", directory, error))
+}
+
+/// Writes a small file whole.
+pub(crate) fn write_whole(target: &Path, bytes: &[u8]) -> Result<(), Error> {
+    let new = NewFile::create(target.parent().unwrap_or(Path::new("/")))?;
+    (&new)
+        .write_all(bytes)
+        .map_err(|error| Error::file("write", target, error).needing(bytes.len() as u64))?;
+    new.publish(target)
+}
+
+/// A small file's content; none when there is none. At most `most` bytes are accepted.
+pub(crate) fn read_whole(path: &Path, most: u64) -> Result<Option<Vec<u8>>, Error> {
+    let file = match File::open(path) {
+        Ok(file) => file,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(Error::file("open", path, error)),
+    };
+    let mut bytes = Vec::new();
+    file.take(most + 1)
+        .read_to_end(&mut bytes)
+        .map_err(|error| Error::file("read", path, error))?;
+    if bytes.len() as u64 > most {
+        let error = io::Error::new(
+            io::ErrorKind::InvalidData,
+            format!("it is longer than {most} bytes"),
+        );
+        return Err(Error::file("read", path, error));
+    }
+    Ok(Some(bytes))
+}
+
+/// A directory that only its owner may enter, with those above it.
+pub(crate) fn make_private_directory(path: &Path) -> Result<(), Error> {
+    std::fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(path)
+        .map_err(|error| Error::file("create", path, error))
+}
+
+/// Removes a tree, also one whose directories do not let their owner write. One that is gone is fine.
+pub(crate) fn remove_tree(path: &Path) -> Result<(), Error> {
+    let gone = |result: io::Result<()>| match result {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        other => other,
+    };
+    let removed = gone(std::fs::remove_dir_all(path)).or_else(|error| {
+        if error.kind() != io::ErrorKind::PermissionDenied {
+            return Err(error);
+        }
+        open_up(path)?;
+        gone(std::fs::remove_dir_all(path))
+    });
+    removed.map_err(|error| Error::file("remove", path, error))
+}
+
+/// Gives the owner all rights on every directory of a tree.
+fn open_up(directory: &Path) -> io::Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    std::fs::set_permissions(directory, std::fs::Permissions::from_mode(0o700))?;
+    for entry in std::fs::read_dir(directory)? {
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            open_up(&entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+/// Removes what a crash left in `directory`: half-made files and trees that no living process has locked.
+pub(crate) fn sweep_half_made(directory: &Path) -> Result<u64, Error> {
+    let mut swept = 0;
+    for entry in list(directory)? {
+        let name = entry.file_name();
+        if !name.as_encoded_bytes().starts_with(HALF_MADE.as_bytes()) {
+            continue;
+        }
+        let path = entry.path();
+        // Not readable or gone in the meantime: somebody else's business.
+        let Ok(Some(_lock)) = Lock::alone_now(&path) else {
+            continue;
+        };
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            remove_tree(&path)?;
+        } else {
+            match std::fs::remove_file(&path) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                    return Err(Error::file("remove", &path, error));
+                }
+                _ => {}
+            }
+        }
+        tracing::info!(path = %path.display(), "removed a half-made leftover");
+        swept += 1;
+    }
+    Ok(swept)
+}
+
+/// The entries of a directory.
+pub(crate) fn list(directory: &Path) -> Result<Vec<std::fs::DirEntry>, Error> {
+    std::fs::read_dir(directory)
+        .and_then(Iterator::collect)
+        .map_err(|error| Error::file("list", directory, error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unpublished_file_leaves_nothing() {
+        let directory = tempfile::tempdir().unwrap();
+        drop(NewFile::create(directory.path()).unwrap());
+        assert!(list(directory.path()).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_sweep_takes_leftovers_and_spares_what_is_being_written() {
+        let directory = tempfile::tempdir().unwrap();
+        let being_written = NewFile::create(directory.path()).unwrap();
+        std::fs::write(directory.path().join("tmp-dead"), "half").unwrap();
+        std::fs::create_dir_all(directory.path().join("tmp-tree/usr")).unwrap();
+        std::fs::write(directory.path().join("other"), "whole").unwrap();
+        assert_eq!(sweep_half_made(directory.path()).unwrap(), 2);
+        assert!(being_written.path().exists());
+        being_written
+            .publish(&directory.path().join("done"))
+            .unwrap();
+        let mut names: Vec<_> = list(directory.path())
+            .unwrap()
+            .iter()
+            .map(|e| e.file_name())
+            .collect();
+        names.sort();
+        assert_eq!(names, ["done", "other"]);
+    }
+
+    #[test]
+    fn a_shared_lock_keeps_others_from_holding_it_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let first = Lock::shared(directory.path()).unwrap();
+        let _second = Lock::shared(directory.path()).unwrap();
+        assert!(Lock::alone_now(directory.path()).unwrap().is_none());
+        drop(first);
+        assert!(Lock::alone_now(directory.path()).unwrap().is_none());
+        drop(_second);
+        assert!(Lock::alone_now(directory.path()).unwrap().is_some());
+    }
+}

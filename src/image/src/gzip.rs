@@ -1,0 +1,308 @@
+//! gzip on all cores, and decompression on a thread of its own.
+//!
+//! The stream is cut into pieces of a fixed size, each a gzip member of its own (RFC 1952, 2.2: members may
+//! follow one another; every reader of image layers joins them). So the bytes do not depend on how many threads
+//! wrote them.
+
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Mutex, PoisonError};
+use std::thread;
+
+use flate2::bufread::MultiGzDecoder;
+use flate2::{Compression, GzBuilder};
+
+/// Bytes in one gzip member: large enough to cost less than half a percent of size.
+const PIECE: usize = 4 << 20;
+
+/// Bytes handed from the decompressing thread at once.
+const CHUNK: usize = 256 << 10;
+
+/// More threads only wait for the one that reads the files and hashes.
+const MAX_WORKERS: usize = 8;
+
+/// A piece to compress, and where the result is awaited.
+type Job = (Vec<u8>, SyncSender<Vec<u8>>);
+
+/// Runs `fill` with a writer whose gzip form goes to `output`. Gives back `output` and what `fill` gave.
+pub(crate) fn compress<W, T, E>(
+    output: W,
+    level: u32,
+    fill: impl FnOnce(&mut dyn Write) -> Result<T, E>,
+) -> Result<(W, T), Failed<E>>
+where
+    W: Write + Send,
+{
+    let workers = thread::available_parallelism().map_or(1, |count| count.get().min(MAX_WORKERS));
+    let (jobs, waiting) = sync_channel::<Job>(workers);
+    let (order, results) = sync_channel::<Receiver<Vec<u8>>>(workers);
+    let waiting = Mutex::new(waiting);
+    thread::scope(|scope| {
+        for _ in 0..workers {
+            scope.spawn(|| work(&waiting, level));
+        }
+        let writing = scope.spawn(move || write_in_order(output, &results));
+        let mut pieces = Pieces {
+            buffer: Vec::with_capacity(PIECE),
+            jobs,
+            order,
+        };
+        let filled = fill(&mut pieces);
+        let closed = pieces.close();
+        let written = writing
+            .join()
+            .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        // When the output failed, what `fill` says is only that the pipe broke.
+        let output = written.map_err(Failed::Output)?;
+        let filled = filled.map_err(Failed::Fill)?;
+        closed.map_err(Failed::Output)?;
+        Ok((output, filled))
+    })
+}
+
+/// Which side of [`compress`] failed.
+pub(crate) enum Failed<E> {
+    Output(io::Error),
+    Fill(E),
+}
+
+fn work(waiting: &Mutex<Receiver<Job>>, level: u32) {
+    loop {
+        let job = waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .recv();
+        let Ok((piece, result)) = job else { return };
+        // The receiver is gone when the output failed; then nobody needs the piece.
+        let _ = result.send(member(&piece, level));
+    }
+}
+
+/// One gzip member without name, time or system.
+fn member(piece: &[u8], level: u32) -> Vec<u8> {
+    let output = Vec::with_capacity(piece.len() / 2);
+    let mut encoder = GzBuilder::new()
+        .mtime(0)
+        .operating_system(255)
+        .write(output, Compression::new(level.clamp(1, 9)));
+    encoder
+        .write_all(piece)
+        .and_then(|()| encoder.finish())
+        .expect("writing to memory does not fail")
+}
+
+fn write_in_order<W: Write>(mut output: W, results: &Receiver<Receiver<Vec<u8>>>) -> io::Result<W> {
+    for result in results {
+        let member = result
+            .recv()
+            .map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))?;
+        output.write_all(&member)?;
+    }
+    Ok(output)
+}
+
+/// Cuts what is written into pieces.
+struct Pieces {
+    buffer: Vec<u8>,
+    jobs: SyncSender<Job>,
+    order: SyncSender<Receiver<Vec<u8>>>,
+}
+
+impl Pieces {
+    fn send(&mut self) -> io::Result<()> {
+        let piece = std::mem::replace(&mut self.buffer, Vec::with_capacity(PIECE));
+        let (result, awaited) = sync_channel(1);
+        let broken = |_| io::Error::from(io::ErrorKind::BrokenPipe);
+        self.order.send(awaited).map_err(broken)?;
+        self.jobs
+            .send((piece, result))
+            .map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))
+    }
+
+    fn close(mut self) -> io::Result<()> {
+        if self.buffer.is_empty() {
+            Ok(())
+        } else {
+            self.send()
+        }
+    }
+}
+
+impl Write for Pieces {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let taken = bytes.len().min(PIECE - self.buffer.len());
+        self.buffer.extend_from_slice(&bytes[..taken]);
+        if self.buffer.len() == PIECE {
+            self.send()?;
+        }
+        Ok(taken)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// What a stream begins with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Format {
+    Gzip,
+    Zstd,
+    /// Anything else is taken for tar, whose reader knows better.
+    Plain,
+}
+
+/// Looks at the first bytes without taking them.
+pub(crate) fn detect(input: &mut impl BufRead) -> io::Result<Format> {
+    let start = input.fill_buf()?;
+    Ok(match start {
+        [0x1f, 0x8b, ..] => Format::Gzip,
+        [0x28, 0xb5, 0x2f, 0xfd, ..] => Format::Zstd,
+        _ => Format::Plain,
+    })
+}
+
+/// A reader of what a stream holds, gzip or plain.
+pub(crate) fn decoder<'a>(input: impl Read + Send + 'a) -> io::Result<Box<dyn Read + Send + 'a>> {
+    let mut input = BufReader::with_capacity(CHUNK, input);
+    match detect(&mut input)? {
+        Format::Gzip => Ok(Box::new(MultiGzDecoder::new(input))),
+        Format::Plain => Ok(Box::new(input)),
+        Format::Zstd => Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            "it is compressed with zstd; gzip is what is read here",
+        )),
+    }
+}
+
+/// Runs `consume` with a reader whose bytes another thread reads ahead from `input`.
+pub(crate) fn reading_ahead<R: Read + Send, T>(
+    mut input: R,
+    consume: impl FnOnce(&mut dyn Read) -> T,
+) -> T {
+    let (chunks, received) = sync_channel::<io::Result<Vec<u8>>>(8);
+    thread::scope(|scope| {
+        scope.spawn(move || {
+            loop {
+                let mut chunk = vec![0; CHUNK];
+                let read = fill(&mut input, &mut chunk);
+                let last = !matches!(read, Ok(CHUNK));
+                let sent = chunks.send(read.map(|read| {
+                    chunk.truncate(read);
+                    chunk
+                }));
+                if last || sent.is_err() {
+                    return;
+                }
+            }
+        });
+        consume(&mut Ahead {
+            received,
+            chunk: Vec::new(),
+            at: 0,
+        })
+    })
+}
+
+/// Reads until the buffer is full or the input ends.
+fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
+    let mut filled = 0;
+    while filled < buffer.len() {
+        match input.read(&mut buffer[filled..]) {
+            Ok(0) => break,
+            Ok(read) => filled += read,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(filled)
+}
+
+struct Ahead {
+    received: Receiver<io::Result<Vec<u8>>>,
+    chunk: Vec<u8>,
+    at: usize,
+}
+
+impl Read for Ahead {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.at == self.chunk.len() {
+            // The sender hangs up after the last chunk.
+            let Ok(chunk) = self.received.recv() else {
+                return Ok(0);
+            };
+            (self.chunk, self.at) = (chunk?, 0);
+        }
+        let taken = buffer.len().min(self.chunk.len() - self.at);
+        buffer[..taken].copy_from_slice(&self.chunk[self.at..self.at + taken]);
+        self.at += taken;
+        Ok(taken)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pattern(length: usize) -> Vec<u8> {
+        (0..length).map(|i| (i * i / 7 % 251) as u8).collect()
+    }
+
+    fn packed(bytes: &[u8]) -> Vec<u8> {
+        match compress(Vec::new(), 6, |out| out.write_all(bytes)) {
+            Ok((packed, ())) => packed,
+            Err(_) => panic!("compressing to memory failed"),
+        }
+    }
+
+    #[test]
+    fn several_pieces_come_back_as_one_stream() {
+        let bytes = pattern(2 * PIECE + 12_345);
+        let packed = packed(&bytes);
+        assert!(packed.len() < bytes.len());
+        let decoder = decoder(&packed[..]).unwrap();
+        let mut back = Vec::new();
+        reading_ahead(decoder, |input| input.read_to_end(&mut back)).unwrap();
+        assert!(back == bytes);
+    }
+
+    #[test]
+    fn the_same_bytes_give_the_same_gzip() {
+        let bytes = pattern(PIECE + 1);
+        assert!(packed(&bytes) == packed(&bytes));
+        // No time, no name, "unknown" system.
+        assert_eq!(packed(&bytes)[..8], [0x1f, 0x8b, 8, 0, 0, 0, 0, 0]);
+        assert_eq!(packed(&bytes)[9], 255);
+    }
+
+    #[test]
+    fn a_full_disk_is_reported_as_such_and_ends_the_work() {
+        let full = std::fs::File::options()
+            .write(true)
+            .open("/dev/full")
+            .unwrap();
+        let bytes = pattern(40 * PIECE);
+        match compress(full, 1, |out| out.write_all(&bytes)) {
+            Err(Failed::Output(error)) => assert_eq!(error.kind(), io::ErrorKind::StorageFull),
+            Err(Failed::Fill(error)) => panic!("the wrong side is blamed: {error}"),
+            Ok(_) => panic!("a full disk took everything"),
+        }
+    }
+
+    #[test]
+    fn a_cut_stream_is_an_error() {
+        let packed = packed(&pattern(100_000));
+        let mut back = Vec::new();
+        let error = decoder(&packed[..packed.len() - 5])
+            .unwrap()
+            .read_to_end(&mut back)
+            .unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::UnexpectedEof);
+    }
+
+    #[test]
+    fn zstd_is_told_apart() {
+        let error = decoder(&[0x28, 0xb5, 0x2f, 0xfd, 0][..]).err().unwrap();
+        assert!(error.to_string().contains("zstd"), "{error}");
+    }
+}

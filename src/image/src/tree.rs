@@ -1,0 +1,335 @@
+//! Turns a file tree into tar entries, always the same ones for the same tree.
+//!
+//! The tree may be the work of strangers (a build): it is walked by directory descriptors, no symbolic link is
+//! followed, nothing that would block is opened.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat};
+use rustix::io::Errno;
+
+use crate::entry::{Entry, Kind};
+use crate::glob::Globs;
+use crate::names::{MAX_DEPTH, join};
+use crate::tar_writer::TarWriter;
+use crate::{Error, Mtime, TreeOptions, capability};
+
+/// Prefix of an entry that deletes its namesake in the layers below (OCI layer specification, whiteouts).
+pub(crate) const WHITEOUT: &[u8] = b".wh.";
+/// Name of an entry that hides all that the layers below have in its directory.
+pub(crate) const OPAQUE: &[u8] = b".wh..wh..opq";
+
+/// Bytes read from a file at once.
+const BUFFER: usize = 256 << 10;
+/// The largest list of attribute names, and the largest value (linux/limits.h).
+const XATTR_MAX: usize = 64 << 10;
+
+const READ: OFlags = OFlags::RDONLY
+    .union(OFlags::NOFOLLOW)
+    .union(OFlags::CLOEXEC)
+    .union(OFlags::NONBLOCK);
+const DIRECTORY: OFlags = READ.union(OFlags::DIRECTORY);
+
+/// Packs one tree.
+pub(crate) struct Packer<'a, W: Write> {
+    writer: TarWriter<W>,
+    options: &'a TreeOptions,
+    exclude: Globs,
+    root: PathBuf,
+    /// First path of each file that has several, by device and inode.
+    links: HashMap<(u64, u64), Vec<u8>>,
+    buffer: Vec<u8>,
+}
+
+impl<'a, W: Write> Packer<'a, W> {
+    pub(crate) fn new(writer: TarWriter<W>, options: &'a TreeOptions) -> Self {
+        Self {
+            writer,
+            options,
+            exclude: Globs::new(&options.exclude),
+            root: PathBuf::new(),
+            links: HashMap::new(),
+            buffer: vec![0; BUFFER],
+        }
+    }
+
+    /// All below `tree`.
+    pub(crate) fn pack(&mut self, tree: &Path) -> Result<(), Error> {
+        self.root = tree.to_owned();
+        let root = rustix::fs::open(tree, DIRECTORY, Mode::empty())
+            .map_err(|error| Error::file("open the directory", tree, error))?;
+        self.directory(root.as_fd(), b"", 0)
+    }
+
+    /// The end mark; gives the output back.
+    pub(crate) fn finish(self) -> io::Result<W> {
+        self.writer.finish()
+    }
+
+    fn directory(
+        &mut self,
+        directory: BorrowedFd<'_>,
+        path: &[u8],
+        depth: usize,
+    ) -> Result<(), Error> {
+        if depth > MAX_DEPTH {
+            return Err(self.problem(
+                path,
+                format!("it is more than {MAX_DEPTH} directories deep"),
+            ));
+        }
+        let mut children = Vec::new();
+        for name in self.names(directory, path)? {
+            let child = join(path, &name);
+            if self.exclude.matches(&child, &name) {
+                continue;
+            }
+            let stat = rustix::fs::statat(directory, &name[..], AtFlags::SYMLINK_NOFOLLOW)
+                .map_err(|error| self.failed("look at", &child, error))?;
+            if self.is_whiteout(&stat) {
+                // Before all others, as the specification wishes.
+                self.write(&Entry {
+                    mtime: self.mtime(0),
+                    ..Entry::new(join(path, &[WHITEOUT, &name].concat()), Kind::File, 0o644)
+                })?;
+                continue;
+            }
+            if name.starts_with(WHITEOUT) {
+                return Err(self.problem(
+                    &child,
+                    "names that begin with .wh. mean deletions; rename it",
+                ));
+            }
+            children.push((name, child, stat));
+        }
+        for (name, child, stat) in children {
+            self.child(directory, &name, child, &stat, depth)?;
+        }
+        Ok(())
+    }
+
+    /// Names in a directory, sorted by their bytes.
+    fn names(&self, directory: BorrowedFd<'_>, path: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
+        let failed = |error| self.failed("list", path, error);
+        let mut names = Vec::new();
+        for entry in Dir::read_from(directory).map_err(failed)? {
+            let name = entry.map_err(failed)?.file_name().to_bytes().to_vec();
+            if name != b"." && name != b".." {
+                names.push(name);
+            }
+        }
+        names.sort_unstable();
+        Ok(names)
+    }
+
+    fn child(
+        &mut self,
+        parent: BorrowedFd<'_>,
+        name: &[u8],
+        path: Vec<u8>,
+        stat: &Stat,
+        depth: usize,
+    ) -> Result<(), Error> {
+        let mut entry = Entry {
+            uid: self.id(stat.st_uid),
+            gid: self.id(stat.st_gid),
+            mtime: self.mtime(stat.st_mtime),
+            ..Entry::new(path, Kind::File, stat.st_mode & 0o7777)
+        };
+        let kind = FileType::from_raw_mode(stat.st_mode);
+        if kind != FileType::Directory && stat.st_nlink > 1 {
+            if let Some(first) = self.links.get(&(stat.st_dev, stat.st_ino)) {
+                (entry.kind, entry.link) = (Kind::Hardlink, first.clone());
+                return self.write(&entry);
+            }
+            self.links
+                .insert((stat.st_dev, stat.st_ino), entry.name.clone());
+        }
+        match kind {
+            FileType::Directory => {
+                let directory = self.open(parent, name, &entry.name, DIRECTORY)?;
+                let attributes = self.attributes(directory.as_fd(), &entry.name)?;
+                let path = std::mem::take(&mut entry.name);
+                entry.kind = Kind::Directory;
+                entry.name = [&path[..], b"/"].concat();
+                entry.xattrs = attributes.kept;
+                self.write(&entry)?;
+                if attributes.opaque {
+                    let opaque = Entry::new(join(&path, OPAQUE), Kind::File, 0o644);
+                    self.write(&Entry {
+                        mtime: self.mtime(0),
+                        ..opaque
+                    })?;
+                }
+                self.directory(directory.as_fd(), &path, depth + 1)
+            }
+            FileType::RegularFile => self.file(parent, name, entry, stat),
+            FileType::Symlink => {
+                entry.kind = Kind::Symlink;
+                // Linux gives every link all rights; what others give must not show.
+                entry.mode = 0o777;
+                entry.link = rustix::fs::readlinkat(parent, name, Vec::new())
+                    .map_err(|error| self.failed("read the link", &entry.name, error))?
+                    .into_bytes();
+                self.write(&entry)
+            }
+            FileType::CharacterDevice | FileType::BlockDevice => {
+                entry.kind = if kind == FileType::BlockDevice {
+                    Kind::Block
+                } else {
+                    Kind::Character
+                };
+                entry.device = (
+                    rustix::fs::major(stat.st_rdev),
+                    rustix::fs::minor(stat.st_rdev),
+                );
+                self.write(&entry)
+            }
+            FileType::Fifo => {
+                entry.kind = Kind::Fifo;
+                self.write(&entry)
+            }
+            // A socket means nothing without the process that listens on it.
+            _ => Ok(()),
+        }
+    }
+
+    fn file(
+        &mut self,
+        parent: BorrowedFd<'_>,
+        name: &[u8],
+        mut entry: Entry,
+        stat: &Stat,
+    ) -> Result<(), Error> {
+        let file = File::from(self.open(parent, name, &entry.name, READ)?);
+        let now =
+            rustix::fs::fstat(&file).map_err(|error| self.failed("look at", &entry.name, error))?;
+        if (now.st_dev, now.st_ino) != (stat.st_dev, stat.st_ino) {
+            return Err(self.problem(&entry.name, "it was replaced while it was read"));
+        }
+        entry.size = now.st_size as u64;
+        entry.xattrs = self.attributes(file.as_fd(), &entry.name)?.kept;
+        let mut buffer = std::mem::take(&mut self.buffer);
+        let written = self.writer.file(&entry, &file, &mut buffer);
+        self.buffer = buffer;
+        written.map_err(|error| match error.kind() {
+            io::ErrorKind::UnexpectedEof => {
+                self.problem(&entry.name, "it became shorter while it was read")
+            }
+            _ => Error::file("pack", self.shown(&entry.name), error),
+        })
+    }
+
+    fn open(
+        &self,
+        parent: BorrowedFd<'_>,
+        name: &[u8],
+        path: &[u8],
+        flags: OFlags,
+    ) -> Result<OwnedFd, Error> {
+        rustix::fs::openat(parent, name, flags, Mode::empty())
+            .map_err(|error| self.failed("open", path, error))
+    }
+
+    fn write(&mut self, entry: &Entry) -> Result<(), Error> {
+        self.writer
+            .header(entry)
+            .map_err(|error| Error::file("pack", self.shown(&entry.name), error))
+    }
+
+    /// An overlay's mark for "deleted": a character device with number 0:0.
+    fn is_whiteout(&self, stat: &Stat) -> bool {
+        self.options.overlay_upper
+            && FileType::from_raw_mode(stat.st_mode) == FileType::CharacterDevice
+            && stat.st_rdev == 0
+    }
+
+    fn id(&self, on_disk: u32) -> u64 {
+        u64::from(on_disk.saturating_sub(self.options.uid_offset))
+    }
+
+    fn mtime(&self, on_disk: i64) -> u64 {
+        match self.options.mtime {
+            Mtime::Fixed(time) => time,
+            Mtime::Clamp(latest) => u64::try_from(on_disk).unwrap_or(0).min(latest),
+        }
+    }
+
+    fn attributes(&self, file: BorrowedFd<'_>, path: &[u8]) -> Result<Attributes, Error> {
+        let mut found = Attributes::default();
+        let mut names = Vec::new();
+        match rustix::fs::flistxattr(file, &mut [0u8; 0][..]) {
+            Ok(0) | Err(Errno::NOTSUP) => return Ok(found),
+            Ok(_) => names.resize(XATTR_MAX, 0u8),
+            Err(error) => return Err(self.failed("list the attributes of", path, error)),
+        }
+        let length = rustix::fs::flistxattr(file, &mut names[..])
+            .map_err(|error| self.failed("list the attributes of", path, error))?;
+        let mut value = vec![0; XATTR_MAX];
+        let mut names: Vec<&[u8]> = names[..length]
+            .split(|&byte| byte == 0)
+            .filter(|name| !name.is_empty())
+            .collect();
+        names.sort_unstable();
+        for name in names {
+            let length = rustix::fs::fgetxattr(file, name, &mut value[..])
+                .map_err(|error| self.failed("read an attribute of", path, error))?;
+            self.attribute(&mut found, name, &value[..length], path)?;
+        }
+        Ok(found)
+    }
+
+    fn attribute(
+        &self,
+        found: &mut Attributes,
+        name: &[u8],
+        value: &[u8],
+        path: &[u8],
+    ) -> Result<(), Error> {
+        let overlay = [&b"trusted.overlay."[..], b"user.overlay."]
+            .into_iter()
+            .find_map(|own| name.strip_prefix(own));
+        match overlay {
+            Some(b"opaque") if self.options.overlay_upper => found.opaque |= value == b"y",
+            Some(b"redirect" | b"metacopy") if self.options.overlay_upper => {
+                return Err(self.problem(path, "its content is partly in another layer; mount the overlay with redirect_dir=off,metacopy=off"));
+            }
+            Some(_) => {}
+            None if name == capability::NAME => {
+                if let Some(value) = capability::as_version_2(value, self.options.uid_offset) {
+                    found.kept.push((name.to_vec(), value));
+                }
+            }
+            None if name.starts_with(b"user.") => found.kept.push((name.to_vec(), value.to_vec())),
+            None => {}
+        }
+        Ok(())
+    }
+
+    fn shown(&self, path: &[u8]) -> PathBuf {
+        self.root.join(std::ffi::OsStr::from_bytes(path))
+    }
+
+    fn failed(&self, action: &'static str, path: &[u8], error: Errno) -> Error {
+        Error::file(action, self.shown(path), error)
+    }
+
+    fn problem(&self, path: &[u8], problem: impl Into<String>) -> Error {
+        Error::Tree {
+            path: self.shown(path),
+            problem: problem.into(),
+        }
+    }
+}
+
+/// What a file's extended attributes say.
+#[derive(Default)]
+struct Attributes {
+    kept: Vec<(Vec<u8>, Vec<u8>)>,
+    opaque: bool,
+}
