@@ -83,15 +83,11 @@ impl Entry {
     }
 }
 
-/// A name from an archive, for a message: no control characters, not endless.
+/// A name from an archive, for a message: not endless. Messages quote it, so control characters are escaped there.
 pub(crate) fn shown(name: &[u8]) -> String {
     let text = String::from_utf8_lossy(name);
-    let mut short: String = text
-        .chars()
-        .take(160)
-        .flat_map(char::escape_debug)
-        .collect();
-    if text.chars().nth(160).is_some() {
+    let mut short: String = text.chars().take(160).collect();
+    if short.len() < text.len() {
         short.push('…');
     }
     short

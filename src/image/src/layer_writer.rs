@@ -127,20 +127,7 @@ impl LayerWriter {
                 self.adorn_unopened(&parent, name, metadata)
                     .map_err(failed)?;
             }
-            Kind::Hardlink => {
-                let target = names::normal(&entry.link, MAX_PATH)?;
-                let (target_above, target_name) = split(&target);
-                let to_nothing = |_| Refusal::LinkToNothing {
-                    entry: shown(&entry.name),
-                    target: shown(&entry.link),
-                };
-                let from = self.beneath.directory(target_above).map_err(to_nothing)?;
-                if path != target {
-                    self.in_place_of_what_is_there(&parent, &path, || {
-                        rustix::fs::linkat(&from, target_name, &parent, name, AtFlags::empty())
-                    })?;
-                }
-            }
+            Kind::Hardlink => self.hardlink(&parent, &path, entry)?,
             Kind::Fifo => {
                 let fifo = || rustix::fs::mkfifoat(&parent, name, Mode::from_raw_mode(0o600));
                 self.in_place_of_what_is_there(&parent, &path, fifo)?;
@@ -201,6 +188,29 @@ impl LayerWriter {
             }
         }
         Ok(())
+    }
+
+    fn hardlink(&mut self, parent: &OwnedFd, path: &[u8], entry: &Entry) -> Result<(), Failed> {
+        let target = names::normal(&entry.link, MAX_PATH)?;
+        if path == target {
+            return Ok(());
+        }
+        let nothing = || Refusal::LinkToNothing {
+            entry: shown(&entry.name),
+            target: shown(&entry.link),
+        };
+        let (above, name) = split(&target);
+        let from = self.beneath.directory(above).map_err(|_| nothing())?;
+        // The kernel links no directories.
+        if look(&from, name)
+            .ok()
+            .flatten()
+            .is_none_or(|stat| is(&stat, FileType::Directory))
+        {
+            return Err(nothing().into());
+        }
+        let link = || rustix::fs::linkat(&from, name, parent, split(path).1, AtFlags::empty());
+        self.in_place_of_what_is_there(parent, path, link)
     }
 
     fn directory(

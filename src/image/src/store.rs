@@ -241,3 +241,6 @@ impl Store {
 pub(crate) fn json(document: &impl serde::Serialize) -> Vec<u8> {
     serde_json::to_vec(document).expect("the store's documents have string keys only")
 }
+
+#[cfg(test)]
+mod tests;

@@ -44,6 +44,8 @@ pub(crate) struct Packer<'a, W: Write> {
     /// First path of each file that has several, by device and inode.
     links: HashMap<(u64, u64), Vec<u8>>,
     buffer: Vec<u8>,
+    /// Room for the names of a file's attributes.
+    attribute_names: Vec<u8>,
 }
 
 impl<'a, W: Write> Packer<'a, W> {
@@ -55,6 +57,7 @@ impl<'a, W: Write> Packer<'a, W> {
             root: PathBuf::new(),
             links: HashMap::new(),
             buffer: vec![0; BUFFER],
+            attribute_names: vec![0; XATTR_MAX],
         }
     }
 
@@ -260,18 +263,26 @@ impl<'a, W: Write> Packer<'a, W> {
         }
     }
 
-    fn attributes(&self, file: BorrowedFd<'_>, path: &[u8]) -> Result<Attributes, Error> {
+    fn attributes(&mut self, file: BorrowedFd<'_>, path: &[u8]) -> Result<Attributes, Error> {
+        let mut names = std::mem::take(&mut self.attribute_names);
+        let result = match rustix::fs::flistxattr(file, &mut names[..]) {
+            Ok(0) | Err(Errno::NOTSUP) => Ok(Attributes::default()),
+            Ok(length) => self.read_attributes(file, path, &names[..length]),
+            Err(error) => Err(self.failed("list the attributes of", path, error)),
+        };
+        self.attribute_names = names;
+        result
+    }
+
+    fn read_attributes(
+        &self,
+        file: BorrowedFd<'_>,
+        path: &[u8],
+        names: &[u8],
+    ) -> Result<Attributes, Error> {
         let mut found = Attributes::default();
-        let mut names = Vec::new();
-        match rustix::fs::flistxattr(file, &mut [0u8; 0][..]) {
-            Ok(0) | Err(Errno::NOTSUP) => return Ok(found),
-            Ok(_) => names.resize(XATTR_MAX, 0u8),
-            Err(error) => return Err(self.failed("list the attributes of", path, error)),
-        }
-        let length = rustix::fs::flistxattr(file, &mut names[..])
-            .map_err(|error| self.failed("list the attributes of", path, error))?;
         let mut value = vec![0; XATTR_MAX];
-        let mut names: Vec<&[u8]> = names[..length]
+        let mut names: Vec<&[u8]> = names
             .split(|&byte| byte == 0)
             .filter(|name| !name.is_empty())
             .collect();
