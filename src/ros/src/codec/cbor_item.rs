@@ -1,6 +1,167 @@
-//! Where a CBOR item ends.
-use crate::codec::CodecError;
-/// Length of one CBOR item.
-pub fn cbor_item_len(_: &[u8]) -> Result<usize, CodecError> {
-    Ok(0)
+//! Heads of CBOR items, and where an item ends.
+
+use crate::codec::cbor_out::{ARRAY, BYTES, MAP, SIMPLE, TAG, TEXT};
+use crate::codec::fault::{CodecError, CodecErrorKind};
+
+/// Deepest nesting that is looked into where no message type bounds it.
+pub(crate) const MAX_NESTING: usize = 128;
+
+/// The first bytes of an item.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Head {
+    /// Major type, in place.
+    pub(crate) major: u8,
+    /// The low five bits: 24 to 27 for the width of `value`, 31 for no declared length.
+    pub(crate) info: u8,
+    /// Number, length, count or tag; the bits of a float.
+    pub(crate) value: u64,
+    /// Bytes of the head itself.
+    pub(crate) size: usize,
+}
+
+/// `info` of an item without declared length, and of the break that ends it.
+pub(crate) const INDEFINITE: u8 = 31;
+
+impl Head {
+    /// Reads the head at the beginning of `input`.
+    #[inline]
+    pub(crate) fn read(input: &[u8]) -> Result<Head, &'static str> {
+        let Some((&first, rest)) = input.split_first() else {
+            return Err("the input ends here");
+        };
+        let (major, info) = (first & 0xe0, first & 0x1f);
+        let width = match info {
+            0..=23 => {
+                return Ok(Head {
+                    major,
+                    info,
+                    value: u64::from(info),
+                    size: 1,
+                });
+            }
+            24..=27 => 1 << (info - 24),
+            INDEFINITE if matches!(major, BYTES | TEXT | ARRAY | MAP | SIMPLE) => 0,
+            _ => return Err("a reserved head"),
+        };
+        let bytes = rest.get(..width).ok_or("the input ends here")?;
+        let value = bytes
+            .iter()
+            .fold(0, |value, byte| value << 8 | u64::from(*byte));
+        Ok(Head {
+            major,
+            info,
+            value,
+            size: 1 + width,
+        })
+    }
+
+    pub(crate) fn is_break(self) -> bool {
+        self.major == SIMPLE && self.info == INDEFINITE
+    }
+}
+
+/// Length of the CBOR item at the beginning of `input`, without building it. Items may nest 128 deep.
+pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
+    let fail = |at, reason| CodecError::of_input(CodecErrorKind::Cbor { at, reason });
+    // Items still to come at each level; None until a break.
+    let mut open: Vec<Open> = Vec::new();
+    let mut at = 0;
+    loop {
+        let head = Head::read(&input[at..]).map_err(|reason| fail(at, reason))?;
+        let indefinite = head.info == INDEFINITE;
+        let chunk_of = open.last().and_then(|level| level.chunks);
+        if chunk_of.is_some_and(|major| !head.is_break() && (head.major != major || indefinite)) {
+            return Err(fail(at, "a string's chunk is of another type"));
+        }
+        let start = at;
+        at += head.size;
+        let opened = match head.major {
+            _ if head.is_break() => {
+                let ended = open.pop();
+                if !ended.is_some_and(|level| level.left.is_none() && !(level.map && level.odd)) {
+                    return Err(fail(start, "a break where nothing is to be ended"));
+                }
+                None
+            }
+            BYTES | TEXT if indefinite => Some(Open {
+                left: None,
+                chunks: Some(head.major),
+                ..Open::default()
+            }),
+            BYTES | TEXT => {
+                let length = usize::try_from(head.value).unwrap_or(usize::MAX);
+                if length > input.len() - at {
+                    return Err(fail(start, "a string longer than the input"));
+                }
+                at += length;
+                None
+            }
+            ARRAY | MAP if indefinite => Some(Open {
+                left: None,
+                map: head.major == MAP,
+                ..Open::default()
+            }),
+            ARRAY => Some(Open {
+                left: Some(head.value),
+                ..Open::default()
+            }),
+            MAP => Some(Open {
+                left: Some(head.value.saturating_mul(2)),
+                ..Open::default()
+            }),
+            TAG => Some(Open {
+                left: Some(1),
+                ..Open::default()
+            }),
+            _ => None,
+        };
+        if let Some(level) = opened {
+            if open.len() >= MAX_NESTING {
+                return Err(CodecError::of_input(CodecErrorKind::TooDeep(MAX_NESTING)));
+            }
+            open.push(level);
+            if level.left != Some(0) {
+                continue;
+            }
+            open.pop();
+        }
+        if close_complete(&mut open) {
+            return Ok(at);
+        }
+    }
+}
+
+/// A level of nesting.
+#[derive(Debug, Clone, Copy, Default)]
+struct Open {
+    /// Items still to come; None until a break.
+    left: Option<u64>,
+    /// The major type that the chunks of a string must have.
+    chunks: Option<u8>,
+    /// A map without declared length.
+    map: bool,
+    /// A key is waiting for its value.
+    odd: bool,
+}
+
+/// Counts an item that just ended, and those that end with it; true when nothing is open any more.
+fn close_complete(open: &mut Vec<Open>) -> bool {
+    loop {
+        let Some(level) = open.last_mut() else {
+            return true;
+        };
+        match &mut level.left {
+            None => {
+                level.odd = !level.odd;
+                return false;
+            }
+            Some(left) => {
+                *left -= 1;
+                if *left > 0 {
+                    return false;
+                }
+                open.pop();
+            }
+        }
+    }
 }

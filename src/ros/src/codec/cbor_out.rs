@@ -1,7 +1,10 @@
-//! ROS bytes → CBOR (RFC 8949).
+//! ROS bytes → CBOR (RFC 8949), numeric arrays as typed arrays (RFC 8746).
 
-use crate::codec::CborOptions;
-use crate::codec::fault::Fault;
+use crate::codec::fault::{CodecErrorKind, Fault};
+use crate::codec::plan::{Literal, Plan, Scalar};
+use crate::codec::typed_array::little_endian_tag;
+use crate::codec::walk::{Format, walk};
+use crate::codec::{CborOptions, InvalidUtf8};
 use crate::schema::MessageType;
 
 /// Major types, in place.
@@ -12,8 +15,11 @@ pub(crate) const TEXT: u8 = 3 << 5;
 pub(crate) const ARRAY: u8 = 4 << 5;
 pub(crate) const MAP: u8 = 5 << 5;
 pub(crate) const TAG: u8 = 6 << 5;
+/// Booleans, null, floats, and the end of what has no declared length.
+pub(crate) const SIMPLE: u8 = 7 << 5;
 
 /// Writes an item's head in its shortest form.
+#[inline]
 pub(crate) fn head(out: &mut Vec<u8>, major: u8, value: u64) {
     match value {
         0..=23 => out.push(major | value as u8),
@@ -33,11 +39,130 @@ pub(crate) fn head(out: &mut Vec<u8>, major: u8, value: u64) {
     }
 }
 
+/// Appends the message as a CBOR map.
 pub(crate) fn write(
-    _: &MessageType,
-    _: &[u8],
-    _: &mut Vec<u8>,
-    _: &CborOptions,
+    message: &MessageType,
+    bytes: &[u8],
+    out: &mut Vec<u8>,
+    options: &CborOptions,
 ) -> Result<(), Fault> {
-    Ok(())
+    let end = out.len().saturating_add(options.max_bytes);
+    walk(message, bytes, &mut Cbor { out, options, end })
+}
+
+struct Cbor<'a> {
+    out: &'a mut Vec<u8>,
+    options: &'a CborOptions,
+    /// Where the output must have ended.
+    end: usize,
+}
+
+impl Format for Cbor<'_> {
+    #[inline]
+    fn literal(&mut self, plan: &Plan, literal: &Literal) {
+        self.out.extend_from_slice(plan.cbor(literal));
+    }
+
+    #[inline]
+    fn scalar(&mut self, scalar: Scalar, bytes: &[u8]) {
+        match scalar {
+            Scalar::Bool => self.out.push(SIMPLE | if bytes[0] == 0 { 20 } else { 21 }),
+            Scalar::U8 | Scalar::U16 | Scalar::U32 | Scalar::U64 => {
+                head(self.out, UNSIGNED, unsigned(bytes))
+            }
+            Scalar::I8 | Scalar::I16 | Scalar::I32 | Scalar::I64 => self.integer(signed(bytes)),
+            Scalar::F32 => self.float(26, bytes),
+            Scalar::F64 => self.float(27, bytes),
+            Scalar::Time | Scalar::Duration => {
+                let (secs, nsecs) = bytes.split_at(4);
+                let part = if scalar == Scalar::Time {
+                    Scalar::U32
+                } else {
+                    Scalar::I32
+                };
+                head(self.out, MAP, 2);
+                self.out.extend_from_slice(b"\x64secs");
+                self.scalar(part, secs);
+                self.out.extend_from_slice(b"\x65nsecs");
+                self.scalar(part, nsecs);
+            }
+        }
+    }
+
+    fn text(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+        let text = match (std::str::from_utf8(bytes), self.options.invalid_utf8) {
+            (Ok(text), _) => text,
+            (Err(_), InvalidUtf8::Replace) => &*String::from_utf8_lossy(bytes),
+            (Err(_), InvalidUtf8::Refuse) => return Err(CodecErrorKind::InvalidUtf8.into()),
+        };
+        head(self.out, TEXT, text.len() as u64);
+        self.out.extend_from_slice(text.as_bytes());
+        Ok(())
+    }
+
+    fn bytes(&mut self, bytes: &[u8]) {
+        head(self.out, BYTES, bytes.len() as u64);
+        self.out.extend_from_slice(bytes);
+    }
+
+    fn scalars(&mut self, scalar: Scalar, bytes: &[u8]) {
+        match little_endian_tag(scalar) {
+            Some(tag) if self.options.typed_arrays => {
+                head(self.out, TAG, tag);
+                self.bytes(bytes);
+            }
+            _ => {
+                self.begin_array(bytes.len() / scalar.size());
+                for element in bytes.chunks_exact(scalar.size()) {
+                    self.scalar(scalar, element);
+                }
+            }
+        }
+    }
+
+    fn begin_array(&mut self, count: usize) {
+        head(self.out, ARRAY, count as u64);
+    }
+
+    fn element(&mut self, _: usize) {}
+
+    fn end_array(&mut self) {}
+
+    #[inline]
+    fn room(&self, more: usize) -> Result<(), Fault> {
+        if self.out.len().saturating_add(more) <= self.end {
+            return Ok(());
+        }
+        Err(CodecErrorKind::TooLarge(self.options.max_bytes).into())
+    }
+}
+
+impl Cbor<'_> {
+    fn integer(&mut self, value: i64) {
+        match u64::try_from(value) {
+            Ok(value) => head(self.out, UNSIGNED, value),
+            // CBOR stores -1 - n, which is what all bits flipped gives.
+            Err(_) => head(self.out, NEGATIVE, !value as u64),
+        }
+    }
+
+    fn float(&mut self, width: u8, bytes: &[u8]) {
+        self.out.push(SIMPLE | width);
+        self.out.extend(bytes.iter().rev());
+    }
+}
+
+/// Up to eight little-endian bytes.
+#[inline]
+fn unsigned(bytes: &[u8]) -> u64 {
+    let mut wide = [0; 8];
+    wide[..bytes.len()].copy_from_slice(bytes);
+    u64::from_le_bytes(wide)
+}
+
+/// The same with the sign carried on.
+#[inline]
+fn signed(bytes: &[u8]) -> i64 {
+    let unused = 64 - 8 * bytes.len() as u32;
+    ((unsigned(bytes) << unused) as i64) >> unused
 }

@@ -7,7 +7,7 @@ use crate::schema::MessageType;
 /// Why a conversion failed, and at which field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CodecError {
-    /// The message type being converted.
+    /// The message type being converted; empty where none is involved.
     pub type_name: String,
     /// The field, from the message's top: `header.stamp`, `poses[3].position.x`; empty for the message itself.
     pub path: String,
@@ -17,14 +17,21 @@ pub struct CodecError {
 
 impl fmt::Display for CodecError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.path.is_empty() {
-            write!(f, "{}: {}", self.type_name, self.kind)
-        } else {
-            write!(
-                f,
-                "field {} of {}: {}",
-                self.path, self.type_name, self.kind
-            )
+        match (&*self.type_name, &*self.path) {
+            ("", _) => write!(f, "{}", self.kind),
+            (type_name, "") => write!(f, "{type_name}: {}", self.kind),
+            (type_name, path) => write!(f, "field {path} of {type_name}: {}", self.kind),
+        }
+    }
+}
+
+impl CodecError {
+    /// An error of input that belongs to no message type.
+    pub(crate) fn of_input(kind: CodecErrorKind) -> CodecError {
+        CodecError {
+            type_name: String::new(),
+            path: String::new(),
+            kind,
         }
     }
 }
@@ -46,10 +53,10 @@ pub enum CodecErrorKind {
         /// How many.
         usize,
     ),
-    /// An array's length cannot be true.
-    #[error("an array of {count} elements cannot fit into the {left} bytes that follow")]
+    /// A string's or an array's length cannot be true.
+    #[error("a length of {count} cannot be true with {left} bytes to follow")]
     LengthBeyondEnd {
-        /// Its declared length.
+        /// As declared.
         count: u64,
         /// Bytes after the length.
         left: usize,
@@ -145,6 +152,10 @@ impl From<CodecErrorKind> for Fault {
 }
 
 impl Fault {
+    pub(crate) fn is_out_of_range(&self) -> bool {
+        matches!(self.0.kind, CodecErrorKind::OutOfRange { .. })
+    }
+
     #[cold]
     pub(crate) fn in_field(mut self, name: &str) -> Fault {
         self.0.place.push(Segment::Field(name.to_owned()));

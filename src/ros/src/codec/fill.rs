@@ -1,1 +1,343 @@
-//! Being written.
+//! Objects in, serialized messages out: fields in any order, missing ones by default, stamps by the clock.
+//!
+//! ROS fields are positional and of varying size, JSON's and CBOR's come in any order. Nearly all clients keep the
+//! definition's order, so values go straight to their place, with a default wherever a field was passed over. When
+//! one comes after all (or twice), it is appended, and the pieces are put in order at the object's end.
+
+use std::sync::LazyLock;
+
+use crate::codec::fault::{CodecErrorKind, Fault};
+use crate::codec::number::Wire;
+use crate::codec::plan::{Count, Kind, Member, Members, Scalar};
+use crate::codec::{FillOptions, Time};
+use crate::schema::MessageType;
+
+/// Where values come from.
+pub(crate) trait Input {
+    /// Progress within an object.
+    type Object;
+    /// Progress within an array.
+    type Array;
+
+    fn begin_object(&mut self) -> Result<Self::Object, Fault>;
+    /// Reads the next key and gives the field of that name, None at the object's end. `expected` is the likely one.
+    fn next_member(
+        &mut self,
+        object: &mut Self::Object,
+        members: &Members,
+        expected: usize,
+    ) -> Result<Option<usize>, Fault>;
+    fn begin_array(&mut self, expected: &'static str) -> Result<Self::Array, Fault>;
+    /// Whether another element follows.
+    fn next_element(&mut self, array: &mut Self::Array) -> Result<bool, Fault>;
+    fn boolean(&mut self) -> Result<bool, Fault>;
+    fn number<T: Wire>(&mut self) -> Result<T, Fault>;
+    /// Appends a string's text.
+    fn text(&mut self, out: &mut Vec<u8>) -> Result<(), Fault>;
+    /// Appends bytes given as one value; false, and nothing read, when they come as an array of numbers.
+    fn bytes(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault>;
+    /// Appends numbers given as one value; false, and nothing read, when they come one by one.
+    fn typed_array<T: Wire>(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault>;
+    /// Reads the string "now", if that is what follows.
+    fn now(&mut self) -> bool;
+}
+
+/// Appends the message that `input` describes.
+pub(crate) fn fill<I: Input>(
+    input: &mut I,
+    message: &MessageType,
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+) -> Result<(), Fault> {
+    let limit = out.len().saturating_add(options.max_bytes);
+    let mut filler = Filler {
+        input,
+        out,
+        options,
+        end: limit,
+        places: Vec::new(),
+        scratch: Vec::new(),
+    };
+    filler.message(message)?;
+    filler.room(0)
+}
+
+struct Filler<'a, I> {
+    input: &'a mut I,
+    out: &'a mut Vec<u8>,
+    options: &'a FillOptions,
+    /// Where the output must have ended.
+    end: usize,
+    /// Begin and end in `out` of the fields of the open objects, innermost object last.
+    places: Vec<(usize, usize)>,
+    scratch: Vec<u8>,
+}
+
+impl<I: Input> Filler<'_, I> {
+    fn message(&mut self, message: &MessageType) -> Result<(), Fault> {
+        let plan = &message.plan;
+        let members = plan.members.list();
+        let (base, start) = (self.places.len(), self.out.len());
+        let mut moved = false;
+        let mut object = self.input.begin_object()?;
+        loop {
+            let next = self.places.len() - base;
+            let Some(index) = self.input.next_member(&mut object, &plan.members, next)? else {
+                break;
+            };
+            for skipped in &members[next.min(index)..index] {
+                self.default_field(plan.header, skipped)?;
+            }
+            let begin = self.out.len();
+            let member = &members[index];
+            self.field(plan.header, member)
+                .map_err(|fault| fault.in_field(&member.name))?;
+            let place = (begin, self.out.len());
+            match self.places.get_mut(base + index) {
+                None => self.places.push(place),
+                Some(earlier) => {
+                    *earlier = place;
+                    moved = true;
+                }
+            }
+        }
+        for missing in &members[self.places.len() - base..] {
+            self.default_field(plan.header, missing)?;
+        }
+        if moved {
+            self.put_in_order(base, start);
+        }
+        self.places.truncate(base);
+        Ok(())
+    }
+
+    #[inline]
+    fn field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
+        match &member.kind {
+            Kind::Scalar(scalar @ (Scalar::Time | Scalar::Duration)) => {
+                let default = if in_header { self.options.now } else { None };
+                self.time(*scalar, default.unwrap_or_default())
+            }
+            Kind::Scalar(scalar) => self.scalar(*scalar),
+            Kind::Text => self.text(),
+            Kind::Bytes(count) => {
+                let begin = self.begin_count(*count);
+                if self.input.bytes(self.out)? {
+                    return self.end_count(*count, begin, self.out.len() - begin);
+                }
+                self.out.truncate(begin);
+                let found = self.numbers::<u8>(*count, "bytes")?;
+                self.end_count(*count, begin, found)
+            }
+            Kind::Scalars(scalar, count) => self.scalars(*scalar, *count),
+            Kind::Texts(count) => self.elements(*count, Self::text),
+            Kind::Struct(message) => self.message(message),
+            Kind::Structs(message, count) => {
+                self.elements(*count, |filler| filler.message(message))
+            }
+        }
+    }
+
+    fn scalar(&mut self, scalar: Scalar) -> Result<(), Fault> {
+        match scalar {
+            Scalar::Bool => self.out.push(self.input.boolean()?.into()),
+            Scalar::I8 => self.input.number::<i8>()?.put(self.out),
+            Scalar::U8 => self.input.number::<u8>()?.put(self.out),
+            Scalar::I16 => self.input.number::<i16>()?.put(self.out),
+            Scalar::U16 => self.input.number::<u16>()?.put(self.out),
+            Scalar::I32 => self.input.number::<i32>()?.put(self.out),
+            Scalar::U32 => self.input.number::<u32>()?.put(self.out),
+            Scalar::I64 => self.input.number::<i64>()?.put(self.out),
+            Scalar::U64 => self.input.number::<u64>()?.put(self.out),
+            Scalar::F32 => self.input.number::<f32>()?.put(self.out),
+            Scalar::F64 => self.input.number::<f64>()?.put(self.out),
+            Scalar::Time | Scalar::Duration => self.time(scalar, Time::default())?,
+        }
+        Ok(())
+    }
+
+    fn scalars(&mut self, scalar: Scalar, count: Count) -> Result<(), Fault> {
+        let begin = self.begin_count(count);
+        let found = match scalar {
+            Scalar::I8 => self.numbers::<i8>(count, "a list of int8"),
+            Scalar::U8 => self.numbers::<u8>(count, "a list of uint8"),
+            Scalar::I16 => self.numbers::<i16>(count, "a list of int16"),
+            Scalar::U16 => self.numbers::<u16>(count, "a list of uint16"),
+            Scalar::I32 => self.numbers::<i32>(count, "a list of int32"),
+            Scalar::U32 => self.numbers::<u32>(count, "a list of uint32"),
+            Scalar::I64 => self.numbers::<i64>(count, "a list of int64"),
+            Scalar::U64 => self.numbers::<u64>(count, "a list of uint64"),
+            Scalar::F32 => self.numbers::<f32>(count, "a list of float32"),
+            Scalar::F64 => self.numbers::<f64>(count, "a list of float64"),
+            Scalar::Bool | Scalar::Time | Scalar::Duration => {
+                self.out.truncate(begin - prefix_size(count));
+                return self.elements(count, |filler| filler.scalar(scalar));
+            }
+        }?;
+        self.end_count(count, begin, found)
+    }
+
+    /// Appends numbers and gives how many there were.
+    fn numbers<T: Wire>(&mut self, count: Count, expected: &'static str) -> Result<usize, Fault> {
+        let begin = self.out.len();
+        if self.input.typed_array::<T>(self.out)? {
+            return Ok((self.out.len() - begin) / T::SCALAR.size());
+        }
+        let most = count.most();
+        let mut array = self.input.begin_array(expected)?;
+        let mut found = 0;
+        while self.input.next_element(&mut array)? {
+            if found == most {
+                return Err(CodecErrorKind::WrongLength {
+                    expected: most,
+                    found: found + 1,
+                }
+                .into());
+            }
+            self.input
+                .number::<T>()
+                .map_err(|fault| fault.at_index(found))?
+                .put(self.out);
+            found += 1;
+        }
+        Ok(found)
+    }
+
+    fn elements(
+        &mut self,
+        count: Count,
+        mut element: impl FnMut(&mut Self) -> Result<(), Fault>,
+    ) -> Result<(), Fault> {
+        let begin = self.begin_count(count);
+        let most = count.most();
+        let mut array = self.input.begin_array("a list")?;
+        let mut found = 0;
+        while self.input.next_element(&mut array)? {
+            if found == most {
+                return Err(CodecErrorKind::WrongLength {
+                    expected: most,
+                    found: found + 1,
+                }
+                .into());
+            }
+            element(self)
+                .and_then(|()| self.room(0))
+                .map_err(|fault| fault.at_index(found))?;
+            found += 1;
+        }
+        self.end_count(count, begin, found)
+    }
+
+    fn text(&mut self) -> Result<(), Fault> {
+        let begin = self.begin_count(Count::Variable);
+        self.input.text(self.out)?;
+        self.end_count(Count::Variable, begin, self.out.len() - begin)
+    }
+
+    /// `default` counts where the object leaves a part out.
+    fn time(&mut self, scalar: Scalar, default: Time) -> Result<(), Fault> {
+        let begin = self.out.len();
+        if scalar == Scalar::Time && self.input.now() {
+            self.put_time(self.options.now.unwrap_or_default());
+            return Ok(());
+        }
+        self.put_time(if scalar == Scalar::Time {
+            default
+        } else {
+            Time::default()
+        });
+        let mut object = self.input.begin_object()?;
+        let mut expected = 0;
+        while let Some(index) = self
+            .input
+            .next_member(&mut object, &TIME_MEMBERS, expected)?
+        {
+            let part = match scalar {
+                Scalar::Time => self.input.number::<u32>(),
+                _ => self.input.number::<i32>().map(|part| part as u32),
+            };
+            let part = part.map_err(|fault| fault.in_field(&TIME_MEMBERS.list()[index].name))?;
+            self.out[begin + 4 * index..][..4].copy_from_slice(&part.to_le_bytes());
+            expected = index + 1;
+        }
+        Ok(())
+    }
+
+    fn put_time(&mut self, time: Time) {
+        self.out.extend_from_slice(&time.secs.to_le_bytes());
+        self.out.extend_from_slice(&time.nsecs.to_le_bytes());
+    }
+
+    /// A field that the object passes over; noted as if it had been there.
+    fn default_field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
+        let begin = self.out.len();
+        self.room(member.min_size)
+            .map_err(|fault| fault.in_field(&member.name))?;
+        self.out.resize(begin + member.min_size, 0);
+        let stamp = match &member.kind {
+            Kind::Scalar(Scalar::Time) if in_header => Some(begin),
+            Kind::Struct(message) if message.plan.header => Some(begin + 4),
+            _ => None,
+        };
+        if let (Some(at), Some(now)) = (stamp, self.options.now) {
+            self.out[at..at + 4].copy_from_slice(&now.secs.to_le_bytes());
+            self.out[at + 4..at + 8].copy_from_slice(&now.nsecs.to_le_bytes());
+        }
+        self.places.push((begin, self.out.len()));
+        Ok(())
+    }
+
+    /// Rewrites the object that began at `start` with its fields where they belong.
+    #[cold]
+    fn put_in_order(&mut self, base: usize, start: usize) {
+        self.scratch.clear();
+        self.scratch.extend_from_slice(&self.out[start..]);
+        self.out.truncate(start);
+        for &(begin, end) in &self.places[base..] {
+            self.out
+                .extend_from_slice(&self.scratch[begin - start..end - start]);
+        }
+    }
+
+    /// Leaves room for a length; gives where the elements begin.
+    fn begin_count(&mut self, count: Count) -> usize {
+        self.out.extend_from_slice(&[0; 4][..prefix_size(count)]);
+        self.out.len()
+    }
+
+    /// Writes the length before `begin`, or checks it.
+    fn end_count(&mut self, count: Count, begin: usize, found: usize) -> Result<(), Fault> {
+        self.room(0)?;
+        match count {
+            Count::Fixed(expected) if found != expected => {
+                Err(CodecErrorKind::WrongLength { expected, found }.into())
+            }
+            Count::Fixed(_) => Ok(()),
+            Count::Variable => {
+                let length = u32::try_from(found)
+                    .map_err(|_| CodecErrorKind::TooLarge(u32::MAX as usize))?;
+                self.out[begin - 4..begin].copy_from_slice(&length.to_le_bytes());
+                Ok(())
+            }
+        }
+    }
+
+    #[inline]
+    fn room(&self, more: usize) -> Result<(), Fault> {
+        if self.out.len().saturating_add(more) <= self.end {
+            return Ok(());
+        }
+        Err(CodecErrorKind::TooLarge(self.options.max_bytes).into())
+    }
+}
+
+/// Bytes of the length that stands before an array.
+fn prefix_size(count: Count) -> usize {
+    if count == Count::Variable { 4 } else { 0 }
+}
+
+/// The parts of a time or duration.
+static TIME_MEMBERS: LazyLock<Members> = LazyLock::new(|| {
+    let part = |name| Member::new(name, Kind::Scalar(Scalar::U32), 4);
+    Members::new(vec![part("secs"), part("nsecs")])
+});

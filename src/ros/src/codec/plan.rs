@@ -29,7 +29,7 @@ pub(crate) struct Plan {
     /// This is `std_msgs/Header`.
     pub(crate) header: bool,
     /// For input: one per field.
-    pub(crate) members: Vec<Member>,
+    pub(crate) members: Members,
     /// For output: one per value after flattening.
     pub(crate) steps: Vec<Step>,
     /// What follows the last value.
@@ -47,12 +47,22 @@ struct Name {
     name: Box<str>,
 }
 
+/// The fields of a message, as input sees them.
+#[derive(Debug, Default)]
+pub(crate) struct Members {
+    list: Vec<Member>,
+    /// Indices into `list`, by name.
+    sorted: Vec<usize>,
+}
+
 /// A field, as input sees it.
 #[derive(Debug)]
 pub(crate) struct Member {
     pub(crate) name: Box<str>,
     /// `"name":`, as most writers put it.
     pub(crate) json_key: Box<[u8]>,
+    /// The name as a string of CBOR.
+    pub(crate) cbor_key: Box<[u8]>,
     pub(crate) kind: Kind,
     pub(crate) min_size: usize,
 }
@@ -142,6 +152,16 @@ impl Scalar {
     }
 }
 
+impl Count {
+    /// No array of this kind has more elements.
+    pub(crate) fn most(self) -> usize {
+        match self {
+            Count::Fixed(count) => count,
+            Count::Variable => usize::MAX,
+        }
+    }
+}
+
 impl Kind {
     fn of(field: &Field) -> Kind {
         let count = match field.arity {
@@ -175,8 +195,8 @@ impl Plan {
             fixed_size: fields.iter().all(Field::is_fixed_size),
             values: Plan::count_values(fields),
             depth: depths.max().unwrap_or(1),
-            header: name == "std_msgs/Header",
-            members: fields.iter().map(Member::of).collect(),
+            header: is_header(name, fields),
+            members: Members::new(fields.iter().map(member).collect()),
             ..Plan::default()
         };
         let mut pending = Pending::default();
@@ -228,8 +248,7 @@ impl Plan {
                 pending.json.push(b',');
             }
             pending.json.extend_from_slice(&json_key(&field.name));
-            head(&mut pending.cbor, TEXT, field.name.len() as u64);
-            pending.cbor.extend_from_slice(field.name.as_bytes());
+            pending.cbor.extend_from_slice(&cbor_key(&field.name));
             self.names.push(Name {
                 outer,
                 name: field.name.as_str().into(),
@@ -271,13 +290,36 @@ struct Pending {
     cbor: Vec<u8>,
 }
 
+impl Members {
+    pub(crate) fn new(list: Vec<Member>) -> Members {
+        let mut sorted: Vec<usize> = (0..list.len()).collect();
+        sorted.sort_unstable_by_key(|index| list[*index].name.as_bytes());
+        Members { list, sorted }
+    }
+
+    /// In order of serialization.
+    #[inline]
+    pub(crate) fn list(&self) -> &[Member] {
+        &self.list
+    }
+
+    /// The field of this name.
+    pub(crate) fn find(&self, name: &[u8]) -> Option<usize> {
+        let found = self
+            .sorted
+            .binary_search_by_key(&name, |index| self.list[*index].name.as_bytes());
+        found.ok().map(|at| self.sorted[at])
+    }
+}
+
 impl Member {
-    fn of(field: &Field) -> Member {
+    pub(crate) fn new(name: &str, kind: Kind, min_size: usize) -> Member {
         Member {
-            name: field.name.as_str().into(),
-            json_key: json_key(&field.name).into(),
-            kind: Kind::of(field),
-            min_size: field.min_size(),
+            name: name.into(),
+            json_key: json_key(name).into(),
+            cbor_key: cbor_key(name).into(),
+            kind,
+            min_size,
         }
     }
 }
@@ -285,4 +327,28 @@ impl Member {
 /// Field names are plain ASCII, so there is nothing to escape.
 fn json_key(name: &str) -> Vec<u8> {
     format!("\"{name}\":").into_bytes()
+}
+
+fn cbor_key(name: &str) -> Vec<u8> {
+    let mut key = Vec::with_capacity(name.len() + 2);
+    head(&mut key, TEXT, name.len() as u64);
+    key.extend_from_slice(name.as_bytes());
+    key
+}
+
+fn member(field: &Field) -> Member {
+    Member::new(&field.name, Kind::of(field), field.min_size())
+}
+
+/// Whether this is `std_msgs/Header` as everyone knows it, with its stamp at byte 4.
+fn is_header(name: &str, fields: &[Field]) -> bool {
+    use Primitive::{String, Time, Uint32};
+    let shape = [("seq", Uint32), ("stamp", Time), ("frame_id", String)];
+    name == "std_msgs/Header"
+        && fields.len() == shape.len()
+        && fields.iter().zip(shape).all(|(field, (name, primitive))| {
+            field.name == name
+                && field.arity == Arity::One
+                && matches!(&field.base, Base::Primitive(found) if *found == primitive)
+        })
 }
