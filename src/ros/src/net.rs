@@ -65,3 +65,18 @@ impl Sockets for HostSockets {
         })
     }
 }
+
+/// The network namespace of this process where that has nothing but `lo`: every host name means loopback.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct LoopbackSockets;
+
+#[async_trait]
+impl Sockets for LoopbackSockets {
+    async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
+        HostSockets.connect(address).await
+    }
+
+    async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
+        HostSockets.listen(address).await
+    }
+}

@@ -1,0 +1,168 @@
+//! Calls to services of other nodes, over persistent connections that are kept between calls.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::time::timeout;
+
+use super::link::broken;
+use super::{HANDSHAKE, Inner};
+use crate::bus::{BusError, Graph, ServiceType};
+use crate::ros1::names::PeerUri;
+use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
+
+/// Connections kept per service while nobody calls.
+const MAX_IDLE: usize = 8;
+
+/// Idle connections, by service.
+#[derive(Default)]
+pub(super) struct CallPool {
+    idle: Mutex<HashMap<String, Vec<ServiceConnection>>>,
+}
+
+impl CallPool {
+    /// A connection that the server has not closed.
+    fn take(&self, service: &str) -> Option<ServiceConnection> {
+        let mut idle = self.idle.lock();
+        let connections = idle.get_mut(service)?;
+        while let Some(connection) = connections.pop() {
+            if !connection.is_stale() {
+                return Some(connection);
+            }
+        }
+        None
+    }
+
+    fn put(&self, service: &str, connection: ServiceConnection) {
+        let mut idle = self.idle.lock();
+        let connections = idle.entry(service.to_owned()).or_default();
+        if connections.len() < MAX_IDLE {
+            connections.push(connection);
+        }
+    }
+
+    /// Drops connections to nodes that no longer serve what they were called for.
+    pub(super) fn keep_current(&self, graph: &Graph) {
+        self.idle.lock().retain(|service, connections| {
+            let Some(server) = graph.services.get(service) else {
+                return false;
+            };
+            connections.retain(|connection| {
+                let said = connection.header().get("callerid");
+                !connection.is_stale() && said.is_none_or(|name| name == server)
+            });
+            !connections.is_empty()
+        });
+    }
+
+    pub(super) fn clear(&self) {
+        self.idle.lock().clear();
+    }
+}
+
+/// Calls once. Tried again only where the server had closed a kept connection before it took the request.
+pub(super) async fn call(
+    bus: &Arc<Inner>,
+    service: &str,
+    request: Bytes,
+    time: Duration,
+) -> Result<Bytes, BusError> {
+    let called = timeout(time, async {
+        loop {
+            let kept = bus.calls.take(service);
+            let reused = kept.is_some();
+            let mut connection = match kept {
+                Some(connection) => connection,
+                None => open(bus, service, ("persistent", "1")).await?,
+            };
+            match connection.call(request.clone()).await {
+                Ok(answer) => {
+                    bus.calls.put(service, connection);
+                    return answer.map_err(|reason| BusError::CallFailed {
+                        service: service.to_owned(),
+                        reason,
+                    });
+                }
+                Err(CallError::NotTaken) if reused => {}
+                Err(CallError::Broken(error)) => return Err(broken(service, error)),
+                Err(error) => {
+                    return Err(BusError::CallFailed {
+                        service: service.to_owned(),
+                        reason: error.to_string(),
+                    });
+                }
+            }
+        }
+    });
+    called.await.unwrap_or_else(|_| {
+        Err(BusError::Timeout {
+            what: format!("service {service}"),
+            after: time,
+        })
+    })
+}
+
+/// Asks a server for its type.
+pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceType, BusError> {
+    if let Some(served) = bus.services.lock().get(service) {
+        return Ok(served.service_type.clone());
+    }
+    let connection = open(bus, service, ("probe", "1")).await?;
+    let header = connection.header();
+    match (header.get("type"), header.get("md5sum")) {
+        (Some(name), Some(md5)) => Ok(ServiceType {
+            name: name.to_owned(),
+            md5: md5.to_owned(),
+        }),
+        _ => Err(BusError::Protocol {
+            what: format!("server of {service}"),
+            reason: "its header has no type and md5sum".to_owned(),
+        }),
+    }
+}
+
+async fn open(
+    bus: &Inner,
+    service: &str,
+    (purpose, flag): (&str, &str),
+) -> Result<ServiceConnection, BusError> {
+    let found = bus
+        .master
+        .ask("lookupService", vec![service.into()])
+        .await?;
+    let uri = match &found {
+        Ok(value) => value.as_str().unwrap_or_default(),
+        Err(_) => return Err(BusError::NoService(service.to_owned())),
+    };
+    let what = || format!("service {service} at {uri}");
+    let place = PeerUri::parse(uri, "rosrpc").ok_or_else(|| BusError::Protocol {
+        what: what(),
+        reason: "its address should look like rosrpc://host:port".to_owned(),
+    })?;
+    let header = Header::new([
+        ("callerid", bus.node.as_str()),
+        ("service", service),
+        ("md5sum", "*"),
+    ])
+    .with(purpose, flag);
+    let opening = async {
+        let resolved = bus.sockets.resolve(&place.host, place.port).await;
+        let address = resolved.map_err(Error::Io)?;
+        ServiceConnection::open(&*bus.sockets, address, &header, bus.max_message).await
+    };
+    match timeout(HANDSHAKE, opening).await {
+        Ok(Ok(connection)) => Ok(connection),
+        Ok(Err(Error::Refused(reason))) => Err(BusError::CallFailed {
+            service: service.to_owned(),
+            reason,
+        }),
+        Ok(Err(error)) => Err(broken(&what(), error)),
+        Err(_) => Err(BusError::Timeout {
+            what: what(),
+            after: HANDSHAKE,
+        }),
+    }
+}

@@ -1,0 +1,264 @@
+//! The connection to one publisher of one topic: found by `requestTopic`, made again while the publisher stays
+//! listed.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use bytes::BytesMut;
+use parking_lot::Mutex;
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::task::AbortHandle;
+use tokio::time::{sleep, timeout};
+
+use super::master_client::to_bus_error;
+use super::subscriptions::TopicIn;
+use super::{HANDSHAKE, Inner};
+use crate::bus::{BusError, Message, WireType};
+use crate::ros1::reply::Reply;
+use crate::ros1::tcpros::{self, FrameReader, Header};
+use crate::ros1::xmlrpc::{Client, Value};
+
+/// Between attempts, at first and at last.
+const PAUSE: Duration = Duration::from_millis(50);
+const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+/// A publisher that is no longer listed may still have messages on the way.
+const GRACE: Duration = Duration::from_secs(2);
+
+/// One publisher, as seen by the topic.
+pub(super) struct Link {
+    pub(super) id: i32,
+    uri: String,
+    listed: watch::Sender<bool>,
+    task: Mutex<Option<AbortHandle>>,
+    peer: Mutex<Option<Arc<WireType>>>,
+    pub(super) connected: AtomicBool,
+    pub(super) messages: AtomicU64,
+    pub(super) bytes: AtomicU64,
+}
+
+impl Link {
+    pub(super) fn uri(&self) -> &str {
+        &self.uri
+    }
+
+    pub(super) fn is_listed(&self) -> bool {
+        *self.listed.borrow()
+    }
+
+    pub(super) fn list(&self, listed: bool) {
+        self.listed
+            .send_if_modified(|before| std::mem::replace(before, listed) != listed);
+    }
+
+    pub(super) fn abort(&self) {
+        if let Some(task) = self.task.lock().take() {
+            task.abort();
+        }
+    }
+
+    /// What the publisher said it publishes, once it was connected.
+    pub(super) fn wire_type(&self) -> Option<Arc<WireType>> {
+        self.peer.lock().clone()
+    }
+}
+
+/// Starts to keep a connection to the publisher at `uri`.
+pub(super) fn start(bus: &Arc<Inner>, topic: &Arc<TopicIn>, uri: &str) -> Arc<Link> {
+    let link = Arc::new(Link {
+        id: bus.id(),
+        uri: uri.to_owned(),
+        listed: watch::Sender::new(true),
+        task: Mutex::new(None),
+        peer: Mutex::new(None),
+        connected: AtomicBool::new(false),
+        messages: AtomicU64::new(0),
+        bytes: AtomicU64::new(0),
+    });
+    let task = bus.spawn(keep(bus.clone(), topic.clone(), link.clone()));
+    *link.task.lock() = Some(task);
+    link
+}
+
+async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
+    let mut listed = link.listed.subscribe();
+    let mut pause = PAUSE;
+    let mut told = String::new();
+    loop {
+        let result = tokio::select! {
+            result = connect_and_read(&bus, &topic, &link) => result,
+            () = left(&mut listed, GRACE) => Ok(()),
+        };
+        if link.connected.swap(false, Ordering::Relaxed) {
+            pause = PAUSE;
+        }
+        if let Err(error) = result {
+            let text = error.to_string();
+            if text != told {
+                tracing::warn!(topic = topic.name, publisher = link.uri, %error, "cannot read from publisher");
+                told = text;
+            }
+        }
+        tokio::select! {
+            () = sleep(pause) => {}
+            () = left(&mut listed, Duration::ZERO) => {}
+        }
+        pause = (pause * 2).min(LONGEST_PAUSE);
+        if !link.is_listed() && topic.released(&link) {
+            return;
+        }
+    }
+}
+
+/// Returns when the publisher has not been listed for `grace`.
+async fn left(listed: &mut watch::Receiver<bool>, grace: Duration) {
+    loop {
+        if listed.wait_for(|listed| !listed).await.is_err() {
+            return;
+        }
+        match timeout(grace, listed.wait_for(|listed| *listed)).await {
+            Ok(Ok(_)) => {}
+            Ok(Err(_)) | Err(_) => return,
+        }
+    }
+}
+
+async fn connect_and_read(
+    bus: &Arc<Inner>,
+    topic: &Arc<TopicIn>,
+    link: &Arc<Link>,
+) -> Result<(), BusError> {
+    let wanted = topic.wanted();
+    let connection = connect(bus, &topic.name, &link.uri, &wanted).await?;
+    let Connection {
+        mut stream,
+        mut frames,
+        publisher,
+        latching,
+        wire_type,
+    } = connection;
+    let wire_type = Arc::new(wire_type);
+    *link.peer.lock() = Some(wire_type.clone());
+    link.connected.store(true, Ordering::Relaxed);
+    let publisher: Arc<str> = publisher.into();
+    loop {
+        let next = frames.next(&mut stream).await;
+        let Some(bytes) = next.map_err(|error| broken(&link.uri, error))? else {
+            return Ok(());
+        };
+        link.messages.fetch_add(1, Ordering::Relaxed);
+        link.bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        topic.deliver(
+            &link.uri,
+            Message {
+                bytes,
+                wire_type: wire_type.clone(),
+                publisher: publisher.clone(),
+                latching,
+            },
+        );
+    }
+}
+
+/// A publisher that has answered our header.
+pub(super) struct Connection {
+    stream: TcpStream,
+    frames: FrameReader,
+    publisher: String,
+    latching: bool,
+    pub(super) wire_type: WireType,
+}
+
+/// Asks the node at `uri` for the topic, connects and exchanges headers.
+pub(super) async fn connect(
+    bus: &Inner,
+    topic: &str,
+    uri: &str,
+    wanted: &WireType,
+) -> Result<Connection, BusError> {
+    let (host, port) = request_topic(bus, topic, uri).await?;
+    let what = || format!("publisher of {topic} at {host}:{port}");
+    let header = Header::new([
+        ("callerid", bus.node.as_str()),
+        ("topic", topic),
+        ("type", &wanted.name),
+        ("md5sum", &wanted.md5),
+        ("tcp_nodelay", "1"),
+    ]);
+    let mut buffer = BytesMut::new();
+    let shake = async {
+        let address = bus.sockets.resolve(&host, port).await?;
+        let mut stream = bus.sockets.connect(address).await?;
+        let answer = header.exchange(&mut stream, &mut buffer).await?;
+        Ok((stream, answer))
+    };
+    let (stream, answer) = match timeout(HANDSHAKE, shake).await {
+        Ok(shaken) => shaken.map_err(|error| broken(&what(), error))?,
+        Err(_) => {
+            return Err(BusError::Timeout {
+                what: what(),
+                after: HANDSHAKE,
+            });
+        }
+    };
+    let wire_type = WireType {
+        name: answer.get("type").unwrap_or("*").to_owned(),
+        md5: answer.get("md5sum").unwrap_or("*").to_owned(),
+        definition: answer.text("message_definition").to_owned(),
+    };
+    if wanted.md5 != "*" && wire_type.md5 != "*" && wanted.md5 != wire_type.md5 {
+        return Err(BusError::TypeMismatch {
+            what: topic.to_owned(),
+            theirs: format!("{} {}", wire_type.name, wire_type.md5),
+            ours: format!("{} {}", wanted.name, wanted.md5),
+        });
+    }
+    Ok(Connection {
+        stream,
+        frames: FrameReader::new(buffer, bus.max_message),
+        publisher: answer.get("callerid").unwrap_or(uri).to_owned(),
+        latching: answer.flag("latching"),
+        wire_type,
+    })
+}
+
+/// Where the node at `uri` serves the topic.
+async fn request_topic(bus: &Inner, topic: &str, uri: &str) -> Result<(String, u16), BusError> {
+    let client = Client::new(bus.sockets.clone(), uri).map_err(to_bus_error)?;
+    let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
+    let args = [bus.node.as_str().into(), topic.into(), protocols];
+    let answer = client.call("requestTopic", &args, HANDSHAKE).await;
+    let refused = |reason: String| BusError::Protocol {
+        what: format!("requestTopic of {uri}"),
+        reason,
+    };
+    let reply = Reply::from_value(answer.map_err(to_bus_error)?)
+        .ok_or_else(|| refused("its answer is not [code, message, value]".to_owned()))?;
+    if reply.code != 1 {
+        return Err(refused(format!("it declined: {}", reply.message)));
+    }
+    let place = match reply.value.as_array() {
+        Some(
+            [
+                Value::String(protocol),
+                Value::String(host),
+                Value::Int(port),
+            ],
+        ) if protocol == "TCPROS" => u16::try_from(*port).ok().map(|port| (host.clone(), port)),
+        _ => None,
+    };
+    place.ok_or_else(|| refused("it offers no TCPROS address".to_owned()))
+}
+
+/// TCPROS's errors as the bus's.
+pub(super) fn broken(what: &str, error: tcpros::Error) -> BusError {
+    let what = what.to_owned();
+    match error {
+        tcpros::Error::Io(source) => BusError::Io { what, source },
+        other => BusError::Protocol {
+            what,
+            reason: other.to_string(),
+        },
+    }
+}

@@ -1,0 +1,278 @@
+//! Topics that this node publishes: several local advertisements share one set of subscribers.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::sync::{mpsc, watch};
+
+use super::Inner;
+use super::registrar::Kind;
+use crate::bus::{AdvertiseOptions, BusError, Publisher, WireType};
+use crate::ros1::tcpros::Outbox;
+
+/// One topic with everyone here who publishes it, and every subscriber.
+#[derive(Default)]
+pub(super) struct TopicOut {
+    state: Mutex<State>,
+    count: watch::Sender<usize>,
+    dropped: AtomicU64,
+}
+
+#[derive(Default)]
+struct State {
+    advert: Option<WireType>,
+    locals: BTreeMap<i32, LocalPublisher>,
+    subscribers: Vec<Arc<Subscriber>>,
+    /// Those who only want to know what subscribers ask for.
+    askers: Vec<mpsc::UnboundedSender<WireType>>,
+}
+
+struct LocalPublisher {
+    latch: bool,
+    queue: usize,
+    last: Option<Bytes>,
+}
+
+/// One connected subscriber.
+pub(super) struct Subscriber {
+    pub(super) id: i32,
+    pub(super) name: String,
+    pub(super) outbox: Outbox,
+    pub(super) messages: AtomicU64,
+    pub(super) bytes: AtomicU64,
+    pub(super) closing: watch::Sender<bool>,
+}
+
+/// Advertises, and registers if this is the topic's first local publisher.
+pub(super) async fn advertise(
+    bus: &Arc<Inner>,
+    name: &str,
+    options: AdvertiseOptions,
+) -> Result<Box<dyn Publisher>, BusError> {
+    let id = bus.id();
+    let topic = {
+        let mut topics = bus.publications.lock();
+        let topic = topics.entry(name.to_owned()).or_default();
+        topic.add(name, id, &options)?;
+        let type_name = options.wire_type.name.as_str();
+        bus.registrar.want(Kind::Publisher, name, Some(type_name));
+        topic.clone()
+    };
+    let handle = Handle {
+        bus: bus.clone(),
+        name: name.to_owned(),
+        topic,
+        id,
+    };
+    bus.registrar.sync(Kind::Publisher, name, false).await?;
+    Ok(Box::new(handle))
+}
+
+/// Makes this node look like a publisher of `name`, so that subscribers connect and say what they want.
+pub(super) fn ask_subscribers(bus: &Arc<Inner>, name: &str) -> Asking {
+    let (sender, answers) = mpsc::unbounded_channel();
+    let mut topics = bus.publications.lock();
+    let topic = topics.entry(name.to_owned()).or_default();
+    let mut state = topic.state.lock();
+    state.askers.push(sender);
+    let type_name = state.advert.as_ref().map_or("*", |advert| &advert.name);
+    bus.registrar.want(Kind::Publisher, name, Some(type_name));
+    drop(state);
+    Asking {
+        bus: bus.clone(),
+        name: name.to_owned(),
+        topic: topic.clone(),
+        answers,
+    }
+}
+
+/// Listening to what subscribers ask for, until dropped.
+pub(super) struct Asking {
+    bus: Arc<Inner>,
+    name: String,
+    topic: Arc<TopicOut>,
+    pub(super) answers: mpsc::UnboundedReceiver<WireType>,
+}
+
+impl Drop for Asking {
+    fn drop(&mut self) {
+        self.answers.close();
+        release(&self.bus, &self.name, &self.topic, |state| {
+            state.askers.retain(|asker| !asker.is_closed());
+        });
+    }
+}
+
+impl TopicOut {
+    fn add(&self, name: &str, id: i32, options: &AdvertiseOptions) -> Result<(), BusError> {
+        let mut state = self.state.lock();
+        let ours = &options.wire_type;
+        match &state.advert {
+            Some(before) if before.md5 != ours.md5 => {
+                return Err(BusError::TypeMismatch {
+                    what: format!("advertisement of {name}"),
+                    theirs: format!("{} {}", before.name, before.md5),
+                    ours: format!("{} {}", ours.name, ours.md5),
+                });
+            }
+            Some(_) => {}
+            None => state.advert = Some(ours.clone()),
+        }
+        let local = LocalPublisher {
+            latch: options.latch,
+            queue: options.queue,
+            last: None,
+        };
+        state.locals.insert(id, local);
+        Ok(())
+    }
+
+    /// What is advertised, and whether newcomers are given something.
+    pub(super) fn advert(&self) -> Option<(WireType, bool)> {
+        let state = self.state.lock();
+        let latching = state.locals.values().any(|local| local.latch);
+        state.advert.clone().map(|advert| (advert, latching))
+    }
+
+    /// Passes on what a subscriber asks for to those who want to know; false if nobody does.
+    pub(super) fn overhear(&self, asked: &WireType) -> bool {
+        let state = self.state.lock();
+        for asker in &state.askers {
+            let _ = asker.send(asked.clone());
+        }
+        !state.askers.is_empty()
+    }
+
+    /// Whether a subscriber that asks where to connect is welcome.
+    pub(super) fn is_open(&self) -> bool {
+        let state = self.state.lock();
+        state.advert.is_some() || !state.askers.is_empty()
+    }
+
+    /// Adds a subscriber, with all that is latched already queued for it; `None` if no longer advertised.
+    pub(super) fn attach(&self, id: i32, name: String) -> Option<Arc<Subscriber>> {
+        let mut state = self.state.lock();
+        state.advert.as_ref()?;
+        let queue = state.locals.values().map(|local| local.queue).max();
+        let latched = state.locals.values().filter_map(|local| local.last.clone());
+        let subscriber = Arc::new(Subscriber {
+            id,
+            name,
+            outbox: Outbox::new(queue.unwrap_or(1), latched),
+            messages: AtomicU64::new(0),
+            bytes: AtomicU64::new(0),
+            closing: watch::Sender::new(false),
+        });
+        state.subscribers.push(subscriber.clone());
+        self.count.send_replace(state.subscribers.len());
+        Some(subscriber)
+    }
+
+    pub(super) fn detach(&self, subscriber: &Arc<Subscriber>) {
+        let mut state = self.state.lock();
+        state
+            .subscribers
+            .retain(|other| !Arc::ptr_eq(other, subscriber));
+        self.count.send_replace(state.subscribers.len());
+    }
+
+    fn publish(&self, id: i32, message: Bytes) {
+        let mut state = self.state.lock();
+        let Some(local) = state.locals.get_mut(&id) else {
+            return;
+        };
+        if local.latch {
+            local.last = Some(message.clone());
+        }
+        let mut lost = 0;
+        let size = message.len() as u64;
+        for subscriber in &state.subscribers {
+            subscriber.messages.fetch_add(1, Ordering::Relaxed);
+            subscriber.bytes.fetch_add(size, Ordering::Relaxed);
+            lost += subscriber.outbox.push(message.clone());
+        }
+        if lost > 0 {
+            self.dropped.fetch_add(lost, Ordering::Relaxed);
+        }
+    }
+
+    /// Publishes no more; what is queued is still sent.
+    pub(super) fn retire(&self) {
+        retire(&mut self.state.lock());
+    }
+
+    /// Returns when all subscribers are gone.
+    pub(super) async fn emptied(&self) {
+        let _ = self.count.subscribe().wait_for(|count| *count == 0).await;
+    }
+
+    /// The connected subscribers.
+    pub(super) fn subscribers(&self) -> Vec<Arc<Subscriber>> {
+        self.state.lock().subscribers.clone()
+    }
+}
+
+fn retire(state: &mut State) {
+    state.advert = None;
+    state.locals.clear();
+    for subscriber in &state.subscribers {
+        subscriber.outbox.close();
+        subscriber.closing.send_replace(true);
+    }
+}
+
+/// Takes something back from a topic, and the topic from the Master when nothing is left of it.
+fn release(bus: &Arc<Inner>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(&mut State)) {
+    {
+        let mut topics = bus.publications.lock();
+        let mut state = topic.state.lock();
+        by(&mut state);
+        if state.locals.is_empty() && state.advert.is_some() {
+            retire(&mut state);
+        }
+        let current = topics.get(name).is_some_and(|t| Arc::ptr_eq(t, topic));
+        if !current || !state.locals.is_empty() || !state.askers.is_empty() {
+            return;
+        }
+        topics.remove(name);
+        bus.registrar.want(Kind::Publisher, name, None);
+    }
+    let (bus_of_task, name) = (bus.clone(), name.to_owned());
+    bus.spawn(async move {
+        let registrar = &bus_of_task.registrar;
+        let _ = registrar.sync(Kind::Publisher, &name, false).await;
+    });
+}
+
+/// One local publisher.
+struct Handle {
+    bus: Arc<Inner>,
+    name: String,
+    topic: Arc<TopicOut>,
+    id: i32,
+}
+
+impl Publisher for Handle {
+    fn publish(&self, bytes: Bytes) {
+        self.topic.publish(self.id, bytes);
+    }
+
+    fn subscribers(&self) -> watch::Receiver<usize> {
+        self.topic.count.subscribe()
+    }
+
+    fn dropped(&self) -> u64 {
+        self.topic.dropped.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        release(&self.bus, &self.name, &self.topic, |state| {
+            state.locals.remove(&self.id);
+        });
+    }
+}

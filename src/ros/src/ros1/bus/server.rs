@@ -1,0 +1,156 @@
+//! The TCPROS server: subscribers of our topics and callers of our services connect here.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::BytesMut;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+use super::publications::{Subscriber, TopicOut};
+use super::{FAREWELL, HANDSHAKE, Inner, services};
+use crate::bus::WireType;
+use crate::ros1::tcpros::{Error, Header};
+
+/// Connections at a time; further ones wait in the backlog.
+const MAX_CONNECTIONS: usize = 4000;
+
+/// Serves until dropped, which also ends every connection.
+pub(super) async fn serve(bus: Arc<Inner>, listener: TcpListener) {
+    let room = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut connections = JoinSet::new();
+    loop {
+        let Ok(permit) = room.clone().acquire_owned().await else {
+            return;
+        };
+        let stream = loop {
+            tokio::select! {
+                accepted = listener.accept() => match accepted {
+                    Ok((stream, _)) => break stream,
+                    Err(error) => {
+                        tracing::warn!(%error, "cannot accept a TCPROS connection");
+                        tokio::time::sleep(Duration::from_millis(100)).await;
+                    }
+                },
+                Some(_) = connections.join_next() => {}
+            }
+        };
+        let bus = bus.clone();
+        connections.spawn(async move {
+            let _permit = permit;
+            let _ = stream.set_nodelay(true);
+            if let Err(error) = connection(&bus, stream).await {
+                tracing::debug!(%error, "a TCPROS connection broke");
+            }
+        });
+    }
+}
+
+async fn connection(bus: &Arc<Inner>, mut stream: TcpStream) -> Result<(), Error> {
+    let mut buffer = BytesMut::new();
+    let header = match timeout(HANDSHAKE, Header::read(&mut stream, &mut buffer)).await {
+        Ok(header) => header?,
+        Err(_) => return Err(Error::Header("it did not come in time".to_owned())),
+    };
+    if let Some(service) = header.get("service") {
+        return services::answer(bus, service, &header, stream, buffer).await;
+    }
+    let Some(name) = header.get("topic") else {
+        return refuse(stream, "the header names neither a topic nor a service").await;
+    };
+    let topic = bus.publications.lock().get(name).cloned();
+    let Some(topic) = topic else {
+        let node = &bus.node;
+        return refuse(stream, &format!("{node} does not publish {name}")).await;
+    };
+    subscriber(bus, &topic, name, &header, stream).await
+}
+
+/// Says why not, and hangs up.
+pub(super) async fn refuse(mut stream: TcpStream, reason: &str) -> Result<(), Error> {
+    Header::error(reason).write(&mut stream).await?;
+    Ok(stream.shutdown().await?)
+}
+
+async fn subscriber(
+    bus: &Arc<Inner>,
+    topic: &Arc<TopicOut>,
+    name: &str,
+    header: &Header,
+    mut stream: TcpStream,
+) -> Result<(), Error> {
+    let asked = WireType {
+        name: header.get("type").unwrap_or("*").to_owned(),
+        md5: header.get("md5sum").unwrap_or("*").to_owned(),
+        definition: header.text("message_definition").to_owned(),
+    };
+    let overheard = topic.overhear(&asked);
+    let caller = header.get("callerid").unwrap_or("unknown");
+    let Some((advert, latching)) = topic.advert() else {
+        if overheard {
+            // It was only asked what it wants: hang up without a word, or it would log an error.
+            return Ok(());
+        }
+        let node = &bus.node;
+        return refuse(stream, &format!("{node} no longer publishes {name}")).await;
+    };
+    if asked.md5 != "*" && advert.md5 != "*" && asked.md5 != advert.md5 {
+        let reason = format!(
+            "{caller} wants topic {name} to have datatype/md5sum [{}/{}], but our version has [{}/{}]; \
+             dropping connection",
+            asked.name, asked.md5, advert.name, advert.md5
+        );
+        tracing::warn!(topic = name, reason, "a subscriber was refused");
+        return refuse(stream, &reason).await;
+    }
+    let Some(subscriber) = topic.attach(bus.id(), caller.to_owned()) else {
+        return Ok(());
+    };
+    let attached = Attached { topic, subscriber };
+    let answer = Header::new([
+        ("callerid", bus.node.as_str()),
+        ("topic", name),
+        ("type", &advert.name),
+        ("md5sum", &advert.md5),
+        ("message_definition", &advert.definition),
+        ("latching", if latching { "1" } else { "0" }),
+    ]);
+    answer.write(&mut stream).await?;
+    attached.serve(stream).await
+}
+
+/// A subscriber in its topic's list, until dropped.
+struct Attached<'a> {
+    topic: &'a TopicOut,
+    subscriber: Arc<Subscriber>,
+}
+
+impl Attached<'_> {
+    async fn serve(&self, mut stream: TcpStream) -> Result<(), Error> {
+        let (mut reading, mut writing) = stream.split();
+        let mut closing = self.subscriber.closing.subscribe();
+        let hung_up = async {
+            let mut ignored = [0; 256];
+            while matches!(reading.read(&mut ignored).await, Ok(count) if count > 0) {}
+        };
+        let too_slow = async {
+            let _ = closing.wait_for(|closing| *closing).await;
+            tokio::time::sleep(FAREWELL).await;
+        };
+        tokio::select! {
+            result = self.subscriber.outbox.drain(&mut writing) => result?,
+            () = hung_up => return Ok(()),
+            () = too_slow => return Ok(()),
+        }
+        Ok(writing.shutdown().await?)
+    }
+}
+
+impl Drop for Attached<'_> {
+    fn drop(&mut self) {
+        self.topic.detach(&self.subscriber);
+    }
+}

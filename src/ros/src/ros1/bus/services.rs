@@ -1,0 +1,129 @@
+//! Services that this node serves.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::BytesMut;
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::Inner;
+use super::registrar::Kind;
+use super::server::refuse;
+use crate::bus::{BusError, ServiceHandler, ServiceType};
+use crate::ros1::tcpros::{Error, Header, serve_calls};
+
+/// For a caller to take a header.
+const TAKE: Duration = Duration::from_secs(10);
+
+/// One service.
+pub(super) struct Served {
+    pub(super) service_type: ServiceType,
+    handler: Arc<dyn ServiceHandler>,
+    ended: watch::Sender<bool>,
+}
+
+/// Serves until the guard is dropped.
+pub(super) async fn serve(
+    bus: &Arc<Inner>,
+    name: &str,
+    service_type: ServiceType,
+    handler: Arc<dyn ServiceHandler>,
+) -> Result<Box<dyn Send + Sync>, BusError> {
+    let served = Arc::new(Served {
+        service_type,
+        handler,
+        ended: watch::Sender::new(false),
+    });
+    {
+        let mut services = bus.services.lock();
+        if services.contains_key(name) {
+            return Err(BusError::AlreadyServed(name.to_owned()));
+        }
+        services.insert(name.to_owned(), served.clone());
+        let type_name = served.service_type.name.as_str();
+        bus.registrar.want(Kind::Service, name, Some(type_name));
+    }
+    let guard = Guard {
+        bus: bus.clone(),
+        name: name.to_owned(),
+        served,
+    };
+    bus.registrar.sync(Kind::Service, name, false).await?;
+    Ok(Box::new(guard))
+}
+
+struct Guard {
+    bus: Arc<Inner>,
+    name: String,
+    served: Arc<Served>,
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        self.served.ended.send_replace(true);
+        {
+            let mut services = self.bus.services.lock();
+            let current = services.get(&self.name);
+            if !current.is_some_and(|served| Arc::ptr_eq(served, &self.served)) {
+                return;
+            }
+            services.remove(&self.name);
+            self.bus.registrar.want(Kind::Service, &self.name, None);
+        }
+        let (bus, name) = (self.bus.clone(), self.name.clone());
+        self.bus.spawn(async move {
+            let _ = bus.registrar.sync(Kind::Service, &name, false).await;
+        });
+    }
+}
+
+/// Serves one caller, whose header was read.
+pub(super) async fn answer(
+    bus: &Arc<Inner>,
+    name: &str,
+    header: &Header,
+    mut stream: TcpStream,
+    buffer: BytesMut,
+) -> Result<(), Error> {
+    let served = bus.services.lock().get(name).cloned();
+    let Some(served) = served else {
+        return refuse(stream, &format!("{} does not serve {name}", bus.node)).await;
+    };
+    let ours = &served.service_type;
+    let asked = header.get("md5sum").unwrap_or("*");
+    if asked != "*" && ours.md5 != "*" && asked != ours.md5 {
+        let reason = format!(
+            "client wants service {name} to have md5sum {asked}, but it has {}; dropping connection",
+            ours.md5
+        );
+        return refuse(stream, &reason).await;
+    }
+    let answer = Header::new([
+        ("callerid", bus.node.as_str()),
+        ("service", name),
+        ("type", &ours.name),
+        ("md5sum", &ours.md5),
+        ("request_type", &format!("{}Request", ours.name)),
+        ("response_type", &format!("{}Response", ours.name)),
+    ]);
+    match timeout(TAKE, answer.write(&mut stream)).await {
+        Ok(written) => written?,
+        Err(_) => return Ok(()),
+    }
+    if header.flag("probe") {
+        return Ok(stream.shutdown().await?);
+    }
+    let caller = header.get("callerid").unwrap_or("unknown");
+    serve_calls(
+        stream,
+        buffer,
+        (caller, header.flag("persistent")),
+        &*served.handler,
+        bus.max_message,
+        served.ended.subscribe(),
+    )
+    .await
+}

@@ -1,0 +1,240 @@
+//! Topics that this node subscribes to: several local subscriptions share one set of connections.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+
+use super::Inner;
+use super::link::{self, Link};
+use super::registrar::Kind;
+use crate::bus::{
+    BusError, Message, MessageSender, SubscribeOptions, Subscription, WireType, message_queue,
+};
+use crate::ros1::tcpros;
+
+/// One topic with everyone here who wants it and every publisher of it.
+pub(super) struct TopicIn {
+    pub(super) name: String,
+    locals: Mutex<Locals>,
+    links: Mutex<Links>,
+}
+
+/// One connection per publisher, by its address.
+#[derive(Default)]
+struct Links {
+    by_uri: BTreeMap<String, Arc<Link>>,
+    ended: bool,
+}
+
+#[derive(Default)]
+struct Locals {
+    list: Vec<Local>,
+    /// The last message of each latching publisher, by its address: for locals that come later.
+    latched: HashMap<String, Message>,
+}
+
+struct Local {
+    id: i32,
+    sender: MessageSender,
+    wanted: Option<WireType>,
+}
+
+impl Local {
+    fn takes(&self, offered: &WireType) -> bool {
+        let Some(wanted) = &self.wanted else {
+            return true;
+        };
+        wanted.md5 == "*" || offered.md5 == "*" || wanted.md5 == offered.md5
+    }
+
+    fn send(&self, message: Message) {
+        if self.takes(&message.wire_type) {
+            self.sender.send(message);
+        }
+    }
+}
+
+/// Subscribes, and registers if this is the topic's first local subscription.
+pub(super) async fn subscribe(
+    bus: &Arc<Inner>,
+    name: &str,
+    options: SubscribeOptions,
+) -> Result<Subscription, BusError> {
+    let (sender, messages) = message_queue(options.queue);
+    let id = bus.id();
+    let (topic, first) = {
+        let mut topics = bus.subscriptions.lock();
+        let mut first = false;
+        let topic = topics.entry(name.to_owned()).or_insert_with(|| {
+            first = true;
+            Arc::new(TopicIn {
+                name: name.to_owned(),
+                locals: Mutex::default(),
+                links: Mutex::default(),
+            })
+        });
+        topic.add(Local {
+            id,
+            sender,
+            wanted: options.wire_type,
+        });
+        bus.registrar
+            .want(Kind::Subscriber, name, Some(&topic.type_name()));
+        (topic.clone(), first)
+    };
+    let guard = Guard {
+        bus: bus.clone(),
+        topic: topic.clone(),
+        id,
+    };
+    // Of a new set of connections the publishers must be learnt, even if an earlier registration still stands.
+    let answer = bus.registrar.sync(Kind::Subscriber, name, first).await?;
+    if let Some(publishers) = answer {
+        topic.update(bus, &publishers.to_strings());
+    }
+    Ok(Subscription {
+        dropped: messages.dropped(),
+        messages,
+        guard: Box::new(guard),
+    })
+}
+
+impl TopicIn {
+    fn add(&self, local: Local) {
+        let mut locals = self.locals.lock();
+        for message in locals.latched.values() {
+            local.send(message.clone());
+        }
+        locals.list.push(local);
+    }
+
+    /// What publishers are asked for: the type all locals agree on, or any.
+    pub(super) fn wanted(&self) -> WireType {
+        let locals = self.locals.lock();
+        let any = || WireType {
+            name: "*".to_owned(),
+            md5: "*".to_owned(),
+            definition: String::new(),
+        };
+        let mut types = locals.list.iter().map(|local| local.wanted.as_ref());
+        match types.next() {
+            Some(Some(first)) if types.all(|other| other.is_some_and(|o| o.md5 == first.md5)) => {
+                first.clone()
+            }
+            _ => any(),
+        }
+    }
+
+    /// What the Master is told: the first type that anyone here named.
+    pub(super) fn type_name(&self) -> String {
+        let locals = self.locals.lock();
+        let mut types = locals.list.iter().filter_map(|local| local.wanted.as_ref());
+        let named = types.find(|wanted| wanted.name != "*");
+        named.map_or("*", |wanted| &wanted.name).to_owned()
+    }
+
+    /// Takes a message of the publisher at `uri`.
+    pub(super) fn deliver(&self, uri: &str, message: Message) {
+        let mut locals = self.locals.lock();
+        if message.latching {
+            // Kept for long: it must not hold on to the buffer it came in with its neighbours.
+            let kept = if message.bytes.len() < tcpros::BIG {
+                Message {
+                    bytes: Bytes::copy_from_slice(&message.bytes),
+                    ..message.clone()
+                }
+            } else {
+                message.clone()
+            };
+            locals.latched.insert(uri.to_owned(), kept);
+        }
+        if let Some((last, others)) = locals.list.split_last() {
+            for local in others {
+                local.send(message.clone());
+            }
+            last.send(message);
+        }
+    }
+
+    /// Connects to publishers that are new and lets go of those no longer listed.
+    pub(super) fn update(self: &Arc<Self>, bus: &Arc<Inner>, publishers: &[String]) {
+        let mut links = self.links.lock();
+        if links.ended {
+            return;
+        }
+        for (uri, link) in &links.by_uri {
+            link.list(publishers.contains(uri));
+        }
+        for uri in publishers {
+            let known = links.by_uri.contains_key(uri);
+            // What this bus publishes itself is not brought back to it.
+            if !known && uri != bus.registrar.slave_uri() {
+                let link = link::start(bus, self, uri);
+                links.by_uri.insert(uri.clone(), link);
+            }
+        }
+    }
+
+    /// The link has ended, unless it was listed again meanwhile.
+    pub(super) fn released(&self, link: &Arc<Link>) -> bool {
+        let mut links = self.links.lock();
+        if link.is_listed() {
+            return false;
+        }
+        links.by_uri.remove(link.uri());
+        self.locals.lock().latched.remove(link.uri());
+        true
+    }
+
+    /// Closes all connections and ends all local subscriptions.
+    pub(super) fn end(&self) {
+        let mut links = self.links.lock();
+        links.ended = true;
+        for link in std::mem::take(&mut links.by_uri).into_values() {
+            link.abort();
+        }
+        *self.locals.lock() = Locals::default();
+    }
+
+    /// The connections to publishers.
+    pub(super) fn links(&self) -> Vec<Arc<Link>> {
+        self.links.lock().by_uri.values().cloned().collect()
+    }
+}
+
+/// One local subscription.
+struct Guard {
+    bus: Arc<Inner>,
+    topic: Arc<TopicIn>,
+    id: i32,
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        let bus = &self.bus;
+        let name = &self.topic.name;
+        {
+            let mut topics = bus.subscriptions.lock();
+            let empty = {
+                let mut locals = self.topic.locals.lock();
+                locals.list.retain(|local| local.id != self.id);
+                locals.list.is_empty()
+            };
+            let current = topics
+                .get(name)
+                .is_some_and(|t| Arc::ptr_eq(t, &self.topic));
+            if !empty || !current {
+                return;
+            }
+            topics.remove(name);
+            bus.registrar.want(Kind::Subscriber, name, None);
+        }
+        self.topic.end();
+        let (bus, name) = (bus.clone(), name.clone());
+        self.bus.spawn(async move {
+            let _ = bus.registrar.sync(Kind::Subscriber, &name, false).await;
+        });
+    }
+}

@@ -1,0 +1,91 @@
+//! What type a topic has, asked of its ends.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::timeout;
+
+use super::registrar::Kind;
+use super::{Inner, link, publications, watcher};
+use crate::bus::{BusError, Graph, TopicNodes, WireType};
+
+/// For a topic's subscribers to connect to us and say what they want.
+const ANSWER: Duration = Duration::from_secs(3);
+
+/// The type by whatever is at hand: what we advertise, what we are connected to, a publisher's header, what
+/// subscribers ask for. Where only a name is known (all ends take any md5), md5 is `*`.
+pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusError> {
+    let ours = bus.publications.lock().get(name).cloned();
+    if let Some((advert, _)) = ours.as_ref().and_then(|topic| topic.advert()) {
+        return Ok(advert);
+    }
+    let subscribed = bus.subscriptions.lock().get(name).cloned();
+    let links = subscribed.map(|topic| topic.links()).unwrap_or_default();
+    if let Some(known) = links.iter().find_map(|link| link.wire_type()) {
+        return Ok(WireType::clone(&known));
+    }
+    // What was registered a moment ago may not have reached our own graph yet.
+    let graph = watcher::fetch(bus).await?;
+    let Some(topic) = graph.topics.get(name) else {
+        return Err(BusError::NoTopic(name.to_owned()));
+    };
+    let mut failure = None;
+    let publishers = topic.publishers.iter().filter(|node| **node != bus.node);
+    for uri in publishers.filter_map(|node| graph.nodes.get(node)) {
+        match link::connect(bus, name, uri, &any()).await {
+            Ok(connection) if connection.wire_type.md5 != "*" => return Ok(connection.wire_type),
+            Ok(_) => {}
+            Err(error) => failure = Some(error),
+        }
+    }
+    if let Some(asked) = subscribers(bus, name, topic, &graph).await? {
+        return Ok(asked);
+    }
+    match failure {
+        _ if topic.type_name != "*" => Ok(WireType {
+            name: topic.type_name.clone(),
+            ..any()
+        }),
+        Some(failure) => Err(failure),
+        None => Ok(any()),
+    }
+}
+
+fn any() -> WireType {
+    WireType {
+        name: "*".to_owned(),
+        md5: "*".to_owned(),
+        definition: String::new(),
+    }
+}
+
+/// What the topic's subscribers ask for, the first that asks for something particular.
+async fn subscribers(
+    bus: &Arc<Inner>,
+    name: &str,
+    topic: &TopicNodes,
+    graph: &Graph,
+) -> Result<Option<WireType>, BusError> {
+    let others = |node: &&String| **node != bus.node && graph.nodes.contains_key(*node);
+    let mut missing = topic.subscribers.iter().filter(others).count();
+    if missing == 0 {
+        return Ok(None);
+    }
+    let mut asking = publications::ask_subscribers(bus, name);
+    bus.registrar.sync(Kind::Publisher, name, false).await?;
+    let heard = timeout(ANSWER, async {
+        let mut best = None;
+        while missing > 0 {
+            let Some(asked) = asking.answers.recv().await else {
+                break;
+            };
+            if asked.md5 != "*" {
+                return Some(asked);
+            }
+            missing -= 1;
+            best = best.or(Some(asked).filter(|asked| asked.name != "*"));
+        }
+        best
+    });
+    Ok(heard.await.unwrap_or(None))
+}

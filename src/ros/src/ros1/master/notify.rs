@@ -1,0 +1,176 @@
+//! Calls from the Master to nodes: in order per node, concurrently between nodes, newest wins.
+//!
+//! A node that hangs keeps its own news waiting and nobody else's; it gets the newest state once it answers
+//! again, or is forgotten with its registrations.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use parking_lot::Mutex;
+use tokio::sync::Notify;
+use tokio::time::timeout;
+
+use super::Inner;
+use crate::ros1::xmlrpc::{Client, Error, Value};
+
+/// How the Master signs its calls.
+const CALLER: &str = "/master";
+/// For one attempt.
+const ANSWER: Duration = Duration::from_secs(10);
+/// After a node did not answer in time.
+const PAUSE: Duration = Duration::from_secs(2);
+/// How long the connection to a node is kept after the last news.
+const LINGER: Duration = Duration::from_secs(2);
+
+/// Something one node must be told.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Notice {
+    /// The node's XML-RPC address.
+    pub(super) api: String,
+    subject: Subject,
+    params: Vec<Value>,
+}
+
+/// What a notice is about; a newer notice of the same subject replaces an older one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Subject {
+    Publishers(String),
+    Parameter(String),
+    Shutdown,
+}
+
+impl Subject {
+    fn method(&self) -> &'static str {
+        match self {
+            Subject::Publishers(_) => "publisherUpdate",
+            Subject::Parameter(_) => "paramUpdate",
+            Subject::Shutdown => "shutdown",
+        }
+    }
+}
+
+impl Notice {
+    pub(super) fn publishers(api: &str, topic: &str, publishers: &[String]) -> Self {
+        Self {
+            api: api.to_owned(),
+            subject: Subject::Publishers(topic.to_owned()),
+            params: vec![
+                CALLER.into(),
+                topic.into(),
+                Value::strings(publishers.iter().cloned()),
+            ],
+        }
+    }
+
+    pub(super) fn parameter(api: String, key: String, value: Value) -> Self {
+        Self {
+            api,
+            subject: Subject::Parameter(key.clone()),
+            params: vec![CALLER.into(), key.into(), value],
+        }
+    }
+
+    pub(super) fn shutdown(api: &str, reason: &str) -> Self {
+        Self {
+            api: api.to_owned(),
+            subject: Subject::Shutdown,
+            params: vec![CALLER.into(), reason.into()],
+        }
+    }
+}
+
+/// The queues; a node with an entry has a task that works it off.
+#[derive(Debug, Default)]
+pub(super) struct Notifier {
+    queues: Mutex<HashMap<String, Queue>>,
+}
+
+#[derive(Debug, Default)]
+struct Queue {
+    notices: VecDeque<Notice>,
+    more: Arc<Notify>,
+}
+
+impl Notifier {
+    /// Queues the notices, in this order, and starts the tasks that are missing.
+    pub(super) fn send(master: &Arc<Inner>, notices: Vec<Notice>) {
+        let mut queues = master.notifier.queues.lock();
+        for notice in notices {
+            let queue = queues.entry(notice.api.clone()).or_insert_with(|| {
+                let queue = Queue::default();
+                let more = queue.more.clone();
+                tokio::spawn(work(master.clone(), notice.api.clone(), more));
+                queue
+            });
+            let replaces = |older: &Notice| older.subject == notice.subject;
+            queue.notices.retain(|older| !replaces(older));
+            queue.notices.push_back(notice);
+            queue.more.notify_one();
+        }
+    }
+
+    fn next(&self, api: &str) -> Option<Notice> {
+        self.queues.lock().get_mut(api)?.notices.pop_front()
+    }
+
+    /// Puts a notice back unless a newer one of its subject came meanwhile.
+    fn retry(&self, notice: Notice) {
+        if let Some(queue) = self.queues.lock().get_mut(&notice.api) {
+            let notices = &mut queue.notices;
+            if notices.iter().all(|newer| newer.subject != notice.subject) {
+                notices.push_front(notice);
+            }
+        }
+    }
+
+    /// Ends the node's queue if it is empty, or whatever it holds.
+    fn finish(&self, api: &str, even_if_full: bool) -> bool {
+        let mut queues = self.queues.lock();
+        let done = even_if_full || queues.get(api).is_none_or(|queue| queue.notices.is_empty());
+        if done {
+            queues.remove(api);
+        }
+        done
+    }
+}
+
+async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
+    let notifier = &master.notifier;
+    let Ok(client) = Client::new(master.sockets(), &api) else {
+        notifier.finish(&api, true);
+        return;
+    };
+    let mut recovering = false;
+    loop {
+        let Some(notice) = notifier.next(&api) else {
+            // News come in bursts: the connection is worth keeping for a moment.
+            if timeout(LINGER, more.notified()).await.is_err() && notifier.finish(&api, false) {
+                return;
+            }
+            continue;
+        };
+        let method = notice.subject.method();
+        match client.call(method, &notice.params, ANSWER).await {
+            Ok(_) if recovering => {
+                // It may yet take up older calls that timed out: make this the last word.
+                recovering = false;
+                tokio::time::sleep(PAUSE).await;
+                notifier.retry(notice);
+            }
+            Ok(_) => {}
+            Err(Error::Timeout { .. }) if notice.subject != Subject::Shutdown => {
+                tracing::warn!(%api, method, "the node does not answer; trying again");
+                recovering = true;
+                tokio::time::sleep(PAUSE).await;
+                if master.is_known(&api) {
+                    notifier.retry(notice);
+                }
+            }
+            Err(error) => {
+                // Nobody is there (process_exited will see to that), or it does not want to know.
+                tracing::debug!(%api, method, %error, "the node was not told");
+            }
+        }
+    }
+}

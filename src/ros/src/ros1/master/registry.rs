@@ -1,0 +1,339 @@
+//! Who publishes, subscribes to and serves what. Pure state: what other nodes must be told comes back as
+//! [`Notice`]s.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+
+use super::notify::Notice;
+use crate::bus::TopicNodes;
+
+/// Registrations of all nodes together, at most: a node gone wild must not eat the host's memory.
+const MAX_REGISTRATIONS: usize = 50_000;
+/// The type of a topic of which nobody has said it yet.
+pub(crate) const ANY_TYPE: &str = "*";
+
+/// One kind of registration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Publisher,
+    Subscriber,
+    Service,
+    Parameter,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Node {
+    api: String,
+    publishes: BTreeSet<String>,
+    subscribes: BTreeSet<String>,
+    serves: BTreeSet<String>,
+    watches: BTreeSet<String>,
+}
+
+impl Node {
+    fn new(api: &str) -> Self {
+        Self {
+            api: api.to_owned(),
+            publishes: BTreeSet::new(),
+            subscribes: BTreeSet::new(),
+            serves: BTreeSet::new(),
+            watches: BTreeSet::new(),
+        }
+    }
+
+    fn names(&mut self, kind: Kind) -> &mut BTreeSet<String> {
+        match kind {
+            Kind::Publisher => &mut self.publishes,
+            Kind::Subscriber => &mut self.subscribes,
+            Kind::Service => &mut self.serves,
+            Kind::Parameter => &mut self.watches,
+        }
+    }
+
+    fn is_idle(&self) -> bool {
+        self.publishes.is_empty()
+            && self.subscribes.is_empty()
+            && self.serves.is_empty()
+            && self.watches.is_empty()
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Service {
+    node: String,
+    api: String,
+}
+
+/// All registrations.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Registry {
+    nodes: BTreeMap<String, Node>,
+    /// Topics with their ends in the order registered. Kept without ends too: ROS remembers types.
+    topics: BTreeMap<String, Topic>,
+    services: BTreeMap<String, Service>,
+    count: usize,
+    /// Grows with everything that really changed.
+    #[serde(skip)]
+    version: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Topic {
+    type_name: String,
+    publishers: Vec<String>,
+    subscribers: Vec<String>,
+}
+
+/// The registry is full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Full;
+
+impl Registry {
+    /// Registers `node` under `name`. For services `service_api` says where it is served.
+    pub(super) fn register(
+        &mut self,
+        kind: Kind,
+        name: &str,
+        type_name: &str,
+        (node, api): (&str, &str),
+        service_api: &str,
+        notices: &mut Vec<Notice>,
+    ) -> Result<(), Full> {
+        if self.count >= MAX_REGISTRATIONS || self.topics.len() >= MAX_REGISTRATIONS {
+            return Err(Full);
+        }
+        let before = self.nodes.get(node).map(|found| found.api.clone());
+        if let Some(old) = before.filter(|old| old != api) {
+            self.drop_node(node, notices);
+            notices.push(Notice::shutdown(&old, "new node registered with same name"));
+        }
+        let entry = self
+            .nodes
+            .entry(node.to_owned())
+            .or_insert_with(|| Node::new(api));
+        let new = entry.names(kind).insert(name.to_owned());
+        self.count += usize::from(new);
+        self.version += u64::from(new);
+        match kind {
+            Kind::Publisher | Kind::Subscriber => {
+                let topic = self.topics.entry(name.to_owned()).or_insert_with(|| Topic {
+                    type_name: ANY_TYPE.to_owned(),
+                    publishers: Vec::new(),
+                    subscribers: Vec::new(),
+                });
+                // As rosmaster: what a publisher says counts, a subscriber only fills the gap.
+                let counts = kind == Kind::Publisher || topic.type_name == ANY_TYPE;
+                if counts && type_name != ANY_TYPE && type_name != topic.type_name {
+                    topic.type_name = type_name.to_owned();
+                    self.version += 1;
+                }
+                if new {
+                    let ends = match kind {
+                        Kind::Publisher => &mut topic.publishers,
+                        _ => &mut topic.subscribers,
+                    };
+                    ends.push(node.to_owned());
+                }
+                if kind == Kind::Publisher {
+                    self.tell_subscribers(name, notices);
+                }
+            }
+            Kind::Service => {
+                let service = Service {
+                    node: node.to_owned(),
+                    api: service_api.to_owned(),
+                };
+                let before = self.services.insert(name.to_owned(), service);
+                if let Some(other) = before.filter(|before| before.node != node) {
+                    self.release(&other.node, Kind::Service, name);
+                }
+            }
+            Kind::Parameter => {}
+        }
+        Ok(())
+    }
+
+    /// Takes a registration back; false if `node` at `api` holds none.
+    pub(super) fn unregister(
+        &mut self,
+        kind: Kind,
+        name: &str,
+        node: &str,
+        api: &str,
+        notices: &mut Vec<Notice>,
+    ) -> bool {
+        let held_at = match kind {
+            Kind::Service => self
+                .services
+                .get(name)
+                .filter(|service| service.node == node)
+                .map(|service| service.api.as_str()),
+            _ => self.nodes.get(node).map(|found| found.api.as_str()),
+        };
+        if held_at != Some(api) || !self.holds(kind, name, node) {
+            return false;
+        }
+        self.detach(kind, name, node, notices);
+        self.release(node, kind, name);
+        true
+    }
+
+    /// Drops every registration of `node`.
+    pub(super) fn drop_node(&mut self, node: &str, notices: &mut Vec<Notice>) {
+        let Some(gone) = self.nodes.remove(node) else {
+            return;
+        };
+        self.version += 1;
+        let kinds = [
+            (Kind::Publisher, gone.publishes),
+            (Kind::Subscriber, gone.subscribes),
+            (Kind::Service, gone.serves),
+            (Kind::Parameter, gone.watches),
+        ];
+        for (kind, names) in kinds {
+            self.count -= names.len();
+            for name in names {
+                self.detach(kind, &name, node, notices);
+            }
+        }
+    }
+
+    fn holds(&self, kind: Kind, name: &str, node: &str) -> bool {
+        self.nodes.get(node).is_some_and(|found| match kind {
+            Kind::Publisher => found.publishes.contains(name),
+            Kind::Subscriber => found.subscribes.contains(name),
+            Kind::Service => found.serves.contains(name),
+            Kind::Parameter => found.watches.contains(name),
+        })
+    }
+
+    /// Removes a registration from the node's side, and the node with its last one.
+    fn release(&mut self, node: &str, kind: Kind, name: &str) {
+        let Some(entry) = self.nodes.get_mut(node) else {
+            return;
+        };
+        self.count -= usize::from(entry.names(kind).remove(name));
+        self.version += 1;
+        if entry.is_idle() {
+            self.nodes.remove(node);
+        }
+    }
+
+    /// Removes a registration from the side of what is registered.
+    fn detach(&mut self, kind: Kind, name: &str, node: &str, notices: &mut Vec<Notice>) {
+        match kind {
+            Kind::Publisher => {
+                if let Some(topic) = self.topics.get_mut(name) {
+                    topic.publishers.retain(|other| other != node);
+                }
+                self.tell_subscribers(name, notices);
+            }
+            Kind::Subscriber => {
+                if let Some(topic) = self.topics.get_mut(name) {
+                    topic.subscribers.retain(|other| other != node);
+                }
+            }
+            Kind::Service => {
+                if self.services.get(name).is_some_and(|s| s.node == node) {
+                    self.services.remove(name);
+                }
+            }
+            Kind::Parameter => {}
+        }
+    }
+
+    fn tell_subscribers(&self, name: &str, notices: &mut Vec<Notice>) {
+        let publishers = self.publisher_apis(name);
+        for api in self.subscriber_apis(name) {
+            notices.push(Notice::publishers(&api, name, &publishers));
+        }
+    }
+
+    /// Addresses of a topic's publishers.
+    pub(super) fn publisher_apis(&self, topic: &str) -> Vec<String> {
+        let topic = self.topics.get(topic);
+        self.apis(topic.map_or(&[], |topic| &topic.publishers))
+    }
+
+    /// Addresses of a topic's subscribers.
+    pub(super) fn subscriber_apis(&self, topic: &str) -> Vec<String> {
+        let topic = self.topics.get(topic);
+        self.apis(topic.map_or(&[], |topic| &topic.subscribers))
+    }
+
+    fn apis(&self, nodes: &[String]) -> Vec<String> {
+        let known = nodes.iter().filter_map(|name| self.nodes.get(name));
+        known.map(|node| node.api.clone()).collect()
+    }
+
+    /// Grows with everything that really changed.
+    pub(super) fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// A node's address.
+    pub(super) fn node_api(&self, node: &str) -> Option<&str> {
+        self.nodes.get(node).map(|found| found.api.as_str())
+    }
+
+    /// Whether any node lives at `api`.
+    pub(super) fn is_known(&self, api: &str) -> bool {
+        self.nodes.values().any(|node| node.api == api)
+    }
+
+    /// Where a service is served.
+    pub(super) fn service_api(&self, service: &str) -> Option<&str> {
+        self.services.get(service).map(|found| found.api.as_str())
+    }
+
+    /// All nodes with their addresses.
+    pub(super) fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.nodes
+            .iter()
+            .map(|(name, node)| (name.as_str(), node.api.as_str()))
+    }
+
+    /// All services with the nodes that serve them.
+    pub(super) fn services(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.services
+            .iter()
+            .map(|(name, service)| (name.as_str(), service.node.as_str()))
+    }
+
+    /// All topics whose type somebody has ever said.
+    pub(super) fn types(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.topics
+            .iter()
+            .map(|(name, topic)| (name.as_str(), topic.type_name.as_str()))
+    }
+
+    /// Topics that have an end now.
+    pub(super) fn topics(&self) -> impl Iterator<Item = (&str, TopicNodes)> {
+        self.topics
+            .iter()
+            .filter(|(_, topic)| !topic.publishers.is_empty() || !topic.subscribers.is_empty())
+            .map(|(name, topic)| {
+                let ends = TopicNodes {
+                    type_name: topic.type_name.clone(),
+                    publishers: topic.publishers.clone(),
+                    subscribers: topic.subscribers.clone(),
+                };
+                (name.as_str(), ends)
+            })
+    }
+
+    /// Addresses of those who subscribed to a parameter, by the key they gave.
+    pub(super) fn parameter_watchers(&self) -> BTreeMap<String, Vec<String>> {
+        let mut watchers: BTreeMap<String, Vec<String>> = BTreeMap::new();
+        for node in self.nodes.values() {
+            for key in &node.watches {
+                watchers
+                    .entry(key.clone())
+                    .or_default()
+                    .push(node.api.clone());
+            }
+        }
+        watchers
+    }
+}

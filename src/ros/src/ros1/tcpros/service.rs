@@ -1,0 +1,153 @@
+//! Service calls over TCPROS, both ends.
+//!
+//! After the headers: request = length and bytes; response = one byte (1 done, 0 failed), length and bytes (of
+//! the answer, or of the reason). Persistent connections carry one call after the other.
+
+use std::io;
+use std::net::SocketAddr;
+
+use bytes::{Bytes, BytesMut};
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+
+use super::{Error, FrameReader, Header, write_messages};
+use crate::bus::ServiceHandler;
+use crate::net::Sockets;
+
+/// A connection to a service's server, ready for calls.
+#[derive(Debug)]
+pub struct ServiceConnection {
+    stream: TcpStream,
+    frames: FrameReader,
+    header: Header,
+}
+
+/// A call that got no response.
+#[derive(Debug, thiserror::Error)]
+pub enum CallError {
+    /// The server had closed the connection before it took the request: calling again elsewhere is safe.
+    #[error("the server had closed the connection")]
+    NotTaken,
+    /// The server closed after it may have taken the request.
+    #[error("the server closed the connection during the call")]
+    Abandoned,
+    /// Anything else.
+    #[error(transparent)]
+    Broken(#[from] Error),
+}
+
+impl ServiceConnection {
+    /// Connects and exchanges headers.
+    pub async fn open(
+        sockets: &dyn Sockets,
+        address: SocketAddr,
+        header: &Header,
+        max: usize,
+    ) -> Result<Self, Error> {
+        let mut stream = sockets.connect(address).await?;
+        let mut buffer = BytesMut::new();
+        let header = header.exchange(&mut stream, &mut buffer).await?;
+        Ok(Self {
+            stream,
+            frames: FrameReader::new(buffer, max),
+            header,
+        })
+    }
+
+    /// What the server said of itself.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Whether the server has closed (or said something nobody asked for) while the connection lay idle.
+    pub fn is_stale(&self) -> bool {
+        let mut byte = [0];
+        !self.frames.is_empty()
+            || !matches!(self.stream.try_read(&mut byte),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock)
+    }
+
+    /// One call: the answer, or the reason that the server gave for having none. After an error, or when the
+    /// call is dropped half-way, the connection must be dropped too.
+    pub async fn call(&mut self, request: Bytes) -> Result<Result<Bytes, String>, CallError> {
+        if let Err(error) = write_messages(&mut self.stream, &[request]).await {
+            return Err(if was_reset(&error) {
+                CallError::NotTaken
+            } else {
+                CallError::Broken(error.into())
+            });
+        }
+        let done = match self.frames.byte(&mut self.stream).await {
+            Ok(Some(byte)) => byte,
+            Ok(None) => return Err(self.closed()),
+            // Reset: request bytes had not been read when the server closed.
+            Err(Error::Io(error)) if was_reset(&error) => return Err(CallError::NotTaken),
+            Err(error) => return Err(error.into()),
+        };
+        let payload = match self.frames.next(&mut self.stream).await? {
+            Some(payload) => payload,
+            None => return Err(Error::from(io::Error::from(io::ErrorKind::UnexpectedEof)).into()),
+        };
+        Ok(match done {
+            0 => Err(String::from_utf8_lossy(&payload).into_owned()),
+            _ => Ok(payload),
+        })
+    }
+
+    /// The stream ended instead of a response. If the server's end came first, the kernel has meanwhile had the
+    /// request refused, and keeps that as the socket's error.
+    fn closed(&self) -> CallError {
+        match self.stream.take_error() {
+            Ok(Some(error)) if was_reset(&error) => CallError::NotTaken,
+            _ => CallError::Abandoned,
+        }
+    }
+}
+
+fn was_reset(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe
+    )
+}
+
+/// Serves the calls of one connection whose headers were exchanged, until `ended` between two calls.
+pub async fn serve_calls(
+    mut stream: TcpStream,
+    buffer: BytesMut,
+    (caller, persistent): (&str, bool),
+    handler: &dyn ServiceHandler,
+    max: usize,
+    mut ended: watch::Receiver<bool>,
+) -> Result<(), Error> {
+    let mut frames = FrameReader::new(buffer, max);
+    loop {
+        let request = tokio::select! {
+            request = frames.next(&mut stream) => request?,
+            _ = ended.wait_for(|ended| *ended) => None,
+        };
+        let Some(request) = request else {
+            return Ok(());
+        };
+        let (done, payload) = match handler.call(request, caller).await {
+            Ok(response) => (1, response),
+            Err(reason) => (0, Bytes::from(reason)),
+        };
+        // The flag travels with the rest: a segment of its own would cost the peer a wake-up.
+        let mut small = Vec::with_capacity(5 + payload.len().min(super::BIG));
+        small.push(done);
+        small.extend_from_slice(&(payload.len() as u32).to_le_bytes());
+        if payload.len() <= super::BIG {
+            small.extend_from_slice(&payload);
+            stream.write_all(&small).await?;
+        } else {
+            stream.write_all(&small).await?;
+            stream.write_all(&payload).await?;
+        }
+        if !persistent {
+            stream.shutdown().await?;
+            return Ok(());
+        }
+    }
+}

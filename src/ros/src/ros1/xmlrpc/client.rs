@@ -1,0 +1,196 @@
+//! The client: keeps connections of earlier calls, opens more for calls at the same time.
+
+use std::fmt;
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use parking_lot::Mutex;
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+use super::http::{HttpError, Reader};
+use super::{Error, Value, parse_response, print_call};
+use crate::net::Sockets;
+use crate::ros1::names::PeerUri;
+
+/// Connections kept while nobody calls.
+const MAX_IDLE: usize = 2;
+/// Bytes in one response's body.
+const MAX_BODY: usize = 64 << 20;
+
+/// One XML-RPC server, to be called.
+pub struct Client {
+    sockets: Arc<dyn Sockets>,
+    uri: PeerUri,
+    idle: Mutex<Vec<Connection>>,
+}
+
+struct Connection {
+    stream: TcpStream,
+    reader: Reader,
+}
+
+/// How a call on one connection failed.
+enum Failure {
+    /// The connection broke before a byte of the answer came.
+    Unanswered(io::Error),
+    Io(io::Error),
+    Http(String),
+}
+
+impl Client {
+    /// A client of the server at `uri` (`http://host:port/`); connects with the first call.
+    pub fn new(sockets: Arc<dyn Sockets>, uri: &str) -> Result<Self, Error> {
+        let uri = PeerUri::parse(uri, "http").ok_or_else(|| Error::BadUri(uri.to_owned()))?;
+        Ok(Self {
+            sockets,
+            uri,
+            idle: Mutex::new(Vec::new()),
+        })
+    }
+
+    /// Calls `method`; the time-out covers everything.
+    pub async fn call(
+        &self,
+        method: &str,
+        params: &[Value],
+        time: Duration,
+    ) -> Result<Value, Error> {
+        match timeout(time, self.exchange(method, params)).await {
+            Ok(result) => result,
+            Err(_) => Err(Error::Timeout {
+                peer: self.peer(),
+                method: method.to_owned(),
+                after: time,
+            }),
+        }
+    }
+
+    /// Closes the connections that no call is using.
+    pub fn disconnect(&self) {
+        self.idle.lock().clear();
+    }
+
+    fn peer(&self) -> String {
+        format!("http://{}:{}", self.uri.host, self.uri.port)
+    }
+
+    async fn exchange(&self, method: &str, params: &[Value]) -> Result<Value, Error> {
+        let body = print_call(method, params);
+        let request = format!(
+            "POST {} HTTP/1.1\r\nHost: {}:{}\r\nUser-Agent: cloudroid\r\nContent-Type: text/xml\r\n\
+             Content-Length: {}\r\n\r\n{body}",
+            self.uri.path,
+            self.uri.host,
+            self.uri.port,
+            body.len()
+        );
+        let mut kept = self.idle.lock().pop();
+        loop {
+            let reused = kept.is_some();
+            let connection = match kept.take() {
+                Some(connection) => connection,
+                None => self.connect().await.map_err(|error| self.io(error))?,
+            };
+            let response = match self.on(connection, &request).await {
+                Ok(response) => response,
+                // The server closed a kept connection meanwhile: that is no failure, ask on a new one.
+                Err(Failure::Unanswered(_)) if reused => {
+                    self.disconnect();
+                    continue;
+                }
+                Err(Failure::Unanswered(error) | Failure::Io(error)) => return Err(self.io(error)),
+                Err(Failure::Http(reason)) => {
+                    return Err(Error::Http {
+                        peer: self.peer(),
+                        reason,
+                    });
+                }
+            };
+            return parse_response(&response)?.map_err(|fault| Error::Fault {
+                peer: self.peer(),
+                method: method.to_owned(),
+                fault,
+            });
+        }
+    }
+
+    fn io(&self, source: io::Error) -> Error {
+        Error::Io {
+            peer: self.peer(),
+            source,
+        }
+    }
+
+    async fn connect(&self) -> io::Result<Connection> {
+        let address = self.sockets.resolve(&self.uri.host, self.uri.port).await?;
+        let stream = self.sockets.connect(address).await?;
+        Ok(Connection {
+            stream,
+            reader: Reader::new(),
+        })
+    }
+
+    /// One request and its response; keeps the connection if both sides can.
+    async fn on(&self, connection: Connection, request: &str) -> Result<Vec<u8>, Failure> {
+        let Connection {
+            mut stream,
+            mut reader,
+        } = connection;
+        stream
+            .write_all(request.as_bytes())
+            .await
+            .map_err(Failure::Unanswered)?;
+        match reader.fill(&mut stream).await {
+            Ok(true) => {}
+            Ok(false) => {
+                return Err(Failure::Unanswered(io::ErrorKind::UnexpectedEof.into()));
+            }
+            Err(error) => return Err(Failure::Unanswered(error)),
+        }
+        let read = async {
+            let mut head = reader.head(&mut stream).await?;
+            while status(&head.start) == Some(100) {
+                head = reader.head(&mut stream).await?;
+            }
+            if status(&head.start) != Some(200) {
+                let start: String = head.start.chars().take(80).collect();
+                return Err(HttpError::Bad(0, format!("it answered {start:?}")));
+            }
+            let body = reader.body(&mut stream, &head, MAX_BODY, true).await?;
+            let version = head.start.split_whitespace().next().unwrap_or_default();
+            let counted = head.field("content-length").is_some();
+            Ok((body, counted && head.keeps_alive(version)))
+        };
+        match read.await {
+            Ok((body, keep)) => {
+                let mut idle = self.idle.lock();
+                if keep && idle.len() < MAX_IDLE && reader.is_empty() {
+                    idle.push(Connection { stream, reader });
+                }
+                Ok(body)
+            }
+            Err(HttpError::Io(error)) => Err(Failure::Io(error)),
+            Err(HttpError::Bad(_, reason)) => Err(Failure::Http(reason)),
+        }
+    }
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("Client")
+            .field("uri", &self.uri)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The number in `HTTP/1.1 200 OK`.
+fn status(start: &str) -> Option<u16> {
+    if !start.starts_with("HTTP/1.") {
+        return None;
+    }
+    start.split_whitespace().nth(1)?.parse().ok()
+}

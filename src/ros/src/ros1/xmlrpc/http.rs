@@ -1,0 +1,233 @@
+//! As much HTTP/1.1 as XML-RPC needs: heads and bodies in either direction, read with limits.
+
+use std::io;
+
+use bytes::{Buf as _, BytesMut};
+use tokio::io::{AsyncRead, AsyncReadExt as _};
+
+/// Start line and header fields together, at most.
+const MAX_HEAD: usize = 16 << 10;
+/// Header fields, at most.
+const MAX_FIELDS: usize = 100;
+/// Bodies up to this size are read into what is at hand; bigger ones grow as they come.
+const READ_STEP: usize = 8 << 10;
+
+/// Why a message could not be read.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum HttpError {
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// Status to answer with, and what is wrong.
+    #[error("{1}")]
+    Bad(u16, String),
+}
+
+fn bad(status: u16, reason: impl Into<String>) -> HttpError {
+    HttpError::Bad(status, reason.into())
+}
+
+/// Start line and header fields.
+#[derive(Debug)]
+pub(super) struct Head {
+    pub(super) start: String,
+    /// Names in lower case.
+    fields: Vec<(String, String)>,
+}
+
+impl Head {
+    pub(super) fn field(&self, name: &str) -> Option<&str> {
+        self.fields
+            .iter()
+            .find(|(found, _)| found == name)
+            .map(|(_, value)| value.as_str())
+    }
+
+    /// Whether the connection may carry another message after this one.
+    pub(super) fn keeps_alive(&self, version: &str) -> bool {
+        match self.field("connection").map(str::to_ascii_lowercase) {
+            Some(tokens) if tokens.contains("close") => false,
+            Some(tokens) if tokens.contains("keep-alive") => true,
+            _ => version == "HTTP/1.1",
+        }
+    }
+
+    /// Whether the peer waits for `100 Continue` before it sends the body.
+    pub(super) fn expects_continue(&self) -> bool {
+        self.field("expect")
+            .is_some_and(|value| value.eq_ignore_ascii_case("100-continue"))
+    }
+
+    /// The length announced, if there is one.
+    pub(super) fn content_length(&self) -> Result<Option<usize>, HttpError> {
+        self.field("content-length")
+            .map(|text| {
+                text.parse()
+                    .map_err(|_| bad(400, format!("Content-Length {text:?} is not a number")))
+            })
+            .transpose()
+    }
+
+    fn chunked(&self) -> bool {
+        self.field("transfer-encoding")
+            .is_some_and(|value| value.to_ascii_lowercase().contains("chunked"))
+    }
+}
+
+/// One side of a connection as a source of messages.
+pub(super) struct Reader {
+    buffer: BytesMut,
+}
+
+impl Reader {
+    pub(super) fn new() -> Self {
+        Self {
+            buffer: BytesMut::new(),
+        }
+    }
+
+    /// Whether nothing of a next message has come yet.
+    pub(super) fn is_empty(&self) -> bool {
+        self.buffer.is_empty()
+    }
+
+    /// Bytes read beyond the last message.
+    pub(super) fn len(&self) -> usize {
+        self.buffer.len()
+    }
+
+    /// Reads more; false at the end of the stream.
+    pub(super) async fn fill(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> io::Result<bool> {
+        self.buffer.reserve(READ_STEP);
+        Ok(stream.read_buf(&mut self.buffer).await? > 0)
+    }
+
+    async fn more(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<(), HttpError> {
+        if self.fill(stream).await? {
+            Ok(())
+        } else {
+            Err(io::Error::from(io::ErrorKind::UnexpectedEof).into())
+        }
+    }
+
+    /// One line without its end.
+    async fn line(
+        &mut self,
+        stream: &mut (impl AsyncRead + Unpin),
+        budget: &mut usize,
+    ) -> Result<String, HttpError> {
+        loop {
+            if let Some(end) = memchr::memchr(b'\n', &self.buffer) {
+                *budget = budget
+                    .checked_sub(end + 1)
+                    .ok_or_else(|| bad(431, format!("the head is over {MAX_HEAD} bytes")))?;
+                let line = self.buffer.split_to(end + 1);
+                let line = line.strip_suffix(b"\n").unwrap_or(&line);
+                let line = line.strip_suffix(b"\r").unwrap_or(line);
+                return Ok(String::from_utf8_lossy(line).into_owned());
+            }
+            if self.buffer.len() > *budget {
+                return Err(bad(431, format!("the head is over {MAX_HEAD} bytes")));
+            }
+            self.more(stream).await?;
+        }
+    }
+
+    /// Start line and fields; blank lines before them are skipped.
+    pub(super) async fn head(
+        &mut self,
+        stream: &mut (impl AsyncRead + Unpin),
+    ) -> Result<Head, HttpError> {
+        let mut budget = MAX_HEAD;
+        let mut start = String::new();
+        while start.is_empty() {
+            start = self.line(stream, &mut budget).await?;
+        }
+        let mut fields = Vec::new();
+        loop {
+            let line = self.line(stream, &mut budget).await?;
+            if line.is_empty() {
+                return Ok(Head { start, fields });
+            }
+            if fields.len() == MAX_FIELDS {
+                return Err(bad(431, format!("more than {MAX_FIELDS} header fields")));
+            }
+            let (name, value) = line
+                .split_once(':')
+                .ok_or_else(|| bad(400, "a header field has no colon"))?;
+            fields.push((name.trim().to_ascii_lowercase(), value.trim().to_owned()));
+        }
+    }
+
+    /// The body that `head` announces. Without any length a response lasts until the stream ends
+    /// (`until_end`), a request has none.
+    pub(super) async fn body(
+        &mut self,
+        stream: &mut (impl AsyncRead + Unpin),
+        head: &Head,
+        max: usize,
+        until_end: bool,
+    ) -> Result<Vec<u8>, HttpError> {
+        let too_large = || bad(413, format!("the body is over {max} bytes"));
+        if head.chunked() {
+            return self.chunks(stream, max).await;
+        }
+        let Some(length) = head.content_length()? else {
+            if !until_end {
+                return Err(bad(411, "Content-Length is missing"));
+            }
+            while self.fill(stream).await? {
+                if self.buffer.len() > max {
+                    return Err(too_large());
+                }
+            }
+            return Ok(std::mem::take(&mut self.buffer).into());
+        };
+        if length > max {
+            return Err(too_large());
+        }
+        self.exactly(stream, length).await
+    }
+
+    /// Grows with what really comes, never with what was promised.
+    async fn exactly(
+        &mut self,
+        stream: &mut (impl AsyncRead + Unpin),
+        length: usize,
+    ) -> Result<Vec<u8>, HttpError> {
+        while self.buffer.len() < length {
+            self.more(stream).await?;
+        }
+        if self.buffer.len() == length {
+            // No copy, and no long buffer left behind on an idle connection.
+            return Ok(std::mem::take(&mut self.buffer).into());
+        }
+        let body = self.buffer[..length].to_vec();
+        self.buffer.advance(length);
+        Ok(body)
+    }
+
+    async fn chunks(
+        &mut self,
+        stream: &mut (impl AsyncRead + Unpin),
+        max: usize,
+    ) -> Result<Vec<u8>, HttpError> {
+        let mut body = Vec::new();
+        loop {
+            let line = self.line(stream, &mut MAX_HEAD.clone()).await?;
+            let digits = line.split(';').next().unwrap_or_default().trim();
+            let length = usize::from_str_radix(digits, 16)
+                .map_err(|_| bad(400, format!("chunk length {digits:?} is not a number")))?;
+            if length == 0 {
+                break;
+            }
+            if length > max || body.len() + length > max {
+                return Err(bad(413, format!("the body is over {max} bytes")));
+            }
+            body.extend(self.exactly(stream, length).await?);
+            self.line(stream, &mut 2).await?;
+        }
+        let mut budget = MAX_HEAD;
+        while !self.line(stream, &mut budget).await?.is_empty() {}
+        Ok(body)
+    }
+}
