@@ -1,10 +1,27 @@
-//! The engine of this host.
+//! The engine of this host: one shim process and one directory for each servant.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
-use crate::spec::Limits;
+use async_trait::async_trait;
+use tokio::sync::oneshot;
+
+use crate::Error;
+use crate::cgroup::Parent;
+use crate::engine::{Engine, Servant};
+use crate::launch::{self, Exit, Runtime};
+use crate::spec::{Limits, Spec};
+
+mod connection;
+mod handle;
+mod pool;
+mod start;
+mod sweep;
+mod validate;
+
+pub use handle::LocalServant;
 
 /// Where each servant's uid range is taken from by default: 1879048192, the first of the 4094 ranges that systemd's
 /// documentation of user ids lists as unused. Ranges for `/etc/subuid` grow from 100000, those of systemd-nspawn from
@@ -91,5 +108,185 @@ impl LocalEngineConfig {
             isolation: Isolation::Require,
             grace: Grace::default(),
         }
+    }
+}
+
+/// A servant that ended while no daemon watched.
+#[derive(Debug, Clone)]
+pub struct Ended {
+    /// Its id.
+    pub id: String,
+    /// How it and its nodes ended; none when its shim was killed before it could say.
+    pub exit: Option<Exit>,
+}
+
+/// What an earlier daemon left.
+#[derive(Debug, Default)]
+pub struct Adoption {
+    /// Still running.
+    pub running: Vec<Arc<LocalServant>>,
+    /// Ended meanwhile; everything of them was removed.
+    pub ended: Vec<Ended>,
+    /// Could not be removed.
+    pub failures: Vec<Error>,
+}
+
+/// Starts and finds servants on this host. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct LocalEngine {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    config: LocalEngineConfig,
+    parent: Parent,
+    networks: pool::Networks,
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        self.parent.remove_if_unused();
+    }
+}
+
+impl LocalEngine {
+    /// Looks at the host and makes the servants' directory. Needs root.
+    pub fn new(config: LocalEngineConfig) -> Result<Self, Error> {
+        if !nix::unistd::geteuid().is_root() {
+            let source = std::io::Error::from(std::io::ErrorKind::PermissionDenied);
+            return Err(Error::Call {
+                call: "running containers as another user than root (run it as root)",
+                source,
+            });
+        }
+        let directory = &config.home_servants_dir;
+        std::fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
+        for program in [
+            Some(config.init.as_path()),
+            config.shim_command.first().map(Path::new),
+        ]
+        .into_iter()
+        .flatten()
+        {
+            std::fs::metadata(program).map_err(Error::file("find the program", program))?;
+        }
+        let parent = Parent::find(&config.cgroup_parent)?;
+        let networks = pool::Networks::default();
+        Ok(Self {
+            shared: Arc::new(Shared {
+                config,
+                parent,
+                networks,
+            }),
+        })
+    }
+
+    /// What this host can limit: the cgroup version, the controllers, and what is amiss.
+    pub fn cgroups(&self) -> &Parent {
+        &self.shared.parent
+    }
+
+    /// Makes network namespaces ahead, so that the next servants start sooner.
+    pub fn warm_up(&self) {
+        self.shared.networks.refill();
+    }
+
+    /// [`Engine::start`], with this engine's own type.
+    pub async fn start_local(&self, spec: Spec) -> Result<Arc<LocalServant>, Error> {
+        let (sender, receiver) = oneshot::channel();
+        let shared = self.shared.clone();
+        let id = spec.id.clone();
+        // A task of its own: when the caller is cancelled half-way, what was half-made is still ended properly.
+        tokio::spawn(async move {
+            let outcome = start::start(&shared, spec).await;
+            if let Err(Ok(unwanted)) = sender.send(outcome) {
+                if let Err(error) = unwanted.stop().await {
+                    tracing::warn!(%error, "a servant that nobody waited for could not be ended");
+                }
+            }
+        });
+        let gone = |_| Error::Start {
+            id,
+            reason: "the engine is shutting down".into(),
+        };
+        receiver.await.map_err(gone)?
+    }
+
+    /// [`Engine::adopt`], and what was found besides.
+    pub async fn adopt_all(&self) -> Result<Adoption, Error> {
+        let home = &self.shared.config.home_servants_dir;
+        let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
+        let mut adoption = Adoption::default();
+        for entry in entries {
+            let directory = entry.map_err(Error::file("read", home))?.path();
+            let id = directory
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned();
+            match self.adopt_one(&id, &directory).await {
+                Ok(Some(servant)) => adoption.running.push(servant),
+                Ok(None) => {
+                    let exit = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+                    match sweep::sweep(&id, &directory).await {
+                        Ok(()) => adoption.ended.push(Ended { id, exit }),
+                        Err(error) => adoption.failures.push(error),
+                    }
+                }
+                Err(error) => adoption.failures.push(error),
+            }
+        }
+        Ok(adoption)
+    }
+
+    /// None when nothing of it runs.
+    async fn adopt_one(
+        &self,
+        id: &str,
+        directory: &Path,
+    ) -> Result<Option<Arc<LocalServant>>, Error> {
+        // What cannot be read belongs to something half-made.
+        let runtime: Option<Runtime> =
+            launch::read(&directory.join(launch::RUNTIME)).unwrap_or_default();
+        let Some(runtime) = runtime else {
+            return Ok(None);
+        };
+        let Some(pidfd) = runtime
+            .shim
+            .open()
+            .map_err(Error::call("looking for a shim"))?
+        else {
+            return Ok(None);
+        };
+        match handle::adopt(id, directory, &runtime, pidfd).await {
+            Ok(servant) => Ok(Some(servant)),
+            Err(error) => {
+                tracing::warn!(%error, id, "a shim does not answer and is ended");
+                Ok(None)
+            }
+        }
+    }
+}
+
+#[async_trait]
+impl Engine for LocalEngine {
+    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, Error> {
+        Ok(self.start_local(spec).await?)
+    }
+
+    async fn adopt(&self) -> Result<Vec<Arc<dyn Servant>>, Error> {
+        let adoption = self.adopt_all().await?;
+        for ended in &adoption.ended {
+            tracing::info!(id = ended.id, exit = ?ended.exit, "a servant had ended; its leftovers are removed");
+        }
+        if let Some(error) = adoption.failures.into_iter().next() {
+            return Err(error);
+        }
+        Ok(adoption
+            .running
+            .into_iter()
+            .map(|servant| servant as Arc<dyn Servant>)
+            .collect())
     }
 }

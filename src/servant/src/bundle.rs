@@ -1,0 +1,292 @@
+//! The OCI runtime configuration of a servant.
+
+use std::path::{Path, PathBuf};
+
+use oci_spec::OciSpecError;
+use oci_spec::runtime::{
+    Capability, LinuxBuilder, LinuxCapabilitiesBuilder, LinuxIdMappingBuilder,
+    LinuxNamespaceBuilder, LinuxNamespaceType, Mount, MountBuilder, PosixRlimit,
+    PosixRlimitBuilder, PosixRlimitType, Process, ProcessBuilder, RootBuilder, Spec as OciSpec,
+    SpecBuilder, UserBuilder,
+};
+
+use crate::rootfs::COMPILE_USER;
+use crate::seccomp;
+use crate::spec::{Profile, Spec};
+
+/// Open files of one process; more only slows down programs that close every number they might have open.
+const OPEN_FILES: u64 = 16_384;
+
+/// Bytes of each tmpfs where neither spec nor engine bounds memory.
+const SCRATCH: u64 = 256 << 20;
+
+const MASKED: [&str; 9] = [
+    "/proc/acpi",
+    "/proc/asound",
+    "/proc/kcore",
+    "/proc/keys",
+    "/proc/latency_stats",
+    "/proc/sched_debug",
+    "/proc/scsi",
+    "/proc/timer_list",
+    "/proc/timer_stats",
+];
+
+const READ_ONLY: [&str; 5] = [
+    "/proc/bus",
+    "/proc/fs",
+    "/proc/irq",
+    "/proc/sys",
+    "/proc/sysrq-trigger",
+];
+
+/// The configuration of the container whose root is mounted at `root`. There is no network namespace in it: the creating
+/// process is in the servant's already and the container inherits it. Limits are not in it either: the cgroup is
+/// made, set and read back before.
+pub fn config(
+    spec: &Spec,
+    root: &Path,
+    cgroup: Option<PathBuf>,
+    uid: (u32, u32),
+) -> Result<OciSpec, OciSpecError> {
+    let mapping = LinuxIdMappingBuilder::default()
+        .container_id(0_u32)
+        .host_id(uid.0)
+        .size(uid.1)
+        .build()?;
+    let namespaces = [
+        LinuxNamespaceType::User,
+        LinuxNamespaceType::Mount,
+        LinuxNamespaceType::Pid,
+        LinuxNamespaceType::Ipc,
+        LinuxNamespaceType::Uts,
+        LinuxNamespaceType::Cgroup,
+    ]
+    .into_iter()
+    .map(|kind| LinuxNamespaceBuilder::default().typ(kind).build())
+    .collect::<Result<Vec<_>, _>>()?;
+    let linux = LinuxBuilder::default()
+        .namespaces(namespaces)
+        .uid_mappings(vec![mapping])
+        .gid_mappings(vec![mapping])
+        // Empty, not absent: an absent path is one that libcontainer chooses.
+        .cgroups_path(cgroup.unwrap_or_default())
+        .seccomp(seccomp::profile(spec.profile)?)
+        .masked_paths(MASKED.map(str::to_owned).to_vec())
+        .readonly_paths(READ_ONLY.map(str::to_owned).to_vec())
+        .build()?;
+    SpecBuilder::default()
+        .version("1.0.2")
+        .hostname(spec.id.clone())
+        .root(
+            RootBuilder::default()
+                .path(root)
+                .readonly(spec.writable.is_none())
+                .build()?,
+        )
+        .process(process(spec)?)
+        .mounts(mounts(spec)?)
+        .linux(linux)
+        .build()
+}
+
+fn process(spec: &Spec) -> Result<Process, OciSpecError> {
+    let user = if spec.profile == Profile::Compile {
+        COMPILE_USER
+    } else {
+        0
+    };
+    let capabilities = if spec.profile == Profile::Install {
+        [
+            Capability::Chown,
+            Capability::DacOverride,
+            Capability::Fowner,
+            Capability::Fsetid,
+            Capability::Setuid,
+            Capability::Setgid,
+            Capability::Setfcap,
+        ]
+        .into()
+    } else {
+        std::collections::HashSet::new()
+    };
+    let none = std::collections::HashSet::new();
+    let capabilities = LinuxCapabilitiesBuilder::default()
+        .bounding(capabilities.clone())
+        .effective(capabilities.clone())
+        .permitted(capabilities)
+        .inheritable(none.clone())
+        .ambient(none)
+        .build()?;
+    ProcessBuilder::default()
+        .terminal(false)
+        .user(UserBuilder::default().uid(user).gid(user).build()?)
+        .args(vec!["init".to_owned()])
+        .env(vec!["HOME=/".to_owned()])
+        .cwd("/")
+        .capabilities(capabilities)
+        .no_new_privileges(true)
+        .rlimits(vec![
+            rlimit(PosixRlimitType::RlimitNofile, OPEN_FILES)?,
+            rlimit(PosixRlimitType::RlimitCore, 0)?,
+        ])
+        .build()
+}
+
+/// At most `wanted`, never more than we have: raising a hard limit takes a capability that we may lack.
+fn rlimit(kind: PosixRlimitType, wanted: u64) -> Result<PosixRlimit, OciSpecError> {
+    let resource = match kind {
+        PosixRlimitType::RlimitNofile => nix::sys::resource::Resource::RLIMIT_NOFILE,
+        _ => nix::sys::resource::Resource::RLIMIT_CORE,
+    };
+    let hard = nix::sys::resource::getrlimit(resource).map_or(wanted, |(_, hard)| hard.min(wanted));
+    PosixRlimitBuilder::default()
+        .typ(kind)
+        .soft(hard)
+        .hard(hard)
+        .build()
+}
+
+fn mounts(spec: &Spec) -> Result<Vec<Mount>, OciSpecError> {
+    let scratch = spec.limits.memory.map_or(SCRATCH, |bytes| bytes / 2);
+    let safe = ["nosuid", "nodev"];
+    let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
+        let mut options: Vec<String> = safe
+            .iter()
+            .chain(extra)
+            .map(|option| (*option).to_owned())
+            .collect();
+        options.extend([format!("mode={mode}"), format!("size={size}")]);
+        mount(target, "tmpfs", "tmpfs", options)
+    };
+    let words = |list: &[&str]| {
+        list.iter()
+            .map(|word| (*word).to_owned())
+            .collect::<Vec<_>>()
+    };
+    let mut mounts = vec![
+        mount(
+            "/proc",
+            "proc",
+            "proc",
+            words(&["nosuid", "noexec", "nodev"]),
+        )?,
+        mount(
+            "/dev",
+            "tmpfs",
+            "tmpfs",
+            words(&["nosuid", "strictatime", "mode=755", "size=64k"]),
+        )?,
+        mount(
+            "/dev/pts",
+            "devpts",
+            "devpts",
+            words(&[
+                "nosuid",
+                "noexec",
+                "newinstance",
+                "ptmxmode=0666",
+                "mode=0620",
+                "gid=5",
+            ]),
+        )?,
+        tmpfs("/dev/shm", "1777", scratch, &["noexec"])?,
+        tmpfs("/tmp", "1777", scratch, &[])?,
+        tmpfs("/run", "755", 16 << 20, &[])?,
+    ];
+    if spec.profile == Profile::Servant {
+        mounts.push(tmpfs("/root", "700", scratch, &[])?);
+        mounts.push(tmpfs("/var/tmp", "1777", scratch, &[])?);
+    }
+    for extra in &spec.mounts {
+        let access = if extra.writable { "rw" } else { "ro" };
+        let target = extra.target.to_string_lossy();
+        let source = extra.source.to_string_lossy();
+        mounts.push(mount(
+            &target,
+            "bind",
+            &source,
+            words(&["bind", "nosuid", "nodev", access]),
+        )?);
+    }
+    Ok(mounts)
+}
+
+fn mount(
+    target: &str,
+    kind: &str,
+    source: &str,
+    options: Vec<String>,
+) -> Result<Mount, OciSpecError> {
+    MountBuilder::default()
+        .destination(target)
+        .typ(kind)
+        .source(source)
+        .options(options)
+        .build()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::spec::Limits;
+
+    fn spec(profile: Profile) -> Spec {
+        Spec {
+            id: "x".into(),
+            layers: vec![],
+            writable: None,
+            profile,
+            limits: Limits {
+                memory: Some(64 << 20),
+                ..Limits::default()
+            },
+            environment: Default::default(),
+            nodes: vec![],
+            owned_directories: vec![],
+            mounts: vec![],
+            resident: serde_json::Value::Null,
+        }
+    }
+
+    fn json(profile: Profile) -> serde_json::Value {
+        serde_json::to_value(config(&spec(profile), Path::new("/r"), None, (5, 65536)).unwrap())
+            .unwrap()
+    }
+
+    #[test]
+    fn only_installing_has_capabilities_and_only_compiling_another_user() {
+        let count = |config: &serde_json::Value| {
+            config["process"]["capabilities"]["bounding"]
+                .as_array()
+                .unwrap()
+                .len()
+        };
+        let user = |config: &serde_json::Value| config["process"]["user"]["uid"].as_u64().unwrap();
+        let (servant, compile, install) = (
+            json(Profile::Servant),
+            json(Profile::Compile),
+            json(Profile::Install),
+        );
+        assert_eq!(
+            (count(&servant), count(&compile), count(&install)),
+            (0, 0, 7)
+        );
+        assert_eq!(
+            (user(&servant), user(&compile), user(&install)),
+            (0, 1000, 0)
+        );
+        for config in [servant, compile, install] {
+            assert_eq!(config["process"]["noNewPrivileges"], true);
+            assert_eq!(config["linux"]["uidMappings"][0]["hostID"], 5);
+        }
+    }
+
+    #[test]
+    fn every_tmpfs_is_bounded() {
+        for mount in json(Profile::Servant)["mounts"].as_array().unwrap() {
+            let bounded = mount["options"].to_string().contains("size=");
+            assert_eq!(mount["type"] == "tmpfs", bounded, "{mount}");
+        }
+    }
+}

@@ -1,0 +1,293 @@
+//! Limits, usage and the certain end of a servant, by control groups of whichever version the host offers.
+//!
+//! ```text
+//!  v2   PARENT/             delegated to us, holds no process itself
+//!         shims/            every shim
+//!         ID/               one servant: its init and its nodes
+//!  v1   OWN/cloudroid/ID/   in each hierarchy that we use, below the cgroup we are in ourselves there
+//! ```
+//!
+//! On a hybrid host the controllers are on v1, and the empty v2 hierarchy beside them is still of use: it has
+//! `cgroup.kill`.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+use crate::engine::{Enforced, Usage};
+use crate::spec::Limits;
+
+mod files;
+mod hosts;
+mod v1;
+mod v2;
+
+use files::{read_number, read_pids};
+pub use hosts::Parent;
+
+/// The directories of one servant.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Cgroup {
+    /// 1 or 2; 0 where there is none.
+    pub version: u8,
+    /// One for each hierarchy in use.
+    leaves: Vec<Leaf>,
+}
+
+/// A directory in one hierarchy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Leaf {
+    /// Controllers that can be used here.
+    controllers: Vec<String>,
+    directory: PathBuf,
+    /// Whether this hierarchy is of the v2 kind.
+    unified: bool,
+}
+
+impl Cgroup {
+    /// Where the cgroup of servant `id` is, or would be.
+    pub fn planned(parent: &Parent, id: &str) -> Self {
+        let leaves = parent.hierarchies.iter().map(|hierarchy| Leaf {
+            controllers: hierarchy.controllers.clone(),
+            directory: hierarchy.directory.join(id),
+            unified: hierarchy.unified,
+        });
+        Self {
+            version: parent.version,
+            leaves: leaves.collect(),
+        }
+    }
+
+    /// Makes its directories.
+    pub fn create(&self) -> Result<(), Error> {
+        for leaf in &self.leaves {
+            make_directory(&leaf.directory)
+                .map_err(Error::file("make the cgroup", &leaf.directory))?;
+        }
+        Ok(())
+    }
+
+    /// Moves a process into it.
+    pub fn enter(&self, pid: u32) -> Result<(), Error> {
+        for leaf in &self.leaves {
+            let file = leaf.directory.join("cgroup.procs");
+            fs::write(&file, pid.to_string()).map_err(Error::file("move a process into", &file))?;
+        }
+        Ok(())
+    }
+
+    /// The path of the v2 directory below the root of its hierarchy, as an OCI `cgroupsPath`. None on v1: one path
+    /// cannot name directories below our own cgroup in hierarchies where those differ; there the creating
+    /// process [enters](Self::enter) first and the container stays where it was made.
+    pub fn oci_path(&self) -> Option<PathBuf> {
+        let leaf = (self.version == 2).then(|| self.leaves.first()).flatten()?;
+        let root = leaf
+            .directory
+            .ancestors()
+            .take_while(|path| path.join("cgroup.procs").exists())
+            .last()?;
+        Some(Path::new("/").join(leaf.directory.strip_prefix(root).ok()?))
+    }
+
+    /// Sets the limits that are given. A limit that cannot be set is not an error here: what is in force is read back.
+    pub fn set(&self, limits: &Limits) -> Enforced {
+        if self.version == 2 {
+            v2::set(self, limits)
+        } else {
+            v1::set(self, limits)
+        }
+        self.enforced()
+    }
+
+    /// The limits in force, as the kernel has them.
+    pub fn enforced(&self) -> Enforced {
+        let limits = if self.version == 2 {
+            v2::limits(self)
+        } else {
+            v1::limits(self)
+        };
+        Enforced {
+            cgroup_version: self.version,
+            limits,
+        }
+    }
+
+    /// What is used now.
+    pub fn usage(&self) -> Usage {
+        let (cpu_usec, memory) = if self.version == 2 {
+            v2::usage(self)
+        } else {
+            v1::usage(self)
+        };
+        let pids = self
+            .file("pids", "pids.current")
+            .and_then(|file| read_number(&file))
+            .unwrap_or(0);
+        Usage {
+            cpu_usec,
+            memory,
+            pids,
+            oom_kills: self.oom_kills(),
+        }
+    }
+
+    /// How many of its processes the kernel has killed for want of memory.
+    pub fn oom_kills(&self) -> u64 {
+        let name = if self.version == 2 {
+            "memory.events"
+        } else {
+            "memory.oom_control"
+        };
+        self.file("memory", name)
+            .and_then(|file| files::read_field(&file, "oom_kill"))
+            .unwrap_or(0)
+    }
+
+    /// Host pids of all its processes, init included.
+    pub fn processes(&self) -> Vec<i32> {
+        self.leaves
+            .first()
+            .map(|leaf| read_pids(&leaf.directory))
+            .unwrap_or_default()
+    }
+
+    /// Kills every process in it, waits until there is none, and removes it. Blocks, at most for `patience`.
+    pub fn destroy(&self, patience: Duration) -> Result<(), Error> {
+        let deadline = Instant::now() + patience;
+        let mut pause = Duration::from_micros(200);
+        while self.leaves.iter().any(|leaf| leaf.directory.exists()) {
+            self.kill();
+            let refused = self
+                .leaves
+                .iter()
+                .filter_map(|leaf| remove(&leaf.directory).err())
+                .next();
+            let Some(error) = refused else { break };
+            if Instant::now() > deadline {
+                let left = self.leaves.iter().find(|leaf| leaf.directory.exists());
+                let path = left.map(|leaf| leaf.directory.clone()).unwrap_or_default();
+                return Err(Error::File {
+                    action: "remove the cgroup",
+                    path,
+                    source: error,
+                });
+            }
+            std::thread::sleep(pause);
+            pause = (pause * 2).min(Duration::from_millis(20));
+        }
+        // On v2 the parent hands controllers down; it goes with the engine.
+        if self.version == 1 {
+            self.leaves
+                .iter()
+                .for_each(|leaf| hosts::remove_if_unused(&leaf.directory));
+        }
+        Ok(())
+    }
+
+    /// Whether any of its directories is there.
+    pub fn exists(&self) -> bool {
+        self.leaves.iter().any(|leaf| leaf.directory.exists())
+    }
+
+    /// Kills every process now in it: at once where the kernel can, one after the other in a frozen group elsewhere.
+    fn kill(&self) {
+        let at_once = self.leaves.iter().filter(|leaf| leaf.unified).any(|leaf| {
+            let file = leaf.directory.join("cgroup.kill");
+            file.exists() && fs::write(file, "1").is_ok()
+        });
+        if at_once {
+            return;
+        }
+        let freezer = self.file("freezer", "freezer.state");
+        // A group that cannot be frozen may fork faster than we kill; the caller repeats until it is empty.
+        let switch = |state: &str| freezer.as_ref().map(|file| fs::write(file, state));
+        switch("FROZEN");
+        for leaf in &self.leaves {
+            for pid in read_pids(&leaf.directory) {
+                let _ = nix::sys::signal::kill(
+                    nix::unistd::Pid::from_raw(pid),
+                    nix::sys::signal::Signal::SIGKILL,
+                );
+            }
+        }
+        switch("THAWED");
+    }
+
+    /// A control file, when its controller is in use.
+    fn file(&self, controller: &str, name: &str) -> Option<PathBuf> {
+        let has = |leaf: &&Leaf| leaf.controllers.iter().any(|known| known == controller);
+        self.leaves
+            .iter()
+            .find(has)
+            .map(|leaf| leaf.directory.join(name))
+    }
+}
+
+/// Makes a directory and its parent, which another servant's end may be removing at the same moment.
+fn make_directory(directory: &Path) -> io::Result<()> {
+    let mut attempts = 0;
+    loop {
+        match fs::create_dir_all(directory) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound && attempts < 50 => attempts += 1,
+            result => return result,
+        }
+    }
+}
+
+fn remove(directory: &Path) -> io::Result<()> {
+    match fs::remove_dir(directory) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        result => result,
+    }
+}
+
+/// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
+/// thousandth of one.
+pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
+    let mut missing = Vec::new();
+    let close = |asked: Option<f64>, got: Option<f64>, tolerance: f64| match (asked, got) {
+        (Some(asked), Some(got)) => (asked - got).abs() <= tolerance,
+        (Some(_), None) => false,
+        (None, _) => true,
+    };
+    let number = |value: Option<u64>| value.map(|value| value as f64);
+    if !close(asked.cpus, enforced.cpus, 0.001) {
+        missing.push("cpus");
+    }
+    if !close(number(asked.cpu_weight), number(enforced.cpu_weight), 1.0) {
+        missing.push("cpu_weight");
+    }
+    if !close(number(asked.memory), number(enforced.memory), 65536.0) {
+        missing.push("memory");
+    }
+    if !close(number(asked.pids), number(enforced.pids), 0.0) {
+        missing.push("pids");
+    }
+    missing
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_that_is_not_in_force_is_named() {
+        let asked = Limits {
+            cpus: Some(1.5),
+            cpu_weight: None,
+            memory: Some(100_000_000),
+            pids: Some(10),
+        };
+        let got = Limits {
+            memory: Some(99_999_744),
+            pids: None,
+            ..asked
+        };
+        assert_eq!(missing(&asked, &got), ["pids"]);
+        assert_eq!(missing(&Limits::default(), &got), [""; 0]);
+    }
+}

@@ -1,0 +1,27 @@
+//! Reading control files.
+
+use std::fs;
+use std::path::Path;
+
+/// The number that a file holds; none for `max` or when it cannot be read.
+pub(super) fn read_number(file: &Path) -> Option<u64> {
+    fs::read_to_string(file).ok()?.trim().parse().ok()
+}
+
+/// The number after `name` in a file of `name number` lines.
+pub(super) fn read_field(file: &Path, name: &str) -> Option<u64> {
+    let text = fs::read_to_string(file).ok()?;
+    text.lines().find_map(|line| {
+        line.strip_prefix(name)?
+            .strip_prefix(' ')?
+            .trim()
+            .parse()
+            .ok()
+    })
+}
+
+/// The processes of a cgroup directory.
+pub(super) fn read_pids(directory: &Path) -> Vec<i32> {
+    let text = fs::read_to_string(directory.join("cgroup.procs")).unwrap_or_default();
+    text.lines().filter_map(|line| line.parse().ok()).collect()
+}

@@ -1,0 +1,344 @@
+//! What the host offers, and the place below which servants' cgroups are made.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+use crate::local::CgroupParent;
+
+/// Servants' cgroups are below a directory of this name where we choose it ourselves.
+const NAME: &str = "cloudroid";
+/// The unit whose cgroup is delegated to us.
+const UNIT: &str = "cloudroid-servants.service";
+/// Controllers that limits or the end of a servant need.
+const WANTED_V1: [&str; 5] = ["cpu", "cpuacct", "memory", "pids", "freezer"];
+const WANTED_V2: [&str; 5] = ["cpu", "memory", "pids", "io", "cpuset"];
+
+/// Below which directories servants' cgroups are made; found once per engine and handed to each shim.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Parent {
+    /// 1, 2, or 0 where no hierarchy can be used.
+    pub version: u8,
+    /// One for each hierarchy that is used.
+    pub(super) hierarchies: Vec<Below>,
+    /// Why the version is 0, or a controller is missing; empty when all is well.
+    pub reason: String,
+}
+
+/// A parent directory in one hierarchy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Below {
+    pub(super) controllers: Vec<String>,
+    pub(super) directory: PathBuf,
+    pub(super) unified: bool,
+}
+
+/// A mounted hierarchy and where in it this process is.
+#[derive(Debug, Clone, PartialEq)]
+struct Mounted {
+    controllers: Vec<String>,
+    mount: PathBuf,
+    own: PathBuf,
+    unified: bool,
+}
+
+impl Parent {
+    /// Finds and, where needed, makes the place.
+    pub fn find(choice: &CgroupParent) -> Result<Self, Error> {
+        let read = |path: &str| fs::read_to_string(path).map_err(Error::file("read", path));
+        let mounted = parse(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
+        let uses_v1 = mounted
+            .iter()
+            .any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has(name)));
+        match mounted.iter().find(|hierarchy| hierarchy.unified) {
+            _ if uses_v1 => Self::v1(&mounted, choice),
+            Some(unified) => Self::v2(unified, choice),
+            None => Ok(Self {
+                version: 0,
+                hierarchies: vec![],
+                reason: "no cgroup hierarchy is mounted".into(),
+            }),
+        }
+    }
+
+    /// Which controllers can be used, sorted.
+    pub fn controllers(&self) -> Vec<String> {
+        let mut names: Vec<_> = self
+            .hierarchies
+            .iter()
+            .flat_map(|below| below.controllers.clone())
+            .collect();
+        names.sort();
+        names
+    }
+
+    /// Where shims go: on v2 away from the daemon's own unit, which systemd could not restart otherwise.
+    pub fn shims(&self) -> Option<PathBuf> {
+        let first = self.hierarchies.first().filter(|_| self.version == 2)?;
+        Some(first.directory.join("shims"))
+    }
+
+    /// Removes the place if it is one that we chose and no servant is left in it.
+    pub fn remove_if_unused(&self) {
+        if let Some(shims) = self.shims() {
+            // Refused while a shim is in it.
+            let _ = fs::remove_dir(&shims);
+            remove_if_unused(&shims);
+        }
+    }
+
+    fn v1(mounted: &[Mounted], choice: &CgroupParent) -> Result<Self, Error> {
+        let wanted = |hierarchy: &&Mounted| {
+            hierarchy.unified || WANTED_V1.iter().any(|name| hierarchy.has(name))
+        };
+        let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
+            controllers: hierarchy.controllers.clone(),
+            directory: match choice {
+                CgroupParent::Auto => hierarchy.own.join(NAME),
+                CgroupParent::Path(path) => {
+                    hierarchy.mount.join(path.strip_prefix("/").unwrap_or(path))
+                }
+            },
+            unified: hierarchy.unified,
+        });
+        let parent = Self {
+            version: 1,
+            hierarchies: below.collect(),
+            reason: String::new(),
+        };
+        let known = parent.controllers();
+        let absent: Vec<_> = ["cpu", "memory", "pids"]
+            .into_iter()
+            .filter(|name| !known.iter().any(|k| k == name))
+            .collect();
+        let reason = if absent.is_empty() {
+            String::new()
+        } else {
+            format!("cgroup v1 without {}", absent.join(", "))
+        };
+        Ok(Self { reason, ..parent })
+    }
+
+    fn v2(unified: &Mounted, choice: &CgroupParent) -> Result<Self, Error> {
+        let directory = match choice {
+            CgroupParent::Path(path) => unified.mount.join(path.strip_prefix("/").unwrap_or(path)),
+            CgroupParent::Auto => choose_v2(unified),
+        };
+        fs::create_dir_all(directory.join("shims"))
+            .map_err(Error::file("make the cgroup", &directory))?;
+        // From the place just above down: each directory hands to the next what it was handed itself.
+        let mut reason = String::new();
+        let above = directory
+            .parent()
+            .filter(|above| above.starts_with(&unified.mount));
+        for place in above.into_iter().chain([directory.as_path()]) {
+            if let Err(error) = enable(place, place == directory) {
+                reason = format!(
+                    "the controllers of {} cannot be handed down: {error}",
+                    place.display()
+                );
+            }
+        }
+        let enabled =
+            fs::read_to_string(directory.join("cgroup.subtree_control")).unwrap_or_default();
+        let controllers = enabled.split_whitespace().map(str::to_owned).collect();
+        let below = Below {
+            controllers,
+            directory,
+            unified: true,
+        };
+        Ok(Self {
+            version: 2,
+            hierarchies: vec![below],
+            reason,
+        })
+    }
+}
+
+impl Mounted {
+    fn has(&self, controller: &str) -> bool {
+        !self.unified && self.controllers.iter().any(|name| name == controller)
+    }
+}
+
+/// The unit's cgroup when it is there or can be started; our own place in the root when no systemd manages it;
+/// otherwise a place beside us.
+fn choose_v2(unified: &Mounted) -> PathBuf {
+    let unit = unified.mount.join("system.slice").join(UNIT);
+    let own_is_root = unified.own == unified.mount;
+    if unit.exists()
+        || (!own_is_root
+            && Path::new("/run/systemd/system").exists()
+            && start_unit()
+            && unit.exists())
+    {
+        return unit;
+    }
+    if own_is_root {
+        unified.own.join(NAME)
+    } else {
+        unified.own.with_file_name(NAME)
+    }
+}
+
+/// Asks systemd for the delegated unit where it was not installed. The directory made in it keeps its cgroup alive.
+fn start_unit() -> bool {
+    let script = "mkdir -p /sys/fs/cgroup$(cut -d: -f3 /proc/self/cgroup)/shims";
+    let mut command = Command::new("systemd-run");
+    command.args([
+        "--quiet",
+        "--unit",
+        UNIT,
+        "--description",
+        "Cgroups of Cloudroid's servants",
+    ]);
+    for property in [
+        "Type=oneshot",
+        "RemainAfterExit=yes",
+        "Delegate=yes",
+        "KillMode=none",
+    ] {
+        command.args(["--property", property]);
+    }
+    command.args(["/bin/sh", "-c", script]);
+    command.status().is_ok_and(|status| status.success())
+}
+
+/// Hands the controllers that `place` has to its children. Above our own place only what is lacking is asked for, and
+/// a refusal counts for nothing when it turns out that nothing was lacking.
+fn enable(place: &Path, ours: bool) -> io::Result<()> {
+    let available = fs::read_to_string(place.join("cgroup.controllers"))?;
+    let control = place.join("cgroup.subtree_control");
+    let handed = fs::read_to_string(&control)?;
+    let mut refused = None;
+    for name in WANTED_V2
+        .iter()
+        .filter(|name| available.split_whitespace().any(|known| known == **name))
+    {
+        if !handed.split_whitespace().any(|known| known == *name) {
+            refused = fs::write(&control, format!("+{name}")).err().or(refused);
+        }
+    }
+    match refused {
+        Some(error) if ours => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Removes the directory above a servant's when it is one that we chose and no servant is left in it.
+pub(super) fn remove_if_unused(leaf: &Path) {
+    if let Some(parent) = leaf.parent().filter(|parent| parent.ends_with(NAME)) {
+        // Not empty: other servants live.
+        let _ = fs::remove_dir(parent);
+    }
+}
+
+/// From the texts of /proc/self/mountinfo and /proc/self/cgroup.
+fn parse(mountinfo: &str, cgroup: &str) -> Vec<Mounted> {
+    let mut found: Vec<Mounted> = Vec::new();
+    for line in mountinfo.lines() {
+        let Some((left, right)) = line.split_once(" - ") else {
+            continue;
+        };
+        let left: Vec<_> = left.split(' ').collect();
+        let right: Vec<_> = right.split(' ').collect();
+        let ([_, _, _, root, mount, ..], [kind, _, options, ..]) = (&left[..], &right[..]) else {
+            continue;
+        };
+        let unified = match *kind {
+            "cgroup2" => true,
+            "cgroup" => false,
+            _ => continue,
+        };
+        let options: Vec<_> = options.split(',').collect();
+        let Some((names, path)) = own_path(cgroup, &options, unified) else {
+            continue;
+        };
+        let inside = Path::new(path)
+            .strip_prefix(root)
+            .or_else(|_| Path::new(path).strip_prefix("/"));
+        let own = Path::new(mount).join(inside.unwrap_or(Path::new("")));
+        // join() of an empty path adds a slash; the components are what counts.
+        let own: PathBuf = own.components().collect();
+        let known = found
+            .iter()
+            .any(|other| other.unified == unified && other.controllers == names);
+        if !known {
+            found.push(Mounted {
+                controllers: names,
+                mount: mount.into(),
+                own,
+                unified,
+            });
+        }
+    }
+    found
+}
+
+/// Our line of /proc/self/cgroup for a hierarchy: its controllers and our path.
+fn own_path<'a>(
+    cgroup: &'a str,
+    options: &[&str],
+    unified: bool,
+) -> Option<(Vec<String>, &'a str)> {
+    cgroup.lines().find_map(|line| {
+        let mut fields = line.splitn(3, ':');
+        let (_, names, path) = (fields.next()?, fields.next()?, fields.next()?);
+        let names: Vec<String> = names
+            .split(',')
+            .filter(|name| !name.is_empty())
+            .map(str::to_owned)
+            .collect();
+        let same = if unified {
+            names.is_empty()
+        } else {
+            !names.is_empty() && names.iter().all(|name| options.contains(&name.as_str()))
+        };
+        same.then_some((names, path))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hybrid_host_is_understood() {
+        let mountinfo = "\
+30 24 0:26 / /sys/fs/cgroup/cpu,cpuacct rw,relatime - cgroup cgroup rw,cpu,cpuacct
+31 24 0:27 / /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory
+32 24 0:28 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw
+33 24 0:29 / /proc rw - proc proc rw";
+        let cgroup = "4:memory:/private/x\n1:cpu,cpuacct:/\n0::/\n";
+        let found = parse(mountinfo, cgroup);
+        let owns: Vec<_> = found
+            .iter()
+            .map(|one| (one.own.to_str().unwrap(), one.unified))
+            .collect();
+        assert_eq!(
+            owns,
+            [
+                ("/sys/fs/cgroup/cpu,cpuacct", false),
+                ("/sys/fs/cgroup/memory/private/x", false),
+                ("/sys/fs/cgroup/unified", true)
+            ]
+        );
+        let parent = Parent::v1(&found, &CgroupParent::Auto).unwrap();
+        assert_eq!(
+            parent.hierarchies[1].directory,
+            Path::new("/sys/fs/cgroup/memory/private/x/cloudroid")
+        );
+        assert_eq!(parent.reason, "cgroup v1 without pids");
+    }
+
+    #[test]
+    fn a_hierarchy_that_is_mounted_in_part_is_understood() {
+        let mountinfo = "31 24 0:27 /docker/abc /sys/fs/cgroup ro,nosuid - cgroup2 cgroup rw";
+        let found = parse(mountinfo, "0::/docker/abc/own\n");
+        assert_eq!(found[0].own, Path::new("/sys/fs/cgroup/own"));
+    }
+}

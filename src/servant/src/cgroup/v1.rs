@@ -1,0 +1,88 @@
+//! Control files of cgroup v1 (kernel documentation, admin-guide/cgroup-v1).
+
+use std::fs;
+
+use super::Cgroup;
+use super::files::read_number;
+use crate::spec::Limits;
+
+/// Microseconds; the kernel's default.
+const PERIOD: f64 = 100_000.0;
+
+/// What `memory.limit_in_bytes` reads when there is no limit: the largest multiple of a page.
+const NO_LIMIT: u64 = 1 << 62;
+
+pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
+    // Whether a write took effect is read back by the caller.
+    let write = |controller, name, value: String| {
+        cgroup
+            .file(controller, name)
+            .map(|file| fs::write(file, value))
+    };
+    if let Some(cpus) = limits.cpus {
+        write("cpu", "cpu.cfs_period_us", PERIOD.to_string());
+        write(
+            "cpu",
+            "cpu.cfs_quota_us",
+            (cpus * PERIOD).round().max(1000.0).to_string(),
+        );
+    }
+    if let Some(weight) = limits.cpu_weight {
+        write("cpu", "cpu.shares", shares(weight).to_string());
+    }
+    if let Some(memory) = limits.memory {
+        // With swap may not be below without swap, in neither direction of the change: so both, twice.
+        for _ in 0..2 {
+            write("memory", "memory.limit_in_bytes", memory.to_string());
+            write("memory", "memory.memsw.limit_in_bytes", memory.to_string());
+        }
+    }
+    if let Some(pids) = limits.pids {
+        write("pids", "pids.max", pids.to_string());
+    }
+}
+
+pub(super) fn limits(cgroup: &Cgroup) -> Limits {
+    let number = |controller, name| read_number(&cgroup.file(controller, name)?);
+    let period = number("cpu", "cpu.cfs_period_us");
+    // -1, which is no limit, is no u64 and so reads as none.
+    let quota = number("cpu", "cpu.cfs_quota_us");
+    Limits {
+        cpus: quota
+            .zip(period)
+            .map(|(quota, period)| quota as f64 / period as f64),
+        cpu_weight: number("cpu", "cpu.shares").map(weight),
+        memory: number("memory", "memory.limit_in_bytes").filter(|bytes| *bytes < NO_LIMIT),
+        pids: number("pids", "pids.max"),
+    }
+}
+
+/// Microseconds of CPU and bytes of memory.
+pub(super) fn usage(cgroup: &Cgroup) -> (u64, u64) {
+    let number = |controller, name| read_number(&cgroup.file(controller, name)?);
+    let cpu = number("cpuacct", "cpuacct.usage").unwrap_or(0) / 1000;
+    (cpu, number("memory", "memory.usage_in_bytes").unwrap_or(0))
+}
+
+/// A v2 weight (1..10000, 100 by default) as v1 shares (1024 by default).
+fn shares(weight: u64) -> u64 {
+    (weight * 1024 / 100).clamp(2, 262_144)
+}
+
+fn weight(shares: u64) -> u64 {
+    (shares * 100).div_ceil(1024).clamp(1, 10_000)
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn weights_survive_the_way_to_v1_and_back() {
+        for weight in [1, 50, 100, 333, 1000, 10_000] {
+            assert!(
+                super::weight(super::shares(weight)).abs_diff(weight) <= 1,
+                "{weight}"
+            );
+        }
+        assert_eq!(super::shares(100), 1024);
+    }
+}

@@ -1,0 +1,99 @@
+//! What the daemon leaves in a servant's directory for its shim, and the shim for a later daemon.
+//!
+//! | file | written by | holds |
+//! |---|---|---|
+//! | `spec.json` | daemon, before the shim starts | [`Launch`] |
+//! | `runtime.json` | shim, first thing | [`Runtime`]: what to end and remove when the shim cannot |
+//! | `shim.sock` | shim | where a daemon connects |
+//! | `log.jsonl`, `log.jsonl.1` | shim | what nodes printed |
+//! | `shim.log` | shim | its own complaints |
+//! | `exit.json` | shim, last thing | [`Exit`] |
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+use crate::cgroup::{Cgroup, Parent};
+use crate::engine::ContainerState;
+use crate::local::{Grace, Isolation};
+use crate::process::Identity;
+use crate::protocol::NodeStatus;
+use crate::spec::Spec;
+
+/// [`Launch`]'s file.
+pub const SPEC: &str = "spec.json";
+/// [`Runtime`]'s file.
+pub const RUNTIME: &str = "runtime.json";
+/// [`Exit`]'s file.
+pub const EXIT: &str = "exit.json";
+/// The shim's socket.
+pub const SOCKET: &str = "shim.sock";
+/// The shim's standard error.
+pub const SHIM_LOG: &str = "shim.log";
+
+/// Everything a shim needs to know.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Launch {
+    /// With the engine's default limits filled in.
+    pub spec: Spec,
+    /// First host uid and how many.
+    pub uid_range: (u32, u32),
+    /// Where its cgroup is made.
+    pub parent: Parent,
+    /// Whether every limit must be in force.
+    pub isolation: Isolation,
+    /// How long nodes have to end.
+    pub grace: Grace,
+    /// The static init.
+    pub init: PathBuf,
+}
+
+/// What is left when a shim is gone without a word.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Runtime {
+    /// The shim.
+    pub shim: Identity,
+    /// The servant's cgroup.
+    pub cgroup: Cgroup,
+    /// First host uid and how many.
+    pub uid_range: (u32, u32),
+}
+
+/// How a servant ended.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Exit {
+    /// Its last state.
+    pub state: ContainerState,
+    /// Its nodes by name.
+    pub nodes: BTreeMap<String, NodeStatus>,
+}
+
+/// Reads a file of ours; none when there is none.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, Error> {
+    let text = match fs::read(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        result => result.map_err(Error::file("read", path))?,
+    };
+    let value = serde_json::from_slice(&text);
+    value.map(Some).map_err(|error| Error::Malformed {
+        path: path.into(),
+        reason: error.to_string(),
+    })
+}
+
+/// Writes a file of ours, whole or not at all.
+pub fn write<T: Serialize>(path: &Path, value: &T) -> Result<(), Error> {
+    let text = serde_json::to_vec(value).map_err(|error| Error::Malformed {
+        path: path.into(),
+        reason: error.to_string(),
+    })?;
+    let half = path.with_extension("half");
+    let mut file = fs::File::create(&half).map_err(Error::file("make", &half))?;
+    file.write_all(&text).map_err(Error::file("write", &half))?;
+    fs::rename(&half, path).map_err(Error::file("write", path))
+}

@@ -1,0 +1,160 @@
+//! The daemon's end of a connection to a shim: what the shim tells is kept and passed on, what is asked is sent.
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
+
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
+
+use crate::engine::{ContainerState, Enforced, NodeEvent};
+use crate::protocol::{self, Command, FromShim, NodeStatus, Request};
+
+/// Events that a slow listener may be behind.
+const EVENTS: usize = 256;
+
+/// What is known of a servant.
+#[derive(Debug)]
+pub(super) struct Known {
+    pub(super) state: watch::Sender<ContainerState>,
+    pub(super) events: broadcast::Sender<NodeEvent>,
+    pub(super) nodes: watch::Sender<BTreeMap<String, NodeStatus>>,
+    pub(super) enforced: watch::Sender<Enforced>,
+    /// Nothing more comes.
+    pub(super) closed: watch::Sender<bool>,
+    waiting: Mutex<Waiting>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    next: u64,
+    answers: BTreeMap<u64, oneshot::Sender<Option<String>>>,
+    closed: bool,
+}
+
+impl Default for Known {
+    fn default() -> Self {
+        Self {
+            state: watch::Sender::new(ContainerState::Creating),
+            events: broadcast::Sender::new(EVENTS),
+            nodes: watch::Sender::default(),
+            enforced: watch::Sender::default(),
+            closed: watch::Sender::new(false),
+            waiting: Mutex::default(),
+        }
+    }
+}
+
+impl Known {
+    /// Takes in what the shim says until it says no more.
+    pub(super) async fn listen(&self, read: OwnedReadHalf) {
+        let mut lines = BufReader::new(read).lines();
+        while let Ok(Some(line)) = lines.next_line().await {
+            match serde_json::from_str(&line) {
+                Ok(message) => self.take_in(message),
+                Err(error) => tracing::warn!(%error, line, "a shim says something unknown"),
+            }
+        }
+        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        waiting.closed = true;
+        waiting.answers.clear();
+        drop(waiting);
+        self.closed.send_replace(true);
+    }
+
+    fn take_in(&self, message: FromShim) {
+        match message {
+            FromShim::Hello {
+                state,
+                nodes,
+                enforced,
+                ..
+            } => {
+                self.enforced.send_replace(enforced);
+                self.nodes.send_replace(nodes);
+                self.state.send_replace(state);
+            }
+            FromShim::State { state } => {
+                self.state.send_replace(state);
+            }
+            FromShim::Node { event, status } => {
+                self.nodes.send_modify(|nodes| {
+                    nodes.insert(event.node().to_owned(), status);
+                });
+                // Nobody listens: nobody is told.
+                let _ = self.events.send(event);
+            }
+            FromShim::Enforced { enforced } => {
+                self.enforced.send_replace(enforced);
+            }
+            FromShim::Reply { id, error } => {
+                let answer = self
+                    .waiting
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .answers
+                    .remove(&id);
+                if let Some(answer) = answer {
+                    let _ = answer.send(error);
+                }
+            }
+        }
+    }
+
+    /// A number for a request, and where its answer will come; none when the connection is closed.
+    fn expect_answer(&self) -> Option<(u64, oneshot::Receiver<Option<String>>)> {
+        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        if waiting.closed {
+            return None;
+        }
+        let id = waiting.next;
+        waiting.next += 1;
+        let (sender, receiver) = oneshot::channel();
+        waiting.answers.insert(id, sender);
+        Some((id, receiver))
+    }
+}
+
+/// Sends requests.
+#[derive(Debug)]
+pub(super) struct Requests {
+    write: AsyncMutex<OwnedWriteHalf>,
+}
+
+/// Why a request was not fulfilled.
+#[derive(Debug)]
+pub(super) enum Unfulfilled {
+    /// The shim's words.
+    Refused(String),
+    /// It does not answer any more.
+    Gone,
+}
+
+impl Requests {
+    pub(super) fn split(stream: UnixStream) -> (OwnedReadHalf, Self) {
+        let (read, write) = stream.into_split();
+        (
+            read,
+            Self {
+                write: AsyncMutex::new(write),
+            },
+        )
+    }
+
+    pub(super) async fn ask(&self, known: &Known, command: Command) -> Result<(), Unfulfilled> {
+        let (id, answer) = known.expect_answer().ok_or(Unfulfilled::Gone)?;
+        let line = protocol::line(&Request { id, command });
+        self.write
+            .lock()
+            .await
+            .write_all(&line)
+            .await
+            .map_err(|_| Unfulfilled::Gone)?;
+        match answer.await {
+            Ok(None) => Ok(()),
+            Ok(Some(reason)) => Err(Unfulfilled::Refused(reason)),
+            Err(_) => Err(Unfulfilled::Gone),
+        }
+    }
+}

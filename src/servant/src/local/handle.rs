@@ -1,0 +1,427 @@
+//! A servant as the daemon holds it.
+
+use std::fs::File;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::net::UnixStream as StdStream;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tokio::io::unix::AsyncFd;
+use tokio::net::UnixStream;
+use tokio::sync::{broadcast, mpsc, watch};
+use tokio::task::JoinHandle;
+
+use super::connection::{Known, Requests, Unfulfilled};
+use super::sweep;
+use crate::Error;
+use crate::cgroup::Cgroup;
+use crate::endpoint::Endpoint;
+use crate::engine::{ContainerState, Enforced, LogLine, NodeEvent, NodeExit, Servant, Usage};
+use crate::launch::{self, Exit, Launch, Runtime};
+use crate::local::Grace;
+use crate::netns::NetNs;
+use crate::process::{self, Identity};
+use crate::protocol::Command;
+use crate::spec::{Limits, NodeSpec};
+use crate::{logs, sys};
+
+/// Beyond the grace time, for a shim to finish what it does at the end.
+const FINISH: Duration = Duration::from_secs(20);
+/// For a shim that runs to answer.
+const ANSWER: Duration = Duration::from_secs(10);
+
+/// A servant of the local engine. Dropping it leaves the servant as it is.
+#[derive(Debug)]
+pub struct LocalServant {
+    id: String,
+    directory: PathBuf,
+    network: Arc<NetNs>,
+    cgroup: Cgroup,
+    uid_range: (u32, u32),
+    grace: Grace,
+    shim: Arc<OwnedFd>,
+    requests: Requests,
+    known: Arc<Known>,
+    listener: JoinHandle<()>,
+}
+
+impl Drop for LocalServant {
+    fn drop(&mut self) {
+        self.listener.abort();
+    }
+}
+
+/// Waits for a shim just started to say that its container runs.
+pub(super) async fn started(
+    launch: &Launch,
+    directory: &Path,
+    network: NetNs,
+    control: StdStream,
+    shim: Identity,
+) -> Result<Arc<LocalServant>, Error> {
+    let id = &launch.spec.id;
+    let ended = || Error::Start {
+        id: id.clone(),
+        reason: last_words(directory),
+    };
+    let pidfd = shim
+        .open()
+        .map_err(Error::call("looking at the shim just started"))?
+        .ok_or_else(ended)?;
+    let runtime = Runtime {
+        shim,
+        cgroup: Cgroup::planned(&launch.parent, id),
+        uid_range: launch.uid_range,
+    };
+    let servant = connect(
+        id,
+        directory,
+        network,
+        control,
+        &runtime,
+        pidfd,
+        launch.grace,
+    )?;
+    let mut state = servant.known.state.subscribe();
+    let mut closed = servant.known.closed.subscribe();
+    tokio::select! {
+        biased;
+        _ = state.wait_for(|state| *state != ContainerState::Creating) => {}
+        _ = closed.wait_for(|closed| *closed) => {}
+    }
+    let reached = state.borrow().clone();
+    match reached {
+        ContainerState::Running { .. } => Ok(servant),
+        ContainerState::Creating => Err(ended()),
+        ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
+            Err(Error::Start {
+                id: id.clone(),
+                reason,
+            })
+        }
+    }
+}
+
+/// Connects to the shim that an earlier daemon left.
+pub(super) async fn adopt(
+    id: &str,
+    directory: &Path,
+    runtime: &Runtime,
+    pidfd: OwnedFd,
+) -> Result<Arc<LocalServant>, Error> {
+    let path = directory.join(launch::SPEC);
+    let missing = || Error::Malformed {
+        path: path.clone(),
+        reason: "there is no launch record".into(),
+    };
+    let launch: Launch = launch::read(&path)?.ok_or_else(missing)?;
+    let opened = File::open(directory).map_err(Error::file("open", directory))?;
+    // Through a descriptor: the path itself may be longer than an address can be.
+    let address = format!("/proc/self/fd/{}/{}", opened.as_raw_fd(), launch::SOCKET);
+    let control = StdStream::connect(address)
+        .map_err(Error::file("connect to", directory.join(launch::SOCKET)))?;
+    // The pid is that of the process held by its pidfd.
+    let network = NetNs::from_pid(runtime.shim.pid)?;
+    let servant = connect(
+        id,
+        directory,
+        network,
+        control,
+        runtime,
+        pidfd,
+        launch.grace,
+    )?;
+    let mut state = servant.known.state.subscribe();
+    let mut closed = servant.known.closed.subscribe();
+    let silent = || Error::Ended {
+        id: id.to_owned(),
+        reason: "its shim does not answer".into(),
+    };
+    let answered = async {
+        tokio::select! {
+            _ = state.wait_for(|state| *state != ContainerState::Creating) => Ok(()),
+            _ = closed.wait_for(|closed| *closed) => Err(silent()),
+        }
+    };
+    tokio::time::timeout(ANSWER, answered)
+        .await
+        .map_err(|_| silent())??;
+    Ok(servant)
+}
+
+fn connect(
+    id: &str,
+    directory: &Path,
+    network: NetNs,
+    control: StdStream,
+    runtime: &Runtime,
+    pidfd: OwnedFd,
+    grace: Grace,
+) -> Result<Arc<LocalServant>, Error> {
+    control
+        .set_nonblocking(true)
+        .map_err(Error::call("talking to a shim"))?;
+    let stream = UnixStream::from_std(control).map_err(Error::call("talking to a shim"))?;
+    let (read, requests) = Requests::split(stream);
+    let known = Arc::new(Known::default());
+    let shim = Arc::new(pidfd);
+    let listener = tokio::spawn(watch_over(
+        known.clone(),
+        read,
+        directory.to_owned(),
+        shim.clone(),
+    ));
+    Ok(Arc::new(LocalServant {
+        id: id.to_owned(),
+        directory: directory.to_owned(),
+        network: Arc::new(network),
+        cgroup: runtime.cgroup.clone(),
+        uid_range: runtime.uid_range,
+        grace,
+        shim,
+        requests,
+        known,
+        listener,
+    }))
+}
+
+/// Listens to the shim; when it falls silent without having said how the servant ended, says so in its place.
+async fn watch_over(
+    known: Arc<Known>,
+    read: tokio::net::unix::OwnedReadHalf,
+    directory: PathBuf,
+    shim: Arc<OwnedFd>,
+) {
+    known.listen(read).await;
+    if let Err(error) = wait_for_end(&shim, FINISH).await {
+        tracing::warn!(%error, "a shim closed its connection and did not end");
+    }
+    let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+    let over = matches!(
+        *known.state.borrow(),
+        ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+    );
+    if !over {
+        let lost = || ContainerState::Failed {
+            reason: "its shim was killed".into(),
+        };
+        let state = exit.map_or_else(lost, |exit| {
+            known.nodes.send_replace(exit.nodes);
+            exit.state
+        });
+        known.state.send_replace(state);
+    }
+}
+
+/// Until the process has ended, reaped or not.
+async fn wait_for_end(pidfd: &OwnedFd, patience: Duration) -> std::io::Result<()> {
+    if process::has_ended(pidfd) {
+        return Ok(());
+    }
+    // SAFETY: the descriptor is borrowed for as long as it is watched.
+    let watched =
+        unsafe { AsyncFd::register_with_interest(pidfd.as_fd(), tokio::io::Interest::READABLE) }?;
+    let _ready = tokio::time::timeout(patience, watched.readable()).await??;
+    Ok(())
+}
+
+/// What the shim complained of before it ended.
+fn last_words(directory: &Path) -> String {
+    let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+    if let Some(Exit {
+        state: ContainerState::Failed { reason } | ContainerState::Stopped { reason },
+        ..
+    }) = exit
+    {
+        return reason;
+    }
+    let log = std::fs::read_to_string(directory.join(launch::SHIM_LOG)).unwrap_or_default();
+    match log.trim() {
+        "" => "its shim ended without a word".into(),
+        text => text
+            .lines()
+            .rev()
+            .take(5)
+            .collect::<Vec<_>>()
+            .into_iter()
+            .rev()
+            .collect::<Vec<_>>()
+            .join("; "),
+    }
+}
+
+impl LocalServant {
+    /// Asks the shim.
+    async fn ask(&self, command: Command) -> Result<(), Error> {
+        self.requests
+            .ask(&self.known, command)
+            .await
+            .map_err(|unfulfilled| match unfulfilled {
+                Unfulfilled::Refused(reason) => Error::Refused {
+                    id: self.id.clone(),
+                    reason,
+                },
+                Unfulfilled::Gone => self.ended(),
+            })
+    }
+
+    fn ended(&self) -> Error {
+        let reason = match &*self.known.state.borrow() {
+            ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
+                reason.clone()
+            }
+            _ => "its shim does not answer".into(),
+        };
+        Error::Ended {
+            id: self.id.clone(),
+            reason,
+        }
+    }
+
+    /// Pid of init on the host.
+    fn init(&self) -> Result<i32, Error> {
+        match *self.known.state.borrow() {
+            ContainerState::Running { init_pid } => Ok(init_pid),
+            _ => Err(self.ended()),
+        }
+    }
+}
+
+/// Completes when the servant has ended and its log is complete.
+async fn ended(mut state: watch::Receiver<ContainerState>) {
+    let over = |state: &ContainerState| {
+        matches!(
+            state,
+            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+        )
+    };
+    // The other side is gone with its handle: then nothing more is known either.
+    let _ = state.wait_for(over).await;
+}
+
+#[async_trait]
+impl Servant for LocalServant {
+    fn id(&self) -> &str {
+        &self.id
+    }
+
+    fn state(&self) -> watch::Receiver<ContainerState> {
+        self.known.state.subscribe()
+    }
+
+    fn events(&self) -> broadcast::Receiver<NodeEvent> {
+        self.known.events.subscribe()
+    }
+
+    fn endpoint(&self) -> Endpoint {
+        Endpoint {
+            netns: self.network.clone(),
+        }
+    }
+
+    fn enforced(&self) -> Enforced {
+        self.known.enforced.borrow().clone()
+    }
+
+    async fn set_limits(&self, limits: Limits) -> Result<Enforced, Error> {
+        self.ask(Command::SetLimits(limits)).await?;
+        Ok(self.enforced())
+    }
+
+    async fn processes(&self) -> Result<Vec<i32>, Error> {
+        let init = self.init()?;
+        Ok(self
+            .cgroup
+            .processes()
+            .into_iter()
+            .filter(|pid| *pid != init)
+            .collect())
+    }
+
+    async fn usage(&self) -> Result<Usage, Error> {
+        self.init()?;
+        Ok(self.cgroup.usage())
+    }
+
+    async fn start_node(&self, node: NodeSpec) -> Result<(), Error> {
+        self.ask(Command::StartNode(node)).await
+    }
+
+    async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
+        if !self.known.nodes.borrow().contains_key(node) {
+            return Err(Error::NoNode {
+                id: self.id.clone(),
+                node: node.to_owned(),
+            });
+        }
+        self.ask(Command::SignalNode {
+            node: node.to_owned(),
+            signal,
+        })
+        .await
+    }
+
+    async fn wait_node(&self, node: &str) -> Result<NodeExit, Error> {
+        let mut nodes = self.known.nodes.subscribe();
+        if !nodes.borrow().contains_key(node) {
+            return Err(Error::NoNode {
+                id: self.id.clone(),
+                node: node.to_owned(),
+            });
+        }
+        let mut state = self.known.state.subscribe();
+        let exit = |nodes: &watch::Receiver<_>| {
+            let nodes: watch::Ref<
+                '_,
+                std::collections::BTreeMap<String, crate::protocol::NodeStatus>,
+            > = nodes.borrow();
+            nodes.get(node).and_then(|status| status.ended().cloned())
+        };
+        let over = |state: &ContainerState| {
+            matches!(
+                state,
+                ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+            )
+        };
+        loop {
+            if let Some(exit) = exit(&nodes) {
+                return Ok(exit);
+            }
+            tokio::select! {
+                biased;
+                _ = nodes.changed() => {}
+                _ = state.wait_for(over) => return exit(&nodes).ok_or_else(|| self.ended()),
+            }
+        }
+    }
+
+    fn follow_log(&self, from_start: bool) -> mpsc::Receiver<LogLine> {
+        logs::follow(self.log_path(), from_start, ended(self.state()))
+    }
+
+    fn uid_range(&self) -> (u32, u32) {
+        self.uid_range
+    }
+
+    fn log_path(&self) -> PathBuf {
+        self.directory.join(logs::FILE)
+    }
+
+    async fn stop(&self) -> Result<(), Error> {
+        // Refused or unanswered: it is ending, or gone, or about to be ended by force.
+        let _ = tokio::time::timeout(ANSWER, self.ask(Command::Stop)).await;
+        let patience = self.grace.interrupt + self.grace.terminate + FINISH;
+        if let Err(error) = wait_for_end(&self.shim, patience).await {
+            tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
+            let _ = sys::pidfd_send_signal(self.shim.as_fd(), libc::SIGKILL);
+            let _ = wait_for_end(&self.shim, FINISH).await;
+        }
+        // Its last words are taken in before they are swept away.
+        let mut state = self.known.state.subscribe();
+        let _ = tokio::time::timeout(ANSWER, ended(state.clone())).await;
+        state.mark_unchanged();
+        sweep::sweep(&self.id, &self.directory).await
+    }
+}

@@ -1,0 +1,120 @@
+//! Starting a servant: directory, uids, network, shim.
+
+use std::fs::{self, File};
+use std::io;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::process::Stdio;
+use std::sync::Arc;
+
+use init::socket;
+
+use super::handle::{self, LocalServant};
+use super::{Shared, sweep, validate};
+use crate::launch::{self, Launch};
+use crate::netns::NetNs;
+use crate::process::Identity;
+use crate::spec::{Limits, Spec};
+use crate::{Error, uids};
+
+pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalServant>, Error> {
+    spec.limits = with_defaults(spec.limits, &shared.config.default_limits);
+    validate::validate(&spec)?;
+    let id = spec.id.clone();
+    let directory = shared.config.home_servants_dir.join(&id);
+    match fs::DirBuilder::new().mode(0o755).create(&directory) {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+            return Err(Error::Exists { id });
+        }
+        result => result.map_err(Error::file("make", &directory))?,
+    }
+    let started = start_in(shared, spec, &directory).await;
+    if started.is_err() {
+        if let Err(error) = sweep::sweep(&id, &directory).await {
+            tracing::warn!(%error, id, "a servant that did not start left something");
+        }
+    }
+    started
+}
+
+fn with_defaults(limits: Limits, defaults: &Limits) -> Limits {
+    Limits {
+        cpus: limits.cpus.or(defaults.cpus),
+        cpu_weight: limits.cpu_weight.or(defaults.cpu_weight),
+        memory: limits.memory.or(defaults.memory),
+        pids: limits.pids.or(defaults.pids),
+    }
+}
+
+async fn start_in(
+    shared: &Shared,
+    spec: Spec,
+    directory: &Path,
+) -> Result<Arc<LocalServant>, Error> {
+    let network = shared.networks.take()?;
+    let (first, lock) = uids::take(shared.config.uid_base)?;
+    let launch = Launch {
+        uid_range: (first, uids::RANGE),
+        parent: shared.parent.clone(),
+        isolation: shared.config.isolation,
+        grace: shared.config.grace,
+        init: shared.config.init.clone(),
+        spec,
+    };
+    launch::write(&directory.join(launch::SPEC), &launch)?;
+    let (control, shim) = spawn(shared, directory)?;
+    hand_over(&control, &network, &lock)?;
+    // The shim holds the lock from here on.
+    drop(lock);
+    handle::started(&launch, directory, network, control, shim).await
+}
+
+/// Starts the shim with our socket as its standard input. No descriptor is prepared between fork and exec, so that the
+/// daemon's memory is not copied for it (posix_spawn).
+fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Error> {
+    let (control, theirs) = UnixStream::pair().map_err(Error::call("socketpair for the shim"))?;
+    let path = directory.join(launch::SHIM_LOG);
+    let log = File::create(&path).map_err(Error::file("make", &path))?;
+    let log_again = log.try_clone().map_err(Error::file("open", &path))?;
+    let (program, arguments) =
+        shared
+            .config
+            .shim_command
+            .split_first()
+            .ok_or_else(|| Error::Call {
+                call: "starting a shim without a shim_command",
+                source: io::Error::from(io::ErrorKind::InvalidInput),
+            })?;
+    let mut command = tokio::process::Command::new(program);
+    command.args(arguments).arg(directory).env_clear();
+    // Memory of the allocator is per process, and there is a process for every servant.
+    command.env("MALLOC_ARENA_MAX", "1");
+    for name in ["PATH", "RUST_BACKTRACE", "RUST_LOG"] {
+        if let Some(value) = std::env::var_os(name) {
+            command.env(name, value);
+        }
+    }
+    command
+        .stdin(Stdio::from(OwnedFd::from(theirs)))
+        .stdout(log)
+        .stderr(log_again);
+    let mut child = command
+        .spawn()
+        .map_err(Error::file("start the shim", program))?;
+    let pid = child.id().unwrap_or_default() as i32;
+    let identity = Identity::of(pid).map_err(Error::call("looking at the shim just started"))?;
+    // It outlives us; while we live we reap it.
+    tokio::spawn(async move {
+        let _ = child.wait().await;
+    });
+    Ok((control, identity))
+}
+
+fn hand_over(control: &UnixStream, network: &NetNs, lock: &OwnedFd) -> Result<(), Error> {
+    let fds = [network.as_fd().as_raw_fd(), lock.as_raw_fd()];
+    socket::send(control.as_raw_fd(), b".", &fds)
+        .map(drop)
+        .map_err(Error::call("sending to the shim"))
+}

@@ -1,0 +1,79 @@
+//! Removing what a servant left: its processes, its cgroup, its directories. The same whether it ended as asked, its shim
+//! was killed, or the daemon died half-way through making it.
+
+use std::fs;
+use std::io;
+use std::os::fd::AsFd;
+use std::path::Path;
+use std::time::Duration;
+
+use crate::launch::{self, Launch, Runtime};
+use crate::{Error, process, rootfs, sys};
+
+/// How long processes may take to be gone after they were killed.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Does everything that can be done, then tells the first thing that could not. Nothing to do is no error.
+pub(super) async fn sweep(id: &str, directory: &Path) -> Result<(), Error> {
+    let (id, directory) = (id.to_owned(), directory.to_owned());
+    let work = tokio::task::spawn_blocking(move || sweep_now(&id, &directory));
+    work.await
+        .unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
+}
+
+fn sweep_now(id: &str, directory: &Path) -> Result<(), Error> {
+    // A record that cannot be read was being written: then nothing that it names was made yet.
+    let runtime: Option<Runtime> =
+        launch::read(&directory.join(launch::RUNTIME)).unwrap_or_default();
+    let launch: Option<Launch> = launch::read(&directory.join(launch::SPEC)).unwrap_or_default();
+    let mut outcomes = Vec::new();
+    if let Some(runtime) = runtime {
+        outcomes.push(end_shim(&runtime));
+        outcomes.push(runtime.cgroup.destroy(PATIENCE));
+        if runtime.cgroup.exists() {
+            outcomes.push(Err(Error::LeftOver {
+                id: id.to_owned(),
+                what: "a cgroup".into(),
+            }));
+        }
+    }
+    if let Some(upper) = launch.and_then(|launch| launch.spec.writable) {
+        outcomes.push(remove(&rootfs::work_directory(&upper)));
+    }
+    outcomes.push(remove(directory));
+    outcomes.into_iter().collect()
+}
+
+/// Kills a shim that still runs, and waits until it has.
+fn end_shim(runtime: &Runtime) -> Result<(), Error> {
+    let Some(pidfd) = runtime
+        .shim
+        .open()
+        .map_err(Error::call("looking for a shim"))?
+    else {
+        return Ok(());
+    };
+    let _ = sys::pidfd_send_signal(pidfd.as_fd(), libc::SIGKILL);
+    let mut watched = [nix::poll::PollFd::new(
+        pidfd.as_fd(),
+        nix::poll::PollFlags::POLLIN,
+    )];
+    let milliseconds =
+        nix::poll::PollTimeout::try_from(PATIENCE).unwrap_or(nix::poll::PollTimeout::MAX);
+    let _ = nix::poll::poll(&mut watched, milliseconds);
+    if process::has_ended(&pidfd) {
+        return Ok(());
+    }
+    let source = io::Error::from(io::ErrorKind::TimedOut);
+    Err(Error::Call {
+        call: "killing a shim",
+        source,
+    })
+}
+
+fn remove(directory: &Path) -> Result<(), Error> {
+    match fs::remove_dir_all(directory) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        result => result.map_err(Error::file("remove", directory)),
+    }
+}

@@ -1,0 +1,260 @@
+//! What a spec must be before anything is made for it.
+
+use std::collections::BTreeSet;
+use std::path::{Component, Path};
+
+use crate::Error;
+use crate::spec::{Profile, Spec};
+
+/// Says what is wrong with it, if anything.
+pub(super) fn validate(spec: &Spec) -> Result<(), Error> {
+    problem(spec).map_or(Ok(()), |reason| {
+        Err(Error::InvalidSpec {
+            id: spec.id.clone(),
+            reason,
+        })
+    })
+}
+
+fn problem(spec: &Spec) -> Option<String> {
+    let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+    if spec.id.is_empty()
+        || spec.id.len() > 48
+        || !spec.id.bytes().all(allowed)
+        || spec.id.starts_with('-')
+    {
+        return Some("an id has 1 to 48 of a-z, 0-9 and -, and does not begin with -".into());
+    }
+    if spec.layers.is_empty() {
+        return Some("it has no layers: give at least one directory".into());
+    }
+    if let Some(layer) = spec
+        .layers
+        .iter()
+        .find(|layer| !layer.is_absolute() || !layer.is_dir())
+    {
+        return Some(format!(
+            "layer {} is not a directory with an absolute path",
+            layer.display()
+        ));
+    }
+    match (&spec.writable, spec.profile) {
+        (None, Profile::Compile | Profile::Install) => {
+            return Some("a build needs a writable directory".into());
+        }
+        (Some(path), _) if !plain(path) || path.parent().is_none() => {
+            return Some(format!(
+                "the writable directory {} needs an absolute path",
+                path.display()
+            ));
+        }
+        _ => {}
+    }
+    if let Some(path) = spec.owned_directories.iter().find(|path| !plain(path)) {
+        return Some(format!(
+            "owned directory {} needs an absolute path without dots",
+            path.display()
+        ));
+    }
+    if spec.writable.is_none() && !spec.owned_directories.is_empty() {
+        return Some("owned directories need a writable directory to be made in".into());
+    }
+    for mount in &spec.mounts {
+        if !plain(&mount.target) || mount.target.parent().is_none() {
+            return Some(format!(
+                "mount target {} needs an absolute path without dots",
+                mount.target.display()
+            ));
+        }
+        if !mount.source.is_absolute() || !mount.source.exists() {
+            return Some(format!(
+                "mount source {} is not there",
+                mount.source.display()
+            ));
+        }
+    }
+    let limits = &spec.limits;
+    if limits
+        .cpus
+        .is_some_and(|cpus| !(cpus >= 0.01 && cpus.is_finite()))
+    {
+        return Some("a limit of cores must be at least 0.01".into());
+    }
+    if limits
+        .cpu_weight
+        .is_some_and(|weight| !(1..=10_000).contains(&weight))
+    {
+        return Some("a CPU weight lies between 1 and 10000".into());
+    }
+    if limits.pids == Some(0) || limits.memory.is_some_and(|bytes| bytes < 4 << 20) {
+        return Some("a servant needs at least 4 MiB of memory and one process".into());
+    }
+    let mut names = BTreeSet::new();
+    for node in &spec.nodes {
+        if node.name.is_empty() || !names.insert(&node.name) {
+            return Some(format!("node name {:?} is empty or given twice", node.name));
+        }
+        if node
+            .argv
+            .first()
+            .is_none_or(|program| !program.starts_with('/'))
+        {
+            return Some(format!(
+                "node {} needs the absolute path of its program",
+                node.name
+            ));
+        }
+    }
+    let variables = spec
+        .nodes
+        .iter()
+        .flat_map(|node| &node.environment)
+        .chain(&spec.environment);
+    for (name, value) in variables {
+        if name.is_empty() || name.contains(['=', '\0']) || value.contains('\0') {
+            return Some(format!(
+                "environment variable {name:?} cannot be passed to a program"
+            ));
+        }
+    }
+    None
+}
+
+/// Absolute, and neither `.` nor `..` in it.
+fn plain(path: &Path) -> bool {
+    path.is_absolute()
+        && path
+            .components()
+            .all(|part| matches!(part, Component::RootDir | Component::Normal(_)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::spec::{Limits, Mount, NodeSpec};
+
+    fn good() -> Spec {
+        Spec {
+            id: "a-1".into(),
+            layers: vec!["/usr".into()],
+            writable: None,
+            profile: Profile::Servant,
+            limits: Limits::default(),
+            environment: Default::default(),
+            nodes: vec![],
+            owned_directories: vec![],
+            mounts: vec![],
+            resident: serde_json::Value::Null,
+        }
+    }
+
+    fn node(name: &str, program: &str) -> NodeSpec {
+        serde_json::from_value(serde_json::json!({ "name": name, "argv": [program] })).unwrap()
+    }
+
+    #[test]
+    fn each_fault_is_named() {
+        assert_eq!(problem(&good()), None);
+        let mount = |target: &str| Mount {
+            source: "/usr".into(),
+            target: target.into(),
+            writable: false,
+        };
+        let faults = [
+            (
+                Spec {
+                    id: "A".into(),
+                    ..good()
+                },
+                "an id has",
+            ),
+            (
+                Spec {
+                    id: "../x".into(),
+                    ..good()
+                },
+                "an id has",
+            ),
+            (
+                Spec {
+                    layers: vec![],
+                    ..good()
+                },
+                "no layers",
+            ),
+            (
+                Spec {
+                    layers: vec!["/nonexistent".into()],
+                    ..good()
+                },
+                "/nonexistent",
+            ),
+            (
+                Spec {
+                    profile: Profile::Compile,
+                    ..good()
+                },
+                "writable",
+            ),
+            (
+                Spec {
+                    mounts: vec![mount("/a/../b")],
+                    ..good()
+                },
+                "/a/../b",
+            ),
+            (
+                Spec {
+                    mounts: vec![mount("/")],
+                    ..good()
+                },
+                "mount target /",
+            ),
+            (
+                Spec {
+                    limits: Limits {
+                        cpus: Some(f64::NAN),
+                        ..Limits::default()
+                    },
+                    ..good()
+                },
+                "cores",
+            ),
+            (
+                Spec {
+                    limits: Limits {
+                        memory: Some(1),
+                        ..Limits::default()
+                    },
+                    ..good()
+                },
+                "4 MiB",
+            ),
+            (
+                Spec {
+                    nodes: vec![node("/a", "true")],
+                    ..good()
+                },
+                "absolute path of its program",
+            ),
+            (
+                Spec {
+                    nodes: vec![node("/a", "/x"), node("/a", "/x")],
+                    ..good()
+                },
+                "given twice",
+            ),
+            (
+                Spec {
+                    environment: [("A=B".into(), "".into())].into(),
+                    ..good()
+                },
+                "A=B",
+            ),
+        ];
+        for (spec, words) in faults {
+            let text = problem(&spec).unwrap_or_else(|| panic!("{words} was not noticed"));
+            assert!(text.contains(words), "{text}");
+        }
+    }
+}

@@ -1,0 +1,182 @@
+//! What nodes print: `log.jsonl` in the servant's directory, one JSON object a line, rotated once to `log.jsonl.1`.
+//!
+//! The shim writes ([`Writer`]), whoever wants reads ([`follow`]): neither waits for the other. Lines are numbered, so that
+//! a reader who was too slow for the rotation is told how many it missed instead of missing them silently.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use serde::{Deserialize, Serialize};
+
+mod follow;
+
+pub use follow::follow;
+
+/// The file's name in the servant's directory.
+pub const FILE: &str = "log.jsonl";
+
+/// A longer line is cut into several.
+pub const LONGEST_LINE: usize = 16 * 1024;
+
+/// Bytes after which the file is rotated.
+pub const ROTATE_AT: u64 = 16 << 20;
+
+/// A line as it stands in the file: a [`LogLine`](crate::engine::LogLine) with its number.
+#[derive(Serialize, Deserialize)]
+struct Record<'a> {
+    number: u64,
+    time: SystemTime,
+    node: std::borrow::Cow<'a, str>,
+    stream: std::borrow::Cow<'a, str>,
+    line: std::borrow::Cow<'a, str>,
+}
+
+/// Appends lines.
+#[derive(Debug)]
+pub struct Writer {
+    path: PathBuf,
+    file: File,
+    written: u64,
+    rotate_at: u64,
+    number: u64,
+    failed: bool,
+}
+
+impl Writer {
+    /// Starts an empty log at `path`.
+    pub fn create(path: &Path, rotate_at: u64) -> io::Result<Self> {
+        let file = open(path)?;
+        Ok(Self {
+            path: path.into(),
+            file,
+            written: 0,
+            rotate_at,
+            number: 0,
+            failed: false,
+        })
+    }
+
+    /// Appends one line. A full disk must not end a servant: what cannot be written is dropped, counted by the gap in
+    /// the numbers, and said once on standard error.
+    pub fn append(&mut self, node: &str, stream: &str, line: &str) {
+        let record = Record {
+            number: self.number,
+            time: SystemTime::now(),
+            node: node.into(),
+            stream: stream.into(),
+            line: line.into(),
+        };
+        self.number += 1;
+        match self.write(&record) {
+            Ok(()) => self.failed = false,
+            Err(error) if !self.failed => {
+                self.failed = true;
+                eprintln!(
+                    "lines are lost: could not write {}: {error}",
+                    self.path.display()
+                );
+            }
+            Err(_) => {}
+        }
+    }
+
+    fn write(&mut self, record: &Record<'_>) -> io::Result<()> {
+        let mut text = serde_json::to_vec(record)?;
+        text.push(b'\n');
+        if self.written > 0 && self.written + text.len() as u64 > self.rotate_at {
+            self.rotate()?;
+        }
+        // One write, so that a reader never sees half of two lines mixed; half of one it waits for.
+        self.file.write_all(&text)?;
+        self.written += text.len() as u64;
+        Ok(())
+    }
+
+    fn rotate(&mut self) -> io::Result<()> {
+        fs::rename(&self.path, rotated(&self.path))?;
+        self.file = open(&self.path)?;
+        self.written = 0;
+        Ok(())
+    }
+}
+
+/// Where the older half is.
+pub fn rotated(path: &Path) -> PathBuf {
+    path.with_extension("jsonl.1")
+}
+
+fn open(path: &Path) -> io::Result<File> {
+    File::options().create(true).append(true).open(path)
+}
+
+/// Cuts what a process prints into lines.
+#[derive(Debug, Default)]
+pub struct Lines {
+    rest: Vec<u8>,
+}
+
+impl Lines {
+    /// Takes what was read and gives each line that is complete.
+    pub fn push(&mut self, mut bytes: &[u8], mut each: impl FnMut(&str)) {
+        while let Some(end) = bytes.iter().position(|byte| *byte == b'\n') {
+            self.rest.extend_from_slice(&bytes[..end]);
+            bytes = &bytes[end + 1..];
+            self.flush(&mut each);
+        }
+        for part in bytes.chunks(LONGEST_LINE) {
+            self.rest.extend_from_slice(part);
+            if self.rest.len() >= LONGEST_LINE {
+                self.flush(&mut each);
+            }
+        }
+    }
+
+    /// Gives what is left without a line end.
+    pub fn finish(mut self, mut each: impl FnMut(&str)) {
+        if !self.rest.is_empty() {
+            self.flush(&mut each);
+        }
+    }
+
+    fn flush(&mut self, each: &mut impl FnMut(&str)) {
+        let line = self.rest.strip_suffix(b"\r").unwrap_or(&self.rest);
+        each(&String::from_utf8_lossy(line));
+        self.rest.clear();
+        // One long line is no reason to hold its memory for the life of the servant.
+        self.rest.shrink_to(1024);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_come_whole_however_they_are_read() {
+        let text = "one\r\n\ntwo \u{e9}\nrest";
+        for size in 1..text.len() {
+            let (mut lines, mut seen) = (Lines::default(), Vec::new());
+            for part in text.as_bytes().chunks(size) {
+                lines.push(part, |line| seen.push(line.to_owned()));
+            }
+            lines.finish(|line| seen.push(line.to_owned()));
+            assert_eq!(
+                seen,
+                ["one", "", "two \u{e9}", "rest"],
+                "read {size} bytes at a time"
+            );
+        }
+    }
+
+    #[test]
+    fn a_line_without_an_end_is_cut() {
+        let (mut lines, mut lengths) = (Lines::default(), Vec::new());
+        lines.push(&[b'x'; LONGEST_LINE * 2 + 7], |line| {
+            lengths.push(line.len())
+        });
+        lines.finish(|line| lengths.push(line.len()));
+        assert_eq!(lengths, [LONGEST_LINE, LONGEST_LINE, 7]);
+    }
+}

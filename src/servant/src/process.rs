@@ -1,0 +1,91 @@
+//! Processes by more than their number.
+
+use std::fs;
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+
+use serde::{Deserialize, Serialize};
+
+use crate::sys;
+
+/// A process that is named in a file: its number alone may be somebody else's by the time it is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Identity {
+    /// Its number.
+    pub pid: i32,
+    /// Clock ticks from boot to its start (proc(5), /proc/PID/stat, field 22).
+    pub start: u64,
+}
+
+impl Identity {
+    /// That of a running process.
+    pub fn of(pid: i32) -> io::Result<Self> {
+        let stat = fs::read_to_string(format!("/proc/{pid}/stat"))?;
+        // The name, in parentheses, may hold anything; fields are counted after its end.
+        let start = stat
+            .rsplit_once(") ")
+            .and_then(|(_, fields)| fields.split(' ').nth(19)?.parse().ok());
+        start
+            .map(|start| Self { pid, start })
+            .ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))
+    }
+
+    /// Holds on to it; none when it has ended.
+    pub fn open(&self) -> io::Result<Option<OwnedFd>> {
+        let pidfd = match sys::pidfd_open(self.pid) {
+            Err(error) if error.raw_os_error() == Some(libc::ESRCH) => return Ok(None),
+            result => result?,
+        };
+        // Compared after it was opened: from here on the number is surely that of the process held.
+        match Self::of(self.pid) {
+            Ok(found) if found == *self && !has_ended(&pidfd) => Ok(Some(pidfd)),
+            Ok(_) => Ok(None),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+/// Whether a process has ended, reaped or not: its pidfd is readable then.
+pub(crate) fn has_ended(pidfd: &OwnedFd) -> bool {
+    let mut watched = [nix::poll::PollFd::new(
+        pidfd.as_fd(),
+        nix::poll::PollFlags::POLLIN,
+    )];
+    nix::poll::poll(&mut watched, nix::poll::PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
+}
+
+/// The number on the host of a process held by its pidfd (proc(5), /proc/PID/fdinfo).
+pub(crate) fn pid_of(pidfd: &OwnedFd) -> Option<i32> {
+    use std::os::fd::AsRawFd;
+    let text = fs::read_to_string(format!("/proc/self/fdinfo/{}", pidfd.as_raw_fd())).ok()?;
+    text.lines()
+        .find_map(|line| line.strip_prefix("Pid:")?.trim().parse().ok())
+        .filter(|pid| *pid > 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_is_found_and_another_with_its_number_is_not() {
+        let mut child = std::process::Command::new("cat")
+            .stdin(std::process::Stdio::piped())
+            .spawn()
+            .unwrap();
+        let identity = Identity::of(child.id() as i32).unwrap();
+        let pidfd = identity.open().unwrap().expect("it runs");
+        assert_eq!(pid_of(&pidfd), Some(identity.pid));
+        assert!(!has_ended(&pidfd));
+        let stranger = Identity {
+            start: identity.start + 1,
+            ..identity
+        };
+        assert!(stranger.open().unwrap().is_none());
+        drop(child.stdin.take());
+        child.wait().unwrap();
+        assert!(identity.open().unwrap().is_none());
+        assert!(has_ended(&pidfd));
+    }
+}

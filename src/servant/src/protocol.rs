@@ -1,0 +1,162 @@
+//! What is said over `shim.sock`: JSON, one message a line. A daemon may connect at any time and as often as it
+//! likes; the shim answers each connection with [`FromShim::Hello`], which tells all there is to know, and from
+//! then on with what changes.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::engine::{ContainerState, Enforced, NodeEvent, NodeExit};
+use crate::process::Identity;
+use crate::spec::{Limits, NodeSpec};
+
+/// A node as the shim knows it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct NodeStatus {
+    /// Pid on the host while it runs.
+    pub pid: Option<i32>,
+    /// How it ended last.
+    pub exit: Option<NodeExit>,
+    /// How often it was started.
+    pub starts: u32,
+}
+
+impl NodeStatus {
+    /// It has ended and does not run again at this moment.
+    pub fn ended(&self) -> Option<&NodeExit> {
+        self.exit.as_ref().filter(|_| self.pid.is_none())
+    }
+}
+
+/// From the shim.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "type")]
+pub enum FromShim {
+    /// First on every connection.
+    Hello {
+        /// Who speaks.
+        shim: Identity,
+        /// The container.
+        state: ContainerState,
+        /// Its nodes by name.
+        nodes: BTreeMap<String, NodeStatus>,
+        /// Limits in force.
+        enforced: Enforced,
+    },
+    /// The container's state has changed.
+    State {
+        /// To this.
+        state: ContainerState,
+    },
+    /// Something happened to a node.
+    Node {
+        /// What.
+        event: NodeEvent,
+        /// How the node is now.
+        status: NodeStatus,
+    },
+    /// The limits in force have changed.
+    Enforced {
+        /// To these.
+        enforced: Enforced,
+    },
+    /// An answer to a [`Request`].
+    Reply {
+        /// Which.
+        id: u64,
+        /// None: done. Some: why not.
+        error: Option<String>,
+    },
+}
+
+impl NodeEvent {
+    /// Which node it is about.
+    pub fn node(&self) -> &str {
+        match self {
+            Self::Started { node, .. }
+            | Self::ExecFailed { node, .. }
+            | Self::Exited { node, .. }
+            | Self::Respawning { node } => node,
+        }
+    }
+}
+
+/// To the shim.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Request {
+    /// Returned in the answer.
+    pub id: u64,
+    /// What to do.
+    pub command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Command {
+    /// Start one more node.
+    StartNode(NodeSpec),
+    /// Send a signal to a node's process group.
+    SignalNode {
+        /// Which.
+        node: String,
+        /// Signal number.
+        signal: i32,
+    },
+    /// Change limits.
+    SetLimits(Limits),
+    /// End the servant. Answered when it has begun; the end of the connection tells the rest.
+    Stop,
+}
+
+/// A message as a line.
+pub(crate) fn line<T: Serialize>(message: &T) -> Vec<u8> {
+    // Our own types have string keys only, which is all that could fail.
+    let mut text = serde_json::to_vec(message).unwrap_or_default();
+    text.push(b'\n');
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_are_lines_and_read_as_written() {
+        let event = NodeEvent::Exited {
+            node: "/a\nb".into(),
+            code: Some(1),
+            signal: None,
+            out_of_memory: false,
+        };
+        let messages = [
+            FromShim::State {
+                state: ContainerState::Running { init_pid: 7 },
+            },
+            FromShim::Node {
+                event,
+                status: NodeStatus::default(),
+            },
+            FromShim::Reply {
+                id: 1,
+                error: Some("no".into()),
+            },
+        ];
+        for message in messages {
+            let text = line(&message);
+            assert_eq!(text.iter().filter(|byte| **byte == b'\n').count(), 1);
+            assert_eq!(serde_json::from_slice::<FromShim>(&text).unwrap(), message);
+        }
+        let request = Request {
+            id: 3,
+            command: Command::SignalNode {
+                node: "/a".into(),
+                signal: 2,
+            },
+        };
+        assert_eq!(
+            serde_json::from_slice::<Request>(&line(&request)).unwrap(),
+            request
+        );
+    }
+}

@@ -1,0 +1,188 @@
+//! From exec to the forked creator, all in one thread.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use init::socket::{self, MAX_FDS};
+use nix::sys::socket::{AddressFamily, SockFlag, SockType, socketpair};
+
+use super::create::{self, Creator};
+use crate::cgroup::{self, Cgroup};
+use crate::engine::{ContainerState, Enforced};
+use crate::launch::{self, Exit, Launch, Runtime};
+use crate::local::Isolation;
+use crate::netns::NetNs;
+use crate::process::Identity;
+use crate::protocol::{self, FromShim};
+use crate::{Error, sys};
+
+/// How long a cgroup may take to become empty.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// What the event loop starts with.
+pub(super) struct Begun {
+    pub(super) directory: PathBuf,
+    pub(super) launch: Launch,
+    pub(super) identity: Identity,
+    pub(super) cgroup: Cgroup,
+    pub(super) enforced: Enforced,
+    /// The daemon that started us.
+    pub(super) control: UnixStream,
+    /// Later daemons.
+    pub(super) listener: UnixListener,
+    /// Our end of init's socket.
+    pub(super) init: OwnedFd,
+    pub(super) creator: Creator,
+    /// Held for as long as the uids are in use.
+    pub(super) _uid_lock: OwnedFd,
+}
+
+pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
+    // Fails only for the leader of a process group, such as a shim started by hand from a shell.
+    let _ = nix::unistd::setsid();
+    let control = take_control()?;
+    let (network, uid_lock) = receive_descriptors(&control)?;
+    let path = directory.join(launch::SPEC);
+    let launch: Launch = launch::read(&path)?.ok_or_else(|| Error::Malformed {
+        path: path.clone(),
+        reason: "there is no launch record".into(),
+    })?;
+    let own = std::process::id() as i32;
+    let identity = Identity::of(own).map_err(Error::call("reading our own start time"))?;
+    let cgroup = Cgroup::planned(&launch.parent, &launch.spec.id);
+    let runtime = Runtime {
+        shim: identity,
+        cgroup: cgroup.clone(),
+        uid_range: launch.uid_range,
+    };
+    launch::write(&directory.join(launch::RUNTIME), &runtime)?;
+    let begun = prepare(&launch, &cgroup, &network).and_then(|enforced| {
+        let (ours, theirs) = socketpair(
+            AddressFamily::Unix,
+            SockType::SeqPacket,
+            None,
+            SockFlag::SOCK_CLOEXEC,
+        )
+        .map_err(Error::nix("socketpair for init"))?;
+        let listener = listen(directory)?;
+        let creator = create::fork(directory, &launch, &cgroup, theirs)?;
+        Ok((enforced, ours, listener, creator))
+    });
+    match begun {
+        Ok((enforced, init, listener, creator)) => Ok(Begun {
+            directory: directory.into(),
+            launch,
+            identity,
+            cgroup,
+            enforced,
+            control,
+            listener,
+            init,
+            creator,
+            _uid_lock: uid_lock,
+        }),
+        Err(error) => {
+            give_up(directory, &cgroup, identity, control, &error);
+            Err(error)
+        }
+    }
+}
+
+/// Standard input is the daemon's socket; it becomes /dev/null, and every other descriptor that we were started with is
+/// closed.
+fn take_control() -> Result<UnixStream, Error> {
+    // SAFETY: descriptor 0 is open, or the call fails; the result is a new descriptor that nobody else owns.
+    let control = unsafe { libc::fcntl(0, libc::F_DUPFD_CLOEXEC, 3) };
+    if control < 0 {
+        return Err(Error::call(
+            "taking the daemon's socket from standard input",
+        )(io::Error::last_os_error()));
+    }
+    // SAFETY: as above.
+    let control = unsafe { OwnedFd::from_raw_fd(control) };
+    let null = File::open("/dev/null").map_err(Error::file("open", "/dev/null"))?;
+    // SAFETY: both are open descriptors.
+    if unsafe { libc::dup2(null.as_raw_fd(), 0) } < 0 {
+        return Err(Error::call("dup2")(io::Error::last_os_error()));
+    }
+    drop(null);
+    let kept = control.as_raw_fd() as u32;
+    sys::close_range(3, kept - 1).map_err(Error::call("close_range"))?;
+    sys::close_range(kept + 1, u32::MAX).map_err(Error::call("close_range"))?;
+    Ok(UnixStream::from(control))
+}
+
+/// The network namespace and the lock on our uids come beside one byte.
+fn receive_descriptors(control: &UnixStream) -> Result<(NetNs, OwnedFd), Error> {
+    let mut fds = [-1; MAX_FDS];
+    let received = socket::receive(control.as_raw_fd(), &mut [0], &mut fds);
+    let (_, count) = received.map_err(Error::call("receiving from the daemon"))?;
+    if count != 2 {
+        let error = io::Error::new(io::ErrorKind::UnexpectedEof, "the daemon has gone");
+        return Err(Error::call("receiving from the daemon")(error));
+    }
+    // SAFETY: received just now, owned by nobody else.
+    let [network, lock] = [fds[0], fds[1]].map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
+    Ok((NetNs::from_fd(network)?, lock))
+}
+
+/// Cgroup, limits, network namespace.
+fn prepare(launch: &Launch, cgroup: &Cgroup, network: &NetNs) -> Result<Enforced, Error> {
+    if let Some(shims) = launch.parent.shims() {
+        std::fs::create_dir_all(&shims).map_err(Error::file("make the cgroup", &shims))?;
+        let file = shims.join("cgroup.procs");
+        std::fs::write(&file, std::process::id().to_string())
+            .map_err(Error::file("move the shim into", &file))?;
+    }
+    cgroup.create()?;
+    let enforced = cgroup.set(&launch.spec.limits);
+    let missing = cgroup::missing(&launch.spec.limits, &enforced.limits);
+    if launch.isolation == Isolation::Require && !missing.is_empty() {
+        let reason = match launch.parent.reason.as_str() {
+            "" => format!("cgroup v{}", launch.parent.version),
+            reason => reason.to_owned(),
+        };
+        return Err(Error::Isolation {
+            missing: missing.join(", "),
+            reason,
+        });
+    }
+    network.enter()?;
+    Ok(enforced)
+}
+
+/// Binds `shim.sock` through a descriptor of its directory: the path itself may be longer than an address can be.
+fn listen(directory: &Path) -> Result<UnixListener, Error> {
+    let opened = File::open(directory).map_err(Error::file("open", directory))?;
+    let path = format!("/proc/self/fd/{}/{}", opened.as_raw_fd(), launch::SOCKET);
+    UnixListener::bind(path).map_err(Error::file("listen on", directory.join(launch::SOCKET)))
+}
+
+/// Leaves word, and nothing else.
+fn give_up(directory: &Path, cgroup: &Cgroup, shim: Identity, control: UnixStream, error: &Error) {
+    let state = ContainerState::Failed {
+        reason: error.to_string(),
+    };
+    if let Err(error) = cgroup.destroy(PATIENCE) {
+        eprintln!("{error}");
+    }
+    let exit = Exit {
+        state: state.clone(),
+        nodes: Default::default(),
+    };
+    if let Err(error) = launch::write(&directory.join(launch::EXIT), &exit) {
+        eprintln!("{error}");
+    }
+    let hello = FromShim::Hello {
+        shim,
+        state,
+        nodes: exit.nodes,
+        enforced: Enforced::default(),
+    };
+    // When the daemon has gone, exit.json tells the next one.
+    let _ = io::Write::write_all(&mut &control, &protocol::line(&hello));
+}

@@ -1,0 +1,282 @@
+//! Creating the container, in a process that exits when it is done.
+//!
+//! libcontainer must run in a process with one thread, changes that process's working directory and dumpable flag, and
+//! uses memory that would otherwise stay for the servant's whole life. So the shim forks, the child creates the container as
+//! its own *sibling* (init's parent is the shim), and ends. The mount namespace in which the layers were put together ends
+//! with it too; the container has its own copy.
+
+use std::collections::HashMap;
+use std::ffi::CString;
+use std::fs::File;
+use std::io::Write;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::sync::Arc;
+
+use libcontainer::container::builder::ContainerBuilder;
+use libcontainer::syscall::syscall::SyscallType;
+use libcontainer::workload::{
+    Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError,
+};
+use nix::unistd::ForkResult;
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+use crate::bundle;
+use crate::cgroup::Cgroup;
+use crate::launch::Launch;
+use crate::rootfs::{Rootfs, make_skeleton};
+
+/// A line of the creator's report. The last one counts.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Report {
+    /// Init runs.
+    Created {
+        /// Its pid on the host.
+        init: i32,
+    },
+    /// Something went wrong; maybe not the last words.
+    Failed(String),
+}
+
+/// The creating process.
+#[derive(Debug)]
+pub(super) struct Creator {
+    /// Where it reports.
+    pub(super) report: OwnedFd,
+}
+
+/// Forks it. The calling process must have one thread.
+pub(super) fn fork(
+    directory: &Path,
+    launch: &Launch,
+    cgroup: &Cgroup,
+    socket: OwnedFd,
+) -> Result<Creator, Error> {
+    let (report, write) =
+        nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
+    // SAFETY: one thread, so that the child may do whatever its parent might.
+    match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork of the creator"))? {
+        ForkResult::Parent { .. } => Ok(Creator { report }),
+        ForkResult::Child => {
+            drop(report);
+            let write = Arc::new(File::from(write));
+            // Errors that libcontainer meets in its own children are only logged. On cgroup v1 its cleanup after a failure
+            // kills us, too: then what was logged is all that is known.
+            let _ = tracing::subscriber::set_global_default(Complaints(write.clone()));
+            let outcome = match create(directory, launch, cgroup, socket) {
+                Ok(init) => Report::Created { init },
+                Err(reason) => Report::Failed(reason),
+            };
+            report_line(&write, &outcome);
+            // SAFETY: ends the child without running what the parent has registered for its own end.
+            unsafe { libc::_exit(0) }
+        }
+    }
+}
+
+fn create(
+    directory: &Path,
+    launch: &Launch,
+    cgroup: &Cgroup,
+    socket: OwnedFd,
+) -> Result<i32, String> {
+    let text = |error: &dyn std::error::Error| chain(error);
+    // Opened before anything of the servant is mounted.
+    let init = File::open(&launch.init)
+        .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
+    let oci_path = cgroup.oci_path();
+    if oci_path.is_none() {
+        cgroup
+            .enter(std::process::id())
+            .map_err(|error| text(&error))?;
+    }
+    let skeleton = directory.join("skeleton");
+    make_skeleton(
+        &skeleton,
+        &launch.spec.id,
+        &launch.spec.layers,
+        &launch.spec.mounts,
+    )
+    .map_err(|error| text(&error))?;
+    let rootfs = Rootfs {
+        directory,
+        layers: &launch.spec.layers,
+        skeleton: &skeleton,
+        upper: launch.spec.writable.as_deref(),
+        uid_range: launch.uid_range,
+    };
+    let root = rootfs.mount().map_err(|error| text(&error))?;
+    rootfs
+        .make_owned(&root, &launch.spec.owned_directories)
+        .map_err(|error| text(&error))?;
+    let config = bundle::config(&launch.spec, &root, oci_path, launch.uid_range)
+        .map_err(|error| text(&error))?;
+    let file = directory.join("config.json");
+    let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
+    std::fs::write(&file, json)
+        .map_err(|error| format!("could not write {}: {error}", file.display()))?;
+    let null = || {
+        File::options()
+            .read(true)
+            .write(true)
+            .open("/dev/null")
+            .map_err(|error| text(&error))
+    };
+    let mut container = ContainerBuilder::new(launch.spec.id.clone(), SyscallType::default())
+        .with_root_path(directory.join("container"))
+        .map_err(|error| text(&error))?
+        .with_executor(RunInit {
+            init: Arc::new(init),
+        })
+        .with_stdin(socket)
+        .with_stdout(null()?)
+        .with_stderr(null()?)
+        .validate_id()
+        .map_err(|error| text(&error))?
+        .as_init(directory)
+        .with_systemd(false)
+        .with_detach(true)
+        .as_sibling(true)
+        .build()
+        .map_err(|error| text(&error))?;
+    container.start().map_err(|error| text(&error))?;
+    container
+        .pid()
+        .map(|pid| pid.as_raw())
+        .ok_or_else(|| "libcontainer does not know init's pid".into())
+}
+
+/// An error with all its causes.
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let words = error.to_string();
+        if !text.ends_with(&words) {
+            text = format!("{text}: {words}");
+        }
+        cause = error.source();
+    }
+    text
+}
+
+fn report_line(mut file: &File, report: &Report) {
+    // Nobody reads any more: the shim is gone, and init will see that by itself.
+    let _ = file.write_all(&crate::protocol::line(report));
+}
+
+/// Executes init from an open file: it needs no place in the container and cannot be found there.
+#[derive(Clone)]
+struct RunInit {
+    init: Arc<File>,
+}
+
+impl Executor for RunInit {
+    fn exec(&self, _spec: &libcontainer::oci_spec::runtime::Spec) -> Result<(), ExecutorError> {
+        let name = CString::from(c"cloudroid-init");
+        let environment: [CString; 0] = [];
+        let flags = nix::fcntl::AtFlags::AT_EMPTY_PATH;
+        let Err(error) = nix::unistd::execveat(&*self.init, c"", &[name], &environment, flags);
+        Err(ExecutorError::Other(format!(
+            "init could not be executed: {error}"
+        )))
+    }
+
+    fn validate(
+        &self,
+        _spec: &libcontainer::oci_spec::runtime::Spec,
+    ) -> Result<(), ExecutorValidationError> {
+        Ok(())
+    }
+
+    fn setup_envs(&self, _variables: HashMap<String, String>) -> Result<(), ExecutorSetEnvsError> {
+        // Init needs none, and gives each node its own.
+        Ok(())
+    }
+}
+
+/// Writes what libcontainer logs as errors into the report.
+struct Complaints(Arc<File>);
+
+impl tracing::Subscriber for Complaints {
+    fn enabled(&self, metadata: &tracing::Metadata<'_>) -> bool {
+        *metadata.level() == tracing::Level::ERROR
+    }
+
+    fn max_level_hint(&self) -> Option<tracing::level_filters::LevelFilter> {
+        Some(tracing::level_filters::LevelFilter::ERROR)
+    }
+
+    fn event(&self, event: &tracing::Event<'_>) {
+        let mut text = String::new();
+        event.record(
+            &mut |field: &tracing::field::Field, value: &dyn std::fmt::Debug| {
+                let separator = if text.is_empty() { "" } else { ", " };
+                let part = if field.name() == "message" {
+                    format!("{separator}{value:?}")
+                } else {
+                    format!("{separator}{}: {value:?}", field.name())
+                };
+                text += &part;
+            },
+        );
+        report_line(&self.0, &Report::Failed(text));
+    }
+
+    fn new_span(&self, _span: &tracing::span::Attributes<'_>) -> tracing::Id {
+        tracing::Id::from_u64(1)
+    }
+
+    fn record(&self, _span: &tracing::Id, _values: &tracing::span::Record<'_>) {}
+
+    fn record_follows_from(&self, _span: &tracing::Id, _follows: &tracing::Id) {}
+
+    fn enter(&self, _span: &tracing::Id) {}
+
+    fn exit(&self, _span: &tracing::Id) {}
+}
+
+impl Creator {
+    /// Reads what is left of the report and tells the outcome. `text` is the whole report.
+    pub(super) fn outcome(text: &str) -> Result<i32, String> {
+        let mut complaints: Vec<String> = Vec::new();
+        for line in text.lines() {
+            match serde_json::from_str(line) {
+                Ok(Report::Created { init }) => return Ok(init),
+                Ok(Report::Failed(reason)) if !complaints.contains(&reason) => {
+                    complaints.push(reason)
+                }
+                Ok(Report::Failed(_)) => {}
+                Err(_) => complaints.push(line.to_owned()),
+            }
+        }
+        // The outermost error comes last and says least; the first is the cause.
+        match complaints.as_slice() {
+            [] => Err("the creating process ended without a word: see the kernel's log for an out-of-memory kill".into()),
+            [only] => Err(only.clone()),
+            [first, .., last] => Err(format!("{last} ({first})")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cause_is_told_with_the_outermost_error() {
+        let line = |report: &Report| String::from_utf8(crate::protocol::line(report)).unwrap();
+        let failed = |text: &str| line(&Report::Failed(text.into()));
+        assert_eq!(
+            Creator::outcome(&(failed("warning") + &line(&Report::Created { init: 7 }))),
+            Ok(7)
+        );
+        assert_eq!(
+            Creator::outcome(&(failed("no such mount") + &failed("create failed"))).unwrap_err(),
+            "create failed (no such mount)"
+        );
+        assert!(Creator::outcome("").unwrap_err().contains("without a word"));
+    }
+}

@@ -1,0 +1,291 @@
+//! The servant's processes as the shim knows them. Pure bookkeeping: what has happened goes in, what to tell and what to
+//! do about it comes out.
+
+use std::collections::BTreeMap;
+
+use crate::engine::{NodeEvent, NodeExit};
+use crate::protocol::NodeStatus;
+use crate::spec::NodeSpec;
+
+/// One node.
+#[derive(Debug)]
+struct Node {
+    spec: NodeSpec,
+    status: NodeStatus,
+    /// Pid inside, while it runs.
+    inside: Option<i32>,
+}
+
+/// All of them.
+#[derive(Debug, Default)]
+pub(super) struct Nodes {
+    known: BTreeMap<String, Node>,
+    /// Starts that init has not answered yet, by their number.
+    starting: BTreeMap<u32, String>,
+    next: u32,
+}
+
+/// What follows from the end of a node.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Consequence {
+    /// Nothing.
+    None,
+    /// It is to be started again, after so many seconds.
+    Respawn(f64),
+    /// The servant ends.
+    EndServant,
+}
+
+impl Nodes {
+    /// Adds a node, or replaces one of the same name that has ended.
+    pub(super) fn add(&mut self, spec: NodeSpec) -> Result<(), String> {
+        if spec.name.is_empty()
+            || spec
+                .argv
+                .first()
+                .is_none_or(|program| !program.starts_with('/'))
+        {
+            return Err(format!(
+                "node {:?} needs a name and the absolute path of its program",
+                spec.name
+            ));
+        }
+        let starting = self.starting.values().any(|name| *name == spec.name);
+        let running = self
+            .known
+            .get(&spec.name)
+            .is_some_and(|node| node.inside.is_some());
+        if starting || running {
+            return Err(format!(
+                "node {} runs already: stop it first or choose another name",
+                spec.name
+            ));
+        }
+        let starts = self
+            .known
+            .get(&spec.name)
+            .map_or(0, |node| node.status.starts);
+        let status = NodeStatus {
+            starts,
+            ..NodeStatus::default()
+        };
+        self.known.insert(
+            spec.name.clone(),
+            Node {
+                spec,
+                status,
+                inside: None,
+            },
+        );
+        Ok(())
+    }
+
+    /// A number for the start of a node, and what is to be started.
+    pub(super) fn start(&mut self, name: &str) -> Option<(u32, NodeSpec)> {
+        let node = self.known.get(name).filter(|node| node.inside.is_none())?;
+        let number = self.next;
+        self.next = self.next.wrapping_add(1);
+        self.starting.insert(number, name.to_owned());
+        Some((number, node.spec.clone()))
+    }
+
+    /// Init has executed it.
+    pub(super) fn started(&mut self, number: u32, inside: i32, host: i32) -> Option<NodeEvent> {
+        let name = self.starting.remove(&number)?;
+        let node = self.known.get_mut(&name)?;
+        node.inside = Some(inside);
+        node.status.pid = Some(host);
+        node.status.starts += 1;
+        Some(NodeEvent::Started {
+            node: name,
+            pid: host,
+        })
+    }
+
+    /// It could not be executed.
+    pub(super) fn failed(
+        &mut self,
+        number: u32,
+        reason: String,
+    ) -> Option<(NodeEvent, Consequence)> {
+        let name = self.starting.remove(&number)?;
+        let node = self.known.get_mut(&name)?;
+        node.status.exit = Some(NodeExit {
+            code: None,
+            signal: None,
+            out_of_memory: false,
+            exec_error: Some(reason.clone()),
+        });
+        // Started again it would fail again.
+        let consequence = if node.spec.required {
+            Consequence::EndServant
+        } else {
+            Consequence::None
+        };
+        Some((NodeEvent::ExecFailed { node: name, reason }, consequence))
+    }
+
+    /// The process with this pid inside has ended; none when it is not a node.
+    pub(super) fn exited(
+        &mut self,
+        inside: i32,
+        exit: NodeExit,
+    ) -> Option<(NodeEvent, Consequence)> {
+        let (name, node) = self
+            .known
+            .iter_mut()
+            .find(|(_, node)| node.inside == Some(inside))?;
+        node.inside = None;
+        node.status.pid = None;
+        node.status.exit = Some(exit.clone());
+        let consequence = match &node.spec {
+            spec if spec.required => Consequence::EndServant,
+            spec if spec.respawn => Consequence::Respawn(spec.respawn_delay.clamp(0.0, 3600.0)),
+            _ => Consequence::None,
+        };
+        let NodeExit {
+            code,
+            signal,
+            out_of_memory,
+            ..
+        } = exit;
+        Some((
+            NodeEvent::Exited {
+                node: name.clone(),
+                code,
+                signal,
+                out_of_memory,
+            },
+            consequence,
+        ))
+    }
+
+    /// Nodes that run or are being started, with their pids inside where known.
+    pub(super) fn alive(&self) -> (Vec<(String, i32)>, usize) {
+        let running = self
+            .known
+            .iter()
+            .filter_map(|(name, node)| Some((name.clone(), node.inside?)))
+            .collect();
+        (running, self.starting.len())
+    }
+
+    /// Pid inside of a node.
+    pub(super) fn inside(&self, name: &str) -> Result<i32, String> {
+        let node = self
+            .known
+            .get(name)
+            .ok_or_else(|| format!("there is no node {name}"))?;
+        node.inside
+            .ok_or_else(|| format!("node {name} does not run"))
+    }
+
+    /// How one is.
+    pub(super) fn status(&self, name: &str) -> NodeStatus {
+        self.known
+            .get(name)
+            .map(|node| node.status.clone())
+            .unwrap_or_default()
+    }
+
+    /// How all are.
+    pub(super) fn statuses(&self) -> BTreeMap<String, NodeStatus> {
+        self.known
+            .iter()
+            .map(|(name, node)| (name.clone(), node.status.clone()))
+            .collect()
+    }
+}
+
+/// Reads a status as `waitpid` gives it.
+pub(super) fn exit_of(status: i32, out_of_memory: bool) -> NodeExit {
+    let code = libc::WIFEXITED(status).then(|| libc::WEXITSTATUS(status));
+    let signal = libc::WIFSIGNALED(status).then(|| libc::WTERMSIG(status));
+    NodeExit {
+        code,
+        signal,
+        out_of_memory,
+        exec_error: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn node(name: &str, required: bool, respawn: bool) -> NodeSpec {
+        let argv = vec!["/bin/true".to_owned()];
+        let respawn_delay = 0.5;
+        NodeSpec {
+            name: name.into(),
+            argv,
+            environment: BTreeMap::new(),
+            directory: String::new(),
+            respawn,
+            respawn_delay,
+            required,
+        }
+    }
+
+    fn run(nodes: &mut Nodes, spec: NodeSpec, inside: i32) {
+        let name = spec.name.clone();
+        nodes.add(spec).unwrap();
+        let (number, _) = nodes.start(&name).unwrap();
+        nodes.started(number, inside, inside + 1000).unwrap();
+    }
+
+    #[test]
+    fn the_end_of_a_node_has_the_consequence_that_ros_users_know() {
+        let mut nodes = Nodes::default();
+        run(&mut nodes, node("/plain", false, false), 2);
+        run(&mut nodes, node("/again", false, true), 3);
+        run(&mut nodes, node("/needed", true, true), 4);
+        let mut end = |pid| {
+            nodes
+                .exited(pid, exit_of(0, false))
+                .map(|(_, consequence)| consequence)
+        };
+        assert_eq!(end(2), Some(Consequence::None));
+        assert_eq!(end(3), Some(Consequence::Respawn(0.5)));
+        assert_eq!(end(4), Some(Consequence::EndServant));
+        assert_eq!(end(4), None, "it ended once");
+        assert_eq!(end(99), None, "an orphan is no node");
+    }
+
+    #[test]
+    fn a_name_is_free_again_once_its_node_has_ended() {
+        let mut nodes = Nodes::default();
+        run(&mut nodes, node("/a", false, false), 2);
+        assert!(
+            nodes
+                .add(node("/a", false, false))
+                .unwrap_err()
+                .contains("runs already")
+        );
+        nodes.exited(2, exit_of(256, false)).unwrap();
+        assert_eq!(nodes.status("/a").ended().unwrap().code, Some(1));
+        run(&mut nodes, node("/a", false, false), 3);
+        assert_eq!(
+            (nodes.status("/a").starts, nodes.status("/a").pid),
+            (2, Some(1003))
+        );
+        assert!(
+            nodes
+                .add(NodeSpec {
+                    argv: vec!["relative".into()],
+                    ..node("/b", false, false)
+                })
+                .is_err()
+        );
+    }
+
+    #[test]
+    fn statuses_are_read_as_wait_means_them() {
+        assert_eq!(exit_of(0x0300, false).code, Some(3));
+        assert_eq!(exit_of(9, true).signal, Some(9));
+        assert_eq!(
+            (exit_of(9, true).code, exit_of(9, true).out_of_memory),
+            (None, true)
+        );
+    }
+}
