@@ -127,7 +127,7 @@ impl NewFile {
         std::fs::rename(&self.path, target)
             .map_err(|error| Error::file("create", target, error))?;
         self.published = true;
-        sync_directory(target.parent().unwrap_or(Path::new("/")))
+        sync_directory(directory_of(target))
     }
 }
 
@@ -150,6 +150,15 @@ impl Write for &NewFile {
     }
 }
 
+/// The directory a file is in; a bare name is in the working directory.
+pub(crate) fn directory_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(parent) if parent.as_os_str().is_empty() => Path::new("."),
+        Some(parent) => parent,
+        None => Path::new("/"),
+    }
+}
+
 /// Makes the names in a directory durable.
 pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
     open(directory)?
@@ -159,7 +168,7 @@ pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
 
 /// Writes a small file whole.
 pub(crate) fn write_whole(target: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let new = NewFile::create(target.parent().unwrap_or(Path::new("/")))?;
+    let new = NewFile::create(directory_of(target))?;
     (&new)
         .write_all(bytes)
         .map_err(|error| Error::file("write", target, error).needing(bytes.len() as u64))?;

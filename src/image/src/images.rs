@@ -6,6 +6,9 @@ use crate::oci::{self, Config, Descriptor, History, Process, REF_NAME, RootFs};
 use crate::store::json;
 use crate::{Digest, Error, LayerInfo, Store};
 
+/// Every image's date: a true one would give equal images different digests. umoci fails without one.
+const EPOCH: &str = "1970-01-01T00:00:00Z";
+
 /// What to make an image of. The same values always give the same digest.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ImageSpec {
@@ -284,7 +287,7 @@ fn check_tag(name: &str) -> Result<(), Error> {
 fn configuration(spec: &ImageSpec) -> Config {
     let (architecture, variant) = oci::platform();
     Config {
-        created: None,
+        created: Some(EPOCH.to_owned()),
         architecture: architecture.to_owned(),
         variant: variant.map(str::to_owned),
         os: "linux".to_owned(),
@@ -306,6 +309,7 @@ fn configuration(spec: &ImageSpec) -> Config {
             .layers
             .iter()
             .map(|_| History {
+                created: EPOCH.to_owned(),
                 created_by: "cloudroid".to_owned(),
             })
             .collect(),

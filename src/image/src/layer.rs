@@ -140,7 +140,7 @@ impl Store {
         let layer = self.existing_layer(diff_id)?;
         let from = self.blob_path(&layer.digest);
         let mut file = File::open(&from).map_err(|error| Error::file("open", &from, error))?;
-        let new = NewFile::create(to.parent().unwrap_or(Path::new("/")))?;
+        let new = NewFile::create(files::directory_of(to))?;
         // From file to file the kernel copies, or shares the blocks.
         io::copy(&mut file, &mut new.file())
             .map_err(|error| Error::file("write", to, error).needing(layer.size))?;

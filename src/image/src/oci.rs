@@ -145,6 +145,8 @@ pub(crate) struct RootFs {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct History {
     #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub(crate) created: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub(crate) created_by: String,
 }
 
