@@ -1,1 +1,55 @@
-//! rootfs_builder
+//! From a pushed package to an image.
+//!
+//! ```text
+//!              base definition (images/NAME.toml)
+//!                       │
+//!    mmdebstrap ──▶  base layer ◀────────────── cache, by key of inputs ──────────────┐
+//!                       │                                                             │
+//!    apt, dpkg  ──▶  dependencies layer ◀── package.xml, Contents index, ELF files ───┤
+//!                       │                                                             │
+//!    catkin     ──▶  package layer ◀────── sources, compiled in a sandbox ────────────┘
+//!                       │
+//!    roslaunch  ──▶  what to run ──▶ started once by the caller ──▶ probe ──▶ interface
+//! ```
+//!
+//! In: a [`PushRequest`]. Out: a [`BuildOutcome`] with an untagged image in the store and a [`LaunchPlan`]; [`probe`]
+//! then finds the interface of the running thing. Everything foreign runs in containers without network; what needs
+//! the network is apt on the host. The same inputs give the same layers.
+
+#![forbid(unsafe_code)]
+
+mod apt;
+mod archive;
+pub mod base;
+mod bootstrap;
+mod builder;
+mod cache;
+mod compile;
+mod contents;
+mod deb;
+mod elf;
+mod error;
+mod event;
+mod gather;
+mod install;
+mod key;
+mod keys;
+mod launch;
+mod manifest;
+mod packaged;
+mod prebuilt;
+pub mod probe;
+mod process;
+mod pushed;
+mod request;
+mod sandbox;
+mod source;
+mod sources;
+mod workshop;
+
+pub use apt::Sources;
+pub use builder::{Builder, Config, DEFAULT_BASE};
+pub use error::{Error, Unresolved};
+pub use event::BuildEvent;
+pub use launch::{LaunchNode, LaunchPlan};
+pub use request::{BuildOutcome, BuiltLayer, PushRequest, Source};

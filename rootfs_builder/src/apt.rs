@@ -1,0 +1,332 @@
+//! The distribution's archive, asked through apt with a state directory of its own: nothing of the host's apt is
+//! changed, and the host needs nothing installed but apt.
+//!
+//! In: names of Debian packages and the dpkg status of what is there already. Out: exact versions, and the files.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use serde::{Deserialize, Serialize};
+use tokio::process::Command;
+
+use crate::error::{Error, IoAt};
+use crate::event::Progress;
+use crate::process::{self, Stream};
+
+/// Where packages come from.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Sources {
+    /// The host's own apt sources, where the host is of the same release; else mmdebstrap's default mirror.
+    #[default]
+    Automatic,
+    /// Lines of a sources.list.
+    Lines(Vec<String>),
+}
+
+/// One package at one version.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Deb {
+    /// Without architecture.
+    pub name: String,
+    /// As in the archive.
+    pub version: String,
+    /// `amd64`, `all`.
+    pub architecture: String,
+}
+
+impl std::fmt::Display for Deb {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}={}:{}", self.name, self.version, self.architecture)
+    }
+}
+
+impl Deb {
+    /// The name apt gives the file: the epoch's colon is escaped.
+    fn file_name(&self) -> String {
+        format!("{}_{}_{}.deb", self.name, self.version.replace(':', "%3a"), self.architecture)
+    }
+}
+
+/// apt with a state of its own.
+#[derive(Debug, Clone)]
+pub struct Apt {
+    root: PathBuf,
+}
+
+/// Lists older than this are fetched again before they are used.
+const FRESH: Duration = Duration::from_secs(24 * 3600);
+
+impl Apt {
+    /// Prepares the directory; asks the network nothing yet. `sources`: none for the host's own.
+    pub fn open(root: &Path, sources: Option<&str>) -> Result<Self, Error> {
+        for directory in ["state/lists/partial", "cache", "archives", "parts"] {
+            let path = root.join(directory);
+            fs::create_dir_all(&path).at("making", &path)?;
+        }
+        let status = root.join("empty-status");
+        fs::write(&status, "").at("writing", &status)?;
+        let mut conf = CONFIGURATION.replace("@ROOT@", &root.display().to_string());
+        if let Some(sources) = sources {
+            let path = root.join("sources.list");
+            fs::write(&path, sources).at("writing", &path)?;
+            conf.push_str(&format!(
+                "Dir::Etc::sourcelist \"{0}/sources.list\";\nDir::Etc::sourceparts \"{0}/parts\";\n",
+                root.display()
+            ));
+        }
+        let path = root.join("apt.conf");
+        fs::write(&path, conf).at("writing", &path)?;
+        Ok(Self { root: root.to_owned() })
+    }
+
+    fn command(&self, program: &str) -> Command {
+        let mut command = process::command(program);
+        // Given as an option, it is read after the host's own files and so has the last word.
+        command.arg("-c").arg(self.root.join("apt.conf"));
+        command
+    }
+
+    /// Fetches the lists (packages, and which file is in which) if they are missing or a day old, or when
+    /// `force`d. With old lists at hand a failure is only a warning, which is returned.
+    pub async fn refresh(&self, force: bool, progress: &Progress) -> Result<Option<String>, Error> {
+        let stamp = self.root.join("updated");
+        let age = age(&stamp);
+        if !force && age.is_some_and(|age| age < FRESH) {
+            return Ok(None);
+        }
+        progress.step("fetching package lists").await;
+        let mut update = self.command("apt-get");
+        update.args(["-q", "--error-on=any", "update"]);
+        let mut lines = Vec::new();
+        let result = process::run(update, "apt", |_, line| lines.push(line.to_owned())).await;
+        for line in lines {
+            progress.log(&line).await;
+        }
+        match result {
+            Ok(()) => {
+                fs::write(&stamp, "").at("writing", &stamp)?;
+                Ok(None)
+            }
+            Err(error) if age.is_some() => {
+                Ok(Some(format!("package lists could not be fetched, using those at hand: {error}")))
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The lists that tell which file is in which package.
+    pub async fn contents_files(&self) -> Result<Vec<PathBuf>, Error> {
+        let mut query = self.command("apt-get");
+        query.args(["indextargets", "--format", "$(FILENAME)", "Created-By: Contents-deb"]);
+        let text = process::output(query, "apt").await?;
+        Ok(text.lines().map(PathBuf::from).filter(|path| path.is_file()).collect())
+    }
+
+    /// Names of all packages that can be installed.
+    pub async fn names(&self) -> Result<BTreeSet<String>, Error> {
+        let mut query = self.command("apt-cache");
+        query.arg("pkgnames");
+        let text = process::output(query, "apt").await?;
+        Ok(text.lines().map(str::to_owned).collect())
+    }
+
+    /// What must be installed, in an order that dpkg accepts, so that all of `names` are, given what `status`
+    /// (a dpkg status file; none for an empty system) says is there. Recommended packages are not.
+    pub async fn resolve(&self, status: Option<&Path>, names: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
+        if names.is_empty() {
+            return Ok(Vec::new());
+        }
+        let status = status.map_or_else(|| self.root.join("empty-status"), Path::to_owned);
+        let mut simulate = self.command("apt-get");
+        simulate.arg("-o").arg(format!("Dir::State::status={}", status.display()));
+        simulate.args(["-q", "-s", "-y", "--no-install-recommends", "--no-remove", "install", "--"]);
+        simulate.args(names);
+        match process::output(simulate, "apt").await {
+            Ok(text) => Ok(text.lines().filter_map(parse_inst).collect()),
+            Err(Error::Program { last_lines, .. }) => Err(Error::Unsolvable {
+                wanted: names.iter().map(String::as_str).collect::<Vec<_>>().join(", "),
+                words: apts_words(&last_lines),
+            }),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The versions apt would install, of each alone, without what they depend on.
+    pub async fn candidates(&self, names: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
+        if names.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut query = self.command("apt-cache");
+        query.args(["--no-all-versions", "show", "--"]).args(names);
+        let text = process::output(query, "apt").await?;
+        let mut debs: Vec<Deb> = text.split("\n\n").filter_map(parse_stanza).collect();
+        debs.sort();
+        debs.dedup();
+        Ok(debs)
+    }
+
+    /// Files of these packages, in the same order; those not in the cache are fetched and checked by apt.
+    pub async fn download(&self, debs: &[Deb], progress: &Progress) -> Result<Vec<PathBuf>, Error> {
+        let archives = self.root.join("archives");
+        let missing: Vec<&Deb> = debs.iter().filter(|deb| !archives.join(deb.file_name()).is_file()).collect();
+        if !missing.is_empty() {
+            let total = missing.len() as u64;
+            progress.step(&format!("downloading {total} packages")).await;
+            // Into a directory of its own, then renamed: what is in `archives` is whole.
+            let partial = tempfile::Builder::new()
+                .prefix(".partial-")
+                .tempdir_in(&archives)
+                .at("making a directory in", &archives)?;
+            let mut download = self.command("apt-get");
+            download.current_dir(partial.path()).args(["-q", "download", "--"]);
+            download.args(missing.iter().map(|deb| format!("{}={}", deb.name, deb.version)));
+            let mut done = 0;
+            process::run(download, "apt", |stream, line| {
+                if stream == Stream::Out && line.starts_with("Get:") {
+                    done += 1;
+                    progress.count("packages", done, Some(total));
+                }
+            })
+            .await?;
+            for deb in missing {
+                let from = partial.path().join(deb.file_name());
+                fs::rename(&from, archives.join(deb.file_name())).at("keeping", &from)?;
+            }
+        }
+        Ok(debs.iter().map(|deb| archives.join(deb.file_name())).collect())
+    }
+
+    /// Whether the lists need not be fetched again yet.
+    pub fn is_fresh(&self) -> bool {
+        age(&self.root.join("updated")).is_some_and(|age| age < FRESH)
+    }
+
+    /// Where lists and packages are kept.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Changes whenever the lists do.
+    pub fn stamp(&self) -> String {
+        let mut parts = Vec::new();
+        let lists = self.root.join("state/lists");
+        for entry in fs::read_dir(&lists).into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if name.ends_with("Release") || name.ends_with("Packages") || name.contains("Packages.") {
+                let about = entry.metadata().ok();
+                let changed = about.as_ref().and_then(|m| m.modified().ok());
+                let seconds = changed.and_then(|t| t.duration_since(SystemTime::UNIX_EPOCH).ok());
+                let size = about.map_or(0, |m| m.len());
+                parts.push(format!("{name} {size} {}", seconds.map_or(0, |s| s.as_secs())));
+            }
+        }
+        parts.sort();
+        crate::key::sha256(parts.join("\n").as_bytes())
+    }
+}
+
+/// How long ago it was changed.
+fn age(path: &Path) -> Option<Duration> {
+    let changed = path.metadata().and_then(|about| about.modified()).ok()?;
+    SystemTime::now().duration_since(changed).ok()
+}
+
+/// What differs from the host's apt. Hooks of the host's configuration have no business here.
+const CONFIGURATION: &str = r#"
+Dir::State "@ROOT@/state";
+Dir::State::status "@ROOT@/empty-status";
+Dir::Cache "@ROOT@/cache";
+Dir::Cache::srcpkgcache "srcpkgcache.bin";
+Dir::Cache::pkgcache "";
+Dir::Etc::preferences "/dev/null";
+Dir::Etc::preferencesparts "@ROOT@/parts";
+APT::Sandbox::User "root";
+APT::Default-Release "";
+APT::Install-Recommends "false";
+Acquire::Languages "none";
+Acquire::Retries "3";
+#clear APT::Update::Pre-Invoke;
+#clear APT::Update::Post-Invoke;
+#clear APT::Update::Post-Invoke-Success;
+#clear DPkg::Pre-Install-Pkgs;
+#clear DPkg::Pre-Invoke;
+#clear DPkg::Post-Invoke;
+Acquire::IndexTargets::deb::DEP-11::DefaultEnabled "false";
+Acquire::IndexTargets::deb::DEP-11-icons-small::DefaultEnabled "false";
+Acquire::IndexTargets::deb::DEP-11-icons::DefaultEnabled "false";
+Acquire::IndexTargets::deb::Contents-deb {
+  MetaKey "$(COMPONENT)/Contents-$(ARCHITECTURE)";
+  flatMetaKey "Contents-$(ARCHITECTURE)";
+  ShortDescription "Contents-$(ARCHITECTURE)";
+  Description "$(RELEASE)/$(COMPONENT) $(ARCHITECTURE) Contents (deb)";
+  KeepCompressed "true";
+  KeepCompressedAs "gz";
+};
+Acquire::IndexTargets::deb::Contents-deb::DefaultEnabled "true";
+"#;
+
+/// `Inst libfoo1 [1.0] (1.2-3 Debian:12.1/stable [amd64]) []`
+fn parse_inst(line: &str) -> Option<Deb> {
+    let rest = line.strip_prefix("Inst ")?;
+    let name = rest.split([' ', ':']).next()?;
+    let inside = rest.split_once('(')?.1.split_once(')')?.0;
+    let version = inside.split(' ').next()?;
+    let architecture = inside.rsplit_once('[')?.1.strip_suffix(']')?;
+    Some(Deb { name: name.to_owned(), version: version.to_owned(), architecture: architecture.to_owned() })
+}
+
+/// A stanza of `apt-cache show`.
+fn parse_stanza(stanza: &str) -> Option<Deb> {
+    let field = |name: &str| {
+        stanza.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": ").map(str::to_owned))
+    };
+    Some(Deb { name: field("Package")?, version: field("Version")?, architecture: field("Architecture")? })
+}
+
+/// The part of apt's refusal that says why.
+fn apts_words(lines: &str) -> String {
+    let words: Vec<&str> = lines
+        .lines()
+        .skip_while(|line| !line.starts_with("E:") && !line.starts_with("The following packages have unmet"))
+        .map(str::trim)
+        .collect();
+    if words.is_empty() { lines.to_owned() } else { words.join("; ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn apts_simulation_is_understood() {
+        let deb = parse_inst("Inst libssl3 [3.0.1-1] (3.0.17-1~deb12u2 Debian:12.12/oldstable, Debian-Security:12 [amd64]) []");
+        let deb = deb.expect("an installation");
+        assert_eq!(deb.to_string(), "libssl3=3.0.17-1~deb12u2:amd64");
+        let plain = parse_inst("Inst ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])").expect("an installation");
+        assert_eq!(plain.architecture, "all");
+        assert_eq!(parse_inst("Conf ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])"), None);
+    }
+
+    #[test]
+    fn epochs_are_escaped_in_file_names() {
+        let deb = Deb { name: "login".into(), version: "1:4.13+dfsg1-1".into(), architecture: "amd64".into() };
+        assert_eq!(deb.file_name(), "login_1%3a4.13+dfsg1-1_amd64.deb");
+    }
+
+    #[test]
+    fn the_reason_is_taken_from_apts_refusal() {
+        let lines = "Reading package lists...\nBuilding dependency tree...\nE: Unable to locate package nonesuch";
+        assert_eq!(apts_words(lines), "E: Unable to locate package nonesuch");
+    }
+
+    #[test]
+    fn the_state_directory_is_its_own() {
+        let root = tempfile::tempdir().expect("a directory");
+        Apt::open(root.path(), Some("deb http://example.invalid/debian bookworm main")).expect("prepared");
+        let conf = fs::read_to_string(root.path().join("apt.conf")).expect("written");
+        assert!(conf.contains(&format!("Dir::State \"{}/state\"", root.path().display())), "{conf}");
+        assert!(conf.contains("sources.list"), "{conf}");
+    }
+}

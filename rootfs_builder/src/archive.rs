@@ -1,0 +1,101 @@
+//! The distribution's archive as one thing: versions and files by apt, names by the Contents index.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::apt::Apt;
+use crate::contents::{Carriers, Contents, Part};
+use crate::error::Error;
+use crate::event::Progress;
+
+/// One base's archive.
+pub(crate) struct Archive {
+    pub(crate) apt: Apt,
+    pub(crate) contents: Arc<Contents>,
+    /// All installable packages.
+    pub(crate) names: BTreeSet<String>,
+    /// Changes when the lists do.
+    pub(crate) stamp: String,
+    /// For `sources.list`.
+    pub(crate) sources: String,
+}
+
+impl Archive {
+    /// Opens it; fetches lists where they are missing or old (or `force`d).
+    pub(crate) async fn open(cache: &Path, sources: String, force: bool, progress: &Progress) -> Result<Self, Error> {
+        let name = &crate::key::sha256(sources.as_bytes())[..12];
+        let apt = Apt::open(&cache.join("apt").join(name), Some(&sources))?;
+        if let Some(warning) = apt.refresh(force, progress).await? {
+            progress.warn(warning).await;
+        }
+        let lists = apt.contents_files().await?;
+        let root = apt.root().to_owned();
+        let contents = tokio::task::spawn_blocking(move || Contents::open(&root, &lists)).await??;
+        let names = apt.names().await?;
+        let stamp = apt.stamp();
+        Ok(Self { apt, contents: Arc::new(contents), names, stamp, sources })
+    }
+
+    /// Whether its lists need not be fetched again yet.
+    pub(crate) fn is_fresh(&self) -> bool {
+        self.apt.is_fresh()
+    }
+
+    /// Names that look like a key, the nearest first; at most three.
+    pub(crate) fn similar(&self, key: &str) -> Vec<String> {
+        let plain = key.replace('_', "-").to_lowercase();
+        let bare = plain.trim_start_matches("lib").trim_end_matches("-dev").to_owned();
+        if bare.len() < 3 {
+            return Vec::new();
+        }
+        let mut near: Vec<&String> = self.names.iter().filter(|name| name.contains(&bare)).collect();
+        near.sort_by_key(|name| (name.len(), name.as_str()));
+        near.into_iter().take(3).cloned().collect()
+    }
+
+    /// What to install to run with a ROS package, and which development packages hold files of it besides.
+    pub(crate) fn to_run(&self, ros_package: &str) -> Carried {
+        let mut carried = Carried::default();
+        for (deb, parts) in self.contents.ros_package(ros_package) {
+            let only_cmake = parts.iter().all(|part| *part == Part::CMake);
+            match deb.ends_with("-dev") {
+                true if !only_cmake => carried.unpack.insert(deb),
+                false if !only_cmake => carried.install.insert(deb),
+                _ => false,
+            };
+        }
+        carried
+    }
+
+    /// What to install to compile against a ROS package.
+    pub(crate) fn to_build(&self, ros_package: &str) -> BTreeSet<String> {
+        let needed = [Part::Manifest, Part::CMake, Part::Definitions, Part::Python];
+        let carriers: Carriers = self.contents.ros_package(ros_package);
+        let wanted = |parts: &BTreeSet<Part>| needed.iter().any(|part| parts.contains(part));
+        carriers.into_iter().filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev")).map(|(deb, _)| deb).collect()
+    }
+
+    /// Debian packages with these libraries; second, those that nothing has.
+    pub(crate) fn libraries(&self, names: &BTreeSet<String>) -> (BTreeMap<String, String>, Vec<String>) {
+        let (mut found, mut missing) = (BTreeMap::new(), Vec::new());
+        for name in names {
+            match self.contents.library(name) {
+                Some(deb) => {
+                    found.insert(name.clone(), deb.to_owned());
+                }
+                None => missing.push(name.clone()),
+            }
+        }
+        (found, missing)
+    }
+}
+
+/// Debian packages of one ROS package.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(crate) struct Carried {
+    /// With what they depend on.
+    pub(crate) install: BTreeSet<String>,
+    /// For their files only.
+    pub(crate) unpack: BTreeSet<String>,
+}

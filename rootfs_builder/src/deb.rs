@@ -1,0 +1,171 @@
+//! Looks into Debian packages without installing them.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Write};
+use std::path::{Component, Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, IoAt};
+
+/// A file or link of a Debian package.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Member {
+    /// Relative to the root, such as `usr/share/x/package.xml`.
+    pub(crate) path: PathBuf,
+    /// Permission bits.
+    pub(crate) mode: u32,
+    /// Seconds since 1970.
+    pub(crate) mtime: u64,
+    /// What it is.
+    pub(crate) content: Content,
+}
+
+/// What a member is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) enum Content {
+    /// A regular file.
+    File(#[serde(with = "hex")] Vec<u8>),
+    /// A symbolic link.
+    Link(PathBuf),
+}
+
+/// Members that `keep` accepts. Blocking.
+pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
+    let mut unpack = Command::new("dpkg-deb");
+    unpack.arg("--fsys-tarfile").arg(deb).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut child = unpack.spawn().map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => Error::MissingProgram { program: "dpkg-deb", package: "dpkg" },
+        _ => Error::io("reading", deb, error),
+    })?;
+    let mut found = Vec::new();
+    if let Some(stdout) = child.stdout.take() {
+        let mut archive = tar::Archive::new(BufReader::new(stdout));
+        for entry in archive.entries().at("reading", deb)? {
+            let mut entry = entry.at("reading", deb)?;
+            let path: PathBuf = entry
+                .path()
+                .at("reading", deb)?
+                .components()
+                .filter(|part| matches!(part, Component::Normal(_)))
+                .collect();
+            if !keep(&path) {
+                continue;
+            }
+            let header = entry.header();
+            let (mode, mtime) = (header.mode().at("reading", deb)?, header.mtime().at("reading", deb)?);
+            let kind = header.entry_type();
+            let content = if kind.is_symlink() {
+                match entry.link_name().at("reading", deb)? {
+                    Some(target) => Content::Link(target.into_owned()),
+                    None => continue,
+                }
+            } else if kind.is_file() {
+                let mut bytes = Vec::new();
+                entry.read_to_end(&mut bytes).at("reading", deb)?;
+                Content::File(bytes)
+            } else {
+                continue;
+            };
+            found.push(Member { path, mode: mode & 0o777, mtime, content });
+        }
+    }
+    let status = child.wait().at("reading", deb)?;
+    if !status.success() {
+        return Err(Error::Program {
+            program: format!("dpkg-deb --fsys-tarfile {}", deb.display()),
+            status: status.to_string(),
+            last_lines: "the package is damaged: remove it from the cache and push again".into(),
+        });
+    }
+    Ok(found)
+}
+
+/// What is wanted at run time of a development package: all of the ROS package's own directory but its CMake
+/// files, programs, and the unversioned names of libraries, by which plugins are loaded.
+pub(crate) fn wanted_of_development(path: &Path) -> bool {
+    let parts: Vec<&str> = path.iter().filter_map(|part| part.to_str()).collect();
+    match parts.as_slice() {
+        ["usr", "share", directory, inner, ..] => {
+            !matches!(*directory, "doc" | "man" | "cmake" | "pkgconfig" | "lintian" | "bug") && *inner != "cmake"
+        }
+        ["usr", "lib", name] | ["usr", "lib", _, name] => name.ends_with(".so"),
+        _ => false,
+    }
+}
+
+/// Writes members as a tar archive, sorted by path, owned by root; of several with one path the first is taken.
+/// Blocking.
+pub(crate) fn write_tar(members: &[Member], to: &Path) -> Result<(), Error> {
+    let file = File::create(to).at("writing", to)?;
+    let mut archive = tar::Builder::new(std::io::BufWriter::new(file));
+    let mut sorted: Vec<&Member> = members.iter().collect();
+    sorted.sort_by(|a, b| a.path.cmp(&b.path));
+    sorted.dedup_by(|later, first| later.path == first.path);
+    for member in sorted {
+        let mut header = tar::Header::new_gnu();
+        header.set_mode(member.mode);
+        header.set_mtime(member.mtime);
+        header.set_uid(0);
+        header.set_gid(0);
+        match &member.content {
+            Content::File(bytes) => {
+                header.set_entry_type(tar::EntryType::Regular);
+                header.set_size(bytes.len() as u64);
+                archive.append_data(&mut header, &member.path, bytes.as_slice()).at("writing", to)?;
+            }
+            Content::Link(target) => {
+                header.set_entry_type(tar::EntryType::Symlink);
+                header.set_size(0);
+                archive.append_link(&mut header, &member.path, target).at("writing", to)?;
+            }
+        }
+    }
+    archive.into_inner().and_then(|mut file| file.flush()).at("writing", to)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn development_packages_give_what_running_needs() {
+        let wanted = [
+            "usr/share/opencv_apps/package.xml",
+            "usr/share/opencv_apps/launch/x.launch",
+            "usr/lib/x86_64-linux-gnu/libopencv_apps.so",
+        ];
+        let not = [
+            "usr/include/opencv_apps/x.h",
+            "usr/share/opencv_apps/cmake/x.cmake",
+            "usr/share/doc/libx-dev/copyright",
+            "usr/lib/x86_64-linux-gnu/cmake/opencv_apps/x.cmake",
+            "usr/lib/x86_64-linux-gnu/libx.a",
+            "usr/lib/x86_64-linux-gnu/pkgconfig/x.pc",
+        ];
+        for path in wanted {
+            assert!(wanted_of_development(Path::new(path)), "{path}");
+        }
+        for path in not {
+            assert!(!wanted_of_development(Path::new(path)), "{path}");
+        }
+    }
+
+    #[test]
+    fn members_become_the_same_archive_whatever_their_order() {
+        let member = |path: &str, content| Member { path: path.into(), mode: 0o644, mtime: 5, content };
+        let file = member("usr/share/x/a", Content::File(b"text".to_vec()));
+        let link = member("usr/lib/t/libx.so", Content::Link("libx.so.1".into()));
+        let directory = tempfile::tempdir().expect("a directory");
+        let (one, two) = (directory.path().join("1"), directory.path().join("2"));
+        write_tar(&[file.clone(), link.clone()], &one).expect("written");
+        write_tar(&[link.clone(), file.clone(), link], &two).expect("written");
+        let bytes = std::fs::read(&one).expect("there");
+        assert_eq!(bytes, std::fs::read(&two).expect("there"));
+        let mut archive = tar::Archive::new(bytes.as_slice());
+        let names: Vec<_> =
+            archive.entries().expect("an archive").map(|e| e.expect("one").path().expect("named").into_owned()).collect();
+        assert_eq!(names, [Path::new("usr/lib/t/libx.so"), Path::new("usr/share/x/a")]);
+    }
+}

@@ -1,0 +1,167 @@
+//! What a compiled file needs: the dynamic section of an ELF file (System V gABI, chapter 5), nothing else.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+
+use crate::error::{Error, IoAt};
+
+/// The names in the dynamic section.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Dynamic {
+    /// Libraries to load with it (`DT_NEEDED`).
+    pub(crate) needed: BTreeSet<String>,
+}
+
+const PT_LOAD: u32 = 1;
+const PT_DYNAMIC: u32 = 2;
+const DT_NULL: u64 = 0;
+const DT_NEEDED: u64 = 1;
+const DT_STRTAB: u64 = 5;
+const DT_STRSZ: u64 = 10;
+/// No dynamic section or string table is larger; a damaged header may say so.
+const LARGEST: u64 = 64 << 20;
+
+struct Segment {
+    kind: u32,
+    offset: u64,
+    address: u64,
+    size: u64,
+}
+
+/// Reads a file; none where it is not a dynamically linked ELF file for little-endian machines.
+pub(crate) fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
+    let mut file = File::open(path).at("reading", path)?;
+    let mut magic = Vec::new();
+    (&mut file).take(64).read_to_end(&mut magic).at("reading", path)?;
+    if magic.len() < 52 || !magic.starts_with(b"\x7fELF") || magic[5] != 1 {
+        return Ok(None);
+    }
+    // A damaged file is none of ours to complain about: whoever loads it will.
+    Ok(dynamic(&mut file, &magic))
+}
+
+fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
+    let wide = header[4] == 2;
+    let (table, size, count) = if wide {
+        (u64_at(header, 32)?, u16_at(header, 54)?, u16_at(header, 56)?)
+    } else {
+        (u32_at(header, 28)?.into(), u16_at(header, 42)?, u16_at(header, 44)?)
+    };
+    let headers = part(file, table, u64::from(size) * u64::from(count))?;
+    let segments: Vec<Segment> =
+        headers.chunks_exact(usize::from(size).max(1)).filter_map(|raw| segment(raw, wide)).collect();
+    let place = segments.iter().find(|s| s.kind == PT_DYNAMIC)?;
+    let entries = part(file, place.offset, place.size)?;
+    let mut names = Vec::new();
+    let (mut strings, mut length) = (None, 0);
+    for entry in entries.chunks_exact(if wide { 16 } else { 8 }) {
+        let (tag, value) = if wide {
+            (u64_at(entry, 0)?, u64_at(entry, 8)?)
+        } else {
+            (u32_at(entry, 0)?.into(), u32_at(entry, 4)?.into())
+        };
+        match tag {
+            DT_NULL => break,
+            DT_NEEDED => names.push(value),
+            DT_STRTAB => strings = Some(value),
+            DT_STRSZ => length = value,
+            _ => {}
+        }
+    }
+    // The table's address is where it is loaded; the segment that covers it tells where it is in the file.
+    let address = strings?;
+    let home = segments.iter().find(|s| s.kind == PT_LOAD && (s.address..s.address + s.size).contains(&address))?;
+    let table = part(file, home.offset + (address - home.address), length)?;
+    let needed = names.into_iter().filter_map(|at| {
+        let rest = table.get(usize::try_from(at).ok()?..)?;
+        let end = rest.iter().position(|byte| *byte == 0)?;
+        String::from_utf8(rest[..end].to_vec()).ok()
+    });
+    Some(Dynamic { needed: needed.collect() })
+}
+
+fn segment(raw: &[u8], wide: bool) -> Option<Segment> {
+    let kind = u32_at(raw, 0)?;
+    Some(if wide {
+        Segment { kind, offset: u64_at(raw, 8)?, address: u64_at(raw, 16)?, size: u64_at(raw, 32)? }
+    } else {
+        let field = |at| u32_at(raw, at).map(u64::from);
+        Segment { kind, offset: field(4)?, address: field(8)?, size: field(16)? }
+    })
+}
+
+fn part(file: &mut File, offset: u64, size: u64) -> Option<Vec<u8>> {
+    if size > LARGEST {
+        return None;
+    }
+    let mut bytes = vec![0; usize::try_from(size).ok()?];
+    file.seek(SeekFrom::Start(offset)).ok()?;
+    file.read_exact(&mut bytes).ok()?;
+    Some(bytes)
+}
+
+fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
+    Some(u16::from_le_bytes(bytes.get(at..at + 2)?.try_into().ok()?))
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
+    Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
+}
+
+fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
+    Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?))
+}
+
+/// Libraries that ELF files below `root` need and that are not below it themselves.
+pub(crate) fn needed_below(root: &Path) -> Result<BTreeSet<String>, Error> {
+    let (mut needed, mut present) = (BTreeSet::new(), BTreeSet::new());
+    for entry in walkdir::WalkDir::new(root) {
+        let entry = entry.map_err(|error| Error::io("reading", root, error.into()))?;
+        if !entry.file_type().is_dir() {
+            present.insert(entry.file_name().to_string_lossy().into_owned());
+        }
+        if entry.file_type().is_file()
+            && let Some(dynamic) = read(entry.path())?
+        {
+            needed.extend(dynamic.needed);
+        }
+    }
+    needed.retain(|name| !present.contains(name));
+    Ok(needed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_tells_what_it_needs() {
+        let own = std::env::current_exe().expect("known");
+        let dynamic = read(&own).expect("read").expect("an ELF file");
+        assert!(dynamic.needed.iter().any(|name| name.starts_with("libc.so.")), "{dynamic:?}");
+    }
+
+    #[test]
+    fn anything_else_needs_nothing() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("x");
+        let own = std::fs::read(std::env::current_exe().expect("known")).expect("read");
+        let cases: [&[u8]; 4] = [b"", b"#!/bin/sh\n", &own[..40], &own[..100]];
+        for bytes in cases {
+            std::fs::write(&path, bytes).expect("written");
+            assert_eq!(read(&path).expect("read"), None);
+        }
+    }
+
+    #[test]
+    fn what_is_beside_it_is_not_needed_from_elsewhere() {
+        let directory = tempfile::tempdir().expect("a directory");
+        std::fs::copy(std::env::current_exe().expect("known"), directory.path().join("x")).expect("copied");
+        let before = needed_below(directory.path()).expect("read");
+        let libc = before.iter().find(|name| name.starts_with("libc.so.")).expect("needed").clone();
+        std::fs::write(directory.path().join(&libc), "").expect("written");
+        assert!(!needed_below(directory.path()).expect("read").contains(&libc));
+    }
+}

@@ -1,0 +1,230 @@
+//! What can go wrong while a push becomes an image.
+
+use std::io;
+use std::path::PathBuf;
+
+/// Every way a build can fail. The text names the thing and what to do about it.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No definition of that name.
+    #[error("there is no base {name:?} in {directory}; there are: {known}", directory = directory.display())]
+    UnknownBase {
+        /// What was asked for.
+        name: String,
+        /// Where definitions are.
+        directory: PathBuf,
+        /// Those that there are.
+        known: String,
+    },
+    /// A base definition that cannot be used.
+    #[error("base definition {path}: {problem}", path = path.display())]
+    BadBase {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong in it, with its line where that is known.
+        problem: String,
+    },
+    /// A program of the host is missing.
+    #[error("{program} is not installed: run `apt-get install {package}`")]
+    MissingProgram {
+        /// The command.
+        program: &'static str,
+        /// The Debian package that has it.
+        package: &'static str,
+    },
+    /// A program of the host failed.
+    #[error("{program} failed ({status}): {last_lines}")]
+    Program {
+        /// The command.
+        program: String,
+        /// How it ended.
+        status: String,
+        /// The last lines it printed.
+        last_lines: String,
+    },
+    /// apt knows no way to install these packages together.
+    #[error("apt cannot install {wanted}: {words}")]
+    Unsolvable {
+        /// What was to be installed.
+        wanted: String,
+        /// apt's own words.
+        words: String,
+    },
+    /// Names that nothing provides.
+    #[error("{}", unresolved_text(.0))]
+    Unresolved(Vec<Unresolved>),
+    /// `--apt` names something that is not there.
+    #[error(
+        "{name} is neither a ROS package nor a Debian package of {suite}{hint}; look for it with `apt-cache search {name}`"
+    )]
+    UnknownPackage {
+        /// What was asked for.
+        name: String,
+        /// Of which distribution.
+        suite: String,
+        /// Names that look alike, or nothing.
+        hint: String,
+    },
+    /// The package's build failed.
+    #[error("the build of {package} failed; the complete log is {log}\n{last_lines}", log = log.display())]
+    BuildFailed {
+        /// The ROS package that failed.
+        package: String,
+        /// The complete log.
+        log: PathBuf,
+        /// Its last lines, the compiler's own words among them.
+        last_lines: String,
+    },
+    /// dpkg failed inside the sandbox.
+    #[error("installing packages failed: {last_lines}")]
+    InstallFailed {
+        /// dpkg's last lines.
+        last_lines: String,
+    },
+    /// Something of ours that runs inside a container failed.
+    #[error("{what} failed: {last_lines}")]
+    Inside {
+        /// What it was to do.
+        what: &'static str,
+        /// The last lines it printed.
+        last_lines: String,
+    },
+    /// roslaunch refused the launch file.
+    #[error("roslaunch cannot load {file}: {words}")]
+    Launch {
+        /// The launch file.
+        file: String,
+        /// roslaunch's own words.
+        words: String,
+    },
+    /// No such launch file or executable in the image.
+    #[error("there is no {what} {name:?} in the package; there are: {known}")]
+    NotInPackage {
+        /// `launch file` or `executable`.
+        what: &'static str,
+        /// What was asked for.
+        name: String,
+        /// Those that there are.
+        known: String,
+    },
+    /// Nothing says what to run.
+    #[error("say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}")]
+    NothingToRun {
+        /// Executables of the package.
+        executables: String,
+        /// Launch files of the package.
+        launch_files: String,
+    },
+    /// A package this base cannot compile.
+    #[error("package {package} has build type {build_type}, which base {base} cannot build: it builds catkin and cmake")]
+    BuildType {
+        /// The package.
+        package: String,
+        /// What its package.xml says.
+        build_type: String,
+        /// The base.
+        base: String,
+    },
+    /// The running package does not show what it should.
+    #[error("{0}")]
+    Probe(#[from] crate::probe::ProbeError),
+    /// The image store.
+    #[error(transparent)]
+    Image(#[from] image::Error),
+    /// The container engine.
+    #[error(transparent)]
+    Servant(#[from] servant::Error),
+    /// No room left.
+    #[error("no room left on the disk that holds {path} while {what}; make room (`cloudroidctl rm` removes services) and push again", path = path.display())]
+    DiskFull {
+        /// A path on the full disk.
+        path: PathBuf,
+        /// What was being done.
+        what: String,
+    },
+    /// Some other input or output.
+    #[error("{what} {path}: {source}", path = path.display())]
+    Io {
+        /// What was being done.
+        what: String,
+        /// With which file.
+        path: PathBuf,
+        /// Why it failed.
+        source: io::Error,
+    },
+    /// A thread of this process panicked.
+    #[error("an internal task ended early: {0}")]
+    Task(#[from] tokio::task::JoinError),
+}
+
+/// A name that nothing provides.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Unresolved {
+    /// The rosdep key or ROS package.
+    pub key: String,
+    /// Packages whose package.xml ask for it.
+    pub wanted_by: Vec<String>,
+    /// Debian packages whose names look alike.
+    pub similar: Vec<String>,
+}
+
+fn unresolved_text(all: &[Unresolved]) -> String {
+    let mut text = String::from("nothing provides:");
+    for one in all {
+        text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
+        if !one.similar.is_empty() {
+            text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
+        }
+    }
+    text.push_str("\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also holds its source");
+    text
+}
+
+impl Error {
+    /// An input/output error, told apart from a full disk.
+    pub fn io(what: impl Into<String>, path: impl Into<PathBuf>, source: io::Error) -> Self {
+        let (what, path) = (what.into(), path.into());
+        if source.kind() == io::ErrorKind::StorageFull || source.raw_os_error() == Some(nix::libc::ENOSPC) {
+            Self::DiskFull { path, what }
+        } else {
+            Self::Io { what, path, source }
+        }
+    }
+}
+
+/// `map_err` for input and output: `.at("reading", path)`.
+pub(crate) trait IoAt<T> {
+    /// Names what was being done with which file.
+    fn at(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error>;
+}
+
+impl<T> IoAt<T> for io::Result<T> {
+    fn at(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error> {
+        self.map_err(|source| Error::io(what, path, source))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_that_is_missing_is_named_with_the_next_step() {
+        let error = Error::Unresolved(vec![
+            Unresolved { key: "warp".into(), wanted_by: vec!["a".into(), "b".into()], similar: vec![] },
+            Unresolved { key: "eigne".into(), wanted_by: vec!["a".into()], similar: vec!["libeigen3-dev".into()] },
+        ]);
+        let text = error.to_string();
+        assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
+        assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
+        assert!(text.contains("--map KEY=DEB"), "{text}");
+    }
+
+    #[test]
+    fn a_full_disk_is_told_apart() {
+        let full = io::Error::from_raw_os_error(nix::libc::ENOSPC);
+        let error = Error::io("writing", "/x/y", full);
+        assert!(matches!(error, Error::DiskFull { .. }), "{error}");
+        assert!(error.to_string().contains("/x/y"), "{error}");
+    }
+}

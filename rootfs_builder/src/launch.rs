@@ -1,0 +1,211 @@
+//! What is to run: nodes and parameters, as the image's own roslaunch understands the launch file.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+
+use ros::bus::ParamValue;
+use serde::{Deserialize, Serialize};
+use servant::spec::{Mount, NodeSpec, Profile};
+
+use crate::error::{Error, IoAt};
+use crate::install::{lay_out, set_mode};
+use crate::sandbox::Run;
+use crate::workshop::Workshop;
+
+/// What to run. Independent of how it was asked for.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct LaunchPlan {
+    /// Nodes in the order in which roslaunch starts them.
+    pub nodes: Vec<LaunchNode>,
+    /// Parameters by absolute name, set before any node starts.
+    pub parameters: BTreeMap<String, ParamValue>,
+}
+
+/// One node.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LaunchNode {
+    /// Absolute name, such as `/camera/people_detect`.
+    pub name: String,
+    /// Its ROS package.
+    pub package: String,
+    /// Its type: the executable's name in the package.
+    pub executable: String,
+    /// Launch prefix, path of the program, arguments, remaps, `__name:=`.
+    pub argv: Vec<String>,
+    /// Remaps alone, from → to.
+    pub remaps: BTreeMap<String, String>,
+    /// Added to the image's environment (`<env>`, `ROS_NAMESPACE`).
+    pub environment: BTreeMap<String, String>,
+    /// Where it runs; none for ROS's own default, `ROS_HOME`.
+    pub directory: Option<String>,
+    /// Started again whenever it ends.
+    pub respawn: bool,
+    /// Seconds before that.
+    pub respawn_delay: f64,
+    /// When it ends, all do.
+    pub required: bool,
+}
+
+impl LaunchNode {
+    /// As an engine starts it; `ros_home` is where nodes run by default.
+    pub fn spec(&self, ros_home: &str) -> NodeSpec {
+        NodeSpec {
+            name: self.name.clone(),
+            argv: self.argv.clone(),
+            environment: self.environment.clone(),
+            directory: self.directory.clone().unwrap_or_else(|| ros_home.to_owned()),
+            respawn: self.respawn,
+            respawn_delay: self.respawn_delay,
+            required: self.required,
+        }
+    }
+}
+
+/// What is asked of the script inside.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub(crate) struct Ask {
+    /// Pushed ROS packages; the one meant is the first that has what is asked for.
+    pub(crate) packages: Vec<String>,
+    /// The install space whose setup.sh makes the environment; empty for none.
+    pub(crate) prefix: String,
+    /// Launch file, or empty.
+    pub(crate) launch: String,
+    /// Executables.
+    pub(crate) nodes: Vec<String>,
+    /// Arguments of the launch file.
+    pub(crate) args: BTreeMap<String, String>,
+    /// Remaps for every node.
+    pub(crate) remaps: BTreeMap<String, String>,
+    /// Parameters: absolute ones, and private ones for every node.
+    pub(crate) params: BTreeMap<String, serde_json::Value>,
+}
+
+/// What the script answers.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Answer {
+    pub(crate) nodes: Vec<LaunchNode>,
+    pub(crate) parameters: BTreeMap<String, ParamValue>,
+    pub(crate) environment: BTreeMap<String, String>,
+    pub(crate) warnings: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+enum Refusal {
+    Launch { file: String, words: String },
+    NotFound { what: String, name: String, known: Vec<String> },
+    Nothing { executables: Vec<String>, launch_files: Vec<String> },
+    Setup { file: String, status: i32 },
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(untagged)]
+enum Reply {
+    Refused { error: Refusal },
+    Planned(Answer),
+}
+
+const SCRIPT: &str = include_str!("inside/launch_plan.py");
+
+/// Asks, in a container of these trees.
+pub(crate) async fn ask(
+    shop: &Workshop,
+    mut layers: Vec<PathBuf>,
+    mut environment: BTreeMap<String, String>,
+    ask: &Ask,
+) -> Result<Answer, Error> {
+    let room = shop.site.fresh("plan")?;
+    let (tools, out) = (room.join("tools"), room.join("out"));
+    let question = serde_json::to_vec(ask).unwrap_or_default();
+    lay_out(
+        &tools,
+        &BTreeMap::from([
+            (PathBuf::from("cloudroid/launch_plan.py"), SCRIPT.as_bytes().to_vec()),
+            (PathBuf::from("cloudroid/ask.json"), question),
+            (PathBuf::from("cloudroid/out/.keep"), Vec::new()),
+        ]),
+    )?;
+    fs::create_dir(&out).at("making", &out)?;
+    // The container's root is nobody in particular out here; the directories above let nobody else in.
+    set_mode(&out, 0o777)?;
+    layers.push(tools);
+    for (name, value) in [("HOME", "/tmp"), ("ROS_LOG_DIR", "/tmp"), ("PYTHONDONTWRITEBYTECODE", "1")] {
+        environment.insert(name.to_owned(), value.to_owned());
+    }
+    let finished = shop
+        .site
+        .run(
+            Run {
+                name: "plan",
+                profile: Profile::Servant,
+                layers,
+                writable: None,
+                owned: Vec::new(),
+                mounts: vec![Mount { source: out.clone(), target: "/cloudroid/out".into(), writable: true }],
+                environment,
+                argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"].map(str::to_owned).into(),
+            },
+            |_| {},
+        )
+        .await?;
+    let path = out.join("plan.json");
+    if !finished.success() || !path.is_file() {
+        return Err(Error::Inside { what: "resolving what to run", last_lines: finished.last_words() });
+    }
+    let text = fs::read(&path).at("reading", &path)?;
+    understand(&text)
+}
+
+fn understand(text: &[u8]) -> Result<Answer, Error> {
+    let list = |names: &[String]| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+    match serde_json::from_slice::<Reply>(text) {
+        Ok(Reply::Planned(answer)) => Ok(answer),
+        Ok(Reply::Refused { error }) => Err(match error {
+            Refusal::Launch { file, words } => Error::Launch { file, words },
+            Refusal::NotFound { what, name, known } => Error::NotInPackage {
+                what: if what == "executable" { "executable" } else { "launch file" },
+                name,
+                known: list(&known),
+            },
+            Refusal::Nothing { executables, launch_files } => {
+                Error::NothingToRun { executables: list(&executables), launch_files: list(&launch_files) }
+            }
+            Refusal::Setup { file, status } => Error::Inside {
+                what: "sourcing the install space's setup.sh",
+                last_lines: format!("{file} ended with status {status}"),
+            },
+        }),
+        Err(error) => Err(Error::Inside { what: "resolving what to run", last_lines: error.to_string() }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plan_is_understood() {
+        let text = br#"{"nodes":[{"name":"/a","package":"p","executable":"x","argv":["/x","__name:=a"],"remaps":{},
+            "environment":{},"directory":null,"respawn":true,"respawn_delay":1.5,"required":false}],
+            "parameters":{"/a/k":[1,2.5,"x",true]},"environment":{},"warnings":[],"executables":[],"launch_files":[]}"#;
+        let answer = understand(text).expect("a plan");
+        let spec = answer.nodes[0].spec("/root/.ros");
+        assert_eq!((spec.directory.as_str(), spec.respawn, spec.respawn_delay), ("/root/.ros", true, 1.5));
+        let ParamValue::List(values) = &answer.parameters["/a/k"] else { panic!("a list") };
+        assert_eq!(values[1], ParamValue::Double(2.5));
+    }
+
+    #[test]
+    fn refusals_keep_roslaunchs_words_and_name_what_there_is() {
+        let launch = br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
+        let text = understand(launch).expect_err("refused").to_string();
+        assert_eq!(text, "roslaunch cannot load /x.launch: requires the 'manager' arg to be set");
+        let node = br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
+        let text = understand(node).expect_err("refused").to_string();
+        assert_eq!(text, "there is no executable \"y\" in the package; there are: a, b");
+        let nothing = br#"{"error":{"kind":"nothing","executables":["a","b"],"launch_files":[]}}"#;
+        let text = understand(nothing).expect_err("refused").to_string();
+        assert!(text.contains("executables: a, b; launch files: none"), "{text}");
+    }
+}

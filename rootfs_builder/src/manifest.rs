@@ -1,0 +1,72 @@
+//! What `package.xml` files and plugin lists say, as far as a build asks.
+
+use std::collections::BTreeSet;
+
+
+/// rosdep keys and ROS packages that running the package of this package.xml needs.
+pub(crate) fn run_dependencies(text: &str) -> Result<BTreeSet<String>, String> {
+    Ok(pushed_package(text, Default::default())?.run)
+}
+
+pub(crate) fn pushed_package(text: &str, path: std::path::PathBuf) -> Result<crate::pushed::PushedPackage, String> {
+    let document = roxmltree::Document::parse(text).map_err(|e| e.to_string())?;
+    let root = document.root_element();
+    let texts = |names: &[&str]| -> BTreeSet<String> {
+        root.children()
+            .filter(|n| names.contains(&n.tag_name().name()))
+            .filter_map(|n| n.text())
+            .map(|t| t.trim().to_owned())
+            .collect()
+    };
+    let one = |name: &str| texts(&[name]).pop_first().unwrap_or_default();
+    let build_type = root
+        .descendants()
+        .find(|n| n.has_tag_name("build_type"))
+        .and_then(|n| n.text())
+        .unwrap_or("catkin")
+        .trim()
+        .to_owned();
+    Ok(crate::pushed::PushedPackage {
+        unit: crate::compile::Unit { name: one("name"), path, build_type },
+        version: one("version"),
+        build: texts(&["depend", "build_depend", "buildtool_depend", "build_export_depend"]),
+        run: texts(&["depend", "exec_depend", "run_depend"]),
+    })
+}
+
+/// File names (`libx.so`) of the libraries of a plugin list (pluginlib: one `library`, or several in
+/// `class_libraries`). Anything else names none.
+pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<String> {
+    let Ok(document) = roxmltree::Document::parse(text) else {
+        return BTreeSet::new();
+    };
+    let root = document.root_element();
+    let is_library = |node: &roxmltree::Node<'_, '_>| node.has_tag_name("library");
+    let libraries: Vec<_> = match root.tag_name().name() {
+        "library" => vec![root],
+        "class_libraries" => root.children().filter(is_library).collect(),
+        _ => Vec::new(),
+    };
+    let paths = libraries.iter().filter_map(|library| library.attribute("path"));
+    paths.filter_map(|path| path.rsplit('/').next()).filter(|name| !name.is_empty()).map(file_name).collect()
+}
+
+fn file_name(name: &str) -> String {
+    if name.ends_with(".so") { name.to_owned() } else { format!("{name}.so") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn libraries_of_either_form_are_found() {
+        let one = "<library path=\"lib/libimage_proc\"><class/></library>";
+        assert_eq!(plugin_libraries(one), ["libimage_proc.so".to_owned()].into());
+        let many = "<class_libraries><library path=\"liba\"/><library path=\"lib/libb.so\"/></class_libraries>";
+        assert_eq!(plugin_libraries(many), ["liba.so".to_owned(), "libb.so".to_owned()].into());
+        for other in ["<launch><library path=\"x\"/></launch>", "not xml", ""] {
+            assert!(plugin_libraries(other).is_empty(), "{other}");
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! `--apt NAME`: a ROS package that the distribution has compiled already.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use crate::builder::{Build, Parts};
+use crate::deb::Member;
+use crate::error::Error;
+use crate::gather::{self, Wanted};
+use crate::key::Key;
+
+/// `name`: a ROS package, or a Debian package that holds some.
+pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
+    let archive = &build.archive;
+    let (mut roots, mut debs) = build.extra_packages()?;
+    let packages: Vec<String> = if !archive.contents.ros_package(name).is_empty() {
+        vec![name.to_owned()]
+    } else if archive.names.contains(name) {
+        debs.insert(name.to_owned());
+        archive.contents.ros_packages_in(name).into_iter().map(str::to_owned).collect()
+    } else {
+        Vec::new()
+    };
+    if packages.is_empty() {
+        let similar = archive.similar(name);
+        let hint = if similar.is_empty() { String::new() } else { format!(" (there is {})", similar.join(", ")) };
+        return Err(Error::UnknownPackage { name: name.to_owned(), suite: build.base.suite.clone(), hint });
+    }
+    roots.extend(packages.iter().cloned());
+    build.progress.step(&format!("looking up what {name} needs")).await;
+    let wanted = wanted(build, &roots).await?;
+    debs.extend(wanted.install);
+    debs.extend(build.request.map.values().flat_map(|debs| debs.split([',', ' '])).map(str::to_owned));
+    debs.remove("");
+    let version = version(build, &packages[0]).await?;
+    let dependencies = build.add("dependencies", &build.on_base(), &debs, wanted.extras).await?;
+    Ok(Parts { packages, version, dependencies, package: None, prefix: None })
+}
+
+/// Remembered: it downloads and looks into many packages.
+#[derive(Serialize, Deserialize)]
+struct Note {
+    install: BTreeSet<String>,
+    extras: Vec<Member>,
+    warnings: Vec<String>,
+}
+
+/// Gathers from these ROS packages.
+pub(crate) async fn wanted(build: &Build<'_>, roots: &BTreeSet<String>) -> Result<Wanted, Error> {
+    if roots.is_empty() {
+        return Ok(Wanted::default());
+    }
+    let key = Key::new("gathered")
+        .with("archive", &build.archive.stamp)
+        .with_all("ignore", &build.base.ros_packages.ignore)
+        .with_all("root", roots)
+        .finish();
+    let note: Note = match build.shop.layers.note(&key) {
+        Some(note) => note,
+        None => {
+            let found = gather::gather(&build.archive, &build.base, roots, build.progress).await?;
+            let note = Note { install: found.install, extras: found.extras, warnings: found.warnings };
+            build.shop.layers.keep_note(&key, &note)?;
+            note
+        }
+    };
+    for warning in &note.warnings {
+        build.progress.warn(warning.as_str()).await;
+    }
+    Ok(Wanted { install: note.install, extras: note.extras, warnings: note.warnings })
+}
+
+/// The archive's version of the Debian package that holds a ROS package's programs, or its package.xml.
+async fn version(build: &Build<'_>, package: &str) -> Result<String, Error> {
+    let carriers = build.archive.contents.ros_package(package);
+    let Some(deb) = carriers.keys().find(|deb| !deb.ends_with("-dev")).or(carriers.keys().next()) else {
+        return Ok(String::new());
+    };
+    let key = Key::new("version").with("archive", &build.archive.stamp).with("deb", deb).finish();
+    if let Some(version) = build.shop.layers.note(&key) {
+        return Ok(version);
+    }
+    let found = build.archive.apt.candidates(&BTreeSet::from([deb.clone()])).await?;
+    let version = found.first().map_or_else(String::new, |deb| deb.version.clone());
+    build.shop.layers.keep_note(&key, &version)?;
+    Ok(version)
+}

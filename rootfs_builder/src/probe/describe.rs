@@ -1,0 +1,237 @@
+//! From what was seen to the interface: types asked for and compared with their definitions.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use package::interface::{Action, Direction, Interface, Parameter, Service, Topic};
+use ros::bus::{Bus, BusError, Graph, ParamValue, WireType};
+use ros::schema::{Base, MessageType, Registry};
+use tokio::time::timeout;
+
+use super::{Found, ProbeError, inputs, outputs};
+
+/// A node that does not say its type in this time is left out with a warning.
+const ANSWER: Duration = Duration::from_secs(5);
+
+/// What looking gave.
+pub(super) struct Seen<'a> {
+    /// Outputs whose publisher is latching.
+    pub(super) latched: BTreeSet<String>,
+    /// Inputs registered before anything was subscribed to.
+    pub(super) eager: BTreeSet<String>,
+    /// The graph at the end.
+    pub(super) graph: Arc<Graph>,
+    /// The looking node.
+    pub(super) own_name: &'a str,
+}
+
+/// Asks and compares.
+pub(super) async fn describe(
+    bus: &dyn Bus,
+    registry: &Registry,
+    definitions: &BTreeMap<String, String>,
+    seen: &Seen<'_>,
+) -> Result<Found, ProbeError> {
+    let mut found = Found::default();
+    let mut texts = Texts { definitions, used: BTreeMap::new() };
+    let graph = &*seen.graph;
+    let mut topics = Vec::new();
+    for (direction, names) in
+        [(Direction::Input, inputs(graph, seen.own_name)), (Direction::Output, outputs(graph, seen.own_name))]
+    {
+        for name in names {
+            match ask(&name, bus.topic_type(&name)).await {
+                Ok(wire) => topics.push(topic(registry, seen, name, direction, wire, &mut texts)?),
+                Err(problem) => found.warnings.push(problem),
+            }
+        }
+    }
+    let actions = take_actions(&mut topics, registry, &mut texts)?;
+    topics.sort_by(|a, b| (&a.name, a.direction == Direction::Output).cmp(&(&b.name, b.direction == Direction::Output)));
+    let mut services = Vec::new();
+    for (name, node) in graph.services.iter().filter(|(_, node)| *node != seen.own_name) {
+        if name.ends_with("/get_loggers") || name.ends_with("/set_logger_level") {
+            continue;
+        }
+        match ask(name, bus.service_type(name)).await {
+            Ok(wire) => {
+                let service = registry
+                    .service(&wire.name)
+                    .map_err(|problem| ProbeError::NoDefinition { what: format!("service {name}"), problem })?;
+                compare(&format!("service {name}"), &wire.name, &wire.md5, &service.md5)?;
+                texts.service(&wire.name, [&service.request, &service.response]);
+                services.push(Service { name: name.clone(), type_name: wire.name, md5: wire.md5, node: node.clone() });
+            }
+            Err(problem) => found.warnings.push(problem),
+        }
+    }
+    let parameters = parameters(bus, graph, seen.own_name).await;
+    found.interface = Interface { topics, services, actions, parameters, definitions: texts.used };
+    Ok(found)
+}
+
+async fn ask<T>(name: &str, answer: impl Future<Output = Result<T, BusError>>) -> Result<T, String> {
+    match timeout(ANSWER, answer).await {
+        Ok(Ok(value)) => Ok(value),
+        Ok(Err(error)) => Err(format!("{name} does not tell its type: {error}")),
+        Err(_) => Err(format!("{name} does not tell its type within {ANSWER:?}")),
+    }
+}
+
+fn topic(
+    registry: &Registry,
+    seen: &Seen<'_>,
+    name: String,
+    direction: Direction,
+    wire: WireType,
+    texts: &mut Texts<'_>,
+) -> Result<Topic, ProbeError> {
+    // Some nodes take any type; nothing is to be compared.
+    let any = wire.name == "*" || wire.md5 == "*";
+    if !any {
+        let message = match registry.message(&wire.name) {
+            Ok(message) => message,
+            // No definition in the image, but the publisher sent its own.
+            Err(_) if !wire.definition.is_empty() => {
+                let added = registry.insert_full_text(&wire.name, &wire.definition);
+                added
+                    .and_then(|()| registry.message(&wire.name))
+                    .map_err(|problem| ProbeError::NoDefinition { what: format!("topic {name}"), problem })?
+            }
+            Err(problem) => return Err(ProbeError::NoDefinition { what: format!("topic {name}"), problem }),
+        };
+        compare(&format!("topic {name}"), &wire.name, &wire.md5, message.md5())?;
+        texts.message(&message);
+    }
+    let ends = seen.graph.topics.get(&name);
+    let nodes = match direction {
+        Direction::Input => ends.map(|topic| &topic.subscribers),
+        Direction::Output => ends.map(|topic| &topic.publishers),
+    };
+    let nodes = nodes.into_iter().flatten().filter(|node| *node != seen.own_name).cloned().collect();
+    Ok(Topic {
+        latched: direction == Direction::Output && seen.latched.contains(&name),
+        lazy: direction == Direction::Input && !seen.eager.contains(&name),
+        type_name: wire.name,
+        md5: wire.md5,
+        direction,
+        nodes,
+        name,
+    })
+}
+
+fn compare(what: &str, type_name: &str, announced: &str, defined: &str) -> Result<(), ProbeError> {
+    if announced == "*" || announced == defined {
+        return Ok(());
+    }
+    Err(ProbeError::Mismatch {
+        what: what.to_owned(),
+        type_name: type_name.to_owned(),
+        announced: announced.to_owned(),
+        defined: defined.to_owned(),
+    })
+}
+
+/// Five topics below one name, in the directions of a server, are an action (actionlib).
+fn take_actions(
+    topics: &mut Vec<Topic>,
+    registry: &Registry,
+    texts: &mut Texts<'_>,
+) -> Result<Vec<Action>, ProbeError> {
+    use Direction::{Input, Output};
+    const ENDS: [(&str, Direction); 5] =
+        [("goal", Input), ("cancel", Input), ("status", Output), ("feedback", Output), ("result", Output)];
+    let has = |topics: &[Topic], name: &str, direction| {
+        topics.iter().any(|topic| topic.name == name && topic.direction == direction)
+    };
+    let mut actions = Vec::new();
+    let goals: Vec<Topic> =
+        topics.iter().filter(|topic| topic.direction == Input && topic.name.ends_with("/goal")).cloned().collect();
+    for goal in goals {
+        let name = goal.name.trim_end_matches("/goal");
+        let Some(type_name) = goal.type_name.strip_suffix("ActionGoal") else { continue };
+        if !ENDS.iter().all(|(end, direction)| has(topics, &format!("{name}/{end}"), *direction)) {
+            continue;
+        }
+        if let Ok(action) = registry.action(type_name) {
+            compare(&format!("action {name}"), &goal.type_name, &goal.md5, action.action_goal.md5())?;
+            texts.action(type_name);
+        }
+        actions.push(Action {
+            name: name.to_owned(),
+            type_name: type_name.to_owned(),
+            node: goal.nodes.first().cloned().unwrap_or_default(),
+        });
+    }
+    topics.retain(|topic| {
+        !actions.iter().any(|action| {
+            let end = topic.name.strip_prefix(action.name.as_str()).and_then(|rest| rest.strip_prefix('/'));
+            end.is_some_and(|end| ENDS.contains(&(end, topic.direction)))
+        })
+    });
+    Ok(actions)
+}
+
+async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
+    let mut parameters = Vec::new();
+    for (name, uses) in &graph.parameters {
+        let others = |nodes: &[String]| -> Vec<String> { nodes.iter().filter(|node| *node != own).cloned().collect() };
+        let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
+        let plumbing = matches!(name.as_str(), "/run_id" | "/rosdistro" | "/rosversion" | "/use_sim_time")
+            || name.starts_with("/roslaunch")
+            || name == "/tcp_keepalive"
+            || name == "/enable_statistics";
+        if plumbing || (read_by.is_empty() && written_by.is_empty()) {
+            continue;
+        }
+        let value = bus.get_param(name).await.ok().map(|value| json(&value));
+        parameters.push(Parameter { name: name.clone(), value, read_by, written_by });
+    }
+    parameters
+}
+
+fn json(value: &ParamValue) -> serde_json::Value {
+    serde_json::to_value(value).unwrap_or(serde_json::Value::Null)
+}
+
+/// Definition texts of what is used and all it refers to.
+struct Texts<'a> {
+    definitions: &'a BTreeMap<String, String>,
+    used: BTreeMap<String, String>,
+}
+
+impl Texts<'_> {
+    fn message(&mut self, message: &Arc<MessageType>) {
+        let key = message.name().replacen('/', "/msg/", 1);
+        // Requests, goals and the like have no text of their own: the service's or the action's is theirs.
+        let text = self.definitions.get(&key).cloned().unwrap_or_else(|| message.text().to_owned());
+        if self.used.insert(key, text).is_none() {
+            self.fields(message);
+        }
+    }
+
+    fn fields(&mut self, message: &Arc<MessageType>) {
+        for field in message.fields() {
+            if let Base::Message(inner) = &field.base {
+                self.message(inner);
+            }
+        }
+    }
+
+    fn service(&mut self, name: &str, halves: [&Arc<MessageType>; 2]) {
+        self.copy(name, "srv");
+        halves.into_iter().for_each(|half| self.fields(half));
+    }
+
+    fn action(&mut self, name: &str) {
+        self.copy(name, "action");
+    }
+
+    fn copy(&mut self, name: &str, kind: &str) {
+        let key = name.replacen('/', &format!("/{kind}/"), 1);
+        if let Some(text) = self.definitions.get(&key) {
+            self.used.insert(key, text.clone());
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! A source package or workspace: compiled in a sandbox, run on what its result needs.
+//!
+//! ```text
+//!   compiled in:  base / toolchain / build dependencies / ▒ sources ▒ → install space
+//!   runs in:      base / dependencies / package  ◀──────────────────────┘
+//! ```
+//!
+//! The toolchain and the development packages are in no image. What the result needs at run time is asked of
+//! package.xml (exec dependencies) and of the result itself (the libraries its ELF files need).
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use crate::builder::{Build, Parts};
+use crate::cache::Entry;
+use crate::compile::{self, Unit};
+use crate::error::Error;
+use crate::install::Made;
+use crate::key::{self, Key};
+use crate::keys::{self, Asked, Resolved};
+use crate::pushed::SourceTree;
+use crate::{elf, packaged};
+
+/// Compiles and packs.
+pub(crate) async fn build(build: &Build<'_>, tree: SourceTree) -> Result<Parts, Error> {
+    for package in &tree.packages {
+        if !matches!(package.unit.build_type.as_str(), "catkin" | "cmake") {
+            return Err(Error::BuildType {
+                package: package.unit.name.clone(),
+                build_type: package.unit.build_type.clone(),
+                base: build.base.name.clone(),
+            });
+        }
+    }
+    let own: BTreeSet<String> = tree.packages.iter().map(|package| package.unit.name.clone()).collect();
+    let mut asked = Asked::default();
+    for package in &tree.packages {
+        let name = &package.unit.name;
+        for key in &package.build {
+            asked.build.entry(key.clone()).or_default().insert(name.clone());
+        }
+        for key in &package.run {
+            asked.run.entry(key.clone()).or_default().insert(name.clone());
+        }
+    }
+    let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
+    let units: Vec<Unit> = tree.packages.iter().map(|package| package.unit.clone()).collect();
+    let package = compiled(build, &tree.root, &units, &resolved).await?;
+    let mut needed = BTreeSet::new();
+    if let Some(layer) = package.layer {
+        needed = needed_by(build, &layer).await?;
+    }
+    let dependencies = dependencies(build, &resolved, &needed, &build.on_base()).await?;
+    let mut packages: Vec<String> = tree.packages.iter().map(|package| package.unit.name.clone()).collect();
+    // In the order of compiling the last depends on the others: it is the one meant.
+    packages.reverse();
+    let version = tree.packages.last().map_or_else(String::new, |package| package.version.clone());
+    Ok(Parts { packages, version, dependencies, package: Some(package), prefix: Some(build.base.build.prefix.clone()) })
+}
+
+/// The package layer: from the cache when the same sources were compiled with the same packages before.
+async fn compiled(build: &Build<'_>, root: &Path, units: &[Unit], resolved: &Resolved) -> Result<Made, Error> {
+    let on_base = build.on_base();
+    let toolchain = build.base.build.packages.iter().cloned().collect();
+    let toolchain = build.add("toolchain", &on_base, &toolchain, Vec::new()).await?;
+    let below: Vec<_> = on_base.into_iter().chain(toolchain.layer).collect();
+    let more = build.add("build-dependencies", &below, &resolved.build, Vec::new()).await?;
+    let below: Vec<_> = below.into_iter().chain(more.layer).collect();
+    let hashed = root.to_owned();
+    let sources = tokio::task::spawn_blocking(move || key::tree(&hashed)).await??;
+    let key = Key::new("compiled")
+        .with("build", build.base.build_key())
+        .with("sources", sources)
+        .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
+        .with_all("unit", units.iter().map(|unit| format!("{} {} {}", unit.name, unit.path.display(), unit.build_type)))
+        .finish();
+    let shop = &build.shop;
+    let _turn = shop.turns.take(&key).await;
+    if let Some(entry) = shop.cached(&key).await? {
+        return Ok(Made { layer: entry.layer, cached: true });
+    }
+    let tree = compile::compile(shop, &build.base, &below, root, units, &build.log, build.progress).await?;
+    build.progress.step("packing the package").await;
+    let layer = compile::pack(shop, &build.base, &tree).await?;
+    let made_from = units.iter().map(|unit| unit.name.clone()).collect();
+    shop.keep(&key, Entry { layer: Some(layer), made_from }).await?;
+    Ok(Made { layer: Some(layer), cached: false })
+}
+
+/// Libraries that a package layer needs from elsewhere.
+pub(crate) async fn needed_by(build: &Build<'_>, layer: &image::LayerInfo) -> Result<BTreeSet<String>, Error> {
+    let trees = build.shop.extracted(std::slice::from_ref(layer)).await?;
+    tokio::task::spawn_blocking(move || {
+        let mut needed = BTreeSet::new();
+        for tree in &trees {
+            needed.extend(elf::needed_below(tree)?);
+        }
+        Ok(needed)
+    })
+    .await?
+}
+
+/// The layer of everything needed at run time.
+pub(crate) async fn dependencies(
+    build: &Build<'_>,
+    resolved: &Resolved,
+    libraries: &BTreeSet<String>,
+    below: &[image::LayerInfo],
+) -> Result<Made, Error> {
+    let (mut roots, mut debs) = build.extra_packages()?;
+    roots.extend(resolved.run_ros.iter().cloned());
+    let wanted = packaged::wanted(build, &roots).await?;
+    debs.extend(wanted.install);
+    debs.extend(resolved.run.iter().cloned());
+    let (found, missing) = build.archive.libraries(libraries);
+    debs.extend(found.into_values());
+    let trees = build.shop.extracted(below).await?;
+    for name in missing {
+        // Not in the index, perhaps in an image all the same: a link that a package's script made.
+        if !library_in(&trees, &name) {
+            let text = format!("no package holds the library {name}, which the package needs; a node may fail to start");
+            build.progress.warn(text).await;
+        }
+    }
+    build.add("dependencies", below, &debs, wanted.extras).await
+}
+
+fn library_in(trees: &[PathBuf], name: &str) -> bool {
+    let triplet = crate::contents::triplet();
+    let places = [format!("usr/lib/{triplet}"), "usr/lib".into(), format!("lib/{triplet}"), "lib64".into(), "lib".into()];
+    trees.iter().any(|tree| places.iter().any(|place| tree.join(place).join(name).symlink_metadata().is_ok()))
+}
