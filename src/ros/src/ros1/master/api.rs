@@ -7,7 +7,7 @@ use async_trait::async_trait;
 
 use super::graph::{self, WAIT_GRAPH, wire_generation};
 use super::notify::Notice;
-use super::registry::{Full, Kind};
+use super::registry::{Kind, Refused};
 use super::{Inner, params};
 use crate::ros1::names;
 use crate::ros1::reply::{Args, Reply};
@@ -160,7 +160,7 @@ impl Api {
             Kind::Publisher => format!("Registered [{node}] as publisher of [{topic}]"),
             _ => format!("Subscribed to [{topic}]"),
         };
-        Ok(Reply::done(message, Value::strings(others.map_err(full)?)))
+        Ok(Reply::done(message, Value::strings(others.map_err(refusal)?)))
     }
 
     fn register_service(&self, args: &mut Args) -> Result<Reply, Reply> {
@@ -174,7 +174,7 @@ impl Api {
             let registry = &mut state.registry;
             registry.register(Kind::Service, &service, "", by, &service_api, notices)
         });
-        registered.map_err(full)?;
+        registered.map_err(refusal)?;
         Ok(Reply::done(
             format!("Registered [{node}] as provider of [{service}]"),
             1,
@@ -395,7 +395,7 @@ impl Api {
         let nothing = || Value::Struct(Default::default());
         Ok(Reply::done(
             format!("Subscribed to parameter [{key}]"),
-            value.map_err(full)?.unwrap_or_else(nothing),
+            value.map_err(refusal)?.unwrap_or_else(nothing),
         ))
     }
 
@@ -426,8 +426,8 @@ fn name(args: &mut Args, what: &str, node: &str) -> Result<String, Reply> {
     Ok(names::resolve(&text, node))
 }
 
-fn full(_: Full) -> Reply {
-    Reply::mistake("this Master holds no more registrations", 0)
+fn refusal(reason: Refused) -> Reply {
+    Reply::mistake(reason.to_string(), 0)
 }
 
 fn pair((name, text): (&str, &str)) -> Value {

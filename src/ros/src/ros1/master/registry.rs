@@ -10,6 +10,8 @@ use crate::bus::TopicNodes;
 
 /// Registrations of all nodes together, at most: a node gone wild must not eat the host's memory.
 const MAX_REGISTRATIONS: usize = 50_000;
+/// Former addresses remembered per node name, at most.
+const MAX_REPLACED: usize = 16;
 /// The type of a topic of which nobody has said it yet.
 pub(crate) const ANY_TYPE: &str = "*";
 
@@ -29,6 +31,9 @@ struct Node {
     subscribes: BTreeSet<String>,
     serves: BTreeSet<String>,
     watches: BTreeSet<String>,
+    /// Addresses of the nodes that had this name before and were told to end.
+    #[serde(default)]
+    replaced: Vec<String>,
 }
 
 impl Node {
@@ -39,6 +44,7 @@ impl Node {
             subscribes: BTreeSet::new(),
             serves: BTreeSet::new(),
             watches: BTreeSet::new(),
+            replaced: Vec::new(),
         }
     }
 
@@ -85,9 +91,14 @@ struct Topic {
     subscribers: Vec<String>,
 }
 
-/// The registry is full.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Full;
+/// Why nothing was registered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Refused {
+    #[error("this Master holds no more than {MAX_REGISTRATIONS} registrations")]
+    Full,
+    #[error("a new node registered with the same name, and this one was told to end")]
+    Replaced,
+}
 
 impl Registry {
     /// Registers `node` under `name`. For services `service_api` says where it is served.
@@ -99,19 +110,32 @@ impl Registry {
         (node, api): (&str, &str),
         service_api: &str,
         notices: &mut Vec<Notice>,
-    ) -> Result<(), Full> {
+    ) -> Result<(), Refused> {
         if self.count >= MAX_REGISTRATIONS || self.topics.len() >= MAX_REGISTRATIONS {
-            return Err(Full);
+            return Err(Refused::Full);
         }
-        let before = self.nodes.get(node).map(|found| found.api.clone());
-        if let Some(old) = before.filter(|old| old != api) {
+        let mut replaced = Vec::new();
+        if let Some(before) = self.nodes.get(node).filter(|before| before.api != api) {
+            // A roscpp node registers once more while it ends; that must not end its successor.
+            if before.replaced.iter().any(|old| old == api) {
+                return Err(Refused::Replaced);
+            }
+            replaced.clone_from(&before.replaced);
+            replaced.push(before.api.clone());
+            if replaced.len() > MAX_REPLACED {
+                replaced.remove(0);
+            }
+            let reason = "new node registered with same name";
+            notices.push(Notice::shutdown(&before.api, reason));
             self.drop_node(node, notices);
-            notices.push(Notice::shutdown(&old, "new node registered with same name"));
         }
         let entry = self
             .nodes
             .entry(node.to_owned())
             .or_insert_with(|| Node::new(api));
+        if !replaced.is_empty() {
+            entry.replaced = replaced;
+        }
         let new = entry.names(kind).insert(name.to_owned());
         self.count += usize::from(new);
         self.version += u64::from(new);
