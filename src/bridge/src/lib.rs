@@ -25,9 +25,24 @@
 
 #![forbid(unsafe_code)]
 
+mod actionlib;
 mod bridge;
+mod client;
+mod clock;
+mod cut;
+mod hub;
 mod metrics;
+mod names;
 mod options;
+mod outbox;
+mod outlet;
+mod registrations;
+mod rosapi;
+mod sample;
+mod service_types;
+mod session;
+mod topic_queue;
+mod ws;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use metrics::{Counter, Metrics};

@@ -1,0 +1,281 @@
+//! One client: what it asked for, kept apart from the socket it asked through.
+
+mod actions;
+mod calls;
+mod publishing;
+mod serving;
+mod subscribing;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
+use std::time::Instant;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use rosbridge::{Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Png, Status};
+use tokio_util::sync::CancellationToken;
+
+use crate::SessionOptions;
+use crate::bridge::Shared;
+use crate::outbox::{Control, Outbox};
+use crate::sample::Frame;
+
+/// Messages packed in pictures in fragments in pictures: nobody needs more.
+const MAX_WRAPPING: usize = 4;
+
+/// The client.
+pub(crate) struct Client {
+    pub(crate) shared: Arc<Shared>,
+    pub(crate) name: String,
+    pub(crate) outbox: Arc<Outbox>,
+    hears_clients: bool,
+    resumable: bool,
+    level: AtomicU8,
+    /// Calls and goals under way.
+    under_way: AtomicUsize,
+    ended: CancellationToken,
+    subscriptions: Mutex<subscribing::Subscribed>,
+    outlets: Mutex<publishing::Outlets>,
+    services: Mutex<serving::Services>,
+    actions: Mutex<actions::Actions>,
+}
+
+/// Where an answer goes: to which interaction, in which format.
+#[derive(Debug, Clone)]
+pub(crate) struct Reply {
+    pub(crate) id: Option<Id<'static>>,
+    pub(crate) format: Format,
+}
+
+/// What one connection has to remember besides: messages not yet complete.
+pub(crate) struct Inbox {
+    fragments: Fragments,
+    pictures: Fragments,
+}
+
+impl Inbox {
+    pub(crate) fn new(shared: &Shared) -> Self {
+        let limits = shared.options.fragments;
+        Self { fragments: Fragments::new(limits), pictures: Fragments::new(limits) }
+    }
+}
+
+impl Client {
+    pub(crate) fn new(shared: Arc<Shared>, options: &SessionOptions) -> Arc<Self> {
+        let outbox = Arc::new(Outbox::new(&shared.options, shared.metrics.clone()));
+        Arc::new(Self {
+            shared,
+            name: options.client.clone(),
+            outbox,
+            hears_clients: options.hears_clients,
+            resumable: options.resume.is_some(),
+            level: AtomicU8::new(options.level as u8),
+            under_way: AtomicUsize::new(0),
+            ended: CancellationToken::new(),
+            subscriptions: Mutex::default(),
+            outlets: Mutex::default(),
+            services: Mutex::default(),
+            actions: Mutex::default(),
+        })
+    }
+
+    /// It will not come back: gives up all it had.
+    pub(crate) fn end(&self) {
+        self.ended.cancel();
+        // Dropped outside of the locks: what is dropped may want them.
+        drop(std::mem::take(&mut *self.subscriptions.lock()));
+        drop(std::mem::take(&mut *self.outlets.lock()));
+        drop(std::mem::take(&mut *self.services.lock()));
+        drop(std::mem::take(&mut *self.actions.lock()));
+    }
+
+    /// Whether another socket may take over.
+    pub(crate) fn is_resumable(&self) -> bool {
+        self.resumable
+    }
+
+    pub(crate) async fn ended(&self) {
+        self.ended.cancelled().await;
+    }
+
+    /// Takes a text frame.
+    pub(crate) fn text(self: &Arc<Self>, inbox: &mut Inbox, text: &str) {
+        self.frame(inbox, Incoming::Text(text), None, 0);
+    }
+
+    /// Takes a binary frame.
+    pub(crate) fn binary(self: &Arc<Self>, inbox: &mut Inbox, bytes: &Bytes) {
+        self.frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
+    }
+
+    fn frame(self: &Arc<Self>, inbox: &mut Inbox, frame: Incoming<'_>, source: Option<&Bytes>, wrapping: usize) {
+        let format = frame.format();
+        let op = match Op::parse(frame) {
+            Ok(op) => op,
+            Err(error) => return self.refuse(error, format),
+        };
+        if self.hears(Level::Warning) {
+            for field in rosbridge::unknown_fields(frame) {
+                let text = format!("{}: field {field:?} is not known and was ignored", op.name());
+                self.status(Level::Warning, op.id().cloned().map(Id::into_owned), format, &text);
+            }
+        }
+        let name = op.name();
+        let reply = Reply { id: op.id().cloned().map(Id::into_owned), format };
+        if let Err(reason) = self.perform(inbox, op, &reply, source, wrapping) {
+            self.status(Level::Error, reply.id, format, &format!("{name}: {reason}"));
+        }
+    }
+
+    fn perform(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        op: Op<'_>,
+        reply: &Reply,
+        source: Option<&Bytes>,
+        wrapping: usize,
+    ) -> Result<(), String> {
+        match op {
+            Op::Publish(op) => self.publish(op, reply, source),
+            Op::Fragment(op) => self.fragment(inbox, &op, wrapping),
+            Op::Png(op) => self.png(inbox, &op, wrapping),
+            Op::CallService(op) => self.call_service(op, reply),
+            Op::ServiceResponse(op) => self.service_response(op),
+            Op::Subscribe(op) => self.subscribe(op, reply),
+            Op::Unsubscribe(op) => self.unsubscribe(&op, reply),
+            Op::Advertise(op) => self.advertise(&op, reply),
+            Op::Unadvertise(op) => self.unadvertise(&op, reply),
+            Op::AdvertiseService(op) => self.advertise_service(&op, reply),
+            Op::UnadvertiseService(op) => self.unadvertise_service(&op, reply),
+            Op::SendActionGoal(op) => self.send_action_goal(op, reply),
+            Op::CancelActionGoal(op) => self.cancel_action_goal(&op),
+            Op::ActionFeedback(op) => self.action_feedback(&op),
+            Op::ActionResult(op) => self.action_result(&op),
+            Op::AdvertiseAction(op) => self.advertise_action(&op, reply),
+            Op::UnadvertiseAction(op) => self.unadvertise_action(&op, reply),
+            Op::SetLevel(op) => {
+                self.level.store(op.level as u8, Ordering::Relaxed);
+                Ok(())
+            }
+            Op::Status(op) => {
+                tracing::debug!(client = %self.name, level = op.level.name(), "{}", op.msg);
+                Ok(())
+            }
+            Op::Auth(_) => {
+                self.info(reply, "auth: ignored, this server knows its clients by the token of their connection");
+                Ok(())
+            }
+        }
+    }
+
+    fn fragment(self: &Arc<Self>, inbox: &mut Inbox, op: &Fragment<'_>, wrapping: usize) -> Result<(), String> {
+        let whole = inbox.fragments.add(op, Instant::now()).map_err(|error| error.to_string())?;
+        if let Some(text) = whole {
+            self.unwrapped(inbox, &text, wrapping)?;
+        }
+        Ok(())
+    }
+
+    fn png(self: &Arc<Self>, inbox: &mut Inbox, op: &Png<'_>, wrapping: usize) -> Result<(), String> {
+        let whole = match op.fragment() {
+            None => Some(op.data.to_string()),
+            Some(part) => inbox.pictures.add(&part, Instant::now()).map_err(|error| error.to_string())?,
+        };
+        if let Some(data) = whole {
+            let text =
+                rosbridge::decode_png(&data, self.shared.options.max_png).map_err(|error| error.to_string())?;
+            self.unwrapped(inbox, &text, wrapping)?;
+        }
+        Ok(())
+    }
+
+    fn unwrapped(self: &Arc<Self>, inbox: &mut Inbox, text: &str, wrapping: usize) -> Result<(), String> {
+        if wrapping == MAX_WRAPPING {
+            return Err(format!("messages within messages go {MAX_WRAPPING} deep at most"));
+        }
+        self.frame(inbox, Incoming::Text(text), None, wrapping + 1);
+        Ok(())
+    }
+
+    fn refuse(&self, error: Error, format: Format) {
+        self.status(Level::Error, error.id.clone(), format, &error.to_string());
+    }
+
+    pub(crate) fn hears(&self, level: Level) -> bool {
+        level as u8 <= self.level.load(Ordering::Relaxed)
+    }
+
+    /// Sends a status message, if the client wants to hear at that level.
+    pub(crate) fn status(&self, level: Level, id: Option<Id<'static>>, format: Format, text: &str) {
+        if level == Level::Error {
+            self.shared.metrics.errors.add(1);
+            tracing::debug!(client = %self.name, "{text}");
+        }
+        if self.hears(level) {
+            self.send(Status { id, level, msg: text.into() }.into(), format);
+        }
+    }
+
+    pub(crate) fn info(&self, reply: &Reply, text: &str) {
+        self.status(Level::Info, reply.id.clone(), reply.format, text);
+    }
+
+    pub(crate) fn warn(&self, reply: &Reply, text: &str) {
+        self.status(Level::Warning, reply.id.clone(), reply.format, text);
+    }
+
+    pub(crate) fn error(&self, reply: &Reply, text: &str) {
+        self.status(Level::Error, reply.id.clone(), reply.format, text);
+    }
+
+    /// Sends a message that holds no payload, or one in `format`.
+    pub(crate) fn send(&self, op: Op<'_>, format: Format) {
+        let mut out = Vec::with_capacity(128);
+        op.print(&mut out, format);
+        self.send_frame(Frame { format, bytes: out.into() }, None, false);
+    }
+
+    pub(crate) fn send_frame(&self, frame: Frame, fragment_size: Option<usize>, answer: bool) {
+        self.outbox.control(Control { frame, fragment_size, answer });
+    }
+
+    /// Sends a frame printed in JSON or CBOR as the client wants it.
+    pub(crate) fn send_as(&self, frame: Frame, compression: Compression, fragment_size: Option<usize>) {
+        let wrapped = match compression {
+            Compression::Png if frame.format == Format::Json => frame.clone().into_png(),
+            _ => Ok(frame),
+        };
+        match wrapped {
+            Ok(frame) => self.send_frame(frame, fragment_size, true),
+            Err(reason) => self.status(Level::Error, None, Format::Json, &reason),
+        }
+    }
+
+    /// Counts a call or goal as under way until the guard is dropped.
+    fn begin(self: &Arc<Self>) -> Result<UnderWay, String> {
+        let limit = self.shared.options.max_calls;
+        let before = self.under_way.fetch_add(1, Ordering::Relaxed);
+        let guard = UnderWay(self.clone());
+        if before >= limit {
+            return Err(format!("{limit} calls and goals of this client are under way already; wait for some to end"));
+        }
+        Ok(guard)
+    }
+}
+
+/// One call or goal under way.
+struct UnderWay(Arc<Client>);
+
+impl Drop for UnderWay {
+    fn drop(&mut self) {
+        self.0.under_way.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// How payloads for this compression are printed: in which format, and whether as ROS bytes.
+fn print_format(compression: Compression) -> Format {
+    match compression {
+        Compression::None | Compression::Png => Format::Json,
+        Compression::Cbor | Compression::CborRaw => Format::Cbor,
+    }
+}

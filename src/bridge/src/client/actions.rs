@@ -1,0 +1,69 @@
+//! The ops on actions, mapped onto actionlib's topics.
+
+mod goals;
+mod server;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use ros::bus::WireType;
+use ros::schema::{ActionDef, MessageType};
+use rosbridge::Id;
+
+use super::Client;
+use crate::bridge::Shared;
+use crate::names::plain_type;
+use crate::outlet::Outlet;
+use goals::ActionClient;
+use server::ActionServer;
+
+/// The actions a client uses and serves.
+#[derive(Default)]
+pub(super) struct Actions {
+    /// Those it sends goals to, by action name.
+    used: HashMap<String, Arc<ActionClient>>,
+    /// Goals under way, by the id the client gave.
+    goals: HashMap<Id<'static>, (String, String)>,
+    /// Those it serves, by action name.
+    served: HashMap<String, Arc<ActionServer>>,
+}
+
+impl Client {
+    fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, String> {
+        let name = plain_type(type_name);
+        let registry = &self.shared.registry;
+        // ROS 1 clients write NameAction as well as Name.
+        let def = registry.action(&name).or_else(|error| match name.strip_suffix("Action") {
+            Some(short) => registry.action(short),
+            None => Err(error),
+        });
+        def.map_err(|error| format!("action {action}: {error}"))
+    }
+
+    fn action_outlet(
+        self: &Arc<Self>,
+        topic: String,
+        message_type: &Arc<MessageType>,
+        latch: bool,
+    ) -> Arc<Outlet> {
+        let client = Arc::downgrade(self);
+        let name = topic.clone();
+        let failed = move |reason: String| {
+            if let Some(client) = client.upgrade() {
+                let text = format!("topic {name}: {reason}");
+                client.status(rosbridge::Level::Error, None, rosbridge::Format::Json, &text);
+            }
+        };
+        Outlet::open(&self.shared, &topic, message_type.clone(), latch, 100, failed)
+    }
+}
+
+/// The type that an action's topic has, for those that do not depend on the action.
+fn common_type(shared: &Shared, name: &str) -> Result<Arc<MessageType>, String> {
+    shared.registry.message(name).map_err(|error| error.to_string())
+}
+
+/// Whether what a node sends is what we take it for.
+fn is_type(wire: &WireType, expected: &MessageType) -> bool {
+    wire.md5 == "*" || wire.md5 == expected.md5()
+}

@@ -1,0 +1,193 @@
+//! `call_service`: a client calls a service of the servant, or one of rosapi's, which the bridge answers.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use ros::codec::{self, CborOptions, JsonOptions};
+use ros::schema::{MessageType, ServiceDef};
+use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
+
+use super::publishing::decode_args;
+use super::{Client, Reply, print_format};
+use crate::names::resolve;
+use crate::rosapi;
+use crate::sample::Frame;
+
+/// A call, free of the frame it came in.
+struct Call {
+    service: String,
+    /// As the client wrote it: that is what it looks for in the answer.
+    written: String,
+    id: Option<Id<'static>>,
+    args: Option<(Format, Bytes)>,
+    timeout: Duration,
+    compression: Compression,
+    fragment_size: Option<usize>,
+}
+
+impl Call {
+    fn args(&self) -> Option<Payload<'_>> {
+        self.args.as_ref().map(|(format, bytes)| Payload { format: *format, bytes })
+    }
+}
+
+impl Client {
+    pub(super) fn call_service(self: &Arc<Self>, op: CallService<'_>, reply: &Reply) -> Result<(), String> {
+        self.shared.metrics.calls.add(1);
+        let compression = op.compression.unwrap_or(match reply.format {
+            Format::Json => Compression::None,
+            Format::Cbor => Compression::Cbor,
+        });
+        let call = Call {
+            service: String::new(),
+            written: op.service.clone().into_owned(),
+            id: reply.id.clone(),
+            args: op.args.map(|args| (args.format, Bytes::copy_from_slice(args.bytes))),
+            timeout: op.timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(self.shared.options.call_timeout),
+            compression,
+            fragment_size: op.fragment_size,
+        };
+        let (service, guard) = match resolve(&op.service).and_then(|service| Ok((service, self.begin()?))) {
+            Ok(found) => found,
+            Err(reason) => {
+                self.call_failed(&call, &reason);
+                return Ok(());
+            }
+        };
+        let call = Call { service: service.into_owned(), ..call };
+        let client = self.clone();
+        tokio::spawn(async move {
+            let _guard = guard;
+            let answered = tokio::select! {
+                () = client.ended() => return,
+                answered = client.answer(&call) => answered,
+            };
+            match answered {
+                Ok(frame) => client.send_as(frame, call.compression, call.fragment_size),
+                Err(reason) => client.call_failed(&call, &reason),
+            }
+        });
+        Ok(())
+    }
+
+    async fn answer(&self, call: &Call) -> Result<Frame, String> {
+        let served = self.shared.bus.graph().borrow().services.contains_key(&call.service);
+        if !served && let Some(api) = rosapi::Service::find(&call.service) {
+            return self.answer_rosapi(call, api).await;
+        }
+        let service_type = self
+            .shared
+            .service_types
+            .find(self.shared.bus.as_ref(), &call.service)
+            .await
+            .map_err(|error| error.to_string())?;
+        let def = self.shared.registry.service(&service_type.name).map_err(|error| error.to_string());
+        let def = def.and_then(|def| match def.md5 == service_type.md5 || service_type.md5 == "*" {
+            true => Ok(def),
+            false => Err(format!(
+                "service {} has type {} with MD5 {} there and {} here",
+                call.service, def.name, service_type.md5, def.md5
+            )),
+        });
+        let request = match (&def, call.compression, call.args()) {
+            (Ok(def), compression, args) => decode_args(&def.request, args, compression)?,
+            // ROS bytes both ways need no definition.
+            (Err(_), Compression::CborRaw, Some(args)) => {
+                Bytes::from(args.raw().map_err(|error| error.to_string())?.bytes.into_owned())
+            }
+            (Err(reason), ..) => return Err(reason.clone()),
+        };
+        let response = self
+            .shared
+            .bus
+            .call(&call.service, request, call.timeout)
+            .await
+            .map_err(|error| error.to_string())?;
+        self.response_frame(call, def.as_deref().ok(), &response)
+    }
+
+    async fn answer_rosapi(&self, call: &Call, api: rosapi::Service) -> Result<Frame, String> {
+        let def = api.definition()?;
+        let args = match call.args() {
+            None => Bytes::from_static(b"{}"),
+            Some(args) if args.format == Format::Json && args.is_object() && call.compression != Compression::CborRaw => {
+                Bytes::copy_from_slice(args.bytes)
+            }
+            args => {
+                let request = decode_args(&def.request, args, call.compression)?;
+                let mut json = Vec::new();
+                self.print_payload(&def.request, &request, Format::Json, &mut json)?;
+                Bytes::from(json)
+            }
+        };
+        let values = api.answer(&self.shared, &args).await?;
+        if matches!(call.compression, Compression::None | Compression::Png) {
+            return answer_frame(call, Format::Json, |out| {
+                out.extend_from_slice(&values);
+                Ok::<_, String>(())
+            });
+        }
+        let values = Payload { format: Format::Json, bytes: &values };
+        let response = decode_args(&def.response, Some(values), Compression::None)?;
+        self.response_frame(call, Some(&def), &response)
+    }
+
+    fn response_frame(&self, call: &Call, def: Option<&ServiceDef>, response: &Bytes) -> Result<Frame, String> {
+        let format = print_format(call.compression);
+        let Some(def) = def.filter(|_| call.compression != Compression::CborRaw) else {
+            let mut out = Vec::with_capacity(response.len() + 128);
+            let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
+            writer.text("service", &call.written);
+            writer.text("compression", Compression::CborRaw.name());
+            writer.raw("values", None, response);
+            writer.boolean("result", true);
+            writer.end();
+            return Ok(Frame { format, bytes: out.into() });
+        };
+        answer_frame(call, format, |out| self.print_payload(&def.response, response, format, out))
+    }
+
+    /// Appends a serialized message as a payload of the format.
+    pub(super) fn print_payload(
+        &self,
+        message_type: &MessageType,
+        bytes: &[u8],
+        format: Format,
+        out: &mut Vec<u8>,
+    ) -> Result<(), String> {
+        let json = JsonOptions { non_finite: self.shared.options.non_finite, ..JsonOptions::default() };
+        let printed = match format {
+            Format::Json => codec::to_json(message_type, bytes, out, &json),
+            Format::Cbor => codec::to_cbor(message_type, bytes, out, &CborOptions::default()),
+        };
+        printed.map_err(|error| error.to_string())
+    }
+
+    fn call_failed(&self, call: &Call, reason: &str) {
+        self.shared.metrics.calls_failed.add(1);
+        tracing::debug!(client = %self.name, service = %call.written, "call failed: {reason}");
+        let format = print_format(call.compression);
+        let mut out = Vec::with_capacity(256);
+        let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
+        writer.text("service", &call.written);
+        writer.text("values", reason);
+        writer.boolean("result", false);
+        writer.end();
+        self.send_frame(Frame { format, bytes: out.into() }, call.fragment_size, true);
+    }
+}
+
+fn answer_frame<E>(
+    call: &Call,
+    format: Format,
+    values: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
+) -> Result<Frame, E> {
+    let mut out = Vec::with_capacity(256);
+    let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
+    writer.text("service", &call.written);
+    writer.value("values", values)?;
+    writer.boolean("result", true);
+    writer.end();
+    Ok(Frame { format, bytes: out.into() })
+}

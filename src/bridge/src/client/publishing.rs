@@ -1,0 +1,237 @@
+//! `advertise`, `unadvertise`, `publish`.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use ros::codec::{self, FillOptions, Time};
+use ros::schema::MessageType;
+use rosbridge::{Advertise, Compression, Format, Payload, Publish, Unadvertise};
+
+use super::{Client, Reply};
+use crate::names::{plain_type, resolve};
+use crate::outlet::Outlet;
+
+/// Messages on one topic that wait until its type is known.
+const MAX_UNTYPED: usize = 64;
+/// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
+const SLICED: usize = 16 * 1024;
+/// Messages kept per slow node where the client does not say.
+const DEFAULT_QUEUE: u64 = 100;
+
+/// A client's topics, by their absolute names.
+#[derive(Default)]
+pub(super) struct Outlets {
+    open: HashMap<String, Arc<Outlet>>,
+    untyped: HashMap<String, Vec<Untyped>>,
+}
+
+/// A message whose topic's type is being asked for.
+struct Untyped {
+    format: Format,
+    payload: Bytes,
+    compression: Compression,
+    reply: Reply,
+}
+
+impl Client {
+    pub(super) fn advertise(self: &Arc<Self>, op: &Advertise<'_>, reply: &Reply) -> Result<(), String> {
+        let topic = resolve(&op.topic)?;
+        let message_type = self.publishable_type(&topic, &op.type_name)?;
+        if let Some(md5) = op.md5sum.as_deref().filter(|md5| *md5 != "*" && *md5 != message_type.md5()) {
+            return Err(format!(
+                "type {} has MD5 {} here and {md5} there; use the definition that /rosapi/message_details shows",
+                message_type.name(),
+                message_type.md5()
+            ));
+        }
+        self.open_outlet(&topic, message_type, op.latch, op.queue_size, reply)?;
+        self.info(reply, &format!("advertise: advertised {topic}"));
+        Ok(())
+    }
+
+    pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &Reply) -> Result<(), String> {
+        let topic = resolve(&op.topic)?;
+        let gone = self.outlets.lock().open.remove(&*topic);
+        match gone {
+            Some(_) => self.info(reply, &format!("unadvertise: {topic} is no longer advertised")),
+            None => self.warn(reply, &format!("unadvertise: this client does not advertise {topic}")),
+        }
+        Ok(())
+    }
+
+    /// The type by that name, if the topic may be published with it.
+    fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, String> {
+        let name = plain_type(type_name);
+        let graph = self.shared.bus.graph().borrow().clone();
+        let theirs = graph.topics.get(topic).map(|nodes| nodes.type_name.as_str());
+        if let Some(theirs) = theirs.filter(|theirs| !matches!(*theirs, "" | "*") && *theirs != name) {
+            return Err(format!("topic {topic} has type {theirs}, not {name}"));
+        }
+        self.shared.registry.message(&name).map_err(|error| format!("topic {topic}: {error}"))
+    }
+
+    fn open_outlet(
+        self: &Arc<Self>,
+        topic: &str,
+        message_type: Arc<MessageType>,
+        latch: bool,
+        queue_size: Option<u64>,
+        reply: &Reply,
+    ) -> Result<Arc<Outlet>, String> {
+        let limit = self.shared.options.max_advertisements;
+        let mut outlets = self.outlets.lock();
+        if let Some(known) = outlets.open.get(topic) {
+            if known.message_type.md5() != message_type.md5() {
+                let known = known.message_type.name();
+                return Err(format!("this client advertises {topic} as {known}; unadvertise it first"));
+            }
+            if known.latch == latch {
+                return Ok(known.clone());
+            }
+        } else if outlets.open.len() >= limit {
+            return Err(format!("this client advertises {limit} topics already; unadvertise one"));
+        }
+        let queue = queue_size.filter(|size| *size > 0).unwrap_or(DEFAULT_QUEUE).min(1000) as usize;
+        let (client, reply, name) = (Arc::downgrade(self), reply.clone(), topic.to_owned());
+        let failed = move |reason: String| {
+            if let Some(client) = client.upgrade() {
+                client.outlets.lock().open.remove(&name);
+                client.error(&reply, &format!("advertise: topic {name}: {reason}"));
+            }
+        };
+        let outlet = Outlet::open(&self.shared, topic, message_type, latch, queue, failed);
+        let replaced = outlets.open.insert(topic.to_owned(), outlet.clone());
+        drop(outlets);
+        drop(replaced);
+        Ok(outlet)
+    }
+
+    pub(super) fn publish(
+        self: &Arc<Self>,
+        op: Publish<'_>,
+        reply: &Reply,
+        source: Option<&Bytes>,
+    ) -> Result<(), String> {
+        let topic = resolve(&op.topic)?;
+        let known = self.outlets.lock().open.get(&*topic).cloned();
+        let outlet = match known {
+            Some(outlet) => outlet,
+            None => match self.type_to_publish(&topic, &op)? {
+                Some(message_type) => self.open_outlet(&topic, message_type, op.latch, None, reply)?,
+                None => return self.publish_later(&topic, &op, reply),
+            },
+        };
+        let bytes = decode(&outlet.message_type, op.msg, op.compression, source)
+            .map_err(|reason| format!("topic {topic}: {reason}"))?;
+        outlet.publish(bytes);
+        Ok(())
+    }
+
+    /// What to publish as without having advertised: the type said, or the topic's.
+    fn type_to_publish(&self, topic: &str, op: &Publish<'_>) -> Result<Option<Arc<MessageType>>, String> {
+        if let Some(name) = &op.type_name {
+            return self.publishable_type(topic, name).map(Some);
+        }
+        let graph = self.shared.bus.graph().borrow().clone();
+        let local = self.shared.local_type(topic);
+        match (graph.topics.get(topic), local) {
+            (Some(nodes), _) if !matches!(nodes.type_name.as_str(), "" | "*") => {
+                self.publishable_type(topic, &nodes.type_name).map(Some)
+            }
+            (_, Some(name)) => self.publishable_type(topic, &name).map(Some),
+            (Some(_), None) => Ok(None),
+            (None, None) => Err(format!("topic {topic} does not exist; advertise it with its type first")),
+        }
+    }
+
+    /// Keeps a message until the nodes have said what type the topic has.
+    fn publish_later(self: &Arc<Self>, topic: &str, op: &Publish<'_>, reply: &Reply) -> Result<(), String> {
+        let waiting = Untyped {
+            format: op.msg.format,
+            payload: Bytes::copy_from_slice(op.msg.bytes),
+            compression: op.compression,
+            reply: reply.clone(),
+        };
+        let mut outlets = self.outlets.lock();
+        if let Some(others) = outlets.untyped.get_mut(topic) {
+            if others.len() >= MAX_UNTYPED {
+                return Err(format!("topic {topic} has no known type yet; advertise it first"));
+            }
+            others.push(waiting);
+            return Ok(());
+        }
+        outlets.untyped.insert(topic.to_owned(), vec![waiting]);
+        drop(outlets);
+        let (client, topic) = (self.clone(), topic.to_owned());
+        tokio::spawn(async move {
+            let asked = tokio::select! {
+                () = client.ended() => return,
+                asked = client.shared.bus.topic_type(&topic) => asked,
+            };
+            let waiting = client.outlets.lock().untyped.remove(&topic).unwrap_or_default();
+            let found = asked.map_err(|error| error.to_string());
+            let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
+            for message in waiting {
+                let done = found.clone().and_then(|message_type| {
+                    let outlet = client.open_outlet(&topic, message_type, false, None, &message.reply)?;
+                    let payload = Payload { format: message.format, bytes: &message.payload };
+                    outlet.publish(decode(&outlet.message_type, payload, message.compression, None)?);
+                    Ok(())
+                });
+                if let Err(reason) = done {
+                    client.error(&message.reply, &format!("publish: topic {topic}: {reason}"));
+                }
+            }
+        });
+        Ok(())
+    }
+}
+
+/// A payload as serialized message.
+pub(super) fn decode(
+    message_type: &MessageType,
+    payload: Payload<'_>,
+    compression: Compression,
+    source: Option<&Bytes>,
+) -> Result<Bytes, String> {
+    if compression == Compression::CborRaw {
+        let raw = payload.raw().map_err(|error| error.to_string())?;
+        codec::validate(message_type, &raw.bytes).map_err(|error| error.to_string())?;
+        return Ok(match (&raw.bytes, source) {
+            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => source.slice_ref(slice),
+            _ => Bytes::from(raw.bytes.into_owned()),
+        });
+    }
+    let options = FillOptions { now: Some(Time::now()), ..FillOptions::default() };
+    // Base64 shrinks by a quarter; everything else that matters does by more.
+    let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
+    let decoded = match payload.format {
+        Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
+        Format::Cbor => codec::from_cbor(message_type, payload.bytes, &mut out, &options),
+    };
+    decoded.map_err(|error| error.to_string())?;
+    Ok(Bytes::from(out))
+}
+
+/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults.
+pub(super) fn decode_args(
+    message_type: &MessageType,
+    args: Option<Payload<'_>>,
+    compression: Compression,
+) -> Result<Bytes, String> {
+    match args {
+        None if compression == Compression::CborRaw && message_type.min_size() > 0 => {
+            Err("field \"args\" is missing, the ROS serialization is expected".to_owned())
+        }
+        None => decode(message_type, Payload::json("{}"), Compression::None, None),
+        Some(list) if list.is_list() && compression != Compression::CborRaw => {
+            let fields = message_type.fields();
+            let named = list.named(fields.iter().map(|field| field.name.as_str())).ok_or_else(|| {
+                format!("{} has {} fields, \"args\" has more", message_type.name(), fields.len())
+            })?;
+            decode(message_type, Payload { format: list.format, bytes: &named }, compression, None)
+        }
+        Some(args) => decode(message_type, args, compression, None),
+    }
+}

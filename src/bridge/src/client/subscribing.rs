@@ -1,0 +1,162 @@
+//! `subscribe` and `unsubscribe`.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+
+use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
+
+use super::{Client, Reply};
+use crate::hub::{Listener, Listening};
+use crate::names::{plain_type, resolve};
+use crate::outbox::{Outbox, TopicKey};
+use crate::sample::Sample;
+use crate::topic_queue::{Subscriptions, Wishes};
+
+/// A client's topics, by the name it uses.
+pub(super) type Subscribed = HashMap<Arc<str>, TopicSubscription>;
+
+pub(super) struct TopicSubscription {
+    key: TopicKey,
+    subscriptions: Subscriptions,
+    listening: Listening,
+    listener: Arc<TopicListener>,
+}
+
+/// Puts a topic's messages into the client's queue.
+struct TopicListener {
+    outbox: Arc<Outbox>,
+    key: TopicKey,
+    hears_clients: bool,
+    client: Weak<Client>,
+    topic: Arc<str>,
+    id: Option<Id<'static>>,
+    format: Format,
+}
+
+impl Listener for TopicListener {
+    fn sample(&self, sample: &Arc<Sample>, replay: bool) {
+        if self.hears_clients || !sample.local {
+            self.outbox.sample(self.key, sample.clone(), replay);
+        }
+    }
+
+    fn failed(&self, reason: &str) {
+        if let Some(client) = self.client.upgrade() {
+            let text = format!("subscribe: topic {}: {reason}", self.topic);
+            client.status(Level::Error, self.id.clone(), self.format, &text);
+        }
+    }
+}
+
+impl Client {
+    pub(super) fn subscribe(self: &Arc<Self>, op: Subscribe<'_>, reply: &Reply) -> Result<(), String> {
+        let name = resolve(&op.topic)?;
+        let expected = self.expected_type(&name, &op)?;
+        let wishes = Wishes {
+            throttle_rate: op.throttle_rate,
+            queue_length: op.queue_length,
+            fragment_size: op.fragment_size,
+            compression: op.compression,
+        };
+        let limit = self.shared.options.max_subscriptions;
+        let mut subscribed = self.subscriptions.lock();
+        if let Some(known) = subscribed.get_mut(&*op.topic) {
+            if known.subscriptions.len() >= limit && !known.subscriptions.contains_key(&reply.id) {
+                return Err(format!("topic {name} has {limit} subscriptions of this client already"));
+            }
+            known.subscriptions.insert(reply.id.clone(), wishes);
+            self.apply_wishes(known);
+            known.listening.hub().replay(known.listener.as_ref());
+        } else {
+            if subscribed.len() >= limit {
+                return Err(format!("this client has {limit} topics already; unsubscribe from one"));
+            }
+            let topic: Arc<str> = op.topic.as_ref().into();
+            let key = self.outbox.add_topic(topic.clone(), wishes);
+            let listener = Arc::new(TopicListener {
+                outbox: self.outbox.clone(),
+                key,
+                hears_clients: self.hears_clients,
+                client: Arc::downgrade(self),
+                topic: topic.clone(),
+                id: reply.id.clone(),
+                format: reply.format,
+            });
+            let hub = self.shared.hub(&name, expected.as_deref());
+            let listening = hub.listen(listener.clone());
+            let subscriptions = Subscriptions::from([(reply.id.clone(), wishes)]);
+            subscribed.insert(topic, TopicSubscription { key, subscriptions, listening, listener });
+        }
+        drop(subscribed);
+        self.info(reply, &format!("subscribe: subscribed to {name}"));
+        Ok(())
+    }
+
+    /// The type the client may expect, where anybody knows it; an error where it expects the wrong one.
+    fn expected_type(
+        &self,
+        topic: &str,
+        op: &Subscribe<'_>,
+    ) -> Result<Option<Arc<ros::schema::MessageType>>, String> {
+        let graph = self.shared.bus.graph().borrow().clone();
+        let nodes = graph.topics.get(topic);
+        let actual = nodes.map(|nodes| nodes.type_name.as_str()).filter(|name| !name.is_empty() && *name != "*");
+        let local = self.shared.local_type(topic);
+        let actual = actual.or(local.as_deref());
+        let wanted = op.type_name.as_deref().filter(|name| *name != "*").map(plain_type);
+        match (&wanted, actual) {
+            (None, None) if nodes.is_none() => {
+                return Err(format!(
+                    "topic {topic} does not exist; say its \"type\" to wait for it, /rosapi/topics lists those that do"
+                ));
+            }
+            (Some(wanted), Some(actual)) if *wanted != plain_type(actual) => {
+                return Err(format!("topic {topic} has type {actual}, not {wanted}"));
+            }
+            _ => {}
+        }
+        let Some(name) = wanted.or(actual.map(plain_type)) else { return Ok(None) };
+        match self.shared.registry.message(&name) {
+            Ok(found) => Ok(Some(found)),
+            // A publisher brings the definition along, and for ROS bytes none is needed.
+            Err(_) if op.compression == Compression::CborRaw => Ok(None),
+            Err(_) if nodes.is_some_and(|nodes| !nodes.publishers.is_empty()) => Ok(None),
+            Err(error) => Err(format!("topic {topic}: {error}")),
+        }
+    }
+
+    fn apply_wishes(&self, known: &TopicSubscription) {
+        if let Some(merged) = Wishes::merged(known.subscriptions.values()) {
+            self.outbox.change_topic(known.key, merged);
+        }
+    }
+
+    pub(super) fn unsubscribe(&self, op: &Unsubscribe<'_>, reply: &Reply) -> Result<(), String> {
+        let mut subscribed = self.subscriptions.lock();
+        let Some(known) = subscribed.get_mut(&*op.topic) else {
+            drop(subscribed);
+            self.warn(reply, &format!("unsubscribe: this client has no subscription to {}", op.topic));
+            return Ok(());
+        };
+        let gone = match &reply.id {
+            None => true,
+            id => {
+                if known.subscriptions.remove(id).is_none() {
+                    self.warn(reply, &format!("unsubscribe: no subscription to {} has this id", op.topic));
+                }
+                known.subscriptions.is_empty()
+            }
+        };
+        if gone {
+            let known = subscribed.remove(&*op.topic);
+            drop(subscribed);
+            if let Some(known) = known {
+                self.outbox.remove_topic(known.key);
+            }
+        } else {
+            self.apply_wishes(known);
+        }
+        self.info(reply, &format!("unsubscribe: unsubscribed from {}", op.topic));
+        Ok(())
+    }
+}

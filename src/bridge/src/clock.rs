@@ -1,0 +1,44 @@
+//! What time it is for the servant: the wall's, or a simulation's.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros::bus::ParamValue;
+use ros::codec::Time;
+use tokio::sync::mpsc;
+
+use crate::bridge::Shared;
+use crate::hub::Listener;
+use crate::sample::Sample;
+
+/// How long a simulation may keep silent before the wall's time must do.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+struct Ticks(mpsc::UnboundedSender<Time>);
+
+impl Listener for Ticks {
+    fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
+        // rosgraph_msgs/Clock is one time.
+        if let [a, b, c, d, e, f, g, h] = sample.bytes[..] {
+            let time = Time { secs: u32::from_le_bytes([a, b, c, d]), nsecs: u32::from_le_bytes([e, f, g, h]) };
+            // Nobody waits any more.
+            let _ = self.0.send(time);
+        }
+    }
+
+    fn failed(&self, _reason: &str) {}
+}
+
+/// The time now.
+pub(crate) async fn now(shared: &Arc<Shared>) -> Time {
+    if let Ok(ParamValue::Bool(true)) = shared.bus.get_param("/use_sim_time").await {
+        let (ticks, mut heard) = mpsc::unbounded_channel();
+        let listening = shared.hub("/clock", None).listen(Arc::new(Ticks(ticks)));
+        let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;
+        drop(listening);
+        if let Ok(Some(time)) = tick {
+            return time;
+        }
+    }
+    Time::now()
+}

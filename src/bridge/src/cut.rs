@@ -1,0 +1,112 @@
+//! Messages on their way in fragments. Between two fragments of one message others have their turn.
+
+use std::collections::VecDeque;
+
+use bytes::Bytes;
+use rosbridge::{Format, Fragment, Id, Op, split_text};
+
+use crate::outbox::TopicKey;
+use crate::sample::Frame;
+
+/// Messages cut at the same time.
+const MAX_CUTS: usize = 4;
+
+#[derive(Default)]
+pub(crate) struct Cuts {
+    cuts: VecDeque<Cut>,
+    /// Ids of messages cut so far.
+    ids: i64,
+    /// Whether the next frame is to be a fragment: every other one is.
+    due: bool,
+}
+
+struct Cut {
+    text: String,
+    at: usize,
+    size: usize,
+    id: i64,
+    num: u64,
+    total: u64,
+    key: Option<TopicKey>,
+}
+
+impl Cuts {
+    /// Takes a frame to be cut, where it is a text longer than `size`. Gives whether it was taken.
+    pub(crate) fn cut(&mut self, frame: &Frame, size: Option<usize>, key: Option<TopicKey>) -> bool {
+        let Some(size) = size.filter(|size| frame.format == Format::Json && frame.bytes.len() > *size) else {
+            return false;
+        };
+        let Ok(text) = String::from_utf8(frame.bytes.to_vec()) else { return false };
+        let total = split_text(&text, size).count() as u64;
+        self.ids += 1;
+        self.cuts.push_back(Cut { text, at: 0, size, id: self.ids, num: 0, total, key });
+        true
+    }
+
+    /// Whether no more topics should be begun.
+    pub(crate) fn is_full(&self) -> bool {
+        self.cuts.len() >= MAX_CUTS
+    }
+
+    pub(crate) fn is_due(&self) -> bool {
+        self.due && !self.cuts.is_empty()
+    }
+
+    /// A frame that is no fragment was sent: now it is the fragments' turn.
+    pub(crate) fn make_due(&mut self) {
+        self.due = true;
+    }
+
+    /// The next fragment of the message whose turn it is; with its topic, where it is the last one.
+    pub(crate) fn next(&mut self) -> Option<(Bytes, Option<TopicKey>)> {
+        self.due = false;
+        let mut cut = self.cuts.pop_front()?;
+        let piece = split_text(&cut.text[cut.at..], cut.size).next()?;
+        let mut out = Vec::with_capacity(piece.len() + piece.len() / 8 + 64);
+        let fragment = Fragment { id: Id::Integer(cut.id), data: piece.into(), num: cut.num, total: cut.total };
+        cut.at += piece.len();
+        cut.num += 1;
+        Op::from(fragment).print(&mut out, Format::Json);
+        if cut.num == cut.total {
+            return Some((out.into(), cut.key));
+        }
+        self.cuts.push_back(cut);
+        Some((out.into(), None))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use rosbridge::{FragmentLimits, Fragments, Frame as Incoming};
+
+    use super::*;
+
+    #[test]
+    fn cut_messages_take_turns_and_come_whole() {
+        let texts = ["grüße ".repeat(100), "kurz ".repeat(50)];
+        let mut cuts = Cuts::default();
+        for (key, text) in texts.iter().enumerate() {
+            let frame = Frame { format: Format::Json, bytes: text.clone().into() };
+            assert!(cuts.cut(&frame, Some(99), Some(key as u64)));
+            assert!(!cuts.cut(&frame, Some(10_000), None));
+        }
+        let limits = FragmentLimits { age: Duration::from_secs(1), ..FragmentLimits::default() };
+        let mut fragments = Fragments::new(limits);
+        let mut whole = Vec::new();
+        let mut ends = Vec::new();
+        let mut ids = Vec::new();
+        while let Some((bytes, end)) = cuts.next() {
+            ends.extend(end);
+            let Ok(Op::Fragment(fragment)) = Op::parse(Incoming::Text(std::str::from_utf8(&bytes).unwrap())) else {
+                panic!("not a fragment")
+            };
+            ids.push(fragment.id.to_string());
+            whole.extend(fragments.add(&fragment, Instant::now()).unwrap());
+        }
+        assert_eq!(ids[..4], ["1", "2", "1", "2"]);
+        assert_eq!(ends, [1, 0]);
+        assert_eq!(whole, [texts[1].clone(), texts[0].clone()]);
+    }
+}

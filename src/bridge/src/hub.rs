@@ -1,0 +1,206 @@
+//! One topic of the servant, subscribed to once however many clients listen.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock, Weak};
+
+use parking_lot::Mutex;
+use ros::bus::{Message, SubscribeOptions, Subscription, WireType};
+use ros::schema::MessageType;
+use tokio::task::AbortHandle;
+
+use crate::bridge::Shared;
+use crate::sample::{Sample, TopicTypes};
+
+/// Who listens to a topic: a client's queue, a goal waiting for its result.
+pub(crate) trait Listener: Send + Sync {
+    /// A message; `replay` where it is an old one from a latching publisher. Must not block or call the hub.
+    fn sample(&self, sample: &Arc<Sample>, replay: bool);
+    /// The topic cannot be subscribed to.
+    fn failed(&self, reason: &str);
+}
+
+/// The one subscription.
+pub(crate) struct Hub {
+    pub(crate) topic: String,
+    shared: Weak<Shared>,
+    types: Arc<TopicTypes>,
+    state: Mutex<State>,
+    pump: OnceLock<AbortHandle>,
+}
+
+#[derive(Default)]
+struct State {
+    /// Replaced, not changed, so that a message is handed out without holding the lock.
+    listeners: Arc<Listeners>,
+    /// The last message of every latching publisher.
+    latched: Vec<Arc<Sample>>,
+    failed: Option<String>,
+}
+
+type Listeners = Vec<(u64, Arc<dyn Listener>)>;
+
+/// Keeps a listener on a hub.
+pub(crate) struct Listening {
+    hub: Arc<Hub>,
+    number: u64,
+}
+
+impl Listening {
+    pub(crate) fn hub(&self) -> &Arc<Hub> {
+        &self.hub
+    }
+}
+
+impl Drop for Listening {
+    fn drop(&mut self) {
+        let mut state = self.hub.state.lock();
+        let earlier = state.listeners.clone();
+        let kept = earlier.iter().filter(|(number, _)| *number != self.number).cloned();
+        state.listeners = Arc::new(kept.collect());
+        drop(state);
+        // Only now may the listener itself go.
+        drop(earlier);
+    }
+}
+
+impl Hub {
+    /// Subscribes in the background. `message_type` is what the first listener expects, where it knows.
+    pub(crate) fn start(shared: &Arc<Shared>, topic: &str, message_type: Option<&MessageType>) -> Arc<Hub> {
+        let hub = Arc::new(Hub {
+            topic: topic.to_owned(),
+            shared: Arc::downgrade(shared),
+            types: Arc::new(TopicTypes::new(shared.registry.clone())),
+            state: Mutex::default(),
+            pump: OnceLock::new(),
+        });
+        let options = SubscribeOptions {
+            wire_type: message_type.map(|found| WireType {
+                name: found.name().to_owned(),
+                md5: found.md5().to_owned(),
+                definition: found.full_text().to_owned(),
+            }),
+            queue: shared.options.bus_queue,
+        };
+        let pump = tokio::spawn(pump(Arc::downgrade(&hub), shared.clone(), topic.to_owned(), options));
+        // Set once, here.
+        let _ = hub.pump.set(pump.abort_handle());
+        hub
+    }
+
+    /// A hub for a topic of the bridge itself, which no node publishes.
+    pub(crate) fn internal(shared: &Arc<Shared>, topic: &str) -> Arc<Hub> {
+        Arc::new(Hub {
+            topic: topic.to_owned(),
+            shared: Arc::downgrade(shared),
+            types: Arc::new(TopicTypes::new(shared.registry.clone())),
+            state: Mutex::default(),
+            pump: OnceLock::new(),
+        })
+    }
+
+    /// Adds a listener, which first hears what latching publishers last said.
+    pub(crate) fn listen(self: &Arc<Self>, listener: Arc<dyn Listener>) -> Listening {
+        static NUMBER: AtomicU64 = AtomicU64::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let mut state = self.state.lock();
+        if let Some(reason) = &state.failed {
+            listener.failed(reason);
+        }
+        self.replay_to(&mut state, listener.as_ref());
+        let mut listeners = Listeners::clone(&state.listeners);
+        listeners.push((number, listener));
+        state.listeners = Arc::new(listeners);
+        Listening { hub: self.clone(), number }
+    }
+
+    /// Lets a listener hear once more what latching publishers last said.
+    pub(crate) fn replay(&self, listener: &dyn Listener) {
+        self.replay_to(&mut self.state.lock(), listener);
+    }
+
+    fn replay_to(&self, state: &mut State, listener: &dyn Listener) {
+        if state.latched.is_empty() {
+            return;
+        }
+        // A publisher that is gone has taken its message with it.
+        if let Some(shared) = self.shared.upgrade() {
+            let graph = shared.bus.graph().borrow().clone();
+            let publishers = graph.topics.get(&self.topic).map(|nodes| nodes.publishers.as_slice()).unwrap_or_default();
+            state.latched.retain(|sample| sample.local || publishers.iter().any(|name| **name == *sample.publisher));
+        }
+        for sample in &state.latched {
+            listener.sample(sample, true);
+        }
+    }
+
+    /// Hands a message to every listener.
+    pub(crate) fn deliver(&self, message: Message, local: bool) {
+        let sample = Arc::new(Sample::new(message, local, self.types.clone()));
+        let listeners = {
+            let mut state = self.state.lock();
+            if sample.latching {
+                state.latched.retain(|other| other.publisher != sample.publisher);
+                state.latched.push(sample.clone());
+            }
+            state.listeners.clone()
+        };
+        for (_, listener) in listeners.iter() {
+            listener.sample(&sample, false);
+        }
+    }
+
+    /// A client that latched a message here publishes no longer.
+    pub(crate) fn forget(&self, publisher: &str) {
+        self.state.lock().latched.retain(|sample| *sample.publisher != *publisher);
+    }
+
+    fn fail(&self, reason: String) {
+        let listeners = {
+            let mut state = self.state.lock();
+            state.failed = Some(reason.clone());
+            state.listeners.clone()
+        };
+        for (_, listener) in listeners.iter() {
+            listener.failed(&reason);
+        }
+        // The next to subscribe tries anew.
+        if let Some(shared) = self.shared.upgrade() {
+            shared.forget_hub(self);
+        }
+    }
+}
+
+impl Drop for Hub {
+    fn drop(&mut self) {
+        if let Some(pump) = self.pump.get() {
+            pump.abort();
+        }
+        if let Some(shared) = self.shared.upgrade() {
+            shared.forget_hub(self);
+        }
+    }
+}
+
+/// Moves messages from the bus to the hub until either is gone.
+async fn pump(hub: Weak<Hub>, shared: Arc<Shared>, topic: String, options: SubscribeOptions) {
+    let mut subscription: Subscription = match shared.bus.subscribe(&topic, options).await {
+        Ok(subscription) => subscription,
+        Err(error) => {
+            if let Some(hub) = hub.upgrade() {
+                hub.fail(error.to_string());
+            }
+            return;
+        }
+    };
+    let mut dropped = 0;
+    while let Some(message) = subscription.messages.recv().await {
+        let Some(hub) = hub.upgrade() else { return };
+        shared.metrics.received.add(1);
+        hub.deliver(message, false);
+        let now_dropped = subscription.dropped.load(Ordering::Relaxed);
+        if now_dropped > dropped {
+            shared.metrics.bus_dropped.add(now_dropped - dropped);
+            dropped = now_dropped;
+        }
+    }
+}

@@ -1,0 +1,162 @@
+//! What the graph of nodes, topics and services says.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use futures_util::StreamExt;
+use futures_util::stream;
+use ros::bus::{Graph, TopicNodes};
+use ros::schema::Registry;
+use serde_json::{Value, json};
+
+use super::{NODE, Service, with_own};
+use crate::bridge::Shared;
+use crate::names::plain_type;
+
+/// Services asked for their type at once.
+const ASKED_AT_ONCE: usize = 16;
+
+/// Nobody has said yet: rosapi writes it so.
+fn type_of(nodes: &TopicNodes) -> &str {
+    if nodes.type_name == "*" { "" } else { &nodes.type_name }
+}
+
+pub(super) fn topics(graph: &Graph) -> Value {
+    let topics: Vec<_> = graph.topics.keys().collect();
+    let types: Vec<_> = graph.topics.values().map(type_of).collect();
+    json!({ "topics": topics, "types": types })
+}
+
+pub(super) fn topics_for_type(graph: &Graph, type_name: &str) -> Value {
+    let wanted = plain_type(type_name);
+    let topics = graph.topics.iter().filter(|(_, nodes)| nodes.type_name == wanted).map(|(topic, _)| topic);
+    json!({ "topics": topics.collect::<Vec<_>>() })
+}
+
+pub(super) fn topics_and_raw_types(graph: &Graph, registry: &Registry) -> Value {
+    let mut answer = topics(graph);
+    let texts = graph.topics.values().map(|nodes| {
+        let found = with_own(registry, |registry| registry.message(type_of(nodes)));
+        found.map(|found| found.full_text().to_owned()).unwrap_or_default()
+    });
+    answer["typedefs_full_text"] = texts.collect::<Vec<_>>().into();
+    answer
+}
+
+pub(super) fn topic_type(graph: &Graph, topic: &str) -> Value {
+    json!({ "type": graph.topics.get(topic).map_or("", type_of) })
+}
+
+pub(super) fn publishers(graph: &Graph, topic: &str) -> Value {
+    json!({ "publishers": graph.topics.get(topic).map(|nodes| nodes.publishers.as_slice()).unwrap_or_default() })
+}
+
+pub(super) fn subscribers(graph: &Graph, topic: &str) -> Value {
+    json!({ "subscribers": graph.topics.get(topic).map(|nodes| nodes.subscribers.as_slice()).unwrap_or_default() })
+}
+
+pub(super) fn nodes(graph: &Graph) -> Value {
+    let mut nodes: BTreeSet<&str> = graph.nodes.keys().map(String::as_str).collect();
+    nodes.insert(NODE);
+    json!({ "nodes": nodes })
+}
+
+pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
+    let topics = |ends: fn(&TopicNodes) -> &Vec<String>| -> Vec<&String> {
+        let of_node = graph.topics.iter().filter(|(_, nodes)| ends(nodes).iter().any(|end| end == node));
+        of_node.map(|(topic, _)| topic).collect()
+    };
+    let served = graph.services.iter().filter(|(_, server)| *server == node);
+    let mut services: Vec<String> = served.map(|(service, _)| service.clone()).collect();
+    if node == NODE {
+        services.extend(Service::all().map(Service::full_name));
+    }
+    json!({
+        "subscribing": topics(|nodes| &nodes.subscribers),
+        "publishing": topics(|nodes| &nodes.publishers),
+        "services": services,
+    })
+}
+
+/// A namespace that has all five topics of actionlib.
+pub(super) fn action_servers(graph: &Graph) -> Value {
+    const PARTS: [&str; 5] = ["cancel", "feedback", "goal", "result", "status"];
+    let mut found: BTreeMap<&str, u8> = BTreeMap::new();
+    for topic in graph.topics.keys() {
+        let Some((namespace, part)) = topic.rsplit_once('/').filter(|(namespace, _)| !namespace.is_empty()) else {
+            continue;
+        };
+        if let Some(at) = PARTS.iter().position(|known| *known == part) {
+            *found.entry(namespace).or_default() |= 1 << at;
+        }
+    }
+    let servers = found.into_iter().filter(|(_, parts)| *parts == 0b11111).map(|(namespace, _)| namespace);
+    json!({ "action_servers": servers.collect::<Vec<_>>() })
+}
+
+fn all_services(graph: &Graph) -> BTreeSet<String> {
+    graph.services.keys().cloned().chain(Service::all().map(Service::full_name)).collect()
+}
+
+pub(super) fn services(graph: &Graph) -> Value {
+    json!({ "services": all_services(graph) })
+}
+
+fn server<'g>(graph: &'g Graph, service: &str) -> &'g str {
+    match graph.services.get(service) {
+        Some(node) => node,
+        None if Service::find(service).is_some() => NODE,
+        None => "",
+    }
+}
+
+pub(super) fn service_node(graph: &Graph, service: &str) -> Value {
+    json!({ "node": server(graph, service) })
+}
+
+pub(super) fn service_host(graph: &Graph, service: &str) -> Value {
+    let node = server(graph, service);
+    let address = graph.nodes.get(node).map_or(if node == NODE { "localhost" } else { "" }, String::as_str);
+    let host = address.split_once("://").map_or(address, |(_, rest)| rest);
+    json!({ "host": host.split([':', '/']).next().unwrap_or_default() })
+}
+
+/// A service's type; empty where it cannot be had, as rosapi answers.
+async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
+    let served = shared.bus.graph().borrow().services.contains_key(service);
+    match Service::find(service) {
+        Some(own) if !served => own.type_name(),
+        _ => {
+            let found = shared.service_types.find(shared.bus.as_ref(), service).await;
+            found.map(|found| found.name).unwrap_or_default()
+        }
+    }
+}
+
+pub(super) async fn service_type(shared: &Arc<Shared>, service: &str) -> Value {
+    json!({ "type": find_type(shared, service).await })
+}
+
+/// All services of a type, sorted.
+async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<String> {
+    let wanted = plain_type(type_name);
+    let asked = all_services(graph).into_iter().map(|service| {
+        let shared = shared.clone();
+        async move {
+            let found = find_type(&shared, &service).await;
+            (service, found)
+        }
+    });
+    let answers: BTreeMap<String, String> = stream::iter(asked).buffer_unordered(ASKED_AT_ONCE).collect().await;
+    answers.into_iter().filter(|(_, found)| **found == *wanted).map(|(service, _)| service).collect()
+}
+
+pub(super) async fn services_for_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Value {
+    json!({ "services": of_type(shared, graph, type_name).await })
+}
+
+pub(super) async fn service_providers(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Value {
+    let services = of_type(shared, graph, type_name).await;
+    let providers: Vec<_> = services.iter().map(|service| server(graph, service)).collect();
+    json!({ "providers": providers })
+}

@@ -1,0 +1,78 @@
+//! The parameter server. Values travel as JSON text, since a service's fields have fixed types.
+
+use std::sync::Arc;
+
+use ros::bus::{BusError, ParamValue};
+use serde_json::{Value, json};
+
+use super::Args;
+use crate::bridge::Shared;
+use crate::names::resolve;
+
+fn key(args: &Args) -> Result<String, String> {
+    match args.name.as_str() {
+        "" => Err("field \"name\" is missing, a parameter's name is expected".to_owned()),
+        "/" => Ok("/".to_owned()),
+        name => resolve(name).map(|name| name.into_owned()),
+    }
+}
+
+fn failed(error: BusError) -> String {
+    error.to_string()
+}
+
+pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    let value = match shared.bus.get_param(&key(args)?).await {
+        Ok(value) => serde_json::to_string(&value).map_err(|error| error.to_string())?,
+        Err(BusError::NoParam(_)) => {
+            let default = if args.default.is_empty() { &args.default_value } else { &args.default };
+            match serde_json::from_str::<Value>(default) {
+                Ok(value) => value.to_string(),
+                Err(_) if default.is_empty() => "null".to_owned(),
+                // A default that is no JSON is a text.
+                Err(_) => Value::from(default.as_str()).to_string(),
+            }
+        }
+        Err(error) => return Err(failed(error)),
+    };
+    Ok(json!({ "value": value }))
+}
+
+pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    let value: ParamValue = serde_json::from_str(&args.value).map_err(|_| {
+        format!(
+            "field \"value\" is {:?}, JSON text (a boolean, number, string, list or object) is expected",
+            args.value.chars().take(48).collect::<String>()
+        )
+    })?;
+    shared.bus.set_param(&key(args)?, value).await.map_err(failed)?;
+    Ok(json!({}))
+}
+
+pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    Ok(json!({ "exists": shared.bus.has_param(&key(args)?).await.map_err(failed)? }))
+}
+
+pub(super) async fn search(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    let found = shared.bus.search_param("/", args.name.trim_start_matches('/')).await.map_err(failed)?;
+    Ok(json!({ "global_name": found.unwrap_or_default() }))
+}
+
+pub(super) async fn delete(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    match shared.bus.delete_param(&key(args)?).await {
+        Ok(()) | Err(BusError::NoParam(_)) => Ok(json!({})),
+        Err(error) => Err(failed(error)),
+    }
+}
+
+pub(super) async fn names(shared: &Arc<Shared>) -> Result<Value, String> {
+    Ok(json!({ "names": shared.bus.param_names().await.map_err(failed)? }))
+}
+
+/// `/rosdistro` as roslaunch sets it.
+pub(super) async fn distro(shared: &Arc<Shared>) -> String {
+    match shared.bus.get_param("/rosdistro").await {
+        Ok(ParamValue::String(distro)) => distro.trim().to_owned(),
+        _ => "noetic".to_owned(),
+    }
+}

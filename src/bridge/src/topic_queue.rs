@@ -1,0 +1,158 @@
+//! What waits for one client on one topic: newest wins, bounded in messages and bytes, no faster than asked for.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rosbridge::{Compression, Id};
+
+use crate::sample::Sample;
+
+/// What one `subscribe` asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Wishes {
+    pub(crate) throttle_rate: Duration,
+    pub(crate) queue_length: usize,
+    pub(crate) fragment_size: Option<usize>,
+    pub(crate) compression: Compression,
+}
+
+impl Wishes {
+    /// What satisfies all of a client's subscriptions to a topic: the lowest rate limit and fragment size, the
+    /// longest queue, the most compact encoding.
+    pub(crate) fn merged<'w>(all: impl Iterator<Item = &'w Wishes>) -> Option<Wishes> {
+        all.copied().reduce(|one, other| Wishes {
+            throttle_rate: one.throttle_rate.min(other.throttle_rate),
+            queue_length: one.queue_length.max(other.queue_length),
+            fragment_size: match (one.fragment_size, other.fragment_size) {
+                (Some(one), Some(other)) => Some(one.min(other)),
+                (one, other) => one.or(other),
+            },
+            compression: one.compression.max(other.compression),
+        })
+    }
+}
+
+/// The subscriptions of one client to one topic, by id.
+pub(crate) type Subscriptions = HashMap<Option<Id<'static>>, Wishes>;
+
+/// Bounds that the operator sets.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct QueueLimits {
+    pub(crate) messages: usize,
+    pub(crate) bytes: usize,
+}
+
+/// What became of a sample that was pushed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Pushed {
+    /// Left out because of the throttle rate.
+    pub(crate) throttled: bool,
+    /// Samples dropped to make room, and their bytes.
+    pub(crate) dropped: u64,
+    pub(crate) dropped_bytes: usize,
+}
+
+/// The queue.
+pub(crate) struct TopicQueue {
+    /// The topic as the client wrote it.
+    pub(crate) topic: Arc<str>,
+    pub(crate) wishes: Wishes,
+    limits: QueueLimits,
+    samples: VecDeque<Arc<Sample>>,
+    pub(crate) bytes: usize,
+    /// When the throttle rate lets the next one through.
+    next_at: Option<Instant>,
+    /// When something was last said about messages that cannot be sent.
+    pub(crate) complained: Option<Instant>,
+    /// In the ring of topics that have something to send, or among those that will.
+    pub(crate) scheduled: bool,
+    /// A message is being sent in fragments; the next waits.
+    pub(crate) busy: bool,
+}
+
+impl TopicQueue {
+    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: QueueLimits) -> Self {
+        Self {
+            topic,
+            wishes,
+            limits,
+            samples: VecDeque::new(),
+            bytes: 0,
+            next_at: None,
+            complained: None,
+            scheduled: false,
+            busy: false,
+        }
+    }
+
+    pub(crate) fn has_one(&self) -> bool {
+        self.samples.len() <= 1
+    }
+
+    /// Queues a sample. `replay`: it is an old one for a newcomer, which no throttle rate holds back.
+    pub(crate) fn push(&mut self, sample: Arc<Sample>, replay: bool, now: Instant) -> Pushed {
+        let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
+        if throttles && !replay {
+            if self.next_at.is_some_and(|at| now < at) {
+                return Pushed { throttled: true, ..Pushed::default() };
+            }
+            self.next_at = now.checked_add(self.wishes.throttle_rate);
+        }
+        self.bytes += sample.bytes.len();
+        self.samples.push_back(sample);
+        let longest = match self.wishes.queue_length {
+            0 => self.limits.messages,
+            length => length.min(self.limits.messages),
+        };
+        let mut pushed = Pushed::default();
+        while self.samples.len() > longest || (self.bytes > self.limits.bytes && self.samples.len() > 1) {
+            // The last message of a latching publisher may never come again: drop it last.
+            if self.samples.len() <= self.limits.messages && self.samples.iter().all(|sample| sample.latching) {
+                let publishers = self.samples.iter().map(|sample| &sample.publisher);
+                let distinct = publishers.collect::<std::collections::HashSet<_>>().len();
+                if distinct == self.samples.len() && self.bytes <= self.limits.bytes {
+                    break;
+                }
+            }
+            let Some(lost) = self.drop_one() else { break };
+            pushed.dropped += 1;
+            pushed.dropped_bytes += lost;
+        }
+        pushed
+    }
+
+    /// Drops the oldest sample that can be spared; gives its size.
+    pub(crate) fn drop_one(&mut self) -> Option<usize> {
+        let spare = (0..self.samples.len()).find(|&at| {
+            let sample = &self.samples[at];
+            !sample.latching || self.samples.range(at + 1..).any(|later| later.publisher == sample.publisher)
+        });
+        let lost = self.samples.remove(spare.unwrap_or(0))?;
+        self.bytes -= lost.bytes.len();
+        Some(lost.bytes.len())
+    }
+
+    /// When the next sample may be sent; `None` while there is none.
+    pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
+        if self.samples.is_empty() || self.busy {
+            return None;
+        }
+        let held_back = self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
+        Some(self.next_at.filter(|at| held_back && *at > now).unwrap_or(now))
+    }
+
+    /// The next sample to send.
+    pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<Sample>> {
+        let sample = self.samples.pop_front()?;
+        self.bytes -= sample.bytes.len();
+        if self.wishes.queue_length > 0 {
+            self.next_at = now.checked_add(self.wishes.throttle_rate);
+        }
+        Some(sample)
+    }
+}
+
+#[cfg(test)]
+#[path = "topic_queue_tests.rs"]
+mod tests;

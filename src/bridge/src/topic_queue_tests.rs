@@ -1,0 +1,97 @@
+use ros::bus::{Message, WireType};
+use ros::schema::Registry;
+
+use super::*;
+use crate::sample::TopicTypes;
+
+fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
+    let wire_type = Arc::new(WireType { name: "a/B".into(), md5: "*".into(), definition: String::new() });
+    let message = Message { bytes: vec![0; size].into(), wire_type, publisher: publisher.into(), latching };
+    Arc::new(Sample::new(message, false, Arc::new(TopicTypes::new(Arc::new(Registry::new())))))
+}
+
+fn wishes(throttle: u64, length: usize) -> Wishes {
+    Wishes {
+        throttle_rate: Duration::from_millis(throttle),
+        queue_length: length,
+        fragment_size: None,
+        compression: Compression::None,
+    }
+}
+
+fn queue(throttle: u64, length: usize) -> TopicQueue {
+    TopicQueue::new("/x".into(), wishes(throttle, length), QueueLimits { messages: 5, bytes: 1000 })
+}
+
+fn sizes(queue: &TopicQueue) -> Vec<usize> {
+    queue.samples.iter().map(|sample| sample.bytes.len()).collect()
+}
+
+#[test]
+fn the_newest_win_within_messages_and_bytes() {
+    let now = Instant::now();
+    let mut messages = queue(0, 0);
+    for size in 1..=7 {
+        messages.push(sample("/p", false, size), false, now);
+    }
+    assert_eq!(sizes(&messages), [3, 4, 5, 6, 7]);
+    assert_eq!(messages.bytes, 25);
+    let mut bytes = queue(0, 0);
+    bytes.push(sample("/p", false, 600), false, now);
+    let pushed = bytes.push(sample("/p", false, 601), false, now);
+    assert_eq!((pushed.dropped, pushed.dropped_bytes, sizes(&bytes)), (1, 600, vec![601]));
+    bytes.push(sample("/p", false, 5000), false, now);
+    assert_eq!(sizes(&bytes), [5000], "one message is always kept");
+    let mut asked = queue(0, 2);
+    for size in 1..=4 {
+        asked.push(sample("/p", false, size), false, now);
+    }
+    assert_eq!(sizes(&asked), [3, 4]);
+}
+
+#[test]
+fn without_a_queue_a_throttle_leaves_messages_out() {
+    let (now, ms) = (Instant::now(), Duration::from_millis(1));
+    let mut queue = queue(100, 0);
+    assert!(!queue.push(sample("/p", false, 1), false, now).throttled);
+    assert!(queue.push(sample("/p", false, 2), false, now + 99 * ms).throttled);
+    assert!(!queue.push(sample("/p", false, 3), true, now + 99 * ms).throttled);
+    assert!(!queue.push(sample("/p", false, 4), false, now + 100 * ms).throttled);
+    assert_eq!(sizes(&queue), [1, 3, 4]);
+    assert_eq!(queue.due(now), Some(now));
+}
+
+#[test]
+fn with_a_queue_a_throttle_spreads_messages() {
+    let (now, ms) = (Instant::now(), Duration::from_millis(1));
+    let mut queue = queue(100, 2);
+    for size in 1..=3 {
+        queue.push(sample("/p", false, size), false, now);
+    }
+    assert_eq!(queue.due(now), Some(now));
+    assert_eq!(queue.pop(now).unwrap().bytes.len(), 2);
+    assert_eq!(queue.due(now + ms), Some(now + 100 * ms));
+    assert_eq!(queue.pop(now + 100 * ms).unwrap().bytes.len(), 3);
+    assert_eq!(queue.due(now), None);
+}
+
+#[test]
+fn the_last_of_each_latching_publisher_is_dropped_last() {
+    let now = Instant::now();
+    let mut queue = queue(0, 1);
+    for publisher in ["/a", "/b", "/c"] {
+        assert_eq!(queue.push(sample(publisher, true, 1), true, now).dropped, 0);
+    }
+    assert_eq!(queue.push(sample("/b", true, 2), false, now).dropped, 1);
+    assert_eq!(sizes(&queue), [1, 1, 2]);
+}
+
+#[test]
+fn several_subscriptions_of_a_topic_merge() {
+    let one = Wishes { fragment_size: Some(500), ..wishes(100, 0) };
+    let two = Wishes { compression: Compression::CborRaw, ..wishes(50, 3) };
+    let merged = Wishes::merged([one, two].iter()).unwrap();
+    let expected = Wishes { fragment_size: Some(500), compression: Compression::CborRaw, ..wishes(50, 3) };
+    assert_eq!(merged, expected);
+    assert_eq!(Wishes::merged([].iter()), None);
+}

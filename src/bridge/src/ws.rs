@@ -1,0 +1,278 @@
+//! The server's end of a WebSocket (RFC 6455) behind its upgrade.
+//!
+//! Written for this bridge because the data path must not copy a big message once more: payloads go to the socket
+//! from where they were encoded (one vectored write for header and payload), and come from it in a buffer of their
+//! own that the ROS message is cut from. Reading and writing are polled separately, so one task can do both.
+
+pub(crate) mod frame;
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::io::{self, IoSlice};
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+
+use bytes::{Buf, Bytes, BytesMut};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio_util::io::poll_read_buf;
+
+use frame::Header;
+
+/// Payloads up to this size are copied behind their headers, so that many go into one write.
+const COPIED: usize = 8 * 1024;
+/// Least room for a read.
+const READ_SIZE: usize = 32 * 1024;
+/// Room made for a payload before any of it has come; more is added as it comes.
+const READ_AHEAD: usize = 4 << 20;
+/// Slices in one write.
+const MAX_SLICES: usize = 16;
+
+/// What a client sent.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Message {
+    /// Not yet checked to be UTF-8.
+    Text(Bytes),
+    Binary(Bytes),
+    Ping(Bytes),
+    Pong(Bytes),
+    /// Code (1005 where there is none) and reason.
+    Close(u16, String),
+}
+
+/// Why a connection cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum WsError {
+    /// The client breaks the protocol or a limit; the code says which.
+    #[error("{reason}")]
+    Refused { code: u16, reason: String },
+    /// The socket failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// The socket ended without a close frame.
+    #[error("the connection ended without a close frame")]
+    Eof,
+}
+
+impl WsError {
+    pub(crate) fn protocol(reason: &str) -> Self {
+        WsError::Refused { code: 1002, reason: reason.to_owned() }
+    }
+
+    fn too_long(what: &str, length: u64, limit: usize) -> Self {
+        WsError::Refused { code: 1009, reason: format!("a {what} of {length} bytes is over the limit of {limit}") }
+    }
+}
+
+/// A connection.
+pub(crate) struct WebSocket<S> {
+    io: S,
+    max_frame: usize,
+    max_message: usize,
+    read: BytesMut,
+    header: Option<Header>,
+    /// Opcode and beginning of a message that comes in several frames.
+    partial: Option<(u8, BytesMut)>,
+    /// What was queued, in order; `tail` is the last of it, still growing.
+    write: VecDeque<Bytes>,
+    tail: BytesMut,
+    queued: usize,
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
+    pub(crate) fn new(io: S, read_ahead: &[u8], max_frame: usize, max_message: usize) -> Self {
+        Self {
+            io,
+            max_frame,
+            max_message,
+            read: BytesMut::from(read_ahead),
+            header: None,
+            partial: None,
+            write: VecDeque::new(),
+            tail: BytesMut::new(),
+            queued: 0,
+        }
+    }
+
+    /// The next message; after an error there is none.
+    pub(crate) fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<Message, WsError>> {
+        loop {
+            if self.header.is_none() {
+                self.header = self.next_header()?;
+            }
+            if let Some(header) = self.header
+                && header.length <= self.read.len() as u64
+            {
+                self.header = None;
+                let payload = self.read.split_to(header.length as usize);
+                if let Some(message) = self.accept(header, payload)? {
+                    return Poll::Ready(Ok(message));
+                }
+                continue;
+            }
+            self.make_room();
+            if ready!(poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read))? == 0 {
+                return Poll::Ready(Err(WsError::Eof));
+            }
+        }
+    }
+
+    fn next_header(&mut self) -> Result<Option<Header>, WsError> {
+        let Some((header, size)) = Header::parse(&self.read)? else { return Ok(None) };
+        if header.mask.is_none() {
+            return Err(WsError::protocol("a client's frames must be masked"));
+        }
+        if header.length > self.max_frame as u64 {
+            return Err(WsError::too_long("frame", header.length, self.max_frame));
+        }
+        self.read.advance(size);
+        Ok(Some(header))
+    }
+
+    fn make_room(&mut self) {
+        let missing = match self.header {
+            Some(header) => (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len())),
+            None => 0,
+        };
+        let room = missing.max(READ_SIZE / 2);
+        if self.read.capacity() - self.read.len() < room {
+            self.read.reserve(room.max(READ_SIZE));
+        }
+    }
+
+    fn accept(&mut self, header: Header, mut payload: BytesMut) -> Result<Option<Message>, WsError> {
+        if let Some(mask) = header.mask {
+            frame::unmask(&mut payload, mask);
+        }
+        match header.opcode {
+            frame::PING => return Ok(Some(Message::Ping(payload.freeze()))),
+            frame::PONG => return Ok(Some(Message::Pong(payload.freeze()))),
+            frame::CLOSE => return close_message(&payload).map(Some),
+            _ => {}
+        }
+        let (opcode, whole) = match (self.partial.take(), header.opcode) {
+            (None, frame::CONTINUATION) => return Err(WsError::protocol("a message begins with a continuation frame")),
+            (None, opcode) => (opcode, payload),
+            (Some((opcode, mut begun)), frame::CONTINUATION) => {
+                let length = begun.len() as u64 + header.length;
+                if length > self.max_message as u64 {
+                    return Err(WsError::too_long("message", length, self.max_message));
+                }
+                begun.unsplit(payload);
+                (opcode, begun)
+            }
+            (Some(_), _) => return Err(WsError::protocol("a message begins before the last one has ended")),
+        };
+        if !header.last {
+            self.partial = Some((opcode, whole));
+            return Ok(None);
+        }
+        if whole.len() > self.max_message {
+            return Err(WsError::too_long("message", whole.len() as u64, self.max_message));
+        }
+        let whole = whole.freeze();
+        Ok(Some(if opcode == frame::TEXT { Message::Text(whole) } else { Message::Binary(whole) }))
+    }
+
+    /// Bytes queued and not yet taken by the socket.
+    pub(crate) fn queued(&self) -> usize {
+        self.queued
+    }
+
+    /// Queues a frame; nothing is sent before [`poll_flush`](Self::poll_flush).
+    pub(crate) fn queue(&mut self, opcode: u8, payload: Bytes) {
+        let before = self.tail.len();
+        Header::write(&mut self.tail, opcode, payload.len());
+        self.queued += self.tail.len() - before + payload.len();
+        if payload.len() <= COPIED {
+            self.tail.extend_from_slice(&payload);
+        } else {
+            self.write.push_back(self.tail.split().freeze());
+            self.write.push_back(payload);
+        }
+    }
+
+    /// Queues a close frame; the reason is cut to what fits.
+    pub(crate) fn queue_close(&mut self, code: u16, reason: &str) {
+        let mut end = reason.len().min(frame::MAX_CONTROL - 2);
+        while !reason.is_char_boundary(end) {
+            end -= 1;
+        }
+        let mut payload = BytesMut::with_capacity(2 + end);
+        // 1005 means "no code was given" and must not be sent.
+        if code != 1005 {
+            payload.extend_from_slice(&code.to_be_bytes());
+            payload.extend_from_slice(&reason.as_bytes()[..end]);
+        }
+        self.queue(frame::CLOSE, payload.freeze());
+    }
+
+    /// Ready when all that was queued is in the socket.
+    pub(crate) fn poll_flush(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        if !self.tail.is_empty() {
+            self.write.push_back(self.tail.split().freeze());
+        }
+        while self.queued > 0 {
+            let mut slices = [IoSlice::new(&[]); MAX_SLICES];
+            let mut count = 0;
+            for (slice, bytes) in slices.iter_mut().zip(&self.write) {
+                *slice = IoSlice::new(bytes);
+                count += 1;
+            }
+            let mut written = ready!(Pin::new(&mut self.io).poll_write_vectored(cx, &slices[..count]))?;
+            if written == 0 {
+                return Poll::Ready(Err(io::ErrorKind::WriteZero.into()));
+            }
+            self.queued -= written;
+            while let Some(first) = self.write.front_mut() {
+                if written < first.len() {
+                    first.advance(written);
+                    break;
+                }
+                written -= first.len();
+                self.write.pop_front();
+            }
+        }
+        Pin::new(&mut self.io).poll_flush(cx)
+    }
+
+    /// Sends what is queued (a close frame last), and waits for the client's; where its bytes cannot be told apart
+    /// any more, for the end of the connection. Without that the client might see a reset instead of the reason.
+    pub(crate) async fn leave(&mut self, readable: bool) -> Result<(), WsError> {
+        poll_fn(|cx| self.poll_flush(cx)).await?;
+        if readable {
+            while !matches!(poll_fn(|cx| self.poll_next(cx)).await?, Message::Close(..)) {}
+            return Ok(());
+        }
+        poll_fn(|cx| Pin::new(&mut self.io).poll_shutdown(cx)).await?;
+        loop {
+            self.read.clear();
+            self.read.reserve(READ_SIZE);
+            if poll_fn(|cx| poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read)).await? == 0 {
+                return Ok(());
+            }
+        }
+    }
+}
+
+fn close_message(payload: &[u8]) -> Result<Message, WsError> {
+    match payload {
+        [] => Ok(Message::Close(1005, String::new())),
+        [high, low, reason @ ..] => {
+            let code = u16::from_be_bytes([*high, *low]);
+            match std::str::from_utf8(reason) {
+                Ok(reason) if is_sendable(code) => Ok(Message::Close(code, reason.to_owned())),
+                _ => Err(WsError::protocol("a close frame has no valid code and reason")),
+            }
+        }
+        _ => Err(WsError::protocol("a close frame has half a code")),
+    }
+}
+
+/// Codes that may stand in a close frame (RFC 6455, section 7.4).
+fn is_sendable(code: u16) -> bool {
+    matches!(code, 1000..=1003 | 1007..=1014 | 3000..=4999)
+}
+
+#[cfg(test)]
+#[path = "ws/tests.rs"]
+mod tests;
