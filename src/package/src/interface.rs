@@ -39,11 +39,14 @@ pub struct Topic {
     /// `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of the type, lower-case hex, as the node announced it and as the definition gives it.
+    /// MD5 of the type, lower-case hex, as the node announced it and as the definition gives it. Empty where it is
+    /// not known yet, as in a supplement.
+    #[serde(default)]
     pub md5: String,
     /// Which end the package holds.
     pub direction: Direction,
     /// Nodes of the package at that end.
+    #[serde(default)]
     pub nodes: Vec<String>,
     /// Outputs: newcomers get the last message.
     #[serde(default)]
@@ -61,9 +64,11 @@ pub struct Service {
     /// `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of request and response.
+    /// MD5 of request and response. Empty where it is not known yet.
+    #[serde(default)]
     pub md5: String,
-    /// The serving node.
+    /// The serving node. Empty where it is not known.
+    #[serde(default)]
     pub node: String,
 }
 
@@ -75,7 +80,8 @@ pub struct Action {
     /// `package/Name` of the `.action` file, without `Action`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// The serving node.
+    /// The serving node. Empty where it is not known.
+    #[serde(default)]
     pub node: String,
 }
 

@@ -1,4 +1,28 @@
-//! What a deployer pushes, as data: `package.xml` ([`manifest`]) and the interface of the running package
-//! ([`interface`]). Reads files, does nothing else.
+//! What a deployer pushes, as data. Reads files, does nothing else.
+//!
+//! ```text
+//!   directory ──workspace::inspect──▶ Pushed: packages in build order │ an install space
+//!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
+//!   layers ──definitions::read──▶ "pkg/msg/Type" → text
+//!   running package, supplement ──interface──▶ Interface, compared by difference
+//! ```
+//!
+//! Everything here comes from strangers: names are checked before anyone puts them into a path or a command, sizes
+//! are bounded, and no symbolic link leads out of the tree that is read.
 
+#![forbid(unsafe_code)]
+
+pub mod condition;
+pub mod definitions;
+pub mod difference;
+mod error;
 pub mod interface;
+mod interface_toml;
+pub mod manifest;
+pub mod names;
+mod order;
+mod read;
+mod supplement;
+pub mod workspace;
+
+pub use error::Error;

@@ -1,0 +1,232 @@
+//! `condition` attributes of `package.xml` (REP 149, format 3).
+//!
+//! ```text
+//!   either  := both { "or" both }
+//!   both    := test { "and" test }
+//!   test    := value operator value | "(" either ")"
+//!   value   := $VARIABLE | bare word | "quoted" | 'quoted'
+//! ```
+//! All values are text, and are compared as text. A variable that is not set is empty.
+
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
+
+/// The variables that conditions may ask for.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Variables(BTreeMap<String, String>);
+
+impl Variables {
+    /// Those of a ROS 1 distribution such as `noetic`, with Python 3.
+    pub fn ros1(distribution: &str) -> Self {
+        Self::from_iter([
+            ("ROS_VERSION", "1"),
+            ("ROS_DISTRO", distribution),
+            ("ROS_PYTHON_VERSION", "3"),
+        ])
+    }
+
+    fn get(&self, name: &str) -> &str {
+        self.0.get(name).map_or("", String::as_str)
+    }
+
+    /// Whether a condition holds; else what does not parse.
+    pub fn hold(&self, condition: &str) -> Result<bool, String> {
+        let tokens = tokens(condition)?;
+        let mut parser = Parser {
+            tokens: &tokens,
+            variables: self,
+            depth: 0,
+        };
+        let holds = parser.either()?;
+        match parser.tokens {
+            [] => Ok(holds),
+            [extra, ..] => Err(format!("{extra:?} is not expected there")),
+        }
+    }
+}
+
+impl<K: Into<String>, V: Into<String>> FromIterator<(K, V)> for Variables {
+    fn from_iter<I: IntoIterator<Item = (K, V)>>(pairs: I) -> Self {
+        Self(
+            pairs
+                .into_iter()
+                .map(|(name, value)| (name.into(), value.into()))
+                .collect(),
+        )
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Token {
+    Word(String),
+    Quoted(String),
+    Variable(String),
+    Operator(&'static str),
+    Open,
+    Close,
+}
+
+/// Deeper brackets than anyone writes.
+const MAX_DEPTH: usize = 32;
+
+const OPERATORS: [&str; 6] = ["==", "!=", "<=", ">=", "<", ">"];
+
+fn tokens(text: &str) -> Result<Vec<Token>, String> {
+    let mut tokens = Vec::new();
+    let mut rest = text.trim_start();
+    while let Some(first) = rest.chars().next() {
+        let operator = OPERATORS
+            .into_iter()
+            .find(|operator| rest.starts_with(operator));
+        let (token, length) = match (operator, first) {
+            (Some(operator), _) => (Token::Operator(operator), operator.len()),
+            (_, '(') => (Token::Open, 1),
+            (_, ')') => (Token::Close, 1),
+            (_, quote @ ('"' | '\'')) => {
+                let end = rest[1..]
+                    .find(quote)
+                    .ok_or_else(|| format!("the quote {quote} is not closed"))?;
+                (Token::Quoted(rest[1..=end].to_owned()), end + 2)
+            }
+            (_, '$') => {
+                let name = word(&rest[1..]);
+                (Token::Variable(name.to_owned()), 1 + name.len())
+            }
+            _ => {
+                let found = word(rest);
+                (Token::Word(found.to_owned()), found.len())
+            }
+        };
+        if matches!(&token, Token::Word(name) | Token::Variable(name) if name.is_empty()) {
+            return Err(format!("{first:?} is not expected there"));
+        }
+        tokens.push(token);
+        rest = rest[length..].trim_start();
+    }
+    Ok(tokens)
+}
+
+fn word(text: &str) -> &str {
+    let end = text.find(|c: char| !(c.is_alphanumeric() || "_-.".contains(c)));
+    &text[..end.unwrap_or(text.len())]
+}
+
+struct Parser<'a> {
+    tokens: &'a [Token],
+    variables: &'a Variables,
+    depth: usize,
+}
+
+impl Parser<'_> {
+    fn next(&mut self) -> Result<&Token, String> {
+        let (first, rest) = self.tokens.split_first().ok_or("it ends too early")?;
+        self.tokens = rest;
+        Ok(first)
+    }
+
+    fn take_word(&mut self, wanted: &str) -> bool {
+        let there = matches!(self.tokens.first(), Some(Token::Word(word)) if word == wanted);
+        if there {
+            self.tokens = &self.tokens[1..];
+        }
+        there
+    }
+
+    fn either(&mut self) -> Result<bool, String> {
+        let mut holds = self.both()?;
+        while self.take_word("or") {
+            holds |= self.both()?;
+        }
+        Ok(holds)
+    }
+
+    fn both(&mut self) -> Result<bool, String> {
+        let mut holds = self.test()?;
+        while self.take_word("and") {
+            holds &= self.test()?;
+        }
+        Ok(holds)
+    }
+
+    fn test(&mut self) -> Result<bool, String> {
+        if self.tokens.first() == Some(&Token::Open) {
+            self.tokens = &self.tokens[1..];
+            self.depth += 1;
+            if self.depth > MAX_DEPTH {
+                return Err(format!("more than {MAX_DEPTH} brackets are open"));
+            }
+            let holds = self.either()?;
+            self.depth -= 1;
+            return match self.next()? {
+                Token::Close => Ok(holds),
+                other => Err(format!("a closing bracket is missing before {other:?}")),
+            };
+        }
+        let left = self.value()?;
+        let operator = match self.next()? {
+            Token::Operator(operator) => *operator,
+            other => return Err(format!("a comparison is missing before {other:?}")),
+        };
+        let right = self.value()?;
+        let order = left.cmp(&right);
+        Ok(match operator {
+            "==" => order == Ordering::Equal,
+            "!=" => order != Ordering::Equal,
+            "<=" => order != Ordering::Greater,
+            ">=" => order != Ordering::Less,
+            "<" => order == Ordering::Less,
+            _ => order == Ordering::Greater,
+        })
+    }
+
+    fn value(&mut self) -> Result<String, String> {
+        let variables = self.variables;
+        match self.next()? {
+            Token::Word(text) | Token::Quoted(text) => Ok(text.clone()),
+            Token::Variable(name) => Ok(variables.get(name).to_owned()),
+            other => Err(format!("a value is missing before {other:?}")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn holds(condition: &str) -> bool {
+        Variables::ros1("noetic").hold(condition).unwrap()
+    }
+
+    #[test]
+    fn conditions_in_use_are_understood() {
+        assert!(holds("$ROS_VERSION == 1"));
+        assert!(!holds("$ROS_VERSION==2"));
+        assert!(holds("$ROS_PYTHON_VERSION >= 3"));
+        assert!(holds("$ROS_DISTRO != melodic and $ROS_DISTRO > 'kinetic'"));
+        assert!(holds(
+            "$ROS_VERSION == 2 or ($ROS_DISTRO == \"noetic\" and $UNSET == '')"
+        ));
+        // "and" binds more tightly.
+        assert!(holds("1 == 1 or 1 == 2 and 1 == 2"));
+        assert!(!holds("(1 == 1 or 1 == 2) and 1 == 2"));
+    }
+
+    #[test]
+    fn nonsense_is_told() {
+        for (condition, reason) in [
+            ("", "ends too early"),
+            ("$ROS_VERSION", "ends too early"),
+            ("$ROS_VERSION 1", "comparison is missing"),
+            ("1 == 1 1", "not expected"),
+            ("(1 == 1", "ends too early"),
+            ("'x == 1", "not closed"),
+            ("1 == $", "not expected"),
+            ("1 & 2", "not expected"),
+            ("== 1", "value is missing"),
+            (&"(".repeat(1000), "brackets"),
+        ] {
+            let problem = Variables::default().hold(condition).unwrap_err();
+            assert!(problem.contains(reason), "{condition}: {problem}");
+        }
+    }
+}

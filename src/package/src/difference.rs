@@ -1,0 +1,299 @@
+//! What became different between two revisions of a service, and whether robots will notice.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crate::interface::{Action, Direction, Interface, Parameter, Service, Topic};
+
+/// One thing that is different.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Change {
+    /// A robot made for the old interface works with the new one in this respect.
+    pub compatible: bool,
+    /// For people, such as "output topic /found is gone".
+    pub text: String,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+/// All that is different between two interfaces: what breaks robots first, then by text.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Difference {
+    /// Empty when nothing is.
+    pub changes: Vec<Change>,
+}
+
+impl Difference {
+    /// Nothing changed that a robot relies on.
+    pub fn compatible(&self) -> bool {
+        self.changes.iter().all(|change| change.compatible)
+    }
+
+    /// From `old` to `new`. Something new is compatible; something gone, of another type or no longer latched is
+    /// not; parameters are notes only.
+    pub fn between(old: &Interface, new: &Interface) -> Self {
+        let mut changes = Changes::default();
+        changes.topics(&old.topics, &new.topics);
+        changes.services(&old.services, &new.services);
+        changes.actions(old, new);
+        changes.parameters(&old.parameters, &new.parameters);
+        let mut changes = changes.0;
+        changes.sort_by(|a, b| (a.compatible, &a.text).cmp(&(b.compatible, &b.text)));
+        changes.dedup();
+        Self { changes }
+    }
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for change in &self.changes {
+            let mark = if change.compatible { ' ' } else { '!' };
+            writeln!(f, "{mark} {change}")?;
+        }
+        Ok(())
+    }
+}
+
+#[derive(Default)]
+struct Changes(Vec<Change>);
+
+impl Changes {
+    fn note(&mut self, text: String) {
+        self.0.push(Change {
+            compatible: true,
+            text,
+        });
+    }
+
+    fn breaks(&mut self, text: String) {
+        self.0.push(Change {
+            compatible: false,
+            text,
+        });
+    }
+
+    /// Pairs two lists by key, tells what is gone and what is new, and gives the rest to `both`.
+    fn pair<'a, T>(
+        &mut self,
+        old: &'a [T],
+        new: &'a [T],
+        key: impl Fn(&T) -> String,
+        mut both: impl FnMut(&mut Self, &str, &'a T, &'a T),
+    ) {
+        let old: BTreeMap<String, &T> = old.iter().map(|item| (key(item), item)).collect();
+        let mut new: BTreeMap<String, &T> = new.iter().map(|item| (key(item), item)).collect();
+        for (key, old) in old {
+            match new.remove(&key) {
+                Some(new) => both(self, &key, old, new),
+                None => self.breaks(format!("{key} is gone")),
+            }
+        }
+        for key in new.into_keys() {
+            self.note(format!("{key} is new"));
+        }
+    }
+
+    fn typed(&mut self, what: &str, old: (&str, &str), new: (&str, &str)) {
+        if old.0 != new.0 {
+            self.breaks(format!("{what} was a {} and is a {}", old.0, new.0));
+        } else if old.1 != new.1 && !old.1.is_empty() && !new.1.is_empty() {
+            self.breaks(format!(
+                "{what} has another definition of {} (md5 {} was {})",
+                new.0, new.1, old.1
+            ));
+        }
+    }
+
+    fn topics(&mut self, old: &[Topic], new: &[Topic]) {
+        self.pair(old, new, topic, |changes, what, old, new| {
+            changes.typed(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
+            match (old.latched, new.latched) {
+                (true, false) => changes.breaks(format!("{what} is no longer latched")),
+                (false, true) => changes.note(format!("{what} is latched now")),
+                _ => {}
+            }
+        });
+    }
+
+    fn services(&mut self, old: &[Service], new: &[Service]) {
+        let key = |service: &Service| format!("service {}", service.name);
+        self.pair(old, new, key, |changes, what, old, new| {
+            changes.typed(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
+        });
+    }
+
+    fn actions(&mut self, old_all: &Interface, new_all: &Interface) {
+        let key = |action: &Action| format!("action {}", action.name);
+        let definition = |all: &Interface, action: &Action| {
+            let (package, name) = action.type_name.split_once('/')?;
+            all.definitions
+                .get(&format!("{package}/action/{name}"))
+                .map(|text| essence(text))
+        };
+        self.pair(
+            &old_all.actions,
+            &new_all.actions,
+            key,
+            |changes, what, old, new| {
+                changes.typed(what, (&old.type_name, ""), (&new.type_name, ""));
+                let (before, after) = (definition(old_all, old), definition(new_all, new));
+                if old.type_name == new.type_name
+                    && before.is_some()
+                    && after.is_some()
+                    && before != after
+                {
+                    changes.breaks(format!(
+                        "{what} has another definition of {}",
+                        new.type_name
+                    ));
+                }
+            },
+        );
+    }
+
+    fn parameters(&mut self, old: &[Parameter], new: &[Parameter]) {
+        let key = |parameter: &Parameter| format!("parameter {}", parameter.name);
+        let mut notes = Self::default();
+        notes.pair(old, new, key, |changes, what, old, new| {
+            if let (Some(before), Some(after)) = (&old.value, &new.value) {
+                if before != after {
+                    changes.note(format!("{what} is {after} and was {before}"));
+                }
+            }
+        });
+        self.0.extend(notes.0.into_iter().map(|change| Change {
+            compatible: true,
+            ..change
+        }));
+    }
+}
+
+fn topic(topic: &Topic) -> String {
+    let direction = match topic.direction {
+        Direction::Input => "input",
+        Direction::Output => "output",
+    };
+    format!("{direction} topic {}", topic.name)
+}
+
+/// A definition without comments and white space that mean nothing.
+fn essence(text: &str) -> Vec<String> {
+    let lines = text
+        .lines()
+        .map(|line| line.split('#').next().unwrap_or_default());
+    let folded = lines.map(|line| line.split_whitespace().collect::<Vec<_>>().join(" "));
+    folded.filter(|line| !line.is_empty()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn old() -> Interface {
+        let topic = |name: &str, direction, latched| Topic {
+            name: name.into(),
+            type_name: "std_msgs/String".into(),
+            md5: "aa".into(),
+            direction,
+            nodes: vec!["/n".into()],
+            latched,
+            lazy: false,
+        };
+        let parameter = |name: &str, value: i64| Parameter {
+            name: name.into(),
+            value: Some(value.into()),
+            read_by: vec![],
+            written_by: vec![],
+        };
+        Interface {
+            topics: vec![
+                topic("/in", Direction::Input, false),
+                topic("/out", Direction::Output, true),
+            ],
+            services: vec![Service {
+                name: "/s".into(),
+                type_name: "a/S".into(),
+                md5: "bb".into(),
+                node: "/n".into(),
+            }],
+            actions: vec![Action {
+                name: "/act".into(),
+                type_name: "a/Go".into(),
+                node: "/n".into(),
+            }],
+            parameters: vec![parameter("/p", 1)],
+            definitions: [(
+                "a/action/Go".to_owned(),
+                "int32 x # goal\n---\n---\n".to_owned(),
+            )]
+            .into(),
+        }
+    }
+
+    fn texts(difference: &Difference) -> Vec<String> {
+        difference.to_string().lines().map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn the_same_is_no_difference() {
+        let mut new = old();
+        new.topics.reverse();
+        new.topics[0].nodes = vec!["/renamed".into()];
+        new.definitions
+            .insert("a/action/Go".into(), "int32   x\n\n---\n---".into());
+        let difference = Difference::between(&old(), &new);
+        assert_eq!(difference, Difference::default());
+        assert!(difference.compatible());
+    }
+
+    #[test]
+    fn what_is_new_breaks_nothing() {
+        let mut before = old();
+        before.topics.remove(0);
+        before.services.clear();
+        before.parameters[0].value = Some(2.into());
+        let difference = Difference::between(&before, &old());
+        assert!(difference.compatible());
+        assert_eq!(
+            texts(&difference),
+            [
+                "  input topic /in is new",
+                "  parameter /p is 1 and was 2",
+                "  service /s is new"
+            ]
+        );
+    }
+
+    #[test]
+    fn what_is_gone_or_of_another_type_breaks() {
+        let mut new = old();
+        new.topics[0].type_name = "std_msgs/Int32".into();
+        new.topics[1].direction = Direction::Input;
+        new.services[0].md5 = "cc".into();
+        new.definitions
+            .insert("a/action/Go".into(), "int64 x\n---\n---\n".into());
+        new.parameters.clear();
+        let difference = Difference::between(&old(), &new);
+        assert!(!difference.compatible());
+        let expected = [
+            "! action /act has another definition of a/Go",
+            "! input topic /in was a std_msgs/String and is a std_msgs/Int32",
+            "! output topic /out is gone",
+            "! service /s has another definition of a/S (md5 cc was bb)",
+            "  input topic /out is new",
+            "  parameter /p is gone",
+        ];
+        assert_eq!(texts(&difference), expected);
+        let mut unlatched = old();
+        unlatched.topics[1].latched = false;
+        assert_eq!(
+            texts(&Difference::between(&old(), &unlatched)),
+            ["! output topic /out is no longer latched"]
+        );
+        assert!(Difference::between(&unlatched, &old()).compatible());
+    }
+}

@@ -1,0 +1,119 @@
+//! What is wrong with what was pushed.
+
+use std::io;
+use std::path::PathBuf;
+
+/// Every failure names the file, and the line where there is one.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file operation failed.
+    #[error("cannot {action} {}: {source}", .path.display())]
+    File {
+        /// What was attempted, such as "read".
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A file that is larger than such a file can sensibly be.
+    #[error("{} is larger than the {limit} bytes that are read; leave it out", .path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Bytes that are accepted.
+        limit: u64,
+    },
+    /// More of something than can sensibly be.
+    #[error("{} holds more than {limit} {what}; push a smaller directory", .path.display())]
+    TooMany {
+        /// The directory.
+        path: PathBuf,
+        /// Such as "packages".
+        what: &'static str,
+        /// How many are accepted.
+        limit: usize,
+    },
+    /// A link that leads out of what was pushed.
+    #[error("{} leads out of {}; replace the link with a copy", .path.display(), .root.display())]
+    Outside {
+        /// The link.
+        path: PathBuf,
+        /// What it must stay in.
+        root: PathBuf,
+    },
+    /// A `package.xml` that does not parse or says something impossible.
+    #[error("{}, line {line}, column {column}: {problem}", .path.display())]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// Counted from 1.
+        line: u32,
+        /// Counted from 1.
+        column: u32,
+        /// What is wrong.
+        problem: String,
+    },
+    /// Nothing that can be pushed.
+    #[error("{} is no ROS package: {looked_for}; give the directory of a package, of a workspace, or of an install space", .path.display())]
+    NoPackage {
+        /// The directory.
+        path: PathBuf,
+        /// Where a package was looked for.
+        looked_for: String,
+    },
+    /// A devel space, which only works beside its sources and its build.
+    #[error("{} is a devel space, which only works where it was built; push the workspace, or its install space after 'catkin_make install'", .path.display())]
+    DevelSpace {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// Two packages of one name.
+    #[error("two packages are named {name:?}: {} and {}; remove one, or put a CATKIN_IGNORE file beside it", .first.display(), .second.display())]
+    SameName {
+        /// The name.
+        name: String,
+        /// Where it is, below what was pushed.
+        first: PathBuf,
+        /// Where it is again.
+        second: PathBuf,
+    },
+    /// Packages that need each other to be built.
+    #[error("packages need each other to be built: {}; break the circle in their package.xml", .circle.join(" needs "))]
+    Circle {
+        /// The first name is also the last.
+        circle: Vec<String>,
+    },
+    /// An interface file that does not parse or says something impossible.
+    #[error("{}, line {line}, column {column}: {problem}", .path.display())]
+    Interface {
+        /// The file.
+        path: PathBuf,
+        /// Counted from 1.
+        line: usize,
+        /// Counted from 1.
+        column: usize,
+        /// What is wrong.
+        problem: String,
+    },
+    /// A supplement that contradicts what was found in the running package.
+    #[error(
+        "the interface file says that {what} is {stated}, but it was found to be {found}; correct or remove it there"
+    )]
+    Contradiction {
+        /// Such as "input topic /image".
+        what: String,
+        /// What the file says.
+        stated: String,
+        /// What was found.
+        found: String,
+    },
+    /// A name that a service cannot have.
+    #[error("{name:?} cannot be a service's name: {problem}; choose another with --name")]
+    ServiceName {
+        /// What was given.
+        name: String,
+        /// Why not.
+        problem: String,
+    },
+}

@@ -1,0 +1,298 @@
+//! Interfaces as TOML: the supplement that a deployer writes, and the `interface.toml` of a stub.
+
+use std::fmt::Display;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::interface::Interface;
+use crate::{Error, names, read};
+
+/// The largest interface file: definitions of everything are in it.
+const MAX_BYTES: u64 = 16 << 20;
+
+/// Keys that may stand in each table of a file.
+const KEYS: [(&str, &[&str]); 4] = [
+    (
+        "topics",
+        &[
+            "name",
+            "type",
+            "md5",
+            "direction",
+            "nodes",
+            "latched",
+            "lazy",
+        ],
+    ),
+    ("services", &["name", "type", "md5", "node"]),
+    ("actions", &["name", "type", "node"]),
+    ("parameters", &["name", "value", "read_by", "written_by"]),
+];
+
+impl Interface {
+    /// The text of an `interface.toml`. TOML has no null: members and elements that are null are left out.
+    pub fn to_toml(&self) -> String {
+        let mut writable = self.clone();
+        for parameter in &mut writable.parameters {
+            parameter.value = parameter.value.take().and_then(without_nulls);
+        }
+        toml::to_string_pretty(&writable).expect("an interface without nulls is TOML")
+    }
+
+    /// Reads a file. See [`Interface::from_toml`].
+    pub fn read_toml(path: &Path) -> Result<Self, Error> {
+        Self::from_toml(&read::text(path, MAX_BYTES)?, path)
+    }
+
+    /// Parses the text of a file, whose path is for messages. A supplement only needs names, types and the
+    /// topics' directions:
+    ///
+    /// ```toml
+    /// [[topics]]
+    /// name = "/image"
+    /// type = "sensor_msgs/Image"
+    /// direction = "input"        # the package subscribes
+    /// ```
+    pub fn from_toml(text: &str, path: &Path) -> Result<Self, Error> {
+        let failed = |error: &toml::de::Error| wrong(text, path, error.span(), error.message());
+        // First as it stands, for keys that are misspelt.
+        let table: toml::Table = toml::from_str(text).map_err(|error| failed(&error))?;
+        if let Some((key, problem)) = misspelt(&table) {
+            let at = text.find(key).map(|start| start..start + key.len());
+            return Err(wrong(text, path, at, problem));
+        }
+        let interface: Self = toml::from_str(text).map_err(|error| failed(&error))?;
+        if let Some((name, problem)) = interface.impossible() {
+            let at = text.find(name).map(|start| start..start + name.len());
+            return Err(wrong(text, path, at, problem));
+        }
+        Ok(interface)
+    }
+
+    /// A name or type that cannot be, and why.
+    fn impossible(&self) -> Option<(&str, String)> {
+        let named = self
+            .topics
+            .iter()
+            .map(|topic| (&topic.name, Some(&topic.type_name)));
+        let named = named.chain(
+            self.services
+                .iter()
+                .map(|service| (&service.name, Some(&service.type_name))),
+        );
+        let named = named.chain(
+            self.actions
+                .iter()
+                .map(|action| (&action.name, Some(&action.type_name))),
+        );
+        let mut named = named.chain(
+            self.parameters
+                .iter()
+                .map(|parameter| (&parameter.name, None)),
+        );
+        named.find_map(|(name, of_type)| {
+            if !names::is_graph_name(name) {
+                return Some((
+                    name.as_str(),
+                    format!("{name:?} is not an absolute name such as \"/camera/image\""),
+                ));
+            }
+            let bad = of_type.filter(|of_type| !names::is_full_type(of_type))?;
+            Some((
+                bad.as_str(),
+                format!("{bad:?} is not a type such as \"sensor_msgs/Image\""),
+            ))
+        })
+    }
+}
+
+fn without_nulls(value: Value) -> Option<Value> {
+    Some(match value {
+        Value::Null => return None,
+        Value::Array(items) => items.into_iter().filter_map(without_nulls).collect(),
+        Value::Object(members) => {
+            let kept = members
+                .into_iter()
+                .filter_map(|(key, value)| Some((key, without_nulls(value)?)));
+            Value::Object(kept.collect())
+        }
+        // TOML's integers are signed.
+        Value::Number(number) if number.as_i64().is_none() => number.as_f64()?.into(),
+        other => other,
+    })
+}
+
+/// A key that no interface file has, and what it should be.
+fn misspelt(table: &toml::Table) -> Option<(&str, String)> {
+    for (section, content) in table {
+        if section == "definitions" {
+            continue;
+        }
+        let Some((_, keys)) = KEYS.iter().find(|(known, _)| known == section) else {
+            let known = KEYS.map(|(known, _)| known).join(", ");
+            return Some((
+                section,
+                format!("{section:?} is not known; there are {known} and definitions"),
+            ));
+        };
+        let entries = content
+            .as_array()
+            .into_iter()
+            .flatten()
+            .filter_map(toml::Value::as_table);
+        for key in entries.flat_map(toml::Table::keys) {
+            if !keys.contains(&key.as_str()) {
+                return Some((
+                    key,
+                    format!(
+                        "{key:?} is not known in {section}; there are {}",
+                        keys.join(", ")
+                    ),
+                ));
+            }
+        }
+    }
+    None
+}
+
+fn wrong(
+    text: &str,
+    path: &Path,
+    span: Option<std::ops::Range<usize>>,
+    problem: impl Display,
+) -> Error {
+    let before = text
+        .get(..span.map_or(0, |span| span.start))
+        .unwrap_or_default();
+    let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
+    Error::Interface {
+        path: path.to_owned(),
+        line: before.matches('\n').count() + 1,
+        column: before[line_start..].chars().count() + 1,
+        problem: problem.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::interface::{Direction, Parameter};
+
+    fn parse(text: &str) -> Result<Interface, Error> {
+        Interface::from_toml(text, Path::new("x.toml"))
+    }
+
+    const SUPPLEMENT: &str = r#"
+[[topics]]
+name = "/image"
+type = "sensor_msgs/Image"
+direction = "input"
+
+[[services]]
+name = "/reset"
+type = "std_srvs/Empty"
+
+[[actions]]
+name = "/go"
+type = "demo/Go"
+
+[[parameters]]
+name = "/threshold"
+value = 0.5
+
+[definitions]
+"demo/action/Go" = "int32 x\n---\n---\n"
+"#;
+
+    #[test]
+    fn a_supplement_says_only_what_is_needed() {
+        let interface = parse(SUPPLEMENT).unwrap();
+        assert_eq!(interface.topics[0].direction, Direction::Input);
+        assert_eq!(
+            (
+                &interface.topics[0].md5[..],
+                interface.topics[0].nodes.len()
+            ),
+            ("", 0)
+        );
+        assert_eq!(interface.services[0].type_name, "std_srvs/Empty");
+        assert_eq!(interface.parameters[0].value, Some(0.5.into()));
+        assert_eq!(parse("").unwrap(), Interface::default());
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let mut interface = parse(SUPPLEMENT).unwrap();
+        interface.topics[0].nodes = vec!["/n".into()];
+        interface.topics[0].latched = true;
+        interface
+            .definitions
+            .insert("a/msg/B".into(), "# \"\"\" ''' \\ \n\tint32 x\r\n".into());
+        interface.parameters[0].value =
+            Some(serde_json::json!({"a": [1, "x", {"b": true}], "c d/e": 1.5}));
+        interface.parameters.push(Parameter {
+            name: "/asked".into(),
+            value: None,
+            read_by: vec!["/n".into()],
+            written_by: vec![],
+        });
+        assert_eq!(parse(&interface.to_toml()).unwrap(), interface);
+    }
+
+    #[test]
+    fn values_that_toml_has_not_are_left_out_or_made_to_fit() {
+        let mut interface = parse(SUPPLEMENT).unwrap();
+        interface.parameters[0].value =
+            Some(serde_json::json!({"n": null, "a": [null, 1], "big": u64::MAX}));
+        let read = parse(&interface.to_toml()).unwrap();
+        assert_eq!(
+            read.parameters[0].value,
+            Some(serde_json::json!({"a": [1], "big": u64::MAX as f64}))
+        );
+        interface.parameters[0].value = Some(Value::Null);
+        assert_eq!(
+            parse(&interface.to_toml()).unwrap().parameters[0].value,
+            None
+        );
+    }
+
+    #[test]
+    fn a_bad_file_is_told_with_its_place() {
+        let topic = |rest: &str| format!("[[topics]]\nname = \"/a\"\n{rest}");
+        for (text, reason) in [
+            ("[[topics]]\nname = ".to_owned(), "x.toml, line 2, column "),
+            (topic("type = \"a/B\""), "missing field `direction`"),
+            (
+                topic("type = \"a/B\"\ndirection = \"sideways\""),
+                "line 4, column 13: unknown variant `sideways`",
+            ),
+            (
+                topic("typ = \"a/B\"\ndirection = \"input\""),
+                "line 3, column 1: \"typ\" is not known in topics; there are name, type",
+            ),
+            (
+                topic("type = \"B\"\ndirection = \"input\""),
+                "line 3, column 9: \"B\" is not a type such as",
+            ),
+            (
+                "[[parameters]]\nname = \"a\"".to_owned(),
+                "\"a\" is not an absolute name",
+            ),
+            (
+                "[[topic]]\nname = \"a\"".to_owned(),
+                "\"topic\" is not known; there are topics, services",
+            ),
+        ] {
+            let message = parse(&text).unwrap_err().to_string();
+            assert!(message.contains(reason), "{reason:?} is not in: {message}");
+        }
+        let missing = Interface::read_toml(Path::new("/not/there.toml"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            missing.starts_with("cannot open /not/there.toml"),
+            "{missing}"
+        );
+    }
+}

@@ -1,0 +1,452 @@
+//! `package.xml`, formats 1 (REP 127), 2 (REP 140) and 3 (REP 149).
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use roxmltree::{Document, Node};
+
+use crate::condition::Variables;
+use crate::{Error, names, read};
+
+/// The largest `package.xml` that is read.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// What a package says about itself, for the distribution its conditions were evaluated for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Manifest {
+    /// 1, 2 or 3.
+    pub format: u8,
+    /// The package's name, valid.
+    pub name: String,
+    /// As written, such as `1.2.3`; empty when missing.
+    pub version: String,
+    /// Text of the description, white space folded.
+    pub description: String,
+    /// Licences, as written.
+    pub licenses: Vec<String>,
+    /// What it needs, and for what.
+    pub dependencies: BTreeSet<Dependency>,
+    /// `catkin` unless exported otherwise.
+    pub build_type: String,
+    /// It only groups others.
+    pub metapackage: bool,
+}
+
+/// Something a package needs.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Dependency {
+    /// A package or a rosdep key, valid.
+    pub name: String,
+    /// For what.
+    pub kind: Kind,
+}
+
+/// What a dependency is needed for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Kind {
+    /// A tool that runs while it is built, such as catkin.
+    Buildtool,
+    /// A tool that those who build against it need.
+    BuildtoolExport,
+    /// Headers and libraries to build it.
+    Build,
+    /// Headers and libraries to build against it.
+    BuildExport,
+    /// To run it.
+    Exec,
+    /// To test it.
+    Test,
+    /// To build its documentation.
+    Doc,
+}
+
+impl Kind {
+    /// What an element means in a format; none where the format does not know it.
+    fn of_element(element: &str, format: u8) -> Option<&'static [Self]> {
+        Some(match (element, format) {
+            ("buildtool_depend", _) => &[Self::Buildtool],
+            ("build_depend", _) => &[Self::Build],
+            ("test_depend", _) => &[Self::Test],
+            // Format 1 does not tell running from building against.
+            ("run_depend", 1) => &[Self::BuildExport, Self::Exec],
+            ("depend", 2..) => &[Self::Build, Self::BuildExport, Self::Exec],
+            ("build_export_depend", 2..) => &[Self::BuildExport],
+            ("buildtool_export_depend", 2..) => &[Self::BuildtoolExport],
+            ("exec_depend", 2..) => &[Self::Exec],
+            ("doc_depend", 2..) => &[Self::Doc],
+            _ => return None,
+        })
+    }
+}
+
+impl Manifest {
+    /// Reads a file.
+    pub fn read(path: &Path, variables: &Variables) -> Result<Self, Error> {
+        Self::parse(&read::text(path, MAX_BYTES)?, path, variables)
+    }
+
+    /// Parses the text of a file, whose path is for messages.
+    pub fn parse(text: &str, path: &Path, variables: &Variables) -> Result<Self, Error> {
+        let document = Document::parse(text).map_err(|error| malformed(path, &error))?;
+        let reader = Reader {
+            document: &document,
+            path,
+            variables,
+        };
+        reader.manifest()
+    }
+
+    /// Names of what is needed for any of `kinds`.
+    pub fn needs(&self, kinds: &[Kind]) -> BTreeSet<&str> {
+        let wanted = self
+            .dependencies
+            .iter()
+            .filter(|dependency| kinds.contains(&dependency.kind));
+        wanted.map(|dependency| dependency.name.as_str()).collect()
+    }
+}
+
+fn malformed(path: &Path, error: &roxmltree::Error) -> Error {
+    let position = error.pos();
+    let text = error.to_string();
+    // The position is told at the beginning already.
+    let problem = text
+        .strip_suffix(&format!(" at {position}"))
+        .unwrap_or(&text);
+    Error::Manifest {
+        path: path.to_owned(),
+        line: position.row,
+        column: position.col,
+        problem: format!("malformed XML: {problem}"),
+    }
+}
+
+struct Reader<'a> {
+    document: &'a Document<'a>,
+    path: &'a Path,
+    variables: &'a Variables,
+}
+
+impl<'a> Reader<'a> {
+    fn manifest(&self) -> Result<Manifest, Error> {
+        let root = self.document.root_element();
+        if !root.has_tag_name("package") {
+            let problem = format!(
+                "the root element is <{}>, not <package>",
+                root.tag_name().name()
+            );
+            return Err(self.wrong(root, problem));
+        }
+        let format = self.format(root)?;
+        let name = self.name(root)?;
+        let version = self
+            .children(root, "version")?
+            .first()
+            .map(|node| self.text(*node))
+            .unwrap_or_default();
+        let description = self
+            .children(root, "description")?
+            .first()
+            .map(|node| folded(*node))
+            .unwrap_or_default();
+        let licenses = self
+            .children(root, "license")?
+            .into_iter()
+            .map(|node| self.text(node))
+            .collect();
+        let dependencies = self.dependencies(root, format)?;
+        let (build_type, metapackage) = self.export(root)?;
+        Ok(Manifest {
+            format,
+            name,
+            version,
+            description,
+            licenses,
+            dependencies,
+            build_type,
+            metapackage,
+        })
+    }
+
+    fn format(&self, root: Node<'a, 'a>) -> Result<u8, Error> {
+        match root.attribute("format").map(str::trim) {
+            None | Some("1") => Ok(1),
+            Some("2") => Ok(2),
+            Some("3") => Ok(3),
+            Some(other) => Err(self.wrong(
+                root,
+                format!("format {other:?} is not known; 1, 2 and 3 are"),
+            )),
+        }
+    }
+
+    fn name(&self, root: Node<'a, 'a>) -> Result<String, Error> {
+        let names = self.children(root, "name")?;
+        let node = match names[..] {
+            [] => return Err(self.wrong(root, "the <name> element is missing".to_owned())),
+            [only] => only,
+            [_, second, ..] => return Err(self.wrong(second, "a second <name> element".to_owned())),
+        };
+        let name = self.text(node);
+        if !names::is_package(&name) {
+            let problem =
+                format!("{name:?} is not a package name: a letter, then letters, digits, _ and -");
+            return Err(self.wrong(node, problem));
+        }
+        Ok(name)
+    }
+
+    fn dependencies(&self, root: Node<'a, 'a>, format: u8) -> Result<BTreeSet<Dependency>, Error> {
+        let mut dependencies = BTreeSet::new();
+        for node in root.children().filter(Node::is_element) {
+            let Some(kinds) = Kind::of_element(node.tag_name().name(), format) else {
+                continue;
+            };
+            if !self.applies(node)? {
+                continue;
+            }
+            let name = self.text(node);
+            if !names::is_dependency(&name) {
+                let problem = format!(
+                    "{name:?} in <{}> is not the name of a dependency",
+                    node.tag_name().name()
+                );
+                return Err(self.wrong(node, problem));
+            }
+            dependencies.extend(kinds.iter().map(|&kind| Dependency {
+                name: name.clone(),
+                kind,
+            }));
+        }
+        Ok(dependencies)
+    }
+
+    fn export(&self, root: Node<'a, 'a>) -> Result<(String, bool), Error> {
+        let (mut build_type, mut metapackage) = ("catkin".to_owned(), false);
+        for export in self.children(root, "export")? {
+            if let Some(node) = self.children(export, "build_type")?.first() {
+                build_type = self.text(*node);
+            }
+            metapackage |= !self.children(export, "metapackage")?.is_empty();
+        }
+        Ok((build_type, metapackage))
+    }
+
+    /// Child elements of a name whose conditions hold.
+    fn children(&self, parent: Node<'a, 'a>, name: &str) -> Result<Vec<Node<'a, 'a>>, Error> {
+        let mut found = Vec::new();
+        for node in parent.children().filter(|node| node.has_tag_name(name)) {
+            if self.applies(node)? {
+                found.push(node);
+            }
+        }
+        Ok(found)
+    }
+
+    fn applies(&self, node: Node<'a, 'a>) -> Result<bool, Error> {
+        let Some(condition) = node.attribute("condition") else {
+            return Ok(true);
+        };
+        let wrong = |problem| {
+            self.wrong(
+                node,
+                format!("the condition {condition:?} does not parse: {problem}"),
+            )
+        };
+        self.variables.hold(condition).map_err(wrong)
+    }
+
+    fn text(&self, node: Node<'a, 'a>) -> String {
+        folded(node)
+    }
+
+    fn wrong(&self, node: Node<'a, 'a>, problem: String) -> Error {
+        let position = self.document.text_pos_at(node.range().start);
+        Error::Manifest {
+            path: self.path.to_owned(),
+            line: position.row,
+            column: position.col,
+            problem,
+        }
+    }
+}
+
+/// All text in an element, white space folded.
+fn folded(node: Node<'_, '_>) -> String {
+    let texts = node
+        .descendants()
+        .filter(Node::is_text)
+        .filter_map(|text| text.text());
+    let text: String = texts.collect();
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<Manifest, Error> {
+        Manifest::parse(
+            text,
+            Path::new("src/x/package.xml"),
+            &Variables::ros1("noetic"),
+        )
+    }
+
+    fn refused(text: &str) -> String {
+        parse(text).unwrap_err().to_string()
+    }
+
+    fn needs(manifest: &Manifest, kind: Kind) -> Vec<&str> {
+        manifest.needs(&[kind]).into_iter().collect()
+    }
+
+    #[test]
+    fn format_1() {
+        let manifest = parse(
+            r#"<package>
+                 <name> people_detect </name><version>1.2.3</version>
+                 <description>Finds <b>people</b>
+                   in pictures</description>
+                 <license>BSD</license><license>MIT</license>
+                 <buildtool_depend>catkin</buildtool_depend>
+                 <build_depend version_gte="1.0">roscpp</build_depend>
+                 <run_depend>rospy</run_depend>
+                 <test_depend>gtest</test_depend>
+                 <depend>ignored_in_format_1</depend>
+               </package>"#,
+        )
+        .unwrap();
+        assert_eq!(
+            (manifest.format, &manifest.name[..], &manifest.version[..]),
+            (1, "people_detect", "1.2.3")
+        );
+        assert_eq!(manifest.description, "Finds people in pictures");
+        assert_eq!(manifest.licenses, ["BSD", "MIT"]);
+        assert_eq!(needs(&manifest, Kind::Buildtool), ["catkin"]);
+        assert_eq!(needs(&manifest, Kind::Build), ["roscpp"]);
+        assert_eq!(needs(&manifest, Kind::BuildExport), ["rospy"]);
+        assert_eq!(needs(&manifest, Kind::Exec), ["rospy"]);
+        assert_eq!(needs(&manifest, Kind::Test), ["gtest"]);
+        assert_eq!(
+            (&manifest.build_type[..], manifest.metapackage),
+            ("catkin", false)
+        );
+    }
+
+    #[test]
+    fn format_2() {
+        let manifest = parse(
+            r#"<?xml version="1.0"?>
+               <?xml-model href="package_format2.xsd"?>
+               <package format="2">
+                 <name>x</name>
+                 <depend>roscpp</depend>
+                 <build_export_depend>eigen</build_export_depend>
+                 <exec_depend>rospy</exec_depend>
+                 <doc_depend>doxygen</doc_depend>
+                 <buildtool_export_depend>genmsg</buildtool_export_depend>
+                 <export><metapackage/></export>
+               </package>"#,
+        )
+        .unwrap();
+        assert_eq!(needs(&manifest, Kind::Build), ["roscpp"]);
+        assert_eq!(needs(&manifest, Kind::BuildExport), ["eigen", "roscpp"]);
+        assert_eq!(needs(&manifest, Kind::Exec), ["roscpp", "rospy"]);
+        assert_eq!(needs(&manifest, Kind::Doc), ["doxygen"]);
+        assert_eq!(needs(&manifest, Kind::BuildtoolExport), ["genmsg"]);
+        assert!(manifest.metapackage);
+    }
+
+    #[test]
+    fn format_3_is_read_for_its_distribution() {
+        let manifest = parse(
+            r#"<package format="3">
+                 <name>x</name>
+                 <depend condition="$ROS_VERSION == 1">roscpp</depend>
+                 <depend condition="$ROS_VERSION == 2">rclcpp</depend>
+                 <exec_depend condition="$ROS_PYTHON_VERSION == 2">python-numpy</exec_depend>
+                 <exec_depend condition="$ROS_PYTHON_VERSION == 3">python3-numpy</exec_depend>
+                 <export>
+                   <build_type condition="$ROS_VERSION == 1">catkin</build_type>
+                   <build_type condition="$ROS_VERSION == 2">ament_cmake</build_type>
+                 </export>
+               </package>"#,
+        )
+        .unwrap();
+        assert_eq!(needs(&manifest, Kind::Exec), ["python3-numpy", "roscpp"]);
+        assert_eq!(manifest.build_type, "catkin");
+    }
+
+    #[test]
+    fn malformed_xml_is_told_with_its_place() {
+        let text = refused("<package>\n  <name>x</nam>\n</package>");
+        assert!(
+            text.starts_with("src/x/package.xml, line 2, column "),
+            "{text}"
+        );
+        assert!(
+            text.contains("malformed XML") && !text.contains(" at 2:"),
+            "{text}"
+        );
+        assert!(refused("").contains("malformed XML"));
+        let entities = r#"<!DOCTYPE p [<!ENTITY a "aaaa">]><package><name>&a;</name></package>"#;
+        assert!(refused(entities).contains("malformed XML"));
+    }
+
+    #[test]
+    fn what_a_manifest_must_not_say() {
+        for (text, reason) in [
+            ("<launch/>", "<launch>, not <package>"),
+            ("<package/>", "<name> element is missing"),
+            (
+                "<package>\n<name>a</name>\n<name>b</name></package>",
+                "line 3, column 1: a second <name>",
+            ),
+            (
+                "<package><name>1x</name></package>",
+                "\"1x\" is not a package name",
+            ),
+            (
+                "<package><name></name></package>",
+                "\"\" is not a package name",
+            ),
+            ("<package><name>../x</name></package>", "not a package name"),
+            (
+                "<package format='4'><name>x</name></package>",
+                "format \"4\" is not known",
+            ),
+            (
+                "<package><name>x</name><build_depend>-o x</build_depend></package>",
+                "\"-o x\" in <build_depend>",
+            ),
+            (
+                "<package format='2'><name>x</name><depend></depend></package>",
+                "\"\" in <depend>",
+            ),
+            (
+                "<package format='3'><name>x</name><depend condition='$A'>y</depend></package>",
+                "condition \"$A\" does not parse",
+            ),
+        ] {
+            let message = refused(text);
+            assert!(message.contains(reason), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_missing_or_endless_is_told() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("package.xml");
+        let read = || {
+            Manifest::read(&path, &Variables::ros1("noetic"))
+                .unwrap_err()
+                .to_string()
+        };
+        assert!(read().starts_with("cannot open ") && read().contains("package.xml"));
+        std::fs::write(&path, " ".repeat(2 << 20)).unwrap();
+        assert!(read().contains("larger than the 1048576 bytes"));
+        std::fs::write(&path, b"<package>\xff").unwrap();
+        assert!(read().contains("UTF-8"), "{}", read());
+    }
+}

@@ -1,0 +1,68 @@
+//! The order in which packages are built.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::Error;
+use crate::manifest::Kind;
+use crate::workspace::Package;
+
+/// What must be there before a package is built.
+const BEFORE: [Kind; 4] = [
+    Kind::Buildtool,
+    Kind::BuildtoolExport,
+    Kind::Build,
+    Kind::BuildExport,
+];
+
+/// Each package after those it needs to be built, otherwise by name.
+pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error> {
+    let mut waiting: BTreeMap<String, Package> = packages
+        .into_iter()
+        .map(|package| (package.manifest.name.clone(), package))
+        .collect();
+    let mut ordered = Vec::with_capacity(waiting.len());
+    while !waiting.is_empty() {
+        let ready = waiting
+            .values()
+            .find(|package| needed(package, &waiting).is_empty());
+        match ready.map(|package| package.manifest.name.clone()) {
+            Some(name) => ordered.extend(waiting.remove(&name)),
+            None => {
+                return Err(Error::Circle {
+                    circle: circle(&waiting),
+                });
+            }
+        }
+    }
+    Ok(ordered)
+}
+
+/// Names of waiting packages that must come before this one.
+fn needed<'a>(package: &'a Package, waiting: &BTreeMap<String, Package>) -> BTreeSet<&'a str> {
+    let mut names = package.manifest.needs(&BEFORE);
+    names.retain(|name| *name != package.manifest.name && waiting.contains_key(*name));
+    names
+}
+
+/// Follows needs, of which every package here has one, until one comes again.
+fn circle(waiting: &BTreeMap<String, Package>) -> Vec<String> {
+    let mut path: Vec<String> = Vec::new();
+    let mut name = waiting.keys().next().cloned().unwrap_or_default();
+    loop {
+        if let Some(start) = path.iter().position(|seen| *seen == name) {
+            let mut circle = path.split_off(start);
+            circle.push(name);
+            return circle;
+        }
+        let next = waiting.get(&name).and_then(|package| {
+            needed(package, waiting)
+                .first()
+                .map(|next| (*next).to_owned())
+        });
+        path.push(name);
+        match next {
+            Some(next) => name = next,
+            None => return path,
+        }
+    }
+}

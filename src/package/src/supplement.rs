@@ -1,0 +1,248 @@
+//! Adding what a deployer knows of an interface to what was found in the running package.
+
+use std::fmt::Display;
+
+use crate::Error;
+use crate::interface::{Action, Direction, Interface, Parameter, Service, Topic};
+
+impl Interface {
+    /// Adds what a deployer knows to what was found in the running package. What was found stands; a type or
+    /// definition that contradicts it is an error, and then nothing is changed.
+    pub fn supplement(&mut self, stated: &Self) -> Result<(), Error> {
+        let mut merged = self.clone();
+        for topic in &stated.topics {
+            merged.add_topic(topic)?;
+        }
+        for service in &stated.services {
+            merged.add_service(service)?;
+        }
+        for action in &stated.actions {
+            merged.add_action(action)?;
+        }
+        for parameter in &stated.parameters {
+            merged.add_parameter(parameter);
+        }
+        for (key, text) in &stated.definitions {
+            match merged.definitions.get(key) {
+                Some(found) if found.trim() != text.trim() => {
+                    return Err(contradiction(
+                        format!("the definition of {key}"),
+                        "another",
+                        "what the image holds",
+                    ));
+                }
+                Some(_) => {}
+                None => {
+                    merged.definitions.insert(key.clone(), text.clone());
+                }
+            }
+        }
+        merged.sort();
+        *self = merged;
+        Ok(())
+    }
+
+    /// By name, so that equal interfaces are equal texts.
+    pub fn sort(&mut self) {
+        let direction = |topic: &Topic| matches!(topic.direction, Direction::Output);
+        self.topics
+            .sort_by(|a, b| (&a.name, direction(a)).cmp(&(&b.name, direction(b))));
+        self.services.sort_by(|a, b| a.name.cmp(&b.name));
+        self.actions.sort_by(|a, b| a.name.cmp(&b.name));
+        self.parameters.sort_by(|a, b| a.name.cmp(&b.name));
+    }
+
+    fn add_topic(&mut self, stated: &Topic) -> Result<(), Error> {
+        let same =
+            |topic: &&mut Topic| topic.name == stated.name && topic.direction == stated.direction;
+        let Some(found) = self.topics.iter_mut().find(same) else {
+            self.topics.push(stated.clone());
+            return Ok(());
+        };
+        let what = || format!("topic {}", stated.name);
+        agree(what, &stated.type_name, &mut found.type_name)?;
+        agree(
+            || format!("the md5 of topic {}", stated.name),
+            &stated.md5,
+            &mut found.md5,
+        )?;
+        found.latched |= stated.latched;
+        found.lazy |= stated.lazy;
+        join(&mut found.nodes, &stated.nodes);
+        Ok(())
+    }
+
+    fn add_service(&mut self, stated: &Service) -> Result<(), Error> {
+        let Some(found) = self
+            .services
+            .iter_mut()
+            .find(|service| service.name == stated.name)
+        else {
+            self.services.push(stated.clone());
+            return Ok(());
+        };
+        agree(
+            || format!("service {}", stated.name),
+            &stated.type_name,
+            &mut found.type_name,
+        )?;
+        agree(
+            || format!("the md5 of service {}", stated.name),
+            &stated.md5,
+            &mut found.md5,
+        )
+    }
+
+    fn add_action(&mut self, stated: &Action) -> Result<(), Error> {
+        let Some(found) = self
+            .actions
+            .iter_mut()
+            .find(|action| action.name == stated.name)
+        else {
+            self.actions.push(stated.clone());
+            return Ok(());
+        };
+        agree(
+            || format!("action {}", stated.name),
+            &stated.type_name,
+            &mut found.type_name,
+        )
+    }
+
+    fn add_parameter(&mut self, stated: &Parameter) {
+        match self
+            .parameters
+            .iter_mut()
+            .find(|parameter| parameter.name == stated.name)
+        {
+            Some(found) => {
+                found.value = found.value.take().or_else(|| stated.value.clone());
+                join(&mut found.read_by, &stated.read_by);
+                join(&mut found.written_by, &stated.written_by);
+            }
+            None => self.parameters.push(stated.clone()),
+        }
+    }
+}
+
+/// Fills in what is not known; what is known must be the same.
+fn agree(what: impl Fn() -> String, stated: &str, found: &mut String) -> Result<(), Error> {
+    if found.is_empty() {
+        stated.clone_into(found);
+    }
+    if stated.is_empty() || stated == found {
+        Ok(())
+    } else {
+        Err(contradiction(what(), stated, found))
+    }
+}
+
+fn contradiction(what: String, stated: impl Display, found: impl Display) -> Error {
+    Error::Contradiction {
+        what,
+        stated: stated.to_string(),
+        found: found.to_string(),
+    }
+}
+
+fn join(found: &mut Vec<String>, stated: &[String]) {
+    found.extend(stated.iter().cloned());
+    found.sort();
+    found.dedup();
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    fn stated() -> Interface {
+        let text = r#"
+            topics = [{ name = "/image", type = "sensor_msgs/Image", direction = "input" }]
+            services = [{ name = "/reset", type = "std_srvs/Empty" }]
+            actions = [{ name = "/go", type = "demo/Go" }]
+            parameters = [{ name = "/threshold", value = 0.5 }]
+            definitions = { "demo/action/Go" = "int32 x" }
+        "#;
+        Interface::from_toml(text, Path::new("x.toml")).unwrap()
+    }
+
+    #[test]
+    fn a_supplement_adds_and_fills_in() {
+        let mut found = Interface::default();
+        found.topics.push(Topic {
+            name: "/image".into(),
+            type_name: "sensor_msgs/Image".into(),
+            md5: "060021388200f6f0f447d0fcd9c64743".into(),
+            direction: Direction::Input,
+            nodes: vec!["/n".into()],
+            latched: false,
+            lazy: true,
+        });
+        found.parameters.push(Parameter {
+            name: "/threshold".into(),
+            value: Some(0.9.into()),
+            read_by: vec!["/n".into()],
+            written_by: vec![],
+        });
+        let mut stated = stated();
+        stated.topics.push(Topic {
+            direction: Direction::Output,
+            ..stated.topics[0].clone()
+        });
+        found.supplement(&stated).unwrap();
+        assert_eq!(found.topics.len(), 2);
+        assert!(found.topics[0].lazy && found.topics[0].md5.starts_with("0600"));
+        assert_eq!(
+            (
+                found.services.len(),
+                found.actions.len(),
+                found.definitions.len()
+            ),
+            (1, 1, 1)
+        );
+        assert_eq!(
+            found.parameters[0].value,
+            Some(0.9.into()),
+            "what was found stands"
+        );
+        let once = found.clone();
+        found.supplement(&stated).unwrap();
+        assert_eq!(found, once);
+    }
+
+    #[test]
+    fn a_contradiction_is_refused_and_changes_nothing() {
+        let found = stated();
+        let change = |change: fn(&mut Interface)| {
+            let mut stated = found.clone();
+            change(&mut stated);
+            let mut merged = found.clone();
+            let text = merged.supplement(&stated).unwrap_err().to_string();
+            assert_eq!(merged, found);
+            text
+        };
+        let text = change(|stated| stated.topics[0].type_name = "std_msgs/String".into());
+        assert!(
+            text.contains(
+                "topic /image is std_msgs/String, but it was found to be sensor_msgs/Image"
+            ),
+            "{text}"
+        );
+        assert!(
+            change(|stated| stated.services[0].type_name = "a/B".into())
+                .contains("service /reset is a/B")
+        );
+        assert!(
+            change(|stated| stated.actions[0].type_name = "a/B".into())
+                .contains("action /go is a/B")
+        );
+        let text = change(|stated| {
+            _ = stated
+                .definitions
+                .insert("demo/action/Go".into(), "int64 x".into())
+        });
+        assert!(text.contains("the definition of demo/action/Go"), "{text}");
+    }
+}

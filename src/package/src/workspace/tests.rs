@@ -1,0 +1,313 @@
+use super::*;
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn write(&self, name: &str, text: &str) -> &Self {
+        let path = self.0.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+        self
+    }
+
+    /// A package of format 2 in `directory` that depends on `needs`.
+    fn package(&self, directory: &str, name: &str, needs: &[&str]) -> &Self {
+        let needs: String = needs
+            .iter()
+            .map(|need| format!("<depend>{need}</depend>"))
+            .collect();
+        let text = format!(
+            "<package format='2'><name>{name}</name>{needs}<exec_depend>rospy</exec_depend></package>"
+        );
+        self.write(&format!("{directory}/package.xml"), &text)
+    }
+
+    fn link(&self, target: impl AsRef<Path>, name: &str) -> &Self {
+        let path = self.0.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::os::unix::fs::symlink(target, path).unwrap();
+        self
+    }
+
+    fn inspect(&self) -> Result<Pushed, Error> {
+        inspect(self.0.path(), &Variables::ros1("noetic"))
+    }
+
+    fn refused(&self) -> String {
+        self.inspect().unwrap_err().to_string()
+    }
+
+    fn found(&self) -> Vec<(String, String)> {
+        let pushed = self.inspect().unwrap();
+        let packages = pushed.packages().iter();
+        packages
+            .map(|p| (p.manifest.name.clone(), p.path.display().to_string()))
+            .collect()
+    }
+}
+
+fn pairs(expected: &[(&str, &str)]) -> Vec<(String, String)> {
+    expected
+        .iter()
+        .map(|(name, path)| ((*name).to_owned(), (*path).to_owned()))
+        .collect()
+}
+
+#[test]
+fn one_package() {
+    let place = Place::new();
+    place
+        .package(".", "single", &["roscpp"])
+        .package("nested", "not_looked_at", &[]);
+    assert_eq!(place.found(), pairs(&[("single", "")]));
+    let external = place.inspect().unwrap().external();
+    let names: Vec<_> = external
+        .iter()
+        .map(|external| external.name.as_str())
+        .collect();
+    assert_eq!(names, ["roscpp", "rospy"]);
+    assert_eq!(
+        external[0].kinds,
+        BTreeSet::from([Kind::Build, Kind::BuildExport, Kind::Exec])
+    );
+    assert_eq!(external[1].kinds, BTreeSet::from([Kind::Exec]));
+    assert_eq!(external[0].needed_by, BTreeSet::from(["single".to_owned()]));
+}
+
+#[test]
+fn a_workspace_in_build_order() {
+    let place = Place::new();
+    place
+        .package("src/a", "a", &["z_msgs", "roscpp"])
+        .package("src/stack/b", "b", &["a"])
+        .package("src/stack/z", "z_msgs", &["std_msgs"])
+        .package("src/stack/z/test/inner", "inner", &[])
+        .package("elsewhere/c", "c", &[]);
+    assert_eq!(
+        place.found(),
+        pairs(&[
+            ("z_msgs", "src/stack/z"),
+            ("a", "src/a"),
+            ("b", "src/stack/b")
+        ])
+    );
+    let external = place.inspect().unwrap().external();
+    assert!(external.iter().all(|external| external.name != "z_msgs"));
+    assert_eq!(
+        external
+            .iter()
+            .find(|e| e.name == "rospy")
+            .unwrap()
+            .needed_by
+            .len(),
+        3
+    );
+}
+
+#[test]
+fn packages_side_by_side_without_src() {
+    let place = Place::new();
+    place
+        .package("a", "a", &[])
+        .package("b", "b", &[])
+        .package(".hidden/c", "c", &[]);
+    assert_eq!(place.found(), pairs(&[("a", "a"), ("b", "b")]));
+}
+
+#[test]
+fn ignored_and_built_directories_are_left_out() {
+    let place = Place::new();
+    place.package("src/a", "a", &[]);
+    for (directory, mark) in [
+        ("x", "CATKIN_IGNORE"),
+        ("y", "COLCON_IGNORE"),
+        ("z", "AMENT_IGNORE"),
+        ("devel", ".catkin"),
+    ] {
+        place
+            .package(&format!("src/{directory}/a"), "a", &[])
+            .write(&format!("src/{directory}/{mark}"), "");
+    }
+    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
+}
+
+#[test]
+fn links_are_followed_inside_only() {
+    let outside = Place::new();
+    outside.package("o", "o", &[]);
+    let place = Place::new();
+    place.package("repos/a", "a", &[]);
+    place
+        .link("../repos/a", "src/a")
+        .link("..", "src/circle")
+        .link(outside.0.path().join("o"), "src/o");
+    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
+    let place = Place::new();
+    place.link(outside.0.path().join("o/package.xml"), "src/o/package.xml");
+    assert!(
+        place.refused().contains("leads out of"),
+        "{}",
+        place.refused()
+    );
+}
+
+#[test]
+fn two_packages_of_one_name_are_refused() {
+    let place = Place::new();
+    place
+        .package("src/a", "same", &[])
+        .package("src/b", "same", &[]);
+    let text = place.refused();
+    assert!(text.contains("\"same\": src/a and src/b"), "{text}");
+}
+
+#[test]
+fn packages_that_need_each_other_are_refused() {
+    let place = Place::new();
+    place
+        .package("src/a", "a", &["b"])
+        .package("src/b", "b", &["c"])
+        .package("src/c", "c", &["b"]);
+    let text = place.refused();
+    assert!(text.contains("b needs c needs b"), "{text}");
+    // To run each other is no problem, nor is naming oneself.
+    let place = Place::new();
+    place.package("src/a", "a", &["a"]);
+    place.write(
+        "src/b/package.xml",
+        "<package format='2'><name>b</name><depend>a</depend></package>",
+    );
+    place.write(
+        "src/a/package.xml",
+        "<package format='2'><name>a</name><build_depend>a</build_depend><exec_depend>b</exec_depend></package>",
+    );
+    assert_eq!(place.found(), pairs(&[("a", "src/a"), ("b", "src/b")]));
+}
+
+#[test]
+fn a_directory_without_packages_is_told_what_was_looked_for() {
+    let place = Place::new();
+    place.write("README", "x");
+    let text = place.refused();
+    assert!(
+        text.contains("is no ROS package: there is no package.xml in it or anywhere below it"),
+        "{text}"
+    );
+    assert!(text.contains("give the directory of a package"), "{text}");
+    place.write("src/CATKIN_IGNORE", "");
+    let text = place.refused();
+    assert!(
+        text.contains("below its src") && text.contains("1 directories hold"),
+        "{text}"
+    );
+    let missing = inspect(&place.0.path().join("missing"), &Variables::default())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        missing.starts_with("cannot open ") && missing.contains("missing"),
+        "{missing}"
+    );
+    let file = inspect(&place.0.path().join("README"), &Variables::default())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        file.contains("README") && file.contains("not a directory"),
+        "{file}"
+    );
+}
+
+#[test]
+fn malformed_xml_names_its_file() {
+    let place = Place::new();
+    place.write("src/bad/package.xml", "<package>\n<name>x</nam></package>");
+    let text = place.refused();
+    assert!(text.contains("src/bad/package.xml, line 2"), "{text}");
+}
+
+const SETUP: &str = "#!/usr/bin/env sh\n# since this file is sourced ...\n\
+                     : ${_CATKIN_SETUP_DIR:=/home/me/ws/install}\n_SETUP_UTIL=\"$_CATKIN_SETUP_DIR/_setup_util.py\"\n";
+
+#[test]
+fn an_install_space_and_where_it_was_built_for() {
+    for below in ["", "install/"] {
+        let place = Place::new();
+        place
+            .write(&format!("{below}.catkin"), "")
+            .write(&format!("{below}setup.sh"), SETUP);
+        place
+            .package(&format!("{below}share/b"), "b", &["a"])
+            .package(&format!("{below}share/a"), "a", &[]);
+        place.write(&format!("{below}share/doc/readme"), "");
+        let Pushed::Installed(space) = place.inspect().unwrap() else {
+            panic!("not an install space")
+        };
+        assert_eq!(
+            space.prefix.as_deref(),
+            Some(Path::new("/home/me/ws/install"))
+        );
+        assert_eq!(
+            space.root,
+            place.0.path().canonicalize().unwrap().join(below)
+        );
+        let names: Vec<_> = space
+            .packages
+            .iter()
+            .map(|p| (p.manifest.name.as_str(), p.path.to_str().unwrap()))
+            .collect();
+        assert_eq!(names, [("a", "share/a"), ("b", "share/b")]);
+    }
+}
+
+#[test]
+fn an_install_space_that_names_no_usable_place() {
+    for script in [
+        "",
+        ": ${_CATKIN_SETUP_DIR:=relative}",
+        ": ${_CATKIN_SETUP_DIR:=/a/../../etc}",
+        ": ${_CATKIN_SETUP_DIR:=/a;rm}",
+    ] {
+        let place = Place::new();
+        place
+            .write(".catkin", "")
+            .write("setup.sh", script)
+            .package("share/a", "a", &[]);
+        let Pushed::Installed(space) = place.inspect().unwrap() else {
+            panic!("not an install space")
+        };
+        assert_eq!(space.prefix, None, "{script}");
+    }
+}
+
+#[test]
+fn sources_win_over_their_own_install_space() {
+    let place = Place::new();
+    place
+        .package("src/a", "a", &[])
+        .write("install/.catkin", "")
+        .write("install/setup.sh", SETUP);
+    place.package("install/share/a", "a", &[]);
+    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
+}
+
+#[test]
+fn a_devel_space_and_an_empty_install_space_are_refused() {
+    let place = Place::new();
+    place
+        .write(".catkin", "/home/me/ws/src")
+        .write("setup.sh", SETUP);
+    assert!(
+        place.refused().contains("is a devel space"),
+        "{}",
+        place.refused()
+    );
+    place.write(".catkin", "");
+    assert!(
+        place.refused().contains("without a share/*/package.xml"),
+        "{}",
+        place.refused()
+    );
+}
