@@ -1,3 +1,377 @@
-//! cloudroidd
+//! `cloudroidd`: one process per machine that turns pushed ROS packages into services, and gives each robot that
+//! connects a servant of its own. Here: config → build → serve → drain.
+//!
+//! ```text
+//!   cloudroidctl push ─▶ [push] ─▶ rootfs_builder ─▶ image ─▶ [state]
+//!   robot ─▶ [portal] ─▶ [choreographer] ─▶ servant engine ─▶ shim ─▶ container
+//!              └──────▶ bridge ◀──────────── ros (through the container's network namespace)
+//! ```
 
-fn main() {}
+#![deny(unsafe_code)]
+
+mod admission;
+mod bases;
+mod choreographer;
+mod config;
+mod definitions;
+mod doctor;
+mod errors;
+mod home;
+mod journal;
+mod names;
+mod portal;
+mod push;
+mod shim;
+mod sockets;
+mod state;
+mod supervision;
+mod tokens;
+mod views;
+mod works;
+
+use std::ffi::OsString;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::{Context, bail};
+use clap::{Parser, Subcommand};
+use servant::engine::Engine;
+use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
+use tokio::net::{TcpListener, UnixListener};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+use tracing_subscriber::EnvFilter;
+
+use admission::{Admission, Amount};
+use choreographer::Choreographer;
+use config::{Config, IsolationMode};
+use home::Home;
+use portal::App;
+use push::Pusher;
+use state::State;
+use tokens::Tokens;
+
+/// Robot packages as services, on this machine.
+#[derive(Debug, Parser)]
+#[command(name = "cloudroidd", version)]
+struct Arguments {
+    /// State directory; cloudroid below the user's data directory by default.
+    #[arg(long, env = "CLOUDROID_HOME", value_name = "DIR")]
+    home: Option<PathBuf>,
+    /// Address and port of the portal; 127.0.0.1:9090 by default.
+    #[arg(long, value_name = "ADDR")]
+    listen: Option<SocketAddr>,
+    /// Configuration file (TOML).
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    #[command(subcommand)]
+    verb: Option<Verb>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Check what this machine needs, without a daemon.
+    Doctor {
+        /// Print JSON.
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+fn main() -> ExitCode {
+    // A servant's shim forks: it must begin before any thread does.
+    let mut words = std::env::args_os().skip(1);
+    if words.next().is_some_and(|word| word == "shim") {
+        let directory = PathBuf::from(words.next().unwrap_or_default());
+        return servant::shim::run(&directory, Box::new(shim::MasterResident::default()));
+    }
+    let arguments = Arguments::parse();
+    let filter =
+        EnvFilter::try_from_env("CLOUDROID_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .init();
+    let outcome = match &arguments.verb {
+        Some(Verb::Doctor { json }) => examine(&arguments, *json),
+        None => prepare(arguments).and_then(|(config, home, machine)| {
+            let runtime = tokio::runtime::Builder::new_multi_thread()
+                .enable_all()
+                .build()?;
+            runtime.block_on(run(config, home, machine))
+        }),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn home_of(arguments: &Arguments) -> anyhow::Result<PathBuf> {
+    match &arguments.home {
+        Some(home) => Ok(home.clone()),
+        None => Ok(home::default_path(|name| std::env::var_os(name))?),
+    }
+}
+
+fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
+    let doctor = doctor::examine(&home_of(arguments)?, None);
+    if json {
+        println!("{}", serde_json::to_string_pretty(&doctor)?);
+        return Ok(());
+    }
+    for check in &doctor.checks {
+        println!("{:?} {}: {}", check.status, check.name, check.found);
+        if let Some(mend) = &check.mend {
+            println!("    {mend}");
+        }
+    }
+    if doctor.well() {
+        Ok(())
+    } else {
+        bail!("something that is needed is missing")
+    }
+}
+
+/// Everything that can be refused without having changed anything but the state directory.
+fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, doctor::Machine)> {
+    let mut config = Config::read(arguments.config.as_deref())?;
+    config.listen = arguments.listen.unwrap_or(config.listen);
+    config.check()?;
+    let path = home_of(&arguments)?;
+    if !nix::unistd::geteuid().is_root() {
+        bail!(
+            "servants are made by root, and this is user {}; run:\n    {}",
+            nix::unistd::geteuid(),
+            as_root()
+        );
+    }
+    let home = Home::open(&path)?;
+    let (machine, missing) = doctor::look(home.path());
+    if !missing.is_empty() {
+        bail!(
+            "this machine lacks what servants need:\n{}",
+            doctor::list(&missing)
+        );
+    }
+    if config.isolation == IsolationMode::Require && !machine.missing_limits.is_empty() {
+        bail!(
+            "this machine cannot limit servants in {}, and the configuration says isolation = \"require\"; \
+             see cloudroidd doctor, or set isolation = \"best-effort\"",
+            machine.missing_limits.join(", ")
+        );
+    }
+    Ok((config, home, machine))
+}
+
+/// This very command, by sudo.
+fn as_root() -> String {
+    let quoted = |word: OsString| {
+        let text = word.to_string_lossy().into_owned();
+        let plain = !text.is_empty()
+            && text
+                .chars()
+                .all(|c| c.is_ascii_alphanumeric() || "/._-=:,@".contains(c));
+        if plain {
+            text
+        } else {
+            format!("'{}'", text.replace('\'', "'\\''"))
+        }
+    };
+    let command: Vec<String> = std::env::args_os().map(quoted).collect();
+    format!("sudo {}", command.join(" "))
+}
+
+async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Result<()> {
+    let mut signals = supervision::Signals::new()?;
+    let listener = listen(config.listen).await?;
+    let socket = listen_on_socket(&home)?;
+    let app = build(config, &home, machine, listener.local_addr()?)?;
+    for warning in &app.machine.warnings {
+        tracing::warn!("{warning}");
+    }
+    app.pusher
+        .mend()
+        .await
+        .context("cannot mend the image store")?;
+    let adopted = app
+        .choreographer
+        .adopt()
+        .await
+        .context("cannot take over the servants of an earlier daemon")?;
+    let router = portal::router(Arc::clone(&app));
+    let tcp = tokio::spawn(portal::serve_tcp(
+        Arc::clone(&app),
+        router.clone(),
+        listener,
+    ));
+    let unix = tokio::spawn(portal::serve_unix(Arc::clone(&app), router, socket));
+    tracing::info!(
+        "cloudroidd {} listens on http://{} with state below {}; {adopted} servants adopted",
+        env!("CARGO_PKG_VERSION"),
+        app.listen,
+        home.path().display()
+    );
+    supervision::ready();
+    signals.end_asked().await;
+    supervision::stopping();
+    tokio::select! {
+        () = drain(&app) => {}
+        () = signals.end_asked() => tracing::warn!("ending at once"),
+    }
+    app.ending.cancel();
+    let _ = tokio::join!(tcp, unix);
+    let _ = std::fs::remove_file(home.socket());
+    Ok(())
+}
+
+fn build(
+    config: Config,
+    home: &Home,
+    machine: doctor::Machine,
+    listen: SocketAddr,
+) -> anyhow::Result<Arc<App>> {
+    let config = Arc::new(config);
+    let tokens = Tokens::new(&config.tokens)?;
+    let state = Arc::new(State::open(&home.database())?);
+    if !tokens.is_empty() {
+        state.release_robots(tokens.hashes())?;
+    }
+    let store = Arc::new(image::Store::open(&home.images(), &home.layers())?);
+    let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(&config, home)?)?);
+    let room = &config.room;
+    let memory = room
+        .memory
+        .map_or_else(supervision::machine_memory, |size| size.0);
+    let capacity = Amount::new(room.cpus.unwrap_or_else(config::machine_cores), memory);
+    let choreographer = Choreographer::new(
+        Arc::clone(&config),
+        Arc::clone(&state),
+        Arc::clone(&store),
+        Arc::clone(&engine),
+        Admission::new(capacity, room.queue),
+    );
+    let definitions = bases::directory(&config, home)?;
+    let pusher = Pusher::new(
+        &config,
+        home,
+        Arc::clone(&state),
+        Arc::clone(&store),
+        engine,
+        choreographer.clone(),
+        definitions,
+    )?;
+    Ok(Arc::new(App {
+        tokens,
+        listen,
+        home: home.path().to_owned(),
+        state,
+        store,
+        choreographer,
+        pusher: Arc::new(pusher),
+        machine,
+        started: state::now(),
+        sessions: TaskTracker::new(),
+        ending: CancellationToken::new(),
+        config,
+    }))
+}
+
+fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConfig> {
+    let program = std::env::current_exe().context("cannot find this very program")?;
+    let init = doctor::find_init().context("cloudroid-init is not beside cloudroidd")?;
+    let servants = home.path().join("servants");
+    let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
+    engine.default_limits = choreographer::engine_limits(&config.limits);
+    engine.isolation = match config.isolation {
+        IsolationMode::Require => Isolation::Require,
+        IsolationMode::BestEffort => Isolation::BestEffort,
+    };
+    Ok(engine)
+}
+
+async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
+    TcpListener::bind(address)
+        .await
+        .map_err(|error| match error.kind() {
+            std::io::ErrorKind::AddrInUse => anyhow::anyhow!(
+                "{address} is taken by another program (ss -ltnp 'sport = :{}' shows which); \
+             end it, or choose another port with --listen {}:{}",
+                address.port(),
+                address.ip(),
+                address.port().checked_add(1).unwrap_or(9090)
+            ),
+            _ => anyhow::Error::new(error).context(format!(
+                "cannot listen on {address}; choose another with --listen"
+            )),
+        })
+}
+
+fn listen_on_socket(home: &Home) -> anyhow::Result<UnixListener> {
+    use std::os::unix::fs::PermissionsExt;
+    let path = home.socket();
+    // Nobody else can be listening: the home is locked.
+    let _ = std::fs::remove_file(&path);
+    let listener = UnixListener::bind(&path)
+        .with_context(|| format!("cannot listen on {}", path.display()))?;
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600))
+        .with_context(|| format!("cannot protect {}", path.display()))?;
+    Ok(listener)
+}
+
+/// Lets pushes, sessions and, unless they are to be kept, servants end.
+async fn drain(app: &App) {
+    app.choreographer.close();
+    app.pusher.cancel_all().await;
+    if app.config.keeps_servants() {
+        tracing::info!(
+            "ending; {} servants go on",
+            app.choreographer.servants().len()
+        );
+        for handle in app.choreographer.servants() {
+            if let Some(works) = handle.works() {
+                works
+                    .bridge
+                    .close("the daemon is being restarted; connect again");
+            }
+        }
+    } else {
+        let ended = app
+            .choreographer
+            .stop("the daemon is ending", |_| true)
+            .await;
+        tracing::info!("ending; {} servants ended", ended.len());
+    }
+    app.sessions.close();
+    let _ = tokio::time::timeout(app.config.portal.drain.0, app.sessions.wait()).await;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        use clap::CommandFactory;
+        Arguments::command().debug_assert();
+    }
+
+    #[tokio::test]
+    async fn a_taken_port_is_named_with_the_way_out() {
+        let holder = listen("127.0.0.1:0".parse().expect("an address"))
+            .await
+            .expect("a free port");
+        let address = holder.local_addr().expect("bound");
+        let refused = listen(address).await.expect_err("taken").to_string();
+        assert!(
+            refused.contains(&address.to_string()) && refused.contains("--listen"),
+            "{refused}"
+        );
+    }
+}

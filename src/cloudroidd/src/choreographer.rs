@@ -1,0 +1,425 @@
+//! Decides which servants live: one for each robot of each service, started when the robot first connects, kept
+//! for a grace time after it left.
+//!
+//! ```text
+//!              no room                 engine, node or time-out
+//!          ┌───────────────┬─────────────┬────────────┬───────────┐
+//!          │               │             │            │           ▼
+//!      Requested ──▶ Admitted ──▶ Created ──▶ Starting ──▶ Ready ─┬▶ Draining ──▶ Failed
+//!      (asked for)   (room)     (container)  (nodes)   (interface)└▶ Draining ──▶ Stopped
+//!                                    ▲                   idle, stopped, removed
+//!                                    └── adopted: an earlier daemon started it
+//! ```
+//!
+//! Each servant has one task ([`driver`]) that alone changes its state; everybody else asks for its end, counts
+//! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided under one
+//! short lock: a servant that is being ended is never given to anyone.
+
+mod driver;
+mod handle;
+mod readiness;
+mod restart;
+mod tail;
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use api::Phase;
+use parking_lot::Mutex;
+use servant::engine::Engine;
+
+use crate::admission::{Admission, Amount};
+use crate::config::Config;
+use crate::definitions::Definitions;
+use crate::errors::Error;
+use crate::journal::Journal;
+use crate::names;
+use crate::state::{self, NewEvent, RevisionRecord, ServantRecord, State};
+
+pub(crate) use driver::how_it_ended;
+pub use handle::{Handle, Lease};
+pub use tail::{read as read_log, record as log_record};
+
+use driver::Beginning;
+
+/// Decides which servants live. Cheap to clone.
+#[derive(Clone)]
+pub struct Choreographer {
+    inner: Arc<Inner>,
+}
+
+/// What the choreographer and its drivers share.
+pub(crate) struct Inner {
+    pub(crate) config: Arc<Config>,
+    pub(crate) state: Arc<State>,
+    pub(crate) journal: Journal,
+    pub(crate) store: Arc<image::Store>,
+    pub(crate) engine: Arc<dyn Engine>,
+    pub(crate) admission: Admission,
+    pub(crate) definitions: Definitions,
+    servants: Mutex<Servants>,
+    ending: AtomicBool,
+}
+
+#[derive(Default)]
+struct Servants {
+    /// All that live, by id.
+    all: HashMap<String, Arc<Handle>>,
+    /// Those that a robot may be given, by service and robot.
+    given: HashMap<(String, String), Arc<Handle>>,
+}
+
+impl Choreographer {
+    /// One that starts servants by `engine`.
+    pub fn new(
+        config: Arc<Config>,
+        state: Arc<State>,
+        store: Arc<image::Store>,
+        engine: Arc<dyn Engine>,
+        admission: Admission,
+    ) -> Choreographer {
+        let journal = Journal::new(Arc::clone(&state));
+        let inner = Inner {
+            config,
+            state,
+            journal,
+            store,
+            engine,
+            admission,
+            definitions: Definitions::default(),
+            servants: Mutex::default(),
+            ending: AtomicBool::new(false),
+        };
+        Choreographer {
+            inner: Arc::new(inner),
+        }
+    }
+
+    /// The servant of `robot` for `service`: the one that is there, or a new one. Comes back at once; the lease
+    /// tells when the servant can be used, and keeps it for as long as it lives.
+    pub fn ensure(&self, service: &str, robot: &str, anonymous: bool) -> Result<Lease, Error> {
+        let inner = &self.inner;
+        let Some(revision) = inner.state.current(service)? else {
+            return Err(Error::UnknownService {
+                name: service.to_owned(),
+                exists: inner.state.service_names()?,
+            });
+        };
+        let key = (service.to_owned(), robot.to_owned());
+        let (handle, lease) = {
+            let mut servants = inner.servants.lock();
+            if inner.ending.load(Ordering::SeqCst) {
+                return Err(Error::Ending);
+            }
+            if let Some(handle) = servants.given.get(&key) {
+                let outdated =
+                    handle.revision.number != revision.number && handle.connections() == 0;
+                if !outdated {
+                    return Ok(Lease::new(Arc::clone(handle)));
+                }
+                handle.end("a newer revision takes its place");
+            }
+            let handle = Arc::new(Handle::new(
+                names::servant_id(service),
+                robot.to_owned(),
+                anonymous,
+                revision.plan.limits.or(inner.config.limits),
+                Arc::new(revision),
+                state::now(),
+            ));
+            servants.all.insert(handle.id.clone(), Arc::clone(&handle));
+            servants.given.insert(key, Arc::clone(&handle));
+            let lease = Lease::new(Arc::clone(&handle));
+            (handle, lease)
+        };
+        tokio::spawn(driver::drive(Arc::clone(inner), handle, Beginning::Asked));
+        Ok(lease)
+    }
+
+    /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
+    pub async fn adopt(&self) -> Result<usize, Error> {
+        let inner = &self.inner;
+        let running = inner.engine.adopt().await?;
+        let mut records: HashMap<String, ServantRecord> = inner
+            .state
+            .servants()?
+            .into_iter()
+            .map(|record| (record.id.clone(), record))
+            .collect();
+        let mut adopted = 0;
+        for servant in running {
+            let record = records.remove(servant.id());
+            let revision = match &record {
+                Some(record) => inner.state.revision(&record.service, record.revision)?,
+                None => None,
+            };
+            match (record, revision) {
+                (Some(record), Some(revision)) => {
+                    self.adopt_one(record, revision, servant);
+                    adopted += 1;
+                }
+                _ => {
+                    inner.journal.warning(
+                        "servant-unknown",
+                        &format!(
+                            "ended servant {}, which belongs to no service any more",
+                            servant.id()
+                        ),
+                        &NewEvent {
+                            servant: Some(servant.id()),
+                            ..NewEvent::default()
+                        },
+                    );
+                    servant.stop().await?;
+                    inner.state.remove_servant(servant.id())?;
+                }
+            }
+        }
+        for gone in records.into_values() {
+            inner.state.remove_servant(&gone.id)?;
+            inner.journal.warning(
+                "servant-lost",
+                &format!(
+                    "servant {} of {} for {} ended while no daemon ran",
+                    gone.id, gone.service, gone.robot
+                ),
+                &NewEvent {
+                    service: Some(&gone.service),
+                    servant: Some(&gone.id),
+                    robot: Some(&gone.robot),
+                },
+            );
+        }
+        Ok(adopted)
+    }
+
+    fn adopt_one(
+        &self,
+        record: ServantRecord,
+        revision: RevisionRecord,
+        servant: Arc<dyn servant::engine::Servant>,
+    ) {
+        let inner = &self.inner;
+        let limits = revision.plan.limits.or(inner.config.limits);
+        let key = (record.service, record.robot.clone());
+        let handle = Arc::new(Handle::new(
+            record.id.clone(),
+            record.robot,
+            record.anonymous,
+            limits,
+            Arc::new(revision),
+            record.created,
+        ));
+        {
+            let mut servants = inner.servants.lock();
+            servants.all.insert(record.id, Arc::clone(&handle));
+            servants.given.insert(key, Arc::clone(&handle));
+        }
+        let permit = inner.admission.adopt(inner.promised(&handle));
+        tokio::spawn(driver::drive(
+            Arc::clone(inner),
+            handle,
+            Beginning::Adopted(servant, permit),
+        ));
+    }
+
+    /// All servants that live, oldest first.
+    pub fn servants(&self) -> Vec<Arc<Handle>> {
+        let mut servants: Vec<_> = self.inner.servants.lock().all.values().cloned().collect();
+        servants.sort_by(|one, other| (one.created, &one.id).cmp(&(other.created, &other.id)));
+        servants
+    }
+
+    /// One servant.
+    pub fn servant(&self, id: &str) -> Result<Arc<Handle>, Error> {
+        let servants = self.inner.servants.lock();
+        servants.all.get(id).cloned().ok_or_else(|| {
+            let mut exists: Vec<String> = servants.all.keys().cloned().collect();
+            exists.sort();
+            Error::UnknownServant {
+                id: id.to_owned(),
+                exists,
+            }
+        })
+    }
+
+    /// Ends the servants that `chosen` picks and waits until nothing is left of them; gives their ids.
+    pub async fn stop(&self, reason: &str, chosen: impl Fn(&Handle) -> bool) -> Vec<String> {
+        let leaving: Vec<Arc<Handle>> = {
+            let servants = self.inner.servants.lock();
+            let leaving = servants
+                .all
+                .values()
+                .filter(|handle| chosen(handle))
+                .cloned()
+                .collect::<Vec<_>>();
+            for handle in &leaving {
+                handle.end(reason);
+            }
+            leaving
+        };
+        let mut ids = Vec::new();
+        for handle in leaving {
+            handle.ended().await;
+            ids.push(handle.id.clone());
+        }
+        ids.sort();
+        ids
+    }
+
+    /// Starts no more servants.
+    pub fn close(&self) {
+        let _servants = self.inner.servants.lock();
+        self.inner.ending.store(true, Ordering::SeqCst);
+    }
+
+    /// Forgets the definitions of all images but those.
+    pub fn keep_definitions(&self, images: &BTreeSet<String>) {
+        self.inner.definitions.keep_only(images);
+    }
+
+    /// What the machine promises.
+    pub fn admission(&self) -> &Admission {
+        &self.inner.admission
+    }
+
+    /// Refuses limits that would never be admitted.
+    pub fn check_limits(&self, limits: &api::Limits) -> Result<(), Error> {
+        Ok(self
+            .inner
+            .admission
+            .check(self.inner.promised_for(limits))?)
+    }
+
+    /// Images that live servants were started from; they must stay.
+    pub fn images_in_use(&self) -> Vec<String> {
+        self.inner
+            .servants
+            .lock()
+            .all
+            .values()
+            .map(|handle| handle.revision.image.clone())
+            .collect()
+    }
+}
+
+impl Inner {
+    fn promised(&self, handle: &Handle) -> Amount {
+        self.promised_for(&handle.revision.plan.limits)
+    }
+
+    /// Limits asked for at push are a promise; else the configured reserve is.
+    fn promised_for(&self, asked: &api::Limits) -> Amount {
+        let reserve = &self.config.servant;
+        Amount::new(
+            asked.cpus.unwrap_or(reserve.reserve_cpus),
+            asked.memory.unwrap_or(reserve.reserve_memory).0,
+        )
+    }
+
+    /// Ends the servant that has been idle longest, if there is one: someone waits for its room.
+    fn make_room(&self) {
+        let servants = self.servants.lock();
+        let idle = servants
+            .all
+            .values()
+            .filter(|handle| handle.idle_until().is_some() && !handle.is_ending());
+        if let Some(longest) = idle.min_by_key(|handle| handle.idle_until()) {
+            longest.end("its room was needed");
+        }
+    }
+
+    /// Takes the servant out of reach if nobody is connected; true when so.
+    fn retire_if_idle(&self, handle: &Arc<Handle>) -> bool {
+        let mut servants = self.servants.lock();
+        let idle = handle.connections() == 0;
+        if idle {
+            servants.take_back(handle);
+        }
+        idle
+    }
+
+    /// Takes the servant out of reach.
+    fn retire(&self, handle: &Arc<Handle>) {
+        self.servants.lock().take_back(handle);
+    }
+
+    fn forget(&self, handle: &Arc<Handle>) {
+        let mut servants = self.servants.lock();
+        servants.take_back(handle);
+        servants.all.remove(&handle.id);
+    }
+}
+
+impl Servants {
+    fn take_back(&mut self, handle: &Arc<Handle>) {
+        let key = (handle.service().to_owned(), handle.robot.clone());
+        if self
+            .given
+            .get(&key)
+            .is_some_and(|given| Arc::ptr_eq(given, handle))
+        {
+            self.given.remove(&key);
+        }
+    }
+}
+
+/// A servant as the API shows it.
+pub async fn describe(handle: &Handle) -> api::Servant {
+    let life = handle.life();
+    let works = handle.works();
+    let running = matches!(life.phase, Phase::Created | Phase::Starting | Phase::Ready);
+    let container = handle.container().filter(|_| running);
+    let enforced = container.as_ref().map(|container| container.enforced());
+    let (usage, pids) = match &container {
+        Some(container) => (
+            container.usage().await.ok(),
+            container.processes().await.unwrap_or_default(),
+        ),
+        None => (None, Vec::new()),
+    };
+    api::Servant {
+        id: handle.id.clone(),
+        service: handle.service().to_owned(),
+        revision: handle.revision.number,
+        robot: handle.robot.clone(),
+        phase: life.phase,
+        reason: life.reason(),
+        created: handle.created,
+        connections: handle.connections(),
+        idle_until: handle.idle_until(),
+        limits: handle.limits,
+        cgroup_version: enforced
+            .as_ref()
+            .map_or(0, |enforced| enforced.cgroup_version),
+        enforced: enforced.map(|enforced| limits_of(&enforced.limits)),
+        usage: usage.map(|usage| api::Usage {
+            cpu_usec: usage.cpu_usec,
+            memory: usage.memory,
+            pids: usage.pids,
+            oom_kills: usage.oom_kills,
+        }),
+        pids,
+        dropped: works.map_or(0, |works| works.dropped()),
+    }
+}
+
+fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
+    api::Limits {
+        cpus: limits.cpus,
+        cpu_weight: limits.cpu_weight,
+        memory: limits.memory.map(api::Size),
+        pids: limits.pids,
+    }
+}
+
+/// Limits as the engine takes them.
+pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
+    servant::spec::Limits {
+        cpus: limits.cpus,
+        cpu_weight: limits.cpu_weight,
+        memory: limits.memory.map(|memory| memory.0),
+        pids: limits.pids,
+    }
+}

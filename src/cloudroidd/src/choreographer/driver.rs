@@ -1,0 +1,592 @@
+//! The task of one servant: from asked for to gone. It alone changes the servant's state.
+
+use std::collections::HashMap;
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::Phase;
+use futures_util::StreamExt;
+use futures_util::future::BoxFuture;
+use futures_util::stream::FuturesUnordered;
+use package::interface::Interface;
+use servant::engine::{ContainerState, NodeEvent, NodeExit, Servant};
+use servant::spec::{NodeSpec, Profile, Spec};
+use tokio::sync::broadcast::error::RecvError;
+use tokio::time::{Instant, timeout_at};
+
+use super::handle::{Failure, Handle};
+use super::restart::Backoff;
+use super::{Inner, engine_limits, readiness, tail};
+use crate::admission::Permit;
+use crate::definitions;
+use crate::errors::Error;
+use crate::state::{self, NewEvent, ServantRecord};
+use crate::works::Works;
+
+/// Lines of the log that explain a failure.
+const LOG_LINES: usize = 20;
+/// When nothing changes for so long although something of the interface is missing, it is not coming.
+const SETTLED: Duration = Duration::from_secs(5);
+
+/// How a servant begins.
+pub(super) enum Beginning {
+    /// A robot asked for it.
+    Asked,
+    /// An earlier daemon started it.
+    Adopted(Arc<dyn Servant>, Permit),
+}
+
+/// Runs the servant's life to its end and cleans up after it.
+pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, beginning: Beginning) {
+    let about = NewEvent {
+        service: Some(handle.service()),
+        servant: Some(&handle.id),
+        robot: Some(&handle.robot),
+    };
+    let mut permit = None;
+    let outcome = live(&inner, &handle, beginning, &mut permit).await;
+    inner.retire(&handle);
+    let outcome = outcome.map_err(|failure| with_log(failure, &handle));
+    handle.set_over(&outcome);
+    let who = format!(
+        "servant {} of {} for {}",
+        handle.id,
+        handle.service(),
+        handle.robot
+    );
+    let (last, ended) = match &outcome {
+        Ok(reason) => {
+            inner.journal.info(
+                "servant-stopped",
+                &format!("{who} was ended: {reason}"),
+                &about,
+            );
+            (Phase::Stopped, reason.clone())
+        }
+        Err(failure) => {
+            let reason = handle.life().reason().unwrap_or_default();
+            let kind = if matches!(failure, Failure::Full(_)) {
+                "servant-refused"
+            } else {
+                "servant-failed"
+            };
+            inner
+                .journal
+                .error(kind, &format!("{who} {reason}"), &about);
+            (Phase::Failed, format!("the servant {reason}"))
+        }
+    };
+    if let Some(works) = handle.works() {
+        works.bridge.close(&ended);
+    }
+    if let Some(container) = handle.container()
+        && let Err(error) = container.stop().await
+    {
+        inner.journal.error(
+            "servant-leftover",
+            &format!("{who} could not be cleaned up: {error}"),
+            &about,
+        );
+    }
+    if let Err(error) = inner.state.remove_servant(&handle.id) {
+        tracing::error!("servant {} could not be forgotten: {error}", handle.id);
+    }
+    drop(permit);
+    inner.forget(&handle);
+    handle.set_phase(last);
+}
+
+/// From asked for to why it ended as it should, or why it failed.
+async fn live(
+    inner: &Arc<Inner>,
+    handle: &Arc<Handle>,
+    beginning: Beginning,
+    kept: &mut Option<Permit>,
+) -> Result<String, Failure> {
+    let (container, fresh) = match beginning {
+        Beginning::Asked => {
+            let permit = tokio::select! {
+                permit = admit(inner, handle) => permit?,
+                reason = handle.end_asked() => return Ok(reason),
+                () = abandoned(handle) => return Ok("its robot left before there was room".to_owned()),
+            };
+            *kept = Some(permit);
+            handle.set_phase(Phase::Admitted);
+            (start(inner, handle).await?, true)
+        }
+        Beginning::Adopted(container, permit) => {
+            *kept = Some(permit);
+            (container, false)
+        }
+    };
+    handle.set_container(Arc::clone(&container));
+    handle.set_phase(Phase::Created);
+    let mut nodes = Nodes::new(inner, handle, &container);
+    let mut supervised = pin!(run(inner, handle, &container, &mut nodes, fresh));
+    tokio::select! {
+        outcome = &mut supervised => outcome,
+        reason = handle.end_asked() => Ok(reason),
+        failure = container_over(&container) => Err(failure),
+    }
+}
+
+/// Reaches the servant's ROS, waits for its interface, and then until nobody needs it.
+async fn run(
+    inner: &Arc<Inner>,
+    handle: &Arc<Handle>,
+    container: &Arc<dyn Servant>,
+    nodes: &mut Nodes<'_>,
+    fresh: bool,
+) -> Result<String, Failure> {
+    let limit = inner.config.servant.start.0;
+    let deadline = Instant::now() + limit;
+    let works = timeout_at(deadline, Works::reach(inner, handle, container))
+        .await
+        .map_err(|_| {
+            Failure::broken(format!(
+                "did not start its ROS Master within {} s",
+                limit.as_secs()
+            ))
+        })?
+        .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))?;
+    handle.set_works(Arc::clone(&works));
+    handle.set_phase(Phase::Starting);
+    tokio::select! {
+        ready = interface_there(inner, handle, &works, deadline) => ready?,
+        failure = nodes.supervise() => return Err(failure),
+    }
+    handle.set_phase(Phase::Ready);
+    let took = state::now().saturating_sub(handle.created);
+    let message = if fresh {
+        format!(
+            "servant {} of {} is ready for {} after {took} ms",
+            handle.id,
+            handle.service(),
+            handle.robot
+        )
+    } else {
+        format!(
+            "servant {} of {} was adopted, for {}",
+            handle.id,
+            handle.service(),
+            handle.robot
+        )
+    };
+    let about = NewEvent {
+        service: Some(handle.service()),
+        servant: Some(&handle.id),
+        robot: Some(&handle.robot),
+    };
+    inner.journal.info(
+        if fresh {
+            "servant-ready"
+        } else {
+            "servant-adopted"
+        },
+        &message,
+        &about,
+    );
+    tokio::select! {
+        reason = unneeded(inner, handle) => Ok(reason),
+        failure = nodes.supervise() => Err(failure),
+    }
+}
+
+async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
+    let deadline = inner.config.room.deadline.0;
+    let wanted = inner.promised(handle);
+    inner
+        .admission
+        .admit(wanted, deadline, || inner.make_room())
+        .await
+        .map_err(Failure::Full)
+}
+
+/// Comes back when nobody is connected.
+async fn abandoned(handle: &Handle) {
+    let _ = handle
+        .watch_connections()
+        .wait_for(|count| *count == 0)
+        .await;
+}
+
+async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Servant>, Failure> {
+    let broken = |error: Error| Failure::broken(format!("could not be started: {error}"));
+    let spec = spec(inner, handle).await.map_err(broken)?;
+    // Before it runs: a daemon killed now finds it again.
+    let record = ServantRecord {
+        id: handle.id.clone(),
+        service: handle.service().to_owned(),
+        revision: handle.revision.number,
+        robot: handle.robot.clone(),
+        anonymous: handle.anonymous,
+        created: handle.created,
+    };
+    inner
+        .state
+        .add_servant(&record)
+        .map_err(|error| broken(error.into()))?;
+    inner
+        .engine
+        .start(spec)
+        .await
+        .map_err(|error| broken(error.into()))
+}
+
+async fn spec(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Spec, Error> {
+    let store = Arc::clone(&inner.store);
+    let digest = handle.revision.image.clone();
+    let layers = tokio::task::spawn_blocking(move || definitions::layers(&store, &digest))
+        .await
+        .map_err(|_| Error::Internal("extracting layers"))??;
+    let plan = &handle.revision.plan;
+    Ok(Spec {
+        id: handle.id.clone(),
+        layers,
+        writable: None,
+        profile: Profile::Servant,
+        limits: engine_limits(&handle.limits),
+        environment: plan.environment.clone(),
+        nodes: plan.nodes.clone(),
+        owned_directories: Vec::new(),
+        mounts: Vec::new(),
+        resident: crate::shim::resident_config(&plan.parameters),
+    })
+}
+
+/// Comes back when the container has ended, which nobody asked for.
+async fn container_over(container: &Arc<dyn Servant>) -> Failure {
+    let mut states = container.state();
+    let over = |state: &ContainerState| {
+        matches!(
+            state,
+            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+        )
+    };
+    match states.wait_for(over).await.as_deref() {
+        Ok(ContainerState::Stopped { reason }) => Failure::broken(format!("ended: {reason}")),
+        Ok(ContainerState::Failed { reason }) => Failure::broken(format!("failed: {reason}")),
+        _ => Failure::broken("was lost by the engine"),
+    }
+}
+
+/// Waits until everything that the interface promises is registered.
+async fn interface_there(
+    inner: &Inner,
+    handle: &Handle,
+    works: &Works,
+    deadline: Instant,
+) -> Result<(), Failure> {
+    let interface: &Interface = &handle.revision.interface;
+    let mut graphs = works.bus.graph();
+    loop {
+        let graph = graphs.borrow_and_update().clone();
+        let missing = readiness::missing(interface, &graph);
+        if missing.is_empty() {
+            return Ok(());
+        }
+        let nodes_missing = readiness::missing_nodes(interface, &graph);
+        // Topics can come and go with what a node is told; nodes cannot.
+        let until = if nodes_missing.is_empty() {
+            deadline.min(Instant::now() + SETTLED)
+        } else {
+            deadline
+        };
+        match timeout_at(until, graphs.changed()).await {
+            Ok(Ok(())) => {}
+            Ok(Err(_)) => return Err(Failure::broken("lost its ROS Master")),
+            Err(_) if nodes_missing.is_empty() => {
+                let message = format!(
+                    "servant {} is ready without {}",
+                    handle.id,
+                    missing.join(", ")
+                );
+                let about = NewEvent {
+                    service: Some(handle.service()),
+                    servant: Some(&handle.id),
+                    robot: Some(&handle.robot),
+                };
+                inner
+                    .journal
+                    .warning("interface-incomplete", &message, &about);
+                return Ok(());
+            }
+            Err(_) => {
+                let limit = inner.config.servant.start.0.as_secs();
+                return Err(Failure::broken(format!(
+                    "did not become ready within {limit} s: {} did not register ({} missing)",
+                    nodes_missing.join(", "),
+                    missing.join(", ")
+                )));
+            }
+        }
+    }
+}
+
+/// Comes back when nobody has been connected for the grace time.
+async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
+    let times = &inner.config.servant;
+    let grace = if handle.anonymous {
+        times.anonymous_grace.0
+    } else {
+        times.grace.0
+    };
+    let mut connections = handle.watch_connections();
+    loop {
+        let _ = connections.wait_for(|count| *count == 0).await;
+        handle.set_idle_until(Some(state::now() + grace.as_millis() as u64));
+        let returned = tokio::time::timeout(grace, connections.wait_for(|count| *count > 0))
+            .await
+            .is_ok();
+        handle.set_idle_until(None);
+        if !returned && inner.retire_if_idle(handle) {
+            return format!("no robot was connected for {} s", grace.as_secs());
+        }
+    }
+}
+
+fn with_log(failure: Failure, handle: &Handle) -> Failure {
+    match (failure, handle.container()) {
+        (Failure::Broken { reason, log }, Some(container)) if log.is_empty() => {
+            let lines = tail::read(&container.log_path(), LOG_LINES, None);
+            let log = lines
+                .into_iter()
+                .map(|line| format!("{}: {}", line.node, line.line))
+                .collect();
+            Failure::Broken { reason, log }
+        }
+        (failure, _) => failure,
+    }
+}
+
+type Ended<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
+
+/// The servant's nodes: who ended, and who is started again. A node that asked for `respawn` is the engine's.
+struct Nodes<'a> {
+    inner: &'a Inner,
+    handle: &'a Handle,
+    container: &'a Arc<dyn Servant>,
+    running: FuturesUnordered<Ended<'a>>,
+    pausing: FuturesUnordered<BoxFuture<'a, NodeSpec>>,
+    backoffs: HashMap<String, Backoff>,
+    events: tokio::sync::broadcast::Receiver<NodeEvent>,
+    /// Nodes that still run or will run again.
+    alive: usize,
+}
+
+impl<'a> Nodes<'a> {
+    fn new(inner: &'a Inner, handle: &'a Handle, container: &'a Arc<dyn Servant>) -> Nodes<'a> {
+        let nodes = Nodes {
+            inner,
+            handle,
+            container,
+            running: FuturesUnordered::new(),
+            pausing: FuturesUnordered::new(),
+            backoffs: HashMap::new(),
+            events: container.events(),
+            alive: handle.revision.plan.nodes.len(),
+        };
+        for node in handle
+            .revision
+            .plan
+            .nodes
+            .iter()
+            .filter(|node| !node.respawn)
+        {
+            nodes.watch(node.clone());
+        }
+        nodes
+    }
+
+    fn watch(&self, node: NodeSpec) {
+        let container = self.container;
+        let began = Instant::now();
+        self.running.push(Box::pin(async move {
+            let exit = container.wait_node(&node.name).await;
+            (node, began, exit)
+        }));
+    }
+
+    /// Comes back when the servant has lost a node that it cannot do without.
+    async fn supervise(&mut self) -> Failure {
+        loop {
+            tokio::select! {
+                Some((node, began, exit)) = self.running.next() => {
+                    if let Err(failure) = self.ended(node, began, exit) {
+                        return failure;
+                    }
+                }
+                Some(node) = self.pausing.next() => {
+                    if let Err(failure) = self.restart(node).await {
+                        return failure;
+                    }
+                }
+                event = self.events.recv() => match event {
+                    Ok(NodeEvent::Respawning { node }) => self.tell("node-respawned", &format!("{node} is started again")),
+                    Ok(_) | Err(RecvError::Lagged(_)) => {}
+                    Err(RecvError::Closed) => std::future::pending().await,
+                },
+            }
+        }
+    }
+
+    fn ended(
+        &mut self,
+        node: NodeSpec,
+        began: Instant,
+        exit: Result<NodeExit, servant::Error>,
+    ) -> Result<(), Failure> {
+        // The engine lost it: the container's own state says why.
+        let Ok(exit) = exit else { return Ok(()) };
+        let how = how_it_ended(&exit, &self.handle.limits);
+        if exit.out_of_memory {
+            // What it knew is lost, and it would do the same again: its robot is told and begins anew.
+            return Err(self.failure(&node, format!("lost {}: it {how}", node.name)));
+        }
+        let failed = exit.code != Some(0);
+        if failed && self.handle.life().phase < Phase::Ready {
+            return Err(self.failure(&node, format!("did not become ready: {} {how}", node.name)));
+        }
+        if failed && self.handle.revision.plan.restart {
+            let backoff = self.backoffs.entry(node.name.clone()).or_default();
+            let Some(pause) = backoff.failed(began.elapsed()) else {
+                return Err(self.failure(
+                    &node,
+                    format!("gave {} up: it {how}, again and again", node.name),
+                ));
+            };
+            self.tell(
+                "node-failed",
+                &format!(
+                    "{} {how}; it is started again in {} ms",
+                    node.name,
+                    pause.as_millis()
+                ),
+            );
+            self.pausing.push(Box::pin(async move {
+                tokio::time::sleep(pause).await;
+                node
+            }));
+            return Ok(());
+        }
+        self.alive -= 1;
+        if self.alive == 0 {
+            return Err(self.failure(&node, format!("has no node left: {} {how}", node.name)));
+        }
+        self.tell("node-ended", &format!("{} {how}", node.name));
+        Ok(())
+    }
+
+    async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
+        match self.container.start_node(node.clone()).await {
+            Ok(()) => {
+                self.watch(node);
+                Ok(())
+            }
+            Err(error) => Err(self.failure(
+                &node,
+                format!("could not start {} again: {error}", node.name),
+            )),
+        }
+    }
+
+    fn failure(&self, node: &NodeSpec, reason: String) -> Failure {
+        let lines = tail::read(&self.container.log_path(), LOG_LINES, Some(&node.name));
+        Failure::Broken {
+            reason,
+            log: lines.into_iter().map(|line| line.line).collect(),
+        }
+    }
+
+    fn tell(&self, kind: &str, message: &str) {
+        let about = NewEvent {
+            service: Some(self.handle.service()),
+            servant: Some(&self.handle.id),
+            robot: Some(&self.handle.robot),
+        };
+        self.inner.journal.warning(
+            kind,
+            &format!("servant {}: {message}", self.handle.id),
+            &about,
+        );
+    }
+}
+
+pub(crate) fn how_it_ended(exit: &NodeExit, limits: &api::Limits) -> String {
+    if let Some(error) = &exit.exec_error {
+        return format!("could not be executed: {error}");
+    }
+    if exit.out_of_memory {
+        let limit = limits
+            .memory
+            .map_or_else(|| "the limit".to_owned(), |memory| memory.to_string());
+        return format!(
+            "was killed because the servant needed more memory than its limit of {limit}"
+        );
+    }
+    match (exit.code, exit.signal) {
+        (Some(code), _) => format!("exited with status {code}"),
+        (None, Some(signal)) => match nix::sys::signal::Signal::try_from(signal) {
+            Ok(name) => format!("was killed by {name}"),
+            Err(_) => format!("was killed by signal {signal}"),
+        },
+        (None, None) => "ended".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn exit() -> NodeExit {
+        NodeExit {
+            code: None,
+            signal: None,
+            out_of_memory: false,
+            exec_error: None,
+        }
+    }
+
+    #[test]
+    fn ends_are_told_in_words() {
+        let limits = api::Limits {
+            memory: Some(api::Size(128 << 20)),
+            ..api::Limits::default()
+        };
+        let cases = [
+            (
+                NodeExit {
+                    code: Some(3),
+                    ..exit()
+                },
+                "exited with status 3",
+            ),
+            (
+                NodeExit {
+                    signal: Some(11),
+                    ..exit()
+                },
+                "was killed by SIGSEGV",
+            ),
+            (
+                NodeExit {
+                    signal: Some(9),
+                    out_of_memory: true,
+                    ..exit()
+                },
+                "was killed because the servant needed more memory than its limit of 128M",
+            ),
+            (
+                NodeExit {
+                    exec_error: Some("no such file".into()),
+                    ..exit()
+                },
+                "could not be executed: no such file",
+            ),
+        ];
+        for (exit, words) in cases {
+            assert_eq!(how_it_ended(&exit, &limits), words);
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! A servant as everybody but its driver sees it.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+
+use api::{Limits, Millis, Phase};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::admission::Refused;
+use crate::errors::Error;
+use crate::state::RevisionRecord;
+use crate::works::Works;
+
+/// Why a servant failed.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Failure {
+    /// There was no room for it.
+    Full(Refused),
+    /// Anything else.
+    Broken {
+        /// What happened, beginning with a verb.
+        reason: String,
+        /// Last lines of its log.
+        log: Vec<String>,
+    },
+}
+
+impl Failure {
+    /// Without a log.
+    pub fn broken(reason: impl Into<String>) -> Failure {
+        Failure::Broken {
+            reason: reason.into(),
+            log: Vec::new(),
+        }
+    }
+}
+
+/// Where a servant is in its life.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Life {
+    /// The state.
+    pub phase: Phase,
+    /// Set as soon as it has failed, while it is still being cleaned up.
+    pub failure: Option<Failure>,
+    /// Why it was ended, when that was asked for.
+    pub ended: Option<String>,
+}
+
+impl Life {
+    /// Why it is ending or has ended.
+    pub fn reason(&self) -> Option<String> {
+        match &self.failure {
+            Some(Failure::Full(refused)) => Some(refused.to_string()),
+            Some(Failure::Broken { reason, .. }) => Some(reason.clone()),
+            None => self.ended.clone(),
+        }
+    }
+
+    fn is_over(&self) -> bool {
+        self.failure.is_some() || self.phase >= Phase::Draining
+    }
+}
+
+/// A servant.
+pub struct Handle {
+    /// Its id.
+    pub id: String,
+    /// Its robot.
+    pub robot: String,
+    /// The robot named no name; nobody can come back to this servant.
+    pub anonymous: bool,
+    /// Limits asked for.
+    pub limits: Limits,
+    /// What it is started from.
+    pub revision: Arc<RevisionRecord>,
+    /// When it was asked for.
+    pub created: Millis,
+    life: watch::Sender<Life>,
+    connections: watch::Sender<usize>,
+    /// 0: not idle.
+    idle_until: AtomicU64,
+    end: CancellationToken,
+    end_reason: OnceLock<String>,
+    container: OnceLock<Arc<dyn servant::engine::Servant>>,
+    works: OnceLock<Arc<Works>>,
+}
+
+impl Handle {
+    /// A servant that has been asked for.
+    pub fn new(
+        id: String,
+        robot: String,
+        anonymous: bool,
+        limits: Limits,
+        revision: Arc<RevisionRecord>,
+        created: Millis,
+    ) -> Handle {
+        Handle {
+            id,
+            robot,
+            anonymous,
+            limits,
+            revision,
+            created,
+            life: watch::Sender::new(Life {
+                phase: Phase::Requested,
+                failure: None,
+                ended: None,
+            }),
+            connections: watch::Sender::new(0),
+            idle_until: AtomicU64::new(0),
+            end: CancellationToken::new(),
+            end_reason: OnceLock::new(),
+            container: OnceLock::new(),
+            works: OnceLock::new(),
+        }
+    }
+
+    /// Its service.
+    pub fn service(&self) -> &str {
+        &self.revision.service
+    }
+
+    /// Where it is now.
+    pub fn life(&self) -> Life {
+        self.life.borrow().clone()
+    }
+
+    /// Where it is now and later.
+    pub fn watch(&self) -> watch::Receiver<Life> {
+        self.life.subscribe()
+    }
+
+    /// Connections that use it now.
+    pub fn connections(&self) -> usize {
+        *self.connections.borrow()
+    }
+
+    /// Its container, once made.
+    pub fn container(&self) -> Option<Arc<dyn servant::engine::Servant>> {
+        self.container.get().cloned()
+    }
+
+    /// Its ROS and its bridge, once reached.
+    pub fn works(&self) -> Option<Arc<Works>> {
+        self.works.get().cloned()
+    }
+
+    /// When it is ended if nobody connects before.
+    pub fn idle_until(&self) -> Option<Millis> {
+        Some(self.idle_until.load(Ordering::Relaxed)).filter(|until| *until > 0)
+    }
+
+    /// Asks for its end. The first reason stays.
+    pub fn end(&self, reason: &str) {
+        let _ = self.end_reason.set(reason.to_owned());
+        self.end.cancel();
+    }
+
+    /// Whether its end has been asked for.
+    pub fn is_ending(&self) -> bool {
+        self.end.is_cancelled()
+    }
+
+    /// Comes back when its end is asked for, with the reason.
+    pub(super) async fn end_asked(&self) -> String {
+        self.end.cancelled().await;
+        self.end_reason.get().cloned().unwrap_or_default()
+    }
+
+    /// Comes back when nothing is left of it.
+    pub async fn ended(&self) {
+        let mut life = self.watch();
+        let _ = life
+            .wait_for(|life| matches!(life.phase, Phase::Stopped | Phase::Failed))
+            .await;
+    }
+
+    pub(super) fn set_phase(&self, phase: Phase) {
+        self.life.send_modify(|life| life.phase = phase);
+    }
+
+    pub(super) fn set_over(&self, outcome: &Result<String, Failure>) {
+        self.life.send_modify(|life| {
+            life.phase = Phase::Draining;
+            match outcome {
+                Ok(reason) => life.ended = Some(reason.clone()),
+                Err(failure) => life.failure = Some(failure.clone()),
+            }
+        });
+    }
+
+    pub(super) fn set_container(&self, container: Arc<dyn servant::engine::Servant>) {
+        let _ = self.container.set(container);
+    }
+
+    pub(super) fn set_works(&self, works: Arc<Works>) {
+        let _ = self.works.set(works);
+    }
+
+    pub(super) fn set_idle_until(&self, until: Option<Millis>) {
+        self.idle_until.store(until.unwrap_or(0), Ordering::Relaxed);
+    }
+
+    /// The number of connections now and later.
+    pub(super) fn watch_connections(&self) -> watch::Receiver<usize> {
+        self.connections.subscribe()
+    }
+
+    fn error(&self, life: &Life) -> Error {
+        match &life.failure {
+            Some(Failure::Full(refused)) => Error::Full(refused.clone()),
+            Some(Failure::Broken { reason, log }) => Error::Servant {
+                service: self.service().to_owned(),
+                robot: self.robot.clone(),
+                reason: reason.clone(),
+                log: log.clone(),
+            },
+            None => Error::Servant {
+                service: self.service().to_owned(),
+                robot: self.robot.clone(),
+                reason: format!(
+                    "was ended: {}",
+                    life.ended.as_deref().unwrap_or("the daemon is ending")
+                ),
+                log: Vec::new(),
+            },
+        }
+    }
+}
+
+/// The right to use a servant; while one lives the servant is not idle.
+pub struct Lease {
+    handle: Arc<Handle>,
+}
+
+impl Lease {
+    /// Counts one more connection in. Only under the choreographer's lock.
+    pub(super) fn new(handle: Arc<Handle>) -> Lease {
+        handle.connections.send_modify(|count| *count += 1);
+        Lease { handle }
+    }
+
+    /// The servant.
+    pub fn handle(&self) -> &Arc<Handle> {
+        &self.handle
+    }
+
+    /// Waits until there is room for the servant.
+    pub async fn admitted(&self) -> Result<(), Error> {
+        self.reached(Phase::Admitted).await
+    }
+
+    /// Waits until the servant's interface is there.
+    pub async fn ready(&self) -> Result<Arc<Works>, Error> {
+        self.reached(Phase::Ready).await?;
+        self.handle
+            .works()
+            .ok_or(Error::Internal("reaching a ready servant"))
+    }
+
+    async fn reached(&self, phase: Phase) -> Result<(), Error> {
+        let mut life = self.handle.watch();
+        let Ok(life) = life
+            .wait_for(|life| life.is_over() || life.phase >= phase)
+            .await
+        else {
+            return Err(Error::Internal("waiting for a servant"));
+        };
+        if life.is_over() {
+            Err(self.handle.error(&life))
+        } else {
+            Ok(())
+        }
+    }
+}
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        self.handle.connections.send_modify(|count| *count -= 1);
+    }
+}

@@ -1,0 +1,437 @@
+//! The configuration file: TOML, every key optional, unknown keys refused by name.
+//! `systemd/cloudroid.example.toml` shows each key with its default.
+
+use std::fmt;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use api::{Limits, Size};
+use serde::{Deserialize, Deserializer};
+
+use crate::tokens::Tokens;
+
+/// Everything that can be configured.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// Address and port of the portal.
+    pub listen: SocketAddr,
+    /// Bearer tokens, or `sha256:HEX` of them. Needed to listen beyond loopback.
+    pub tokens: Vec<String>,
+    /// Web origins besides this machine's own whose pages may use the portal without a token.
+    pub origins: Vec<String>,
+    /// Where a plain `ws://host:9090` goes.
+    pub default_service: Option<String>,
+    /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
+    pub default_robot: Option<String>,
+    /// What to do on a machine that cannot set the limits.
+    pub isolation: IsolationMode,
+    /// Servants outlive the daemon. Under systemd by default, else not.
+    pub keep_servants: Option<bool>,
+    /// Directory of base image definitions, searched before those built in.
+    pub definitions: Option<PathBuf>,
+    /// Limits of a servant where its push says nothing.
+    pub limits: Limits,
+    /// How many servants fit.
+    pub room: Room,
+    /// The life of a servant.
+    pub servant: Servant,
+    /// What clients may do.
+    pub portal: Portal,
+    /// How big pushes may be.
+    pub push: Push,
+}
+
+/// Whether limits that cannot be set are an error.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum IsolationMode {
+    /// Refuse to run without every limit.
+    Require,
+    /// Say so and run.
+    #[default]
+    BestEffort,
+}
+
+impl fmt::Display for IsolationMode {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            IsolationMode::Require => "require",
+            IsolationMode::BestEffort => "best-effort",
+        })
+    }
+}
+
+/// What of this machine may be promised to servants.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Room {
+    /// Cores to promise; all of the machine's by default.
+    pub cpus: Option<f64>,
+    /// Memory to promise; nine tenths of the machine's by default.
+    pub memory: Option<Size>,
+    /// Robots that may wait for room.
+    pub queue: usize,
+    /// How long each may wait.
+    pub deadline: Time,
+}
+
+/// The life of a servant.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Servant {
+    /// Cores promised to a servant whose push asked for none.
+    pub reserve_cpus: f64,
+    /// Memory promised to a servant whose push asked for none.
+    pub reserve_memory: Size,
+    /// From asked for to Ready.
+    pub start: Time,
+    /// How long a robot's servant is kept after its last connection.
+    pub grace: Time,
+    /// The same for connections that named no robot.
+    pub anonymous_grace: Time,
+}
+
+/// What clients may do to the port.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Portal {
+    /// Biggest WebSocket message, its frames together.
+    pub max_message: Size,
+    /// Biggest WebSocket frame.
+    pub max_frame: Size,
+    /// For a request's header, and for the `auth` message where that is awaited.
+    pub handshake: Time,
+    /// For connections to end when the daemon does.
+    pub drain: Time,
+}
+
+/// How big pushes may be.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Push {
+    /// The archive as sent.
+    pub archive: Size,
+    /// The files in it, unpacked.
+    pub unpacked: Size,
+    /// How many files.
+    pub entries: u64,
+    /// How long the nodes may take to show their interface.
+    pub probe: Time,
+}
+
+/// A duration: `"500ms"`, `"30s"`, `"5m"`, `"1h"`, or a number of seconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Time(pub Duration);
+
+impl Default for Config {
+    fn default() -> Self {
+        Config {
+            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 9090)),
+            tokens: Vec::new(),
+            origins: Vec::new(),
+            default_service: None,
+            default_robot: None,
+            isolation: IsolationMode::default(),
+            keep_servants: None,
+            definitions: None,
+            limits: Limits {
+                cpus: Some(machine_cores()),
+                cpu_weight: Some(100),
+                memory: Some(Size(1 << 30)),
+                pids: Some(512),
+            },
+            room: Room::default(),
+            servant: Servant::default(),
+            portal: Portal::default(),
+            push: Push::default(),
+        }
+    }
+}
+
+impl Default for Room {
+    fn default() -> Self {
+        Room {
+            cpus: None,
+            memory: None,
+            queue: 64,
+            deadline: Time::seconds(10),
+        }
+    }
+}
+
+impl Default for Servant {
+    fn default() -> Self {
+        Servant {
+            reserve_cpus: 0.01,
+            reserve_memory: Size(64 << 20),
+            start: Time::seconds(30),
+            grace: Time::seconds(60),
+            anonymous_grace: Time::seconds(0),
+        }
+    }
+}
+
+impl Default for Portal {
+    fn default() -> Self {
+        Portal {
+            max_message: Size(64 << 20),
+            max_frame: Size(64 << 20),
+            handshake: Time::seconds(10),
+            drain: Time::seconds(10),
+        }
+    }
+}
+
+impl Default for Push {
+    fn default() -> Self {
+        Push {
+            archive: Size(2 << 30),
+            unpacked: Size(8 << 30),
+            entries: 500_000,
+            probe: Time::seconds(30),
+        }
+    }
+}
+
+impl Time {
+    const fn seconds(seconds: u64) -> Time {
+        Time(Duration::from_secs(seconds))
+    }
+
+    fn parse(text: &str) -> Option<Time> {
+        let text = text.trim();
+        let number_ends = text
+            .find(|c: char| !c.is_ascii_digit() && c != '.')
+            .unwrap_or(text.len());
+        let (number, unit) = text.split_at(number_ends);
+        let number: f64 = number.parse().ok()?;
+        let factor = match unit.trim() {
+            "ms" => 0.001,
+            "s" | "" => 1.0,
+            "m" | "min" => 60.0,
+            "h" => 3600.0,
+            _ => return None,
+        };
+        Duration::try_from_secs_f64(number * factor).ok().map(Time)
+    }
+}
+
+impl<'de> Deserialize<'de> for Time {
+    fn deserialize<D: Deserializer<'de>>(source: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Written {
+            Number(f64),
+            Text(String),
+        }
+        let written = match Written::deserialize(source)? {
+            Written::Number(seconds) => seconds.to_string(),
+            Written::Text(text) => text,
+        };
+        Time::parse(&written).ok_or_else(|| {
+            serde::de::Error::custom(format!(
+                "{written:?} is not a duration; write a number with ms, s, m or h, such as \"30s\""
+            ))
+        })
+    }
+}
+
+impl Config {
+    /// Reads `path`; without one, everything is as by default.
+    pub fn read(path: Option<&Path>) -> anyhow::Result<Config> {
+        let Some(path) = path else {
+            return Ok(Config::default());
+        };
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+        Config::parse(&text)
+            .with_context(|| format!("cannot use the configuration {}", path.display()))
+    }
+
+    fn parse(text: &str) -> anyhow::Result<Config> {
+        let defaults = Config::default();
+        let mut config: Config = toml::from_str(text)?;
+        config.limits = config.limits.or(defaults.limits);
+        Ok(config)
+    }
+
+    /// Refuses what cannot work together, before anything is started.
+    pub fn check(&self) -> anyhow::Result<()> {
+        Tokens::new(&self.tokens)?;
+        if !self.listen.ip().is_loopback() && self.tokens.is_empty() {
+            bail!(
+                "listening on {} lets everyone on the network in; \
+                 put a token into the configuration (tokens = [\"…\"]) or listen on 127.0.0.1:{}",
+                self.listen,
+                self.listen.port()
+            );
+        }
+        check_limits(&self.limits).context("[limits] of the configuration")?;
+        if let Some(service) = &self.default_service {
+            crate::names::service(service).context("default_service of the configuration")?;
+        }
+        if let Some(robot) = &self.default_robot {
+            crate::names::robot(robot).context("default_robot of the configuration")?;
+        }
+        if self.portal.max_message.0 == 0 || self.portal.max_frame.0 == 0 {
+            bail!(
+                "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
+            );
+        }
+        Ok(())
+    }
+
+    /// Whether servants outlive this daemon when it is ended.
+    pub fn keeps_servants(&self) -> bool {
+        self.keep_servants
+            .unwrap_or_else(|| std::env::var_os("INVOCATION_ID").is_some())
+    }
+}
+
+/// Cores of this machine that this process may use.
+pub fn machine_cores() -> f64 {
+    std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
+}
+
+/// Refuses limits that no kernel takes.
+pub fn check_limits(limits: &Limits) -> anyhow::Result<()> {
+    if let Some(cpus) = limits.cpus
+        && !(cpus.is_finite() && (0.01..=4096.0).contains(&cpus))
+    {
+        bail!("cpus = {cpus} is not between 0.01 and 4096");
+    }
+    if let Some(weight) = limits.cpu_weight
+        && !(1..=10_000).contains(&weight)
+    {
+        bail!("cpu_weight = {weight} is not between 1 and 10000");
+    }
+    if let Some(memory) = limits.memory
+        && memory.0 < 4 << 20
+    {
+        bail!("memory = {memory} is too little for any node; at least 4M");
+    }
+    if let Some(pids) = limits.pids
+        && pids < 4
+    {
+        bail!("pids = {pids} is too few for any node; at least 4");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_written_means_the_defaults() {
+        assert_eq!(Config::parse("").expect("empty"), Config::default());
+        Config::default()
+            .check()
+            .expect("the defaults work together");
+    }
+
+    #[test]
+    fn the_example_says_the_defaults() {
+        let example = include_str!("../../../systemd/cloudroid.example.toml");
+        assert_eq!(
+            Config::parse(example).expect("comments only"),
+            Config::default()
+        );
+        let uncommented: String = example
+            .lines()
+            .map(|line| line.strip_prefix("#: ").unwrap_or(line))
+            .map(|line| format!("{line}\n"))
+            .collect();
+        let written = Config::parse(&uncommented).expect("every example value is valid");
+        assert_eq!(
+            written.room,
+            Room {
+                cpus: Some(2.0),
+                memory: Some(Size(4 << 30)),
+                ..Room::default()
+            }
+        );
+        assert_eq!(written.servant, Servant::default());
+        assert_eq!(written.portal, Portal::default());
+        assert_eq!(written.push, Push::default());
+        assert_eq!(written.limits.memory, Config::default().limits.memory);
+    }
+
+    #[test]
+    fn a_misspelt_key_is_named() {
+        for (text, key) in [
+            ("lsiten = \"127.0.0.1:1\"", "lsiten"),
+            ("[servant]\ngarce = \"1s\"", "garce"),
+        ] {
+            let refused = format!("{:#}", Config::parse(text).expect_err(key));
+            assert!(refused.contains(key), "{refused}");
+        }
+    }
+
+    #[test]
+    fn durations_are_read_as_people_write_them() {
+        let config =
+            Config::parse("[servant]\ngrace = \"500ms\"\nstart = 5\n[portal]\ndrain = \"1.5m\"")
+                .expect("valid");
+        assert_eq!(config.servant.grace.0, Duration::from_millis(500));
+        assert_eq!(config.servant.start.0, Duration::from_secs(5));
+        assert_eq!(config.portal.drain.0, Duration::from_secs(90));
+        let refused = Config::parse("[servant]\ngrace = \"soon\"")
+            .expect_err("no duration")
+            .to_string();
+        assert!(refused.contains("\"soon\" is not a duration"), "{refused}");
+        Config::parse("[servant]\ngrace = \"-1s\"").expect_err("negative");
+    }
+
+    #[test]
+    fn the_network_needs_a_token() {
+        let open = Config {
+            listen: "0.0.0.0:9090".parse().expect("an address"),
+            ..Config::default()
+        };
+        let refused = open
+            .check()
+            .expect_err("anyone could drive the robots")
+            .to_string();
+        assert!(
+            refused.contains("0.0.0.0:9090") && refused.contains("tokens ="),
+            "{refused}"
+        );
+        Config {
+            tokens: vec!["a-long-secret".into()],
+            ..open
+        }
+        .check()
+        .expect("a token is there");
+    }
+
+    #[test]
+    fn limits_that_no_kernel_takes_are_refused() {
+        for text in [
+            "cpus = 0.0",
+            "cpus = nan",
+            "cpu_weight = 0",
+            "memory = \"1K\"",
+            "pids = 1",
+        ] {
+            let config = Config::parse(&format!("[limits]\n{text}")).expect("well-formed");
+            let refused = format!("{:#}", config.check().expect_err(text));
+            assert!(refused.contains("[limits]"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_limit_not_written_keeps_its_default() {
+        let config = Config::parse("[limits]\nmemory = \"2G\"").expect("valid");
+        assert_eq!(
+            config.limits,
+            Limits {
+                memory: Some(Size(2 << 30)),
+                ..Config::default().limits
+            }
+        );
+    }
+}

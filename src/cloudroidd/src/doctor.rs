@@ -1,0 +1,374 @@
+//! What this machine must offer, looked at before anything is started, by `cloudroidd doctor`, and by
+//! `/api/v1/doctor`. Nothing is changed by looking.
+
+mod cgroups;
+mod idmap;
+
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+
+use api::{Check, CheckStatus, Doctor, Size};
+
+/// Overlays of idmapped layers are known since Linux 5.19.
+const OLDEST_KERNEL: (u32, u32) = (5, 19);
+/// A base image and one package with its dependencies.
+const ROOM_NEEDED: u64 = 2 << 30;
+const ROOM_WANTED: u64 = 10 << 30;
+
+/// What the daemon keeps of a first look.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Machine {
+    /// Version of the usable cgroup controllers; 0: none.
+    pub cgroup_version: u8,
+    /// Limits that cannot be set.
+    pub missing_limits: Vec<String>,
+    /// What does not work as it should.
+    pub warnings: Vec<String>,
+}
+
+/// Every check. `listening`: the portal that runs already and holds its port.
+pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {
+    let mut checks = vec![
+        root(),
+        kernel(),
+        overlay(),
+        user_namespaces(),
+        idmapped_mounts(home),
+        seccomp(),
+    ];
+    checks.push(cgroups::check());
+    checks.push(program("mmdebstrap", "mmdebstrap", "makes base images"));
+    checks.push(program("apt-get", "apt", "resolves and fetches packages"));
+    checks.push(program("dpkg-deb", "dpkg", "unpacks packages"));
+    checks.push(apt_lists());
+    checks.push(room(home));
+    checks.push(init());
+    checks.push(port(listening));
+    Doctor { checks }
+}
+
+/// What matters while the daemon runs, and what keeps it from running.
+pub fn look(home: &Path) -> (Machine, Vec<Check>) {
+    let checks = [
+        root(),
+        kernel(),
+        overlay(),
+        user_namespaces(),
+        idmapped_mounts(home),
+        seccomp(),
+        init(),
+    ];
+    let missing = checks
+        .into_iter()
+        .filter(|check| check.status == CheckStatus::Missing)
+        .collect();
+    let found = cgroups::find();
+    let mut warnings = Vec::new();
+    if !found.missing.is_empty() {
+        warnings.push(format!(
+            "servants cannot be limited in {}: {}",
+            found.missing.join(", "),
+            found.why
+        ));
+    }
+    for check in [
+        program("mmdebstrap", "mmdebstrap", ""),
+        apt_lists(),
+        room(home),
+    ] {
+        if check.status != CheckStatus::Ok {
+            warnings.push(format!("{}: {}", check.name, check.found));
+        }
+    }
+    let machine = Machine {
+        cgroup_version: found.version,
+        missing_limits: found.missing,
+        warnings,
+    };
+    (machine, missing)
+}
+
+/// The static init of servants: beside this program, where packages install it, or where `CLOUDROID_INIT` says.
+pub fn find_init() -> Option<PathBuf> {
+    let named = std::env::var_os("CLOUDROID_INIT").map(PathBuf::from);
+    let beside = std::env::current_exe()
+        .ok()
+        .and_then(|path| Some(path.parent()?.join("cloudroid-init")));
+    let installed = [
+        "/usr/local/lib/cloudroid/cloudroid-init",
+        "/usr/lib/cloudroid/cloudroid-init",
+    ];
+    let candidates = named
+        .into_iter()
+        .chain(beside)
+        .chain(installed.into_iter().map(PathBuf::from));
+    candidates.into_iter().find(|path| path.is_file())
+}
+
+/// A list for people, for the daemon that cannot start.
+pub fn list(checks: &[Check]) -> String {
+    let lines = checks.iter().map(|check| match &check.mend {
+        Some(mend) => format!("  {}: {}\n    {mend}", check.name, check.found),
+        None => format!("  {}: {}", check.name, check.found),
+    });
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+fn ok(name: &str, found: impl Into<String>) -> Check {
+    Check {
+        name: name.to_owned(),
+        status: CheckStatus::Ok,
+        found: found.into(),
+        mend: None,
+    }
+}
+
+fn missing(name: &str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+    Check {
+        name: name.to_owned(),
+        status: CheckStatus::Missing,
+        found: found.into(),
+        mend: Some(mend.into()),
+    }
+}
+
+fn warning(name: &str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+    Check {
+        name: name.to_owned(),
+        status: CheckStatus::Warning,
+        found: found.into(),
+        mend: Some(mend.into()),
+    }
+}
+
+fn root() -> Check {
+    let uid = nix::unistd::geteuid();
+    if uid.is_root() {
+        ok("root", "running as root")
+    } else {
+        missing(
+            "root",
+            format!("running as user {uid}; containers are made by root"),
+            "sudo cloudroidd",
+        )
+    }
+}
+
+fn kernel() -> Check {
+    let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let release = release.trim();
+    match version(release) {
+        Some(found) if found >= OLDEST_KERNEL => ok("kernel", format!("Linux {release}")),
+        Some(_) => missing(
+            "kernel",
+            format!(
+                "Linux {release} is older than {}.{}",
+                OLDEST_KERNEL.0, OLDEST_KERNEL.1
+            ),
+            "install a newer kernel, such as Debian 12's or Ubuntu's linux-generic-hwe, and reboot",
+        ),
+        None => warning(
+            "kernel",
+            format!("{release:?} is no version this program knows"),
+            "uname -r",
+        ),
+    }
+}
+
+fn version(release: &str) -> Option<(u32, u32)> {
+    let mut numbers = release.split(|c: char| !c.is_ascii_digit()).map(str::parse);
+    Some((numbers.next()?.ok()?, numbers.next()?.ok()?))
+}
+
+fn overlay() -> Check {
+    let known = std::fs::read_to_string("/proc/filesystems").unwrap_or_default();
+    if known
+        .lines()
+        .any(|line| line.split_whitespace().last() == Some("overlay"))
+    {
+        ok("overlay", "overlay file systems are known")
+    } else {
+        missing(
+            "overlay",
+            "the kernel does not know overlay file systems",
+            "modprobe overlay",
+        )
+    }
+}
+
+fn user_namespaces() -> Check {
+    let limit = std::fs::read_to_string("/proc/sys/user/max_user_namespaces").ok();
+    match limit.and_then(|text| text.trim().parse::<u64>().ok()) {
+        Some(0) => missing(
+            "user namespaces",
+            "none are allowed",
+            "sysctl -w user.max_user_namespaces=15000",
+        ),
+        Some(limit) => ok("user namespaces", format!("{limit} are allowed")),
+        None => missing(
+            "user namespaces",
+            "the kernel does not know them",
+            "boot a kernel with CONFIG_USER_NS, such as the distribution's own",
+        ),
+    }
+}
+
+fn seccomp() -> Check {
+    match std::fs::read_to_string("/proc/sys/kernel/seccomp/actions_avail") {
+        Ok(actions) if actions.contains("errno") => ok("seccomp", "system calls can be filtered"),
+        _ => missing(
+            "seccomp",
+            "the kernel cannot filter system calls",
+            "boot a kernel with CONFIG_SECCOMP_FILTER, such as the distribution's own",
+        ),
+    }
+}
+
+fn idmapped_mounts(home: &Path) -> Check {
+    const NAME: &str = "idmapped mounts";
+    let existing = home
+        .ancestors()
+        .find(|path| path.is_dir())
+        .unwrap_or(Path::new("/"));
+    if !nix::unistd::geteuid().is_root() {
+        return warning(NAME, "can only be tested as root", "sudo cloudroidd doctor");
+    }
+    match idmap::try_on(existing) {
+        Ok(()) => ok(
+            NAME,
+            format!("work on the file system of {}", existing.display()),
+        ),
+        Err(error) => missing(
+            NAME,
+            format!(
+                "do not work on the file system of {}: {error}",
+                existing.display()
+            ),
+            "choose a state directory on ext4, xfs or btrfs with --home, or install a newer kernel",
+        ),
+    }
+}
+
+fn program(name: &str, package: &str, what_for: &str) -> Check {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    match std::env::split_paths(&path)
+        .map(|directory| directory.join(name))
+        .find(|path| path.is_file())
+    {
+        Some(path) => ok(name, path.display().to_string()),
+        None => missing(
+            name,
+            format!("is not installed; it {what_for}"),
+            format!("apt-get install {package}"),
+        ),
+    }
+}
+
+fn apt_lists() -> Check {
+    const NAME: &str = "apt lists";
+    let directory = "/var/lib/apt/lists";
+    let count = std::fs::read_dir(directory).map_or(0, |entries| {
+        entries
+            .flatten()
+            .filter(|entry| entry.file_name().to_string_lossy().contains("_Packages"))
+            .count()
+    });
+    if count > 0 {
+        ok(NAME, format!("{count} package lists in {directory}"))
+    } else {
+        warning(
+            NAME,
+            format!("no package lists in {directory}"),
+            "apt-get update",
+        )
+    }
+}
+
+fn room(home: &Path) -> Check {
+    const NAME: &str = "disk room";
+    let existing = home
+        .ancestors()
+        .find(|path| path.is_dir())
+        .unwrap_or(Path::new("/"));
+    let Ok(found) = nix::sys::statvfs::statvfs(existing) else {
+        return warning(
+            NAME,
+            format!("unknown for {}", existing.display()),
+            format!("df -h {}", existing.display()),
+        );
+    };
+    let free = found.blocks_available() as u64 * found.fragment_size() as u64;
+    let text = format!("{} free at {}", Size(free), existing.display());
+    let mend = "make room, or choose another state directory with --home; cloudroidctl rm removes services";
+    match free {
+        _ if free < ROOM_NEEDED => missing(
+            NAME,
+            format!("{text}; a first push needs {}", Size(ROOM_NEEDED)),
+            mend,
+        ),
+        _ if free < ROOM_WANTED => warning(NAME, text, mend),
+        _ => ok(NAME, text),
+    }
+}
+
+fn init() -> Check {
+    const NAME: &str = "cloudroid-init";
+    match find_init() {
+        Some(path) => ok(NAME, path.display().to_string()),
+        None => missing(
+            NAME,
+            "the servants' init is not beside cloudroidd",
+            "make build, or name it: CLOUDROID_INIT=PATH cloudroidd",
+        ),
+    }
+}
+
+fn port(listening: Option<SocketAddr>) -> Check {
+    const NAME: &str = "port";
+    if let Some(address) = listening {
+        return ok(NAME, format!("this daemon listens on {address}"));
+    }
+    let address = crate::config::Config::default().listen;
+    match TcpListener::bind(address) {
+        Ok(_) => ok(NAME, format!("{address} is free")),
+        Err(error) => warning(
+            NAME,
+            format!("{address} is taken: {error}"),
+            format!(
+                "ss -ltnp 'sport = :{}' shows by whom; cloudroidd --listen chooses another",
+                address.port()
+            ),
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kernel_versions_are_read() {
+        assert_eq!(version("6.1.0-13-amd64"), Some((6, 1)));
+        assert_eq!(version("5.15.0-1019-aws"), Some((5, 15)));
+        assert_eq!(version("next"), None);
+        assert!(version("5.4.0").expect("a version") < OLDEST_KERNEL);
+    }
+
+    #[test]
+    fn every_need_that_is_not_met_says_how_to_mend_it() {
+        let doctor = examine(Path::new("/nonexistent/home"), None);
+        for check in doctor.checks {
+            assert!(
+                check.status == CheckStatus::Ok || check.mend.is_some(),
+                "{check:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_missing_program_names_its_package() {
+        let check = program("no-such-program", "its-package", "does things");
+        assert_eq!(check.status, CheckStatus::Missing);
+        assert_eq!(check.mend.as_deref(), Some("apt-get install its-package"));
+    }
+}

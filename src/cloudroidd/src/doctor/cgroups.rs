@@ -1,0 +1,133 @@
+//! Which cgroup controllers can limit servants here.
+
+use api::{Check, CheckStatus};
+
+const NAME: &str = "cgroup";
+
+/// What was found.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Found {
+    /// 1 or 2; 0 where no controller can be used.
+    pub version: u8,
+    /// Limits that cannot be set.
+    pub missing: Vec<String>,
+    /// Why not.
+    pub why: String,
+}
+
+/// The check for people.
+pub fn check() -> Check {
+    let found = find();
+    let status = match (found.version, found.missing.is_empty()) {
+        (_, true) => CheckStatus::Ok,
+        _ => CheckStatus::Warning,
+    };
+    let text = match (found.version, found.missing.is_empty()) {
+        (0, _) => format!(
+            "no controller can be used, servants are not limited: {}",
+            found.why
+        ),
+        (version, true) => format!("version {version}: cpu, memory and pids can be limited"),
+        (version, false) => format!(
+            "version {version}, without {}: {}",
+            found.missing.join(", "),
+            found.why
+        ),
+    };
+    let mend = (status != CheckStatus::Ok).then(|| {
+        "boot with systemd.unified_cgroup_hierarchy=1, and give the daemon its controllers (Delegate=yes)".to_owned()
+    });
+    Check {
+        name: NAME.to_owned(),
+        status,
+        found: text,
+        mend,
+    }
+}
+
+/// Looks at the mounted hierarchies.
+pub fn find() -> Found {
+    let mounts = std::fs::read_to_string("/proc/self/mounts").unwrap_or_default();
+    let unified = std::fs::read_to_string("/sys/fs/cgroup/cgroup.controllers").ok();
+    judge(&mounts, unified.as_deref())
+}
+
+/// The limits and the v1 hierarchies or v2 controllers that set them.
+const LIMITS: [&str; 3] = ["cpu", "memory", "pids"];
+
+fn judge(mounts: &str, unified: Option<&str>) -> Found {
+    if let Some(controllers) = unified {
+        let there: Vec<&str> = controllers.split_whitespace().collect();
+        return found(
+            2,
+            |limit| there.contains(&limit),
+            "the controller is not enabled at the root of the hierarchy",
+        );
+    }
+    let hierarchies: Vec<&str> = mounts
+        .lines()
+        .filter_map(|line| {
+            let mut fields = line.split(' ');
+            let (_, _, kind, options) = (
+                fields.next()?,
+                fields.next()?,
+                fields.next()?,
+                fields.next()?,
+            );
+            (kind == "cgroup" && options.split(',').any(|option| option == "rw")).then_some(options)
+        })
+        .collect();
+    let mounted = |limit: &str| {
+        hierarchies
+            .iter()
+            .any(|options| options.split(',').any(|option| option == limit))
+    };
+    if LIMITS.iter().any(|limit| mounted(limit)) {
+        return found(1, mounted, "the controller's hierarchy is not mounted");
+    }
+    found(
+        0,
+        |_| false,
+        "neither /sys/fs/cgroup nor a hierarchy of version 1 offers one",
+    )
+}
+
+fn found(version: u8, there: impl Fn(&str) -> bool, why: &str) -> Found {
+    let missing: Vec<String> = LIMITS
+        .iter()
+        .filter(|limit| !there(limit))
+        .map(|limit| (*limit).to_owned())
+        .collect();
+    let why = if missing.is_empty() {
+        String::new()
+    } else {
+        why.to_owned()
+    };
+    Found {
+        version,
+        missing,
+        why,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_versions_are_told_apart() {
+        let hybrid = "cgroup /sys/fs/cgroup/cpu cgroup rw,relatime,cpu 0 0\n\
+                      cgroup /sys/fs/cgroup/memory cgroup rw,relatime,memory 0 0\n\
+                      cgroup /sys/fs/cgroup/pids cgroup ro,relatime,pids 0 0\n\
+                      cgroup2 /sys/fs/cgroup/unified cgroup2 rw 0 0\n";
+        let v1 = judge(hybrid, None);
+        assert_eq!((v1.version, v1.missing), (1, vec!["pids".to_owned()]));
+        let v2 = judge(
+            "cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n",
+            Some("cpuset cpu io memory pids\n"),
+        );
+        assert_eq!((v2.version, v2.missing.len()), (2, 0));
+        let none = judge("proc /proc proc rw 0 0\n", None);
+        assert_eq!((none.version, none.missing.len()), (0, 3));
+    }
+}

@@ -1,0 +1,302 @@
+//! Every refusal of the HTTP API, and the problem details (RFC 9457) that each becomes.
+
+use api::Problem;
+use api::problem::PROBLEM_JSON;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+
+use crate::admission;
+use crate::names::NameError;
+use crate::state::StateError;
+
+/// Why a request is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No such service.
+    #[error("there is no service {name:?}")]
+    UnknownService {
+        /// Asked for.
+        name: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// No such servant.
+    #[error("there is no servant {id:?}")]
+    UnknownServant {
+        /// Asked for.
+        id: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// No such revision.
+    #[error("service {service} has no revision {revision}")]
+    UnknownRevision {
+        /// The service.
+        service: String,
+        /// Asked for.
+        revision: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// No such image or blob.
+    #[error("there is no {what} in the image store")]
+    UnknownImage {
+        /// Asked for.
+        what: String,
+    },
+    /// Nothing is served there.
+    #[error("nothing is served at {path}")]
+    UnknownPath {
+        /// Asked for.
+        path: String,
+    },
+    /// A name that cannot be given.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// A reserved name is asked for as if it were a service.
+    #[error(
+        "the service name {name} is taken: it was made of the package {package}, and this one is {newcomer}"
+    )]
+    NameTaken {
+        /// The name.
+        name: String,
+        /// Whose it is.
+        package: String,
+        /// Who wants it.
+        newcomer: String,
+    },
+    /// Something in the request is not what it should be.
+    #[error("{0}")]
+    BadRequest(String),
+    /// No token, or one that is not known.
+    #[error("{0}")]
+    Unauthorised(&'static str),
+    /// The request comes from a page that is not ours, or is addressed to another host.
+    #[error("{what}")]
+    Foreign {
+        /// What was wrong.
+        what: String,
+        /// What to do.
+        next: String,
+    },
+    /// Another token owns the robot's name.
+    #[error("the robot name {0:?} belongs to another token")]
+    RobotTaken(String),
+    /// There is no room.
+    #[error(transparent)]
+    Full(#[from] admission::Refused),
+    /// The servant could not be started, or ended.
+    #[error("the servant of {service} for robot {robot} {reason}")]
+    Servant {
+        /// Its service.
+        service: String,
+        /// Its robot.
+        robot: String,
+        /// What happened, beginning with a verb.
+        reason: String,
+        /// Last lines of its log.
+        log: Vec<String>,
+    },
+    /// The daemon is ending.
+    #[error("the daemon is ending")]
+    Ending,
+    /// A push that failed.
+    #[error("{message}")]
+    Push {
+        /// What failed.
+        message: String,
+        /// What to do.
+        next: Option<String>,
+        /// What explains it.
+        log: Vec<String>,
+    },
+    /// The body is too big.
+    #[error("the archive is bigger than {limit}")]
+    TooLarge {
+        /// What is allowed.
+        limit: api::Size,
+    },
+    /// The state database.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// The image store.
+    #[error("the image store: {0}")]
+    Image(#[from] image::Error),
+    /// The engine.
+    #[error(transparent)]
+    Engine(#[from] servant::Error),
+    /// A task of the daemon broke.
+    #[error("the daemon failed at {0}; its log says more")]
+    Internal(&'static str),
+}
+
+/// Seconds after which a full machine may be asked again.
+const RETRY_AFTER: u64 = 10;
+
+impl Error {
+    /// The problem that a client is told.
+    pub fn problem(&self) -> Problem {
+        let (status, kind, title) = self.kind();
+        let mut problem = Problem {
+            kind: format!("urn:cloudroid:{kind}"),
+            title: title.to_owned(),
+            status: status.as_u16(),
+            detail: self.to_string(),
+            next: self.next(),
+            ..Problem::default()
+        };
+        match self {
+            Error::UnknownService { exists, .. }
+            | Error::UnknownServant { exists, .. }
+            | Error::UnknownRevision { exists, .. } => problem.exists = exists.clone(),
+            Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
+            Error::Full(admission::Refused::TooBig { .. }) => {}
+            Error::Full(_) | Error::Ending => problem.retry_after = Some(RETRY_AFTER),
+            _ => {}
+        }
+        problem
+    }
+
+    fn kind(&self) -> (StatusCode, &'static str, &'static str) {
+        use StatusCode as S;
+        match self {
+            Error::UnknownService { .. } => (S::NOT_FOUND, "unknown-service", "unknown service"),
+            Error::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
+            Error::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
+            Error::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
+            Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
+            Error::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
+            Error::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
+            Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
+            Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
+            Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
+            Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
+            Error::RobotTaken(_) => (S::FORBIDDEN, "robot-taken", "robot name taken"),
+            Error::Full(admission::Refused::TooBig { .. }) => {
+                (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit")
+            }
+            Error::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
+            Error::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
+            Error::Ending => (S::SERVICE_UNAVAILABLE, "ending", "daemon ending"),
+            Error::Push { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
+            Error::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
+            Error::State(_) | Error::Image(_) | Error::Engine(_) | Error::Internal(_) => {
+                (S::INTERNAL_SERVER_ERROR, "internal", "the daemon failed")
+            }
+        }
+    }
+
+    fn next(&self) -> Option<String> {
+        let text = match self {
+            Error::UnknownService { exists, .. } if exists.is_empty() => "publish one with: cloudroidctl push".into(),
+            Error::UnknownService { .. } => "use one that exists, or publish it with: cloudroidctl push".into(),
+            Error::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
+            Error::UnknownRevision { service, .. } => {
+                format!("see those that exist with: cloudroidctl services {service}")
+            }
+            Error::NameTaken { name, .. } => {
+                format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
+            }
+            Error::Unauthorised(_) => {
+                "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
+            }
+            Error::Foreign { next, .. } => next.clone(),
+            Error::RobotTaken(_) => "connect with that token, or under another name".into(),
+            Error::Full(admission::Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
+            Error::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [room] in the configuration".into(),
+            Error::Servant { service, .. } => {
+                format!("see cloudroidctl events, and push {service} again when its package is mended")
+            }
+            Error::Push { next, .. } => return next.clone(),
+            Error::TooLarge { .. } => "leave out what is not needed, or raise archive in [push] of the configuration".into(),
+            _ => return None,
+        };
+        Some(text)
+    }
+}
+
+impl IntoResponse for Error {
+    fn into_response(self) -> Response {
+        respond(&self.problem())
+    }
+}
+
+/// A problem as an HTTP answer.
+pub fn respond(problem: &Problem) -> Response {
+    let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+    if status.is_server_error() && status != StatusCode::SERVICE_UNAVAILABLE {
+        tracing::error!("answered {status}: {problem}");
+    }
+    let mut body = serde_json::to_vec_pretty(problem).unwrap_or_default();
+    body.push(b'\n');
+    let mut response = (status, [(header::CONTENT_TYPE, PROBLEM_JSON)], body).into_response();
+    if let Some(seconds) = problem.retry_after {
+        response
+            .headers_mut()
+            .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+    }
+    if status == StatusCode::UNAUTHORIZED {
+        response
+            .headers_mut()
+            .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+    }
+    response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_service_lists_those_that_exist() {
+        let error = Error::UnknownService {
+            name: "nope".into(),
+            exists: vec!["opencv_apps".into()],
+        };
+        let problem = error.problem();
+        assert_eq!(
+            (problem.status, problem.kind.as_str()),
+            (404, "urn:cloudroid:unknown-service")
+        );
+        assert!(problem.detail.contains("nope"), "{problem:?}");
+        assert_eq!(problem.exists, ["opencv_apps"]);
+        assert!(problem.next.is_some());
+    }
+
+    #[test]
+    fn a_full_machine_says_when_to_come_again() {
+        let response = Error::Full(admission::Refused::QueueFull { waiting: 3 }).into_response();
+        assert_eq!(response.status(), 503);
+        assert_eq!(response.headers()[header::RETRY_AFTER], "10");
+        assert_eq!(response.headers()[header::CONTENT_TYPE], PROBLEM_JSON);
+    }
+
+    #[test]
+    fn what_can_never_fit_is_not_to_be_tried_again() {
+        let amount = admission::Amount::new(64.0, 1);
+        let problem = Error::Full(admission::Refused::TooBig {
+            wanted: amount,
+            capacity: amount,
+        })
+        .problem();
+        assert_eq!((problem.status, problem.retry_after), (422, None));
+        assert!(problem.detail.contains("64 cores"), "{problem:?}");
+    }
+
+    #[test]
+    fn a_reserved_name_says_so() {
+        let problem = Error::from(NameError::Reserved("api".into())).problem();
+        assert_eq!(problem.status, 409);
+        assert!(
+            problem.detail.contains("reserved") && problem.detail.contains("api"),
+            "{problem:?}"
+        );
+    }
+
+    #[test]
+    fn a_missing_token_names_the_ways_to_give_one() {
+        let response = Error::Unauthorised("a token is needed").into_response();
+        assert_eq!(response.status(), 401);
+        assert_eq!(response.headers()[header::WWW_AUTHENTICATE], "Bearer");
+    }
+}

@@ -1,0 +1,45 @@
+//! Events: written to the state database and to the daemon's log.
+
+use std::sync::Arc;
+
+use api::Level;
+
+use crate::state::{NewEvent, State};
+
+/// Where events go.
+#[derive(Clone)]
+pub struct Journal {
+    state: Arc<State>,
+}
+
+impl Journal {
+    /// Into `state`.
+    pub fn new(state: Arc<State>) -> Journal {
+        Journal { state }
+    }
+
+    /// As it should be.
+    pub fn info(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
+        tracing::info!(kind, "{message}");
+        self.write(Level::Info, kind, message, about);
+    }
+
+    /// Worth a look.
+    pub fn warning(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
+        tracing::warn!(kind, "{message}");
+        self.write(Level::Warning, kind, message, about);
+    }
+
+    /// Something failed.
+    pub fn error(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
+        tracing::error!(kind, "{message}");
+        self.write(Level::Error, kind, message, about);
+    }
+
+    fn write(&self, level: Level, kind: &str, message: &str, about: &NewEvent<'_>) {
+        // A journal that cannot be written (a full disk, say) must not stop the work it tells of.
+        if let Err(error) = self.state.add_event(level, kind, message, about) {
+            tracing::error!("the event {kind} could not be written: {error}");
+        }
+    }
+}

@@ -1,0 +1,251 @@
+//! Everything on the port, and on the daemon's Unix socket: one router.
+//!
+//! ```text
+//!  TCP, Unix ─▶ hyper ─▶ guard (who asks, and may they) ─┬─▶ /            the page, or the default service
+//!                                                        ├─▶ /healthz /metrics /assets
+//!                                                        ├─▶ /api/v1      what cloudroidctl does
+//!                                                        ├─▶ /v2          images, read-only (OCI distribution)
+//!                                                        └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
+//! ```
+
+mod api_v1;
+mod auth;
+mod guard;
+mod metrics;
+mod oci;
+mod page;
+mod robots;
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::Millis;
+use axum::Router;
+use axum::extract::{DefaultBodyLimit, OriginalUri};
+use axum::routing::{any, get, post};
+use hyper::Request;
+use hyper::body::Incoming;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, UnixListener};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::choreographer::Choreographer;
+use crate::config::Config;
+use crate::errors::Error;
+use crate::push::Pusher;
+use crate::state::State;
+use crate::tokens::Tokens;
+
+pub use api_v1::lines;
+pub use guard::{Peer, query};
+
+/// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+
+/// What requests are answered from.
+pub struct App {
+    /// The configuration.
+    pub config: Arc<Config>,
+    /// Its tokens.
+    pub tokens: Tokens,
+    /// Where the portal listens, as bound.
+    pub listen: std::net::SocketAddr,
+    /// The state directory.
+    pub home: std::path::PathBuf,
+    /// The database.
+    pub state: Arc<State>,
+    /// Images.
+    pub store: Arc<image::Store>,
+    /// Servants.
+    pub choreographer: Choreographer,
+    /// Pushes.
+    pub pusher: Arc<Pusher>,
+    /// The state of this machine, as checked at start.
+    pub machine: crate::doctor::Machine,
+    /// When the daemon started.
+    pub started: Millis,
+    /// Sessions under way.
+    pub sessions: TaskTracker,
+    /// Cancelled when the daemon ends.
+    pub ending: CancellationToken,
+}
+
+impl App {
+    /// Where robots reach a service.
+    pub fn address(&self, service: &str) -> String {
+        let mut address = self.listen;
+        if address.ip().is_unspecified() {
+            let local: std::net::IpAddr = match address.ip() {
+                std::net::IpAddr::V4(_) => std::net::Ipv4Addr::LOCALHOST.into(),
+                std::net::IpAddr::V6(_) => std::net::Ipv6Addr::LOCALHOST.into(),
+            };
+            let host = nix::unistd::gethostname()
+                .ok()
+                .and_then(|name| name.into_string().ok());
+            return match host {
+                Some(host) => format!("ws://{host}:{}/{service}", address.port()),
+                None => {
+                    address.set_ip(local);
+                    format!("ws://{address}/{service}")
+                }
+            };
+        }
+        format!("ws://{address}/{service}")
+    }
+}
+
+/// The routes.
+pub fn router(app: Arc<App>) -> Router {
+    let v1 = Router::new()
+        .route("/status", get(api_v1::status))
+        .route("/doctor", get(api_v1::doctor))
+        .route("/events", get(api_v1::events))
+        .route("/services", get(api_v1::services))
+        .route(
+            "/services/{name}",
+            get(api_v1::service).delete(api_v1::remove_service),
+        )
+        .route("/services/{name}/interface", get(api_v1::interface))
+        .route("/services/{name}/rollback", post(api_v1::rollback))
+        .route(
+            "/servants",
+            get(api_v1::servants).delete(api_v1::stop_servants),
+        )
+        .route(
+            "/servants/{id}",
+            get(api_v1::servant).delete(api_v1::stop_servant),
+        )
+        .route("/servants/{id}/logs", get(api_v1::logs))
+        .route(
+            "/push",
+            post(crate::push::handle).layer(DefaultBodyLimit::disable()),
+        )
+        .route("/openapi.json", get(api_v1::openapi))
+        .fallback(nothing);
+    let images = Router::new()
+        .route("/", get(oci::version))
+        .route("/_catalog", get(oci::catalog))
+        .route("/{name}/tags/list", get(oci::tags))
+        .route("/{name}/manifests/{reference}", get(oci::manifest))
+        .route("/{name}/blobs/{digest}", get(oci::blob))
+        .fallback(oci::nothing);
+    Router::new()
+        .route("/", any(robots::root))
+        .route("/healthz", get(api_v1::health))
+        .route("/metrics", get(metrics::metrics))
+        .route("/assets/{name}", get(page::asset))
+        .nest("/api/v1", v1)
+        // `nest` does not take the path with the closing slash, which is where clients of /v2/ begin.
+        .route("/v2/", get(oci::version))
+        .nest("/v2", images)
+        .route("/api", any(nothing))
+        .route("/stubs", any(nothing))
+        .route("/assets", any(nothing))
+        .route("/{service}", any(robots::service))
+        .fallback(nothing)
+        .layer(axum::middleware::from_fn_with_state(
+            Arc::clone(&app),
+            guard::guard,
+        ))
+        .with_state(app)
+}
+
+async fn nothing(OriginalUri(uri): OriginalUri) -> Error {
+    Error::UnknownPath {
+        path: uri.path().to_owned(),
+    }
+}
+
+/// Accepts TCP connections until the daemon ends.
+pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
+    let connections = TaskTracker::new();
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = app.ending.cancelled() => break,
+        };
+        match accepted {
+            Ok((stream, address)) => {
+                // Small messages are many here, and none may wait for the next.
+                let _ = stream.set_nodelay(true);
+                connections.spawn(serve(
+                    Arc::clone(&app),
+                    router.clone(),
+                    stream,
+                    Peer::Tcp(address),
+                ));
+            }
+            Err(error) => {
+                tracing::warn!("no connection can be accepted: {error}");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+            }
+        }
+    }
+    drain(&app, connections).await;
+}
+
+/// Accepts connections on the Unix socket until the daemon ends.
+pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener) {
+    let connections = TaskTracker::new();
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = app.ending.cancelled() => break,
+        };
+        match accepted.and_then(|(stream, _)| Ok((stream.peer_cred()?, stream))) {
+            Ok((peer, stream)) => {
+                connections.spawn(serve(
+                    Arc::clone(&app),
+                    router.clone(),
+                    stream,
+                    Peer::Unix(peer.uid()),
+                ));
+            }
+            Err(error) => {
+                tracing::warn!("no connection can be accepted on the socket: {error}");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+            }
+        }
+    }
+    drain(&app, connections).await;
+}
+
+async fn drain(app: &App, connections: TaskTracker) {
+    connections.close();
+    let _ = tokio::time::timeout(app.config.portal.drain.0, connections.wait()).await;
+}
+
+async fn serve(
+    app: Arc<App>,
+    router: Router,
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    peer: Peer,
+) {
+    let router = TowerToHyperService::new(router);
+    let service = service_fn(move |mut request: Request<Incoming>| {
+        request.extensions_mut().insert(peer);
+        let answer = hyper::service::Service::call(&router, request);
+        async move { Ok::<_, Infallible>(answer.await.unwrap_or_else(|never| match never {})) }
+    });
+    let connection = hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(app.config.portal.handshake.0)
+        .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades();
+    tokio::pin!(connection);
+    let outcome = tokio::select! {
+        outcome = connection.as_mut() => outcome,
+        () = app.ending.cancelled() => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = outcome {
+        tracing::debug!("a connection from {peer:?} ended: {error}");
+    }
+}

@@ -1,0 +1,229 @@
+//! `/api/v1`: what cloudroidctl and the page ask.
+
+use std::sync::Arc;
+
+use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
+use axum::Json;
+use axum::body::{Body, Bytes};
+use axum::extract::{OriginalUri, Path, Query, State};
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use futures_util::StreamExt;
+use serde::Deserialize;
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::App;
+use crate::choreographer::{self, describe};
+use crate::errors::Error;
+use crate::views;
+
+type Answer<T> = Result<Json<T>, Error>;
+
+/// Lines of a log when nobody says how many.
+const LOG_LINES: usize = 10_000;
+const EVENTS: u32 = 100;
+
+/// `/healthz`.
+pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
+    app.state.service_names()?;
+    Ok("ok\n")
+}
+
+/// The daemon at a glance.
+pub async fn status(State(app): State<Arc<App>>) -> Answer<Status> {
+    Ok(Json(views::status(&app)?))
+}
+
+/// All checks of the machine, made anew.
+pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
+    let home = app.home.clone();
+    let listen = app.listen;
+    let doctor = tokio::task::spawn_blocking(move || crate::doctor::examine(&home, Some(listen)))
+        .await
+        .map_err(|_| Error::Internal("examining the machine"))?;
+    Ok(Json(doctor))
+}
+
+/// Which events.
+#[derive(Debug, Deserialize)]
+pub struct Which {
+    #[serde(default)]
+    since: i64,
+    limit: Option<u32>,
+}
+
+/// The journal.
+pub async fn events(
+    State(app): State<Arc<App>>,
+    Query(which): Query<Which>,
+) -> Answer<Vec<api::Event>> {
+    Ok(Json(
+        app.state
+            .events(which.since, which.limit.unwrap_or(EVENTS))?,
+    ))
+}
+
+/// All services.
+pub async fn services(State(app): State<Arc<App>>) -> Answer<Vec<api::ServiceSummary>> {
+    let mut services = Vec::new();
+    for name in app.state.service_names()? {
+        if let Some(revision) = app.state.current(&name)? {
+            services.push(views::summary(&app, &revision));
+        }
+    }
+    Ok(Json(services))
+}
+
+/// One service.
+pub async fn service(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Answer<ServiceDetail> {
+    Ok(Json(views::service(&app, &name)?))
+}
+
+/// A service's interface with all definitions.
+pub async fn interface(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Answer<package::interface::Interface> {
+    Ok(Json(views::current(&app.state, &name)?.interface))
+}
+
+/// Removes a service, its servants and its images.
+pub async fn remove_service(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Answer<Stopped> {
+    views::current(&app.state, &name)?;
+    Ok(Json(Stopped {
+        stopped: app.pusher.remove(&name).await?,
+    }))
+}
+
+/// Makes an earlier revision the current one.
+pub async fn rollback(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> Answer<ServiceDetail> {
+    let asked: Rollback = if body.is_empty() {
+        Rollback::default()
+    } else {
+        serde_json::from_slice(&body)
+            .map_err(|error| Error::BadRequest(format!("the rollback cannot be read: {error}")))?
+    };
+    app.pusher.rollback(&name, asked.revision).await?;
+    Ok(Json(views::service(&app, &name)?))
+}
+
+/// All servants.
+pub async fn servants(State(app): State<Arc<App>>) -> Json<Vec<api::Servant>> {
+    let handles = app.choreographer.servants();
+    Json(futures_util::future::join_all(handles.iter().map(|handle| describe(handle))).await)
+}
+
+/// One servant.
+pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<api::Servant> {
+    Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
+}
+
+/// Ends one servant.
+pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<Stopped> {
+    app.choreographer.servant(&id)?;
+    Ok(Json(Stopped {
+        stopped: app
+            .choreographer
+            .stop("it was stopped", |handle| handle.id == id)
+            .await,
+    }))
+}
+
+/// Whose servants.
+#[derive(Debug, Deserialize)]
+pub struct OfService {
+    service: Option<String>,
+}
+
+/// Ends all servants, or all of one service.
+pub async fn stop_servants(
+    State(app): State<Arc<App>>,
+    Query(of): Query<OfService>,
+) -> Answer<Stopped> {
+    if let Some(service) = &of.service {
+        views::current(&app.state, service)?;
+    }
+    let chosen = |handle: &choreographer::Handle| {
+        of.service
+            .as_ref()
+            .is_none_or(|service| handle.service() == service)
+    };
+    Ok(Json(Stopped {
+        stopped: app.choreographer.stop("it was stopped", chosen).await,
+    }))
+}
+
+/// Which part of a log.
+#[derive(Debug, Deserialize)]
+pub struct Part {
+    #[serde(default)]
+    follow: bool,
+    tail: Option<usize>,
+}
+
+/// What a servant's nodes print, as JSON lines.
+pub async fn logs(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    Query(part): Query<Part>,
+) -> Result<Response, Error> {
+    let handle = app.choreographer.servant(&id)?;
+    let Some(container) = handle.container() else {
+        return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
+    };
+    // Following begins before the past is read, so that no line falls between; one may come twice instead.
+    let following = part.follow.then(|| container.follow_log(false));
+    let path = container.log_path();
+    let count = part.tail.unwrap_or(LOG_LINES);
+    let past = tokio::task::spawn_blocking(move || choreographer::read_log(&path, count, None))
+        .await
+        .map_err(|_| Error::Internal("reading a log"))?;
+    let last = past.last().map(|line| line.time);
+    let past = futures_util::stream::iter(past).map(choreographer::log_record);
+    match following {
+        Some(future) => {
+            let new =
+                move |line: &servant::engine::LogLine| last.is_none_or(|last| line.time > last);
+            let future =
+                ReceiverStream::new(future).filter(move |line| std::future::ready(new(line)));
+            // A follower must not keep the daemon from ending.
+            let ending = app.ending.clone().cancelled_owned();
+            Ok(lines(
+                past.chain(future.map(choreographer::log_record))
+                    .take_until(ending),
+            ))
+        }
+        None => Ok(lines(past)),
+    }
+}
+
+/// A stream of values as JSON lines.
+pub fn lines<T: serde::Serialize + Send + 'static>(
+    values: impl futures_util::Stream<Item = T> + Send + 'static,
+) -> Response {
+    let encoded = values.map(|value| {
+        let mut line = serde_json::to_vec(&value)?;
+        line.push(b'\n');
+        Ok::<_, serde_json::Error>(line)
+    });
+    ([(header::CONTENT_TYPE, NDJSON)], Body::from_stream(encoded)).into_response()
+}
+
+/// The OpenAPI description of all this.
+pub async fn openapi(OriginalUri(_): OriginalUri) -> Response {
+    (
+        [(header::CONTENT_TYPE, "application/json")],
+        include_str!("openapi.json"),
+    )
+        .into_response()
+}

@@ -1,0 +1,163 @@
+//! rosbridge's `auth` operation, for clients that cannot put a token into the address: it must be the first message.
+//!
+//! That one frame is read here, by hand, because the bridge takes the connection from its first byte on and a
+//! WebSocket library would have read ahead of it. (RFC 6455, section 5.2.)
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use bytes::{Buf, Bytes, BytesMut};
+use tokio::io::{AsyncRead, AsyncReadExt};
+
+use crate::tokens::{AuthMessage, TokenHash, Tokens};
+
+/// An auth message is a few short fields.
+const LONGEST: usize = 16 << 10;
+
+/// Reads the first message: the token that it proves, and what was read beyond it.
+pub async fn first_message<S: AsyncRead + Unpin>(
+    io: &mut S,
+    read_ahead: Bytes,
+    tokens: &Tokens,
+) -> Result<(TokenHash, Bytes), String> {
+    let mut buffer = BytesMut::from(read_ahead);
+    let payload = loop {
+        match take_frame(&mut buffer)? {
+            Some(payload) => break payload,
+            None => {
+                let read = io
+                    .read_buf(&mut buffer)
+                    .await
+                    .map_err(|error| error.to_string())?;
+                if read == 0 {
+                    return Err("the connection ended before its auth message".to_owned());
+                }
+            }
+        }
+    };
+    let now = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0.0, |since| since.as_secs_f64());
+    let token = recognise(&payload, tokens, now)?;
+    Ok((token, buffer.freeze()))
+}
+
+fn recognise(payload: &[u8], tokens: &Tokens, now: f64) -> Result<TokenHash, String> {
+    #[derive(serde::Deserialize)]
+    struct Operation {
+        op: String,
+    }
+    let operation: Operation = serde_json::from_slice(payload).map_err(|_| {
+        "the first message must be an auth operation, because no token was given".to_owned()
+    })?;
+    if operation.op != "auth" {
+        return Err(format!(
+            "{} before auth: no token was given, so the first message must be auth",
+            operation.op
+        ));
+    }
+    let message: AuthMessage = serde_json::from_slice(payload)
+        .map_err(|error| format!("the auth message cannot be read: {error}"))?;
+    tokens
+        .recognise_auth(&message, now)
+        .ok_or_else(|| "the auth message proves no token that is known".to_owned())
+}
+
+/// The payload of one whole text frame, taken out of `buffer`; none while it is not complete.
+fn take_frame(buffer: &mut BytesMut) -> Result<Option<Vec<u8>>, String> {
+    if buffer.len() < 2 {
+        return Ok(None);
+    }
+    let (first, second) = (buffer[0], buffer[1]);
+    if first != 0x81 || second & 0x80 == 0 {
+        return Err("the first message must be one text frame, an auth operation".to_owned());
+    }
+    let (header, length) = match second & 0x7f {
+        126 if buffer.len() < 4 => return Ok(None),
+        126 => (4, usize::from(u16::from_be_bytes([buffer[2], buffer[3]]))),
+        127 => (10, usize::MAX),
+        short => (2, usize::from(short)),
+    };
+    if length > LONGEST {
+        return Err(format!("an auth message has at most {LONGEST} bytes"));
+    }
+    if buffer.len() < header + 4 + length {
+        return Ok(None);
+    }
+    buffer.advance(header);
+    let mask = buffer.split_to(4);
+    let masked = buffer.split_to(length);
+    Ok(Some(
+        masked
+            .iter()
+            .zip(mask.iter().cycle())
+            .map(|(byte, mask)| byte ^ mask)
+            .collect(),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(text: &str) -> Vec<u8> {
+        let mask = [1, 2, 3, 4];
+        let mut frame = vec![0x81];
+        if text.len() < 126 {
+            frame.push(0x80 | text.len() as u8);
+        } else {
+            frame.push(0x80 | 126);
+            frame.extend_from_slice(&(text.len() as u16).to_be_bytes());
+        }
+        frame.extend_from_slice(&mask);
+        frame.extend(
+            text.bytes()
+                .zip(mask.iter().cycle())
+                .map(|(byte, mask)| byte ^ mask),
+        );
+        frame
+    }
+
+    async fn first(sent: &[u8]) -> Result<(TokenHash, Bytes), String> {
+        let tokens = Tokens::new(&["open sesame".to_owned()]).expect("a token");
+        let (ahead, rest) = sent.split_at(sent.len().min(3));
+        let mut rest = rest;
+        first_message(&mut rest, Bytes::copy_from_slice(ahead), &tokens).await
+    }
+
+    #[tokio::test]
+    async fn a_token_is_taken_and_what_follows_is_left() {
+        let padding = "x".repeat(200);
+        let mut sent = frame(&format!(
+            r#"{{"op":"auth","mac":"open sesame","rand":"{padding}"}}"#
+        ));
+        sent.extend_from_slice(b"next frame");
+        let (token, rest) = first(&sent).await.expect("a known token");
+        assert_eq!(token, crate::tokens::hash("open sesame"));
+        assert!(b"next frame".starts_with(&rest[..]), "{rest:?}");
+    }
+
+    #[tokio::test]
+    async fn anything_else_is_refused_with_words() {
+        let cases: [(Vec<u8>, &str); 6] = [
+            (
+                frame(r#"{"op":"auth","mac":"guess"}"#),
+                "no token that is known",
+            ),
+            (
+                frame(r#"{"op":"subscribe","topic":"/x"}"#),
+                "subscribe before auth",
+            ),
+            (frame("hello"), "must be an auth operation"),
+            (vec![0x82, 0x80, 0, 0, 0, 0], "one text frame"),
+            (vec![0x81, 0xff, 0, 0, 0, 0, 0, 0, 0, 0], "at most"),
+            (
+                frame(r#"{"op":"auth","mac":"open sesame"}"#)[..10].to_vec(),
+                "ended before",
+            ),
+        ];
+        for (sent, words) in cases {
+            let refused = first(&sent).await.expect_err(words);
+            assert!(refused.contains(words), "{refused}");
+        }
+    }
+}

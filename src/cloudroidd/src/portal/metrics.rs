@@ -1,0 +1,254 @@
+//! `/metrics`, in Prometheus's text format.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::sync::Arc;
+
+use api::Phase;
+use axum::extract::State;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use bridge::Metrics;
+
+use super::App;
+use crate::choreographer::{Choreographer, Handle, describe};
+use crate::errors::Error;
+
+const PHASES: [Phase; 6] = [
+    Phase::Requested,
+    Phase::Admitted,
+    Phase::Created,
+    Phase::Starting,
+    Phase::Ready,
+    Phase::Draining,
+];
+
+/// Answers with all figures.
+pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
+    let mut out = String::new();
+    let services = app.state.service_names()?.len();
+    gauge(
+        &mut out,
+        "cloudroid_services",
+        "Published services.",
+        [(String::new(), services as f64)],
+    );
+    servants(&mut out, &app.choreographer);
+    let (pushes, failed) = app.pusher.counts();
+    family(
+        &mut out,
+        "cloudroid_pushes_total",
+        "counter",
+        "Pushes since the daemon started.",
+        [
+            (labels(&[("result", "published")]), pushes as f64),
+            (labels(&[("result", "failed")]), failed as f64),
+        ],
+    );
+    room(&mut out, &app.choreographer);
+    usage(&mut out, &app.choreographer.servants()).await;
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], out).into_response())
+}
+
+fn servants(out: &mut String, choreographer: &Choreographer) {
+    let handles = choreographer.servants();
+    let count = |phase| {
+        handles
+            .iter()
+            .filter(|handle| handle.life().phase == phase)
+            .count()
+    };
+    let by_phase = PHASES.map(|phase| {
+        (
+            labels(&[("phase", &phase.to_string())]),
+            count(phase) as f64,
+        )
+    });
+    gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
+    let mut connections: BTreeMap<String, usize> = BTreeMap::new();
+    for handle in &handles {
+        *connections.entry(handle.service().to_owned()).or_default() += handle.connections();
+    }
+    let connections = connections
+        .into_iter()
+        .map(|(service, count)| (labels(&[("service", &service)]), count as f64));
+    gauge(
+        out,
+        "cloudroid_connections",
+        "Connections of robots.",
+        connections,
+    );
+    let bridges: Vec<_> = handles
+        .iter()
+        .filter_map(|handle| Some((labels_of(handle), handle.works()?)))
+        .collect();
+    let messages = bridges.iter().flat_map(|(of, works)| {
+        let metrics = works.bridge.metrics();
+        [
+            (
+                format!("{of},direction=\"in\""),
+                metrics.frames_in.get() as f64,
+            ),
+            (
+                format!("{of},direction=\"out\""),
+                metrics.frames_out.get() as f64,
+            ),
+        ]
+    });
+    family(
+        out,
+        "cloudroid_messages_total",
+        "counter",
+        "WebSocket messages of robots.",
+        messages,
+    );
+    let dropped = bridges
+        .iter()
+        .map(|(of, works)| (of.clone(), works.dropped() as f64));
+    family(
+        out,
+        "cloudroid_dropped_total",
+        "counter",
+        "Messages dropped because someone was slow.",
+        dropped,
+    );
+    Metrics::prometheus_help(out);
+    for (of, works) in &bridges {
+        works.bridge.metrics().prometheus(out, of);
+    }
+}
+
+fn room(out: &mut String, choreographer: &Choreographer) {
+    let (capacity, taken, waiting) = choreographer.admission().look();
+    let rows = [
+        (
+            "cloudroid_room_cpus",
+            "Cores that may be promised.",
+            capacity.cpus(),
+        ),
+        (
+            "cloudroid_room_memory_bytes",
+            "Memory that may be promised.",
+            capacity.memory as f64,
+        ),
+        ("cloudroid_promised_cpus", "Cores promised.", taken.cpus()),
+        (
+            "cloudroid_promised_memory_bytes",
+            "Memory promised.",
+            taken.memory as f64,
+        ),
+        (
+            "cloudroid_waiting",
+            "Robots that wait for room.",
+            waiting as f64,
+        ),
+    ];
+    for (name, help, value) in rows {
+        gauge(out, name, help, [(String::new(), value)]);
+    }
+}
+
+async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
+    let mut rows = Vec::new();
+    for handle in handles {
+        if let Some(usage) = describe(handle).await.usage {
+            rows.push((labels_of(handle), usage));
+        }
+    }
+    let of = |value: fn(&api::Usage) -> f64| {
+        rows.iter()
+            .map(move |(labels, usage)| (labels.clone(), value(usage)))
+    };
+    gauge(
+        out,
+        "cloudroid_servant_memory_bytes",
+        "Memory of a servant.",
+        of(|usage| usage.memory as f64),
+    );
+    gauge(
+        out,
+        "cloudroid_servant_pids",
+        "Processes and threads of a servant.",
+        of(|usage| usage.pids as f64),
+    );
+    let cpu = of(|usage| usage.cpu_usec as f64 / 1e6);
+    family(
+        out,
+        "cloudroid_servant_cpu_seconds_total",
+        "counter",
+        "Processor time of a servant.",
+        cpu,
+    );
+    let kills = of(|usage| usage.oom_kills as f64);
+    family(
+        out,
+        "cloudroid_servant_oom_kills_total",
+        "counter",
+        "Processes killed for want of memory.",
+        kills,
+    );
+}
+
+fn labels_of(handle: &Handle) -> String {
+    labels(&[
+        ("servant", &handle.id),
+        ("service", handle.service()),
+        ("robot", &handle.robot),
+    ])
+}
+
+fn gauge(out: &mut String, name: &str, help: &str, rows: impl IntoIterator<Item = (String, f64)>) {
+    family(out, name, "gauge", help, rows);
+}
+
+fn family(
+    out: &mut String,
+    name: &str,
+    kind: &str,
+    help: &str,
+    rows: impl IntoIterator<Item = (String, f64)>,
+) {
+    // Writing to a String cannot fail.
+    let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} {kind}");
+    for (labels, value) in rows {
+        let braces = if labels.is_empty() {
+            String::new()
+        } else {
+            format!("{{{labels}}}")
+        };
+        let _ = writeln!(out, "{name}{braces} {value}");
+    }
+}
+
+fn labels(pairs: &[(&str, &str)]) -> String {
+    let escape = |text: &str| {
+        text.replace('\\', "\\\\")
+            .replace('"', "\\\"")
+            .replace('\n', "\\n")
+    };
+    pairs
+        .iter()
+        .map(|(name, value)| format!("{name}=\"{}\"", escape(value)))
+        .collect::<Vec<_>>()
+        .join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_come_out_as_prometheus_reads_them() {
+        let mut out = String::new();
+        gauge(
+            &mut out,
+            "a",
+            "Help.",
+            [(String::new(), 1.0), (labels(&[("x", "q\"\\")]), 0.5)],
+        );
+        assert_eq!(
+            out,
+            "# HELP a Help.\n# TYPE a gauge\na 1\na{x=\"q\\\"\\\\\"} 0.5\n"
+        );
+    }
+}

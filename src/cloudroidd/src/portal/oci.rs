@@ -1,0 +1,140 @@
+//! `/v2/`: the images, as the OCI distribution specification (1.1) has a registry serve them; reading only.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{OriginalUri, Path, State};
+use axum::http::{HeaderName, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde_json::json;
+use tokio_util::io::ReaderStream;
+
+use super::App;
+use crate::errors::Error;
+
+const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");
+const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
+const CHUNK: usize = 256 << 10;
+
+/// `/v2/`: yes, this is a registry.
+pub async fn version() -> Response {
+    ([(API_VERSION, "registry/2.0")], Json(json!({}))).into_response()
+}
+
+/// `/v2/_catalog`.
+pub async fn catalog(State(app): State<Arc<App>>) -> Result<Response, Error> {
+    Ok(Json(json!({ "repositories": app.state.service_names()? })).into_response())
+}
+
+/// `/v2/NAME/tags/list`.
+pub async fn tags(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Result<Response, Error> {
+    let revisions = app.state.revisions(&name)?;
+    if revisions.is_empty() {
+        return Ok(unknown(
+            "NAME_UNKNOWN",
+            &format!("there is no repository {name}"),
+        ));
+    }
+    let tags: Vec<String> = revisions
+        .iter()
+        .rev()
+        .map(|revision| revision.number.to_string())
+        .chain(["latest".to_owned()])
+        .collect();
+    Ok(Json(json!({ "name": name, "tags": tags })).into_response())
+}
+
+/// `/v2/NAME/manifests/REFERENCE`: `latest`, a revision's number, or a digest.
+pub async fn manifest(
+    State(app): State<Arc<App>>,
+    Path((name, reference)): Path<(String, String)>,
+) -> Result<Response, Error> {
+    let revisions = app.state.revisions(&name)?;
+    let current = app.state.current(&name)?;
+    let image = match reference.as_str() {
+        "latest" => current.map(|revision| revision.image),
+        _ => revisions
+            .into_iter()
+            .find(|revision| {
+                revision.number.to_string() == reference || revision.image == reference
+            })
+            .map(|revision| revision.image),
+    };
+    let Some(image) = image else {
+        return Ok(unknown(
+            "MANIFEST_UNKNOWN",
+            &format!("there is no image {name}:{reference}"),
+        ));
+    };
+    let store = Arc::clone(&app.store);
+    let found = tokio::task::spawn_blocking(move || store.manifest(&image))
+        .await
+        .map_err(|_| Error::Internal("reading a manifest"))??;
+    let Some(manifest) = found else {
+        return Ok(unknown(
+            "MANIFEST_UNKNOWN",
+            &format!("the image {name}:{reference} is gone"),
+        ));
+    };
+    let headers = [
+        (header::CONTENT_TYPE, manifest.media_type),
+        (CONTENT_DIGEST, manifest.digest.to_string()),
+    ];
+    Ok((headers, manifest.bytes).into_response())
+}
+
+/// `/v2/NAME/blobs/DIGEST`.
+pub async fn blob(
+    State(app): State<Arc<App>>,
+    Path((_name, digest)): Path<(String, String)>,
+) -> Result<Response, Error> {
+    let Ok(parsed) = digest.parse::<image::Digest>() else {
+        return Ok(refused(
+            StatusCode::BAD_REQUEST,
+            "DIGEST_INVALID",
+            &format!("{digest} is not a digest"),
+        ));
+    };
+    let store = Arc::clone(&app.store);
+    let found = tokio::task::spawn_blocking(move || store.blob(&parsed))
+        .await
+        .map_err(|_| Error::Internal("reading a blob"))??;
+    let Some(blob) = found else {
+        return Ok(unknown(
+            "BLOB_UNKNOWN",
+            &format!("there is no blob {digest}"),
+        ));
+    };
+    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(blob.file), CHUNK);
+    let headers = [
+        (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
+        (header::CONTENT_LENGTH, blob.size.to_string()),
+        (CONTENT_DIGEST, digest),
+    ];
+    Ok((headers, Body::from_stream(stream)).into_response())
+}
+
+/// Anything else: pushing by this interface, for one, is not offered.
+pub async fn nothing(OriginalUri(uri): OriginalUri) -> Response {
+    refused(
+        StatusCode::NOT_FOUND,
+        "UNSUPPORTED",
+        &format!("{} is not served; images are read-only here", uri.path()),
+    )
+}
+
+fn unknown(code: &str, message: &str) -> Response {
+    refused(StatusCode::NOT_FOUND, code, message)
+}
+
+fn refused(status: StatusCode, code: &str, message: &str) -> Response {
+    (
+        status,
+        Json(json!({ "errors": [{ "code": code, "message": message }] })),
+    )
+        .into_response()
+}

@@ -1,0 +1,368 @@
+//! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`.
+
+use std::sync::Arc;
+
+use axum::Extension;
+use axum::body::Body;
+use axum::extract::{Path, Request, State};
+use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
+use axum::response::{IntoResponse, Response};
+use bridge::{SessionEnd, SessionOptions};
+use hyper::upgrade::{OnUpgrade, Upgraded};
+use hyper_util::rt::TokioIo;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpStream, UnixStream};
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+
+use super::guard::{self, Caller, Peer};
+use super::{App, auth, page};
+use crate::choreographer::Lease;
+use crate::errors::Error;
+use crate::names;
+
+/// Close code for "try again later" (RFC 6455 and its registry).
+const TRY_AGAIN_LATER: u16 = 1013;
+/// Close code for a policy that was violated.
+const POLICY: u16 = 1008;
+
+/// `/`: the page, or the default service.
+pub async fn root(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+    request: Request,
+) -> Response {
+    if !guard::is_upgrade(request.headers()) {
+        return page::index(request.method());
+    }
+    match app.config.default_service.clone() {
+        Some(service) => connect(app, service, caller, request)
+            .await
+            .unwrap_or_else(IntoResponse::into_response),
+        None => {
+            let exists = app.state.service_names().unwrap_or_default();
+            Error::UnknownService {
+                name: String::new(),
+                exists,
+            }
+            .into_response()
+        }
+    }
+}
+
+/// `/<service>`: its servant, or an explanation.
+pub async fn service(
+    State(app): State<Arc<App>>,
+    Path(service): Path<String>,
+    Extension(caller): Extension<Caller>,
+    request: Request,
+) -> Response {
+    let answer = if guard::is_upgrade(request.headers()) {
+        connect(app, service, caller, request).await
+    } else {
+        explain(&app, &service, request.method())
+    };
+    answer.unwrap_or_else(IntoResponse::into_response)
+}
+
+/// What someone is told who opens a service's address in a browser.
+fn explain(app: &App, service: &str, method: &Method) -> Result<Response, Error> {
+    if !matches!(*method, Method::GET | Method::HEAD) {
+        return Err(Error::BadRequest(format!(
+            "{method} is not answered here; services are reached by WebSocket"
+        )));
+    }
+    let Some(revision) = app.state.current(service)? else {
+        return Err(Error::UnknownService {
+            name: service.to_owned(),
+            exists: app.state.service_names()?,
+        });
+    };
+    let answer = serde_json::json!({
+        "service": service,
+        "revision": revision.number,
+        "address": app.address(service),
+        "protocol": "rosbridge v2 over WebSocket",
+        "next": "connect with any rosbridge client, such as roslibpy or roslibjs; ?robot=ID finds the same servant again",
+        "interface": format!("/api/v1/services/{service}/interface"),
+    });
+    Ok((
+        StatusCode::UPGRADE_REQUIRED,
+        [(header::UPGRADE, "websocket")],
+        axum::Json(answer),
+    )
+        .into_response())
+}
+
+/// What the address says about the robot.
+struct Asked {
+    service: String,
+    robot: Option<String>,
+    resume: Option<String>,
+}
+
+impl Asked {
+    fn read(app: &App, service: String, uri: &Uri) -> Result<Asked, Error> {
+        let plain = uri.path() == "/";
+        let robot = guard::query(uri, "robot")
+            .or_else(|| app.config.default_robot.clone().filter(|_| plain));
+        if let Some(robot) = &robot {
+            names::robot(robot)?;
+        }
+        Ok(Asked {
+            service,
+            robot,
+            resume: guard::query(uri, "resume").filter(|token| !token.is_empty()),
+        })
+    }
+}
+
+async fn connect(
+    app: Arc<App>,
+    service: String,
+    caller: Caller,
+    mut request: Request,
+) -> Result<Response, Error> {
+    let accept = handshake(&request)?;
+    let asked = Asked::read(&app, service, request.uri())?;
+    if app.state.current(&asked.service)?.is_none() {
+        return Err(Error::UnknownService {
+            exists: app.state.service_names()?,
+            name: asked.service,
+        });
+    }
+    // Who has shown a token is told by status when there is no room; who has not must be let in to show one.
+    let lease = if caller.trusted {
+        let lease = lease(&app, &asked, &caller)?;
+        lease.admitted().await?;
+        Some(lease)
+    } else {
+        None
+    };
+    let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
+        return Err(Error::BadRequest(
+            "this connection cannot become a WebSocket".to_owned(),
+        ));
+    };
+    let sessions = app.sessions.clone();
+    sessions.spawn(async move {
+        match upgrade.await {
+            Ok(upgraded) => upgraded_to(app, asked, caller, lease, upgraded).await,
+            Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
+        }
+    });
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+    let headers = response.headers_mut();
+    headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
+    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    Ok(response)
+}
+
+/// The key that accepts an opening handshake (RFC 6455, section 4.2).
+fn handshake(request: &Request) -> Result<HeaderValue, Error> {
+    let bad = |what: &str| Error::BadRequest(format!("this is no WebSocket handshake: {what}"));
+    let text = |name| {
+        request
+            .headers()
+            .get(name)
+            .and_then(|value| value.to_str().ok())
+    };
+    if request.method() != Method::GET {
+        return Err(bad("it does not GET"));
+    }
+    let connection = text(header::CONNECTION).unwrap_or_default();
+    if !connection
+        .split(',')
+        .any(|option| option.trim().eq_ignore_ascii_case("upgrade"))
+    {
+        return Err(bad("Connection does not say Upgrade"));
+    }
+    if text(header::SEC_WEBSOCKET_VERSION) != Some("13") {
+        return Err(bad("Sec-WebSocket-Version is not 13"));
+    }
+    let key = text(header::SEC_WEBSOCKET_KEY).ok_or_else(|| bad("Sec-WebSocket-Key is missing"))?;
+    derive_accept_key(key.as_bytes())
+        .parse()
+        .map_err(|_| bad("Sec-WebSocket-Key is malformed"))
+}
+
+/// The right to the servant that is asked for, if the robot's name is the caller's.
+fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
+    let Some(robot) = &asked.robot else {
+        let robot = format!("anonymous-{}", names::random(6));
+        return app.choreographer.ensure(&asked.service, &robot, true);
+    };
+    let owner = app.state.robot_owner(robot, caller.token.as_ref())?;
+    if owner.is_some() && owner != caller.token {
+        return Err(Error::RobotTaken(robot.clone()));
+    }
+    app.choreographer.ensure(&asked.service, robot, false)
+}
+
+async fn upgraded_to(
+    app: Arc<App>,
+    asked: Asked,
+    caller: Caller,
+    lease: Option<Lease>,
+    upgraded: Upgraded,
+) {
+    // Without hyper's wrapping around them, reads and writes go straight to the socket.
+    let upgraded = match upgraded.downcast::<TokioIo<TcpStream>>() {
+        Ok(parts) => {
+            return session(
+                app,
+                asked,
+                caller,
+                lease,
+                parts.io.into_inner(),
+                parts.read_buf,
+            )
+            .await;
+        }
+        Err(upgraded) => upgraded,
+    };
+    match upgraded.downcast::<TokioIo<UnixStream>>() {
+        Ok(parts) => {
+            session(
+                app,
+                asked,
+                caller,
+                lease,
+                parts.io.into_inner(),
+                parts.read_buf,
+            )
+            .await
+        }
+        Err(upgraded) => {
+            session(
+                app,
+                asked,
+                caller,
+                lease,
+                TokioIo::new(upgraded),
+                bytes::Bytes::new(),
+            )
+            .await
+        }
+    }
+}
+
+async fn session<S>(
+    app: Arc<App>,
+    asked: Asked,
+    mut caller: Caller,
+    lease: Option<Lease>,
+    mut io: S,
+    mut read_ahead: bytes::Bytes,
+) where
+    S: AsyncRead + AsyncWrite + Unpin + Send,
+{
+    let lease = match lease {
+        Some(lease) => Ok(lease),
+        None => {
+            let awaited = auth::first_message(&mut io, read_ahead, &app.tokens);
+            match tokio::time::timeout(app.config.portal.handshake.0, awaited).await {
+                Ok(Ok((token, rest))) => {
+                    read_ahead = rest;
+                    caller.token = Some(token);
+                    caller.trusted = true;
+                }
+                Ok(Err(reason)) => return bridge::refuse(io, POLICY, &reason).await,
+                Err(_) => {
+                    return bridge::refuse(io, POLICY, "no auth message came; send a token").await;
+                }
+            }
+            match self::lease(&app, &asked, &caller) {
+                Ok(lease) => lease.admitted().await.map(|()| lease),
+                Err(error) => Err(error),
+            }
+        }
+    };
+    let ready = match &lease {
+        Ok(lease) => lease.ready().await,
+        Err(_) => Err(Error::Internal("taking a servant")),
+    };
+    let (lease, works) = match (lease, ready) {
+        (Ok(lease), Ok(works)) => (lease, works),
+        (Err(error), _) | (_, Err(error)) => {
+            return bridge::refuse(io, TRY_AGAIN_LATER, &error.to_string()).await;
+        }
+    };
+    let client = match (&asked.robot, caller.peer) {
+        (Some(robot), _) => robot.clone(),
+        (None, Peer::Tcp(address)) => address.to_string(),
+        (None, Peer::Unix(uid)) => format!("user {uid}"),
+    };
+    let options = SessionOptions {
+        client,
+        resume: asked.resume,
+        read_ahead,
+        ..SessionOptions::default()
+    };
+    let end = works.bridge.serve(io, options).await;
+    let handle = lease.handle();
+    match end {
+        SessionEnd::Client { code, .. } => {
+            tracing::debug!("{} left servant {} (code {code})", handle.robot, handle.id);
+        }
+        SessionEnd::Closed { code, reason } => {
+            tracing::info!(
+                "closed the connection of {} to servant {} ({code}: {reason})",
+                handle.robot,
+                handle.id
+            );
+        }
+        SessionEnd::Lost(reason) => {
+            tracing::info!("lost {} at servant {}: {reason}", handle.robot, handle.id)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request(headers: &[(&str, &str)]) -> Request {
+        let mut request = Request::builder().uri("/opencv_apps");
+        for (name, value) in headers {
+            request = request.header(*name, *value);
+        }
+        request.body(Body::empty()).expect("a request")
+    }
+
+    const GOOD: [(&str, &str); 4] = [
+        ("connection", "keep-alive, Upgrade"),
+        ("upgrade", "websocket"),
+        ("sec-websocket-version", "13"),
+        ("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="),
+    ];
+
+    #[test]
+    fn the_handshake_is_answered_as_the_standard_says() {
+        // The example of RFC 6455, section 1.3.
+        assert_eq!(
+            handshake(&request(&GOOD)).expect("good"),
+            "s3pPLMBiTxaQ9kYGzzhZRbK+xOo="
+        );
+    }
+
+    #[test]
+    fn half_a_handshake_is_refused() {
+        for missing in [0, 2, 3] {
+            let headers: Vec<_> = GOOD
+                .iter()
+                .enumerate()
+                .filter(|(at, _)| *at != missing)
+                .map(|(_, pair)| *pair)
+                .collect();
+            assert_eq!(
+                handshake(&request(&headers))
+                    .expect_err("incomplete")
+                    .problem()
+                    .status,
+                400
+            );
+        }
+    }
+}

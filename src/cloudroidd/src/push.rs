@@ -1,0 +1,645 @@
+//! `POST /api/v1/push`: from an archive to a published revision, told line by line.
+//!
+//! ```text
+//!  body ─▶ unpack (nothing leaves the tree) ─▶ build (layers, image) ─▶ probe (start once, record the interface)
+//!                                                                              │
+//!             whoever connects next gets the new revision ◀─ tags ◀─ database ◀┘
+//! ```
+//!
+//! Until the database has the revision nothing of it can be seen, so whatever fails, and whenever the client goes
+//! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
+
+mod probe;
+mod receive;
+mod supplement;
+
+use std::collections::{BTreeSet, HashMap};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
+
+use anyhow::Context;
+use api::{PushEvent, PushOptions};
+use axum::body::Body;
+use axum::extract::{OriginalUri, State as Extracted};
+use axum::response::{IntoResponse, Response};
+use futures_util::StreamExt;
+use image::Store;
+use parking_lot::Mutex;
+use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
+use servant::engine::Engine;
+use tokio::sync::{OwnedMutexGuard, mpsc};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::choreographer::Choreographer;
+use crate::config::{self, Config};
+use crate::errors::Error;
+use crate::home::Home;
+use crate::journal::Journal;
+use crate::names;
+use crate::portal::App;
+use crate::state::{self, NewEvent, Plan, RevisionRecord, State};
+use crate::views;
+
+/// Events that may wait for a slow client before the build waits for it.
+const EVENTS_AHEAD: usize = 256;
+/// Where nodes run, and keep what they write: a tmpfs.
+const HOME_INSIDE: &str = "/root";
+
+/// Publishes, rolls back and removes services.
+pub struct Pusher {
+    config: Arc<Config>,
+    home: PathBuf,
+    state: Arc<State>,
+    store: Arc<Store>,
+    engine: Arc<dyn Engine>,
+    choreographer: Choreographer,
+    builder: Builder,
+    journal: Journal,
+    turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
+    published: AtomicU64,
+    failed: AtomicU64,
+    cancel: CancellationToken,
+    tasks: TaskTracker,
+}
+
+/// Tells the client what is being done. It may have gone away: that cancels the push by itself.
+#[derive(Clone)]
+struct Tell(mpsc::Sender<PushEvent>);
+
+impl Tell {
+    async fn step(&self, title: &str) {
+        self.event(PushEvent::Step {
+            title: title.to_owned(),
+        })
+        .await;
+    }
+
+    async fn warning(&self, message: String) {
+        self.event(PushEvent::Warning { message }).await;
+    }
+
+    async fn event(&self, event: PushEvent) {
+        let _ = self.0.send(event).await;
+    }
+}
+
+/// What a push came to.
+struct Published {
+    service: String,
+    layers: Vec<api::push::Layer>,
+}
+
+/// Answers a push.
+pub async fn handle(
+    Extracted(app): Extracted<Arc<App>>,
+    OriginalUri(uri): OriginalUri,
+    body: Body,
+) -> Response {
+    let options = match read_options(uri.query())
+        .and_then(|options| app.pusher.check(&options).map(|()| options))
+    {
+        Ok(options) => options,
+        Err(error) => {
+            // The client is still sending. Were it cut off, it might not see why.
+            app.pusher.tasks.spawn(receive::discard(
+                body,
+                app.config.push.archive,
+                app.ending.clone(),
+            ));
+            return error.into_response();
+        }
+    };
+    let (sender, receiver) = mpsc::channel(EVENTS_AHEAD);
+    let cancel = app.pusher.cancel.child_token();
+    // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
+    let guard = cancel.clone().drop_guard();
+    let tracker = app.pusher.tasks.clone();
+    tracker.spawn(async move {
+        app.pusher
+            .run(&app, options, body, Tell(sender), cancel)
+            .await
+    });
+    crate::portal::lines(ReceiverStream::new(receiver).map(move |event| {
+        let _ = &guard;
+        event
+    }))
+}
+
+fn read_options(query: Option<&str>) -> Result<PushOptions, Error> {
+    let uri: axum::http::Uri = format!("/?{}", query.unwrap_or_default())
+        .parse()
+        .map_err(|_| Error::BadRequest("the push options cannot be read".to_owned()))?;
+    match crate::portal::query(&uri, "options") {
+        Some(text) => serde_json::from_str(&text).map_err(|error| {
+            Error::BadRequest(format!("the push options cannot be read: {error}"))
+        }),
+        None => Ok(PushOptions::default()),
+    }
+}
+
+impl Pusher {
+    /// With half-made things below `home`.
+    pub fn new(
+        config: &Arc<Config>,
+        home: &Home,
+        state: Arc<State>,
+        store: Arc<Store>,
+        engine: Arc<dyn Engine>,
+        choreographer: Choreographer,
+        bases_dir: PathBuf,
+    ) -> anyhow::Result<Pusher> {
+        let builder = Builder::new(rootfs_builder::Config {
+            cache_dir: cache_directory(home),
+            bases_dir,
+            build_dir: home.path().join("build"),
+            logs_dir: home.path().join("logs"),
+            sources: rootfs_builder::Sources::default(),
+            store: Arc::clone(&store),
+            engine: Arc::clone(&engine),
+        })
+        .context("cannot prepare for building images")?;
+        Ok(Pusher {
+            config: Arc::clone(config),
+            home: home.path().to_owned(),
+            journal: Journal::new(Arc::clone(&state)),
+            state,
+            store,
+            engine,
+            choreographer,
+            builder,
+            turns: Mutex::default(),
+            published: AtomicU64::new(0),
+            failed: AtomicU64::new(0),
+            cancel: CancellationToken::new(),
+            tasks: TaskTracker::new(),
+        })
+    }
+
+    /// Pushes that succeeded and failed since the start.
+    pub fn counts(&self) -> (u64, u64) {
+        (
+            self.published.load(Ordering::Relaxed),
+            self.failed.load(Ordering::Relaxed),
+        )
+    }
+
+    /// Cancels every push and waits until nothing is left of them.
+    pub async fn cancel_all(&self) {
+        self.cancel.cancel();
+        self.tasks.close();
+        self.tasks.wait().await;
+    }
+
+    /// Refuses what can be refused before anything is received.
+    fn check(&self, options: &PushOptions) -> Result<(), Error> {
+        if self.cancel.is_cancelled() {
+            return Err(Error::Ending);
+        }
+        if let Some(name) = &options.name {
+            names::service(name)?;
+        }
+        config::check_limits(&options.limits)
+            .map_err(|error| Error::BadRequest(error.to_string()))?;
+        self.choreographer.check_limits(&options.limits)
+    }
+
+    async fn run(
+        &self,
+        app: &App,
+        options: PushOptions,
+        body: Body,
+        tell: Tell,
+        cancel: CancellationToken,
+    ) {
+        let began = Instant::now();
+        let id = format!("push-{}", names::random(8));
+        let outcome = tokio::select! {
+            outcome = self.push(&id, &options, body, &tell) => outcome,
+            () = cancel.cancelled() => Err(Error::Ending),
+        };
+        let half_made = self.home.join("build").join(&id);
+        let _ = tokio::task::spawn_blocking(move || std::fs::remove_dir_all(half_made)).await;
+        let finished = outcome
+            .and_then(|published| Ok((views::service(app, &published.service)?, published.layers)));
+        match finished {
+            Ok((service, layers)) => {
+                self.published.fetch_add(1, Ordering::Relaxed);
+                let took = began.elapsed().as_millis() as u64;
+                tell.event(PushEvent::Done {
+                    service: Box::new(service),
+                    layers,
+                    took,
+                })
+                .await;
+            }
+            Err(error) => {
+                self.failed.fetch_add(1, Ordering::Relaxed);
+                let name = options.name.as_deref().or(options.apt.as_deref());
+                let what = if cancel.is_cancelled() {
+                    "was cancelled".to_owned()
+                } else {
+                    format!("failed: {error}")
+                };
+                let message = format!("the push of {} {what}", name.unwrap_or(&options.source));
+                self.journal.warning(
+                    "push-failed",
+                    &message,
+                    &NewEvent {
+                        service: name,
+                        ..NewEvent::default()
+                    },
+                );
+                tell.event(PushEvent::Error {
+                    problem: error.problem(),
+                })
+                .await;
+                self.collect_garbage().await;
+            }
+        }
+    }
+
+    async fn push(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        body: Body,
+        tell: &Tell,
+    ) -> Result<Published, Error> {
+        let known = options.name.clone().or_else(|| options.apt.clone());
+        let early = match &known {
+            Some(name) => Some(self.turn(name).await),
+            None => None,
+        };
+        let source = match &options.apt {
+            Some(package) => Source::Packaged(package.clone()),
+            None => {
+                tell.step("receiving the package").await;
+                let tree = self.home.join("build").join(id).join("pushed");
+                receive::unpack(body, &tree, &self.config.push, tell).await?;
+                if let Some(name) = &options.name {
+                    self.check_owner(name, &receive::packages_of(&tree))?;
+                }
+                Source::Tree(tree)
+            }
+        };
+        let built = self.build(id, options, source, tell).await?;
+        let name = options
+            .name
+            .clone()
+            .unwrap_or_else(|| built.package.clone());
+        names::service(&name)?;
+        let _turn = match early {
+            Some(turn) if known.as_ref() == Some(&name) => turn,
+            _ => self.turn(&name).await,
+        };
+        self.check_owner(&name, std::slice::from_ref(&built.package))?;
+        tell.step("starting it once to find its interface").await;
+        let plan = plan_of(&built, options);
+        let found = probe::interface(self, id, &built, &plan, options).await?;
+        for warning in found.warnings {
+            tell.warning(warning).await;
+        }
+        let mut interface = found.interface;
+        if let Some(text) = &options.interface {
+            supplement::add(&mut interface, text, &built.definitions)
+                .map_err(|error| Error::BadRequest(format!("the interface supplement: {error}")))?;
+        }
+        let record = RevisionRecord {
+            service: name.clone(),
+            number: 0,
+            image: built.image.to_string(),
+            published: state::now(),
+            package: built.package.clone(),
+            source: options.source.clone(),
+            plan,
+            interface,
+        };
+        tell.step("publishing").await;
+        let number = self.publish(record).await?;
+        let about = NewEvent {
+            service: Some(&name),
+            ..NewEvent::default()
+        };
+        self.journal.info(
+            "published",
+            &format!("{name} is published, revision {number}"),
+            &about,
+        );
+        let layer = |layer: &rootfs_builder::BuiltLayer| api::push::Layer {
+            name: layer.name.to_owned(),
+            digest: layer.info.digest.to_string(),
+            size: layer.info.size,
+            cached: layer.cached,
+        };
+        Ok(Published {
+            service: name,
+            layers: built.layers.iter().map(layer).collect(),
+        })
+    }
+
+    /// A service belongs to the package that it was first made of.
+    fn check_owner(&self, name: &str, packages: &[String]) -> Result<(), Error> {
+        match (self.state.service_package(name)?, packages) {
+            (Some(owner), [first, ..]) if !packages.contains(&owner) => Err(Error::NameTaken {
+                name: name.to_owned(),
+                package: owner,
+                newcomer: first.clone(),
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    async fn build(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        source: Source,
+        tell: &Tell,
+    ) -> Result<BuildOutcome, Error> {
+        let request = PushRequest {
+            id: id.to_owned(),
+            source,
+            base: options.base.clone(),
+            launch: options.launch.clone(),
+            nodes: options.nodes.clone(),
+            params: options.params.clone(),
+            args: options.args.clone(),
+            remaps: options.remaps.clone(),
+            map: options.map.clone(),
+            with: options.with.clone(),
+        };
+        let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
+        let forwarded = async {
+            while let Some(event) = events.recv().await {
+                tell.event(push_event(event)).await;
+            }
+        };
+        let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);
+        built.map_err(|error| push_error(&error))
+    }
+
+    /// Writes the revision; from here on it is what new servants are started from.
+    async fn publish(&self, record: RevisionRecord) -> Result<u64, Error> {
+        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
+        blocking("publishing", move || {
+            let number = state.publish(&record)?;
+            // A crash before these is mended at the next start.
+            tag(&store, &record.service, number, &record.image)?;
+            tag_current(&store, &record.service, &record.image)?;
+            Ok(number)
+        })
+        .await
+    }
+
+    /// Makes an earlier revision the current one.
+    pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<u64, Error> {
+        let _turn = self.turn(name).await;
+        let current = views::current(&self.state, name)?;
+        let revisions = self.state.revisions(name)?;
+        let target = match wanted {
+            Some(number) => revisions.iter().find(|revision| revision.number == number),
+            None => revisions
+                .iter()
+                .find(|revision| revision.number < current.number),
+        };
+        let Some(target) = target.cloned() else {
+            return Err(Error::UnknownRevision {
+                service: name.to_owned(),
+                revision: wanted.map_or_else(
+                    || format!("before {}", current.number),
+                    |number| number.to_string(),
+                ),
+                exists: revisions
+                    .iter()
+                    .map(|revision| revision.number.to_string())
+                    .collect(),
+            });
+        };
+        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
+        let number = target.number;
+        blocking("rolling back", move || {
+            state.set_current(&target.service, target.number)?;
+            tag_current(&store, &target.service, &target.image)
+        })
+        .await?;
+        let about = NewEvent {
+            service: Some(name),
+            ..NewEvent::default()
+        };
+        let message = format!(
+            "{name} was set from revision {} to revision {number}",
+            current.number
+        );
+        self.journal.info("rolled-back", &message, &about);
+        Ok(number)
+    }
+
+    /// Removes a service, its servants and its images; gives the servants' ids.
+    pub async fn remove(&self, name: &str) -> Result<Vec<String>, Error> {
+        let _turn = self.turn(name).await;
+        let revisions = self.state.revisions(name)?;
+        self.state.remove_service(name)?;
+        let stopped = self
+            .choreographer
+            .stop("its service was removed", |handle| handle.service() == name)
+            .await;
+        let (store, service) = (Arc::clone(&self.store), name.to_owned());
+        blocking("removing a service", move || {
+            store.untag(&service)?;
+            for revision in revisions {
+                store.untag(&format!("{service}:{}", revision.number))?;
+            }
+            Ok(())
+        })
+        .await?;
+        self.collect_garbage().await;
+        let about = NewEvent {
+            service: Some(name),
+            ..NewEvent::default()
+        };
+        self.journal
+            .info("removed", &format!("{name} was removed"), &about);
+        Ok(stopped)
+    }
+
+    /// Makes the tags say what the database says (a crash may have come between), then removes what nothing needs.
+    pub async fn mend(&self) -> Result<(), Error> {
+        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
+        blocking("mending the image store", move || {
+            let mut wanted = BTreeSet::new();
+            for revision in state.all_revisions()? {
+                tag(&store, &revision.service, revision.number, &revision.image)?;
+                wanted.insert(format!("{}:{}", revision.service, revision.number));
+            }
+            for service in state.service_names()? {
+                if let Some(current) = state.current(&service)? {
+                    tag_current(&store, &service, &current.image)?;
+                }
+                wanted.insert(service);
+            }
+            for tag in store
+                .tags()?
+                .into_keys()
+                .filter(|tag| !wanted.contains(tag))
+            {
+                store.untag(&tag)?;
+            }
+            Ok(())
+        })
+        .await?;
+        self.collect_garbage().await;
+        Ok(())
+    }
+
+    async fn collect_garbage(&self) {
+        let keep: BTreeSet<image::Digest> = self
+            .choreographer
+            .images_in_use()
+            .iter()
+            .filter_map(|image| image.parse().ok())
+            .collect();
+        let store = Arc::clone(&self.store);
+        match blocking("collecting garbage", move || Ok(store.gc(&keep)?)).await {
+            Ok(swept) if swept.blobs + swept.trees + swept.leftovers > 0 => {
+                tracing::info!(
+                    "removed {} blobs and {} trees that nothing needs",
+                    swept.blobs,
+                    swept.trees
+                );
+            }
+            Ok(_) => {}
+            Err(error) => tracing::warn!("garbage could not be collected: {error}"),
+        }
+        if let Ok(revisions) = self.state.all_revisions() {
+            let images = revisions
+                .into_iter()
+                .map(|revision| revision.image)
+                .collect();
+            self.choreographer.keep_definitions(&images);
+        }
+    }
+
+    async fn turn(&self, service: &str) -> OwnedMutexGuard<()> {
+        let turn = {
+            let mut turns = self.turns.lock();
+            turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+            Arc::clone(turns.entry(service.to_owned()).or_default())
+        };
+        turn.lock_owned().await
+    }
+}
+
+/// A tag that cannot be set because its image is gone is told, and is no reason not to start.
+fn tag(store: &Store, service: &str, number: u64, image: &str) -> Result<(), Error> {
+    set_tag(store, &format!("{service}:{number}"), image)
+}
+
+fn tag_current(store: &Store, service: &str, image: &str) -> Result<(), Error> {
+    set_tag(store, service, image)
+}
+
+fn set_tag(store: &Store, name: &str, image: &str) -> Result<(), Error> {
+    let digest = image.parse().map_err(|_| Error::UnknownImage {
+        what: image.to_owned(),
+    })?;
+    match store.tag(name, &digest) {
+        Err(error @ image::Error::UnknownImage { .. }) => {
+            tracing::error!("{name} cannot be served: {error}");
+            Ok(())
+        }
+        outcome => Ok(outcome?),
+    }
+}
+
+async fn blocking<T: Send + 'static>(
+    what: &'static str,
+    work: impl FnOnce() -> Result<T, Error> + Send + 'static,
+) -> Result<T, Error> {
+    tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|_| Error::Internal(what))?
+}
+
+fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
+    let mut environment = built.environment.clone();
+    for (name, value) in [
+        ("HOME", HOME_INSIDE),
+        ("ROS_HOME", HOME_INSIDE),
+        ("ROS_LOG_DIR", "/root/log"),
+        ("ROS_MASTER_URI", "http://localhost:11311"),
+        ("ROS_HOSTNAME", "localhost"),
+    ] {
+        environment.insert(name.to_owned(), value.to_owned());
+    }
+    Plan {
+        environment,
+        nodes: built
+            .plan
+            .nodes
+            .iter()
+            .map(|node| node.spec(HOME_INSIDE))
+            .collect(),
+        parameters: built.plan.parameters.clone(),
+        limits: options.limits,
+        // A launch file says itself which nodes come again.
+        restart: options.launch.is_none(),
+    }
+}
+
+fn push_event(event: BuildEvent) -> PushEvent {
+    match event {
+        BuildEvent::Step { title } => PushEvent::Step { title },
+        BuildEvent::Log { line } => PushEvent::Log { line },
+        BuildEvent::Progress { unit, done, total } => PushEvent::Progress {
+            unit: unit.to_owned(),
+            done,
+            total,
+        },
+        BuildEvent::Warning { message } => PushEvent::Warning { message },
+    }
+}
+
+fn push_error(error: &rootfs_builder::Error) -> Error {
+    Error::Push {
+        message: error.to_string(),
+        next: None,
+        log: Vec::new(),
+    }
+}
+
+/// Shared between daemons: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; below the home where neither is known.
+fn cache_directory(home: &Home) -> PathBuf {
+    let variable = |name| {
+        std::env::var_os(name)
+            .filter(|value| !value.is_empty())
+            .map(PathBuf::from)
+    };
+    variable("XDG_CACHE_HOME")
+        .or_else(|| variable("HOME").map(|user| user.join(".cache")))
+        .map_or_else(
+            || home.path().join("cache"),
+            |cache| cache.join("cloudroid"),
+        )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_come_in_the_query() {
+        let options =
+            read_options(Some("options=%7B%22apt%22%3A%22opencv_apps%22%7D")).expect("valid");
+        assert_eq!(options.apt.as_deref(), Some("opencv_apps"));
+        assert_eq!(read_options(None).expect("none"), PushOptions::default());
+        let refused = read_options(Some("options=%7B%22nope%22%3A1%7D"))
+            .expect_err("unknown")
+            .problem();
+        assert_eq!(refused.status, 400);
+        assert!(refused.detail.contains("nope"), "{refused:?}");
+    }
+}

@@ -1,0 +1,215 @@
+//! Finds the interface of a new image: it is started once, as a servant, and looked at.
+
+use std::sync::Arc;
+
+use api::PushOptions;
+use futures_util::StreamExt;
+use futures_util::stream::FuturesUnordered;
+use rootfs_builder::BuildOutcome;
+use rootfs_builder::probe::{Found, ProbeOptions};
+use ros::bus::Bus;
+use ros::ros1::Ros1Bus;
+use ros::schema::Registry;
+use servant::engine::{ContainerState, NodeExit, Servant};
+use servant::spec::{Profile, Spec};
+use tokio_util::task::TaskTracker;
+
+use super::{Pusher, blocking};
+use crate::admission::Amount;
+use crate::choreographer;
+use crate::errors::Error;
+use crate::sockets::ServantSockets;
+use crate::state::Plan;
+use crate::works::MASTER;
+
+/// The name of the looking node.
+const NODE: &str = "/cloudroid_probe";
+/// Lines of a node's log that explain its failure.
+const LOG_LINES: usize = 20;
+
+/// Starts the image once and records what it shows.
+pub(super) async fn interface(
+    pusher: &Pusher,
+    id: &str,
+    built: &BuildOutcome,
+    plan: &Plan,
+    options: &PushOptions,
+) -> Result<Found, Error> {
+    let spec = spec(pusher, id, built, plan, options).await?;
+    let limits = spec.limits;
+    let room = Amount::new(
+        limits.cpus.unwrap_or_default(),
+        limits.memory.unwrap_or_default(),
+    );
+    let _promised = pusher.choreographer.admission().adopt(room);
+    let servant = pusher.engine.start(spec).await?;
+    // Ended however this function is left: a push can be cancelled at any await.
+    let trial = Trial {
+        servant: Some(Arc::clone(&servant)),
+        tasks: pusher.tasks.clone(),
+    };
+    let found = look(pusher, &servant, built, plan).await;
+    trial.end().await?;
+    found
+}
+
+async fn look(
+    pusher: &Pusher,
+    servant: &Arc<dyn Servant>,
+    built: &BuildOutcome,
+    plan: &Plan,
+) -> Result<Found, Error> {
+    let failed = |message: String| Error::Push {
+        message,
+        next: None,
+        log: Vec::new(),
+    };
+    let registry = Registry::from_definitions(&built.definitions)
+        .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
+    let options = ProbeOptions {
+        patience: pusher.config.push.probe.0,
+        ..ProbeOptions::new(
+            plan.nodes.iter().map(|node| node.name.clone()).collect(),
+            NODE,
+        )
+    };
+    let looking = async {
+        let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
+        let bus: Arc<dyn Bus> = Ros1Bus::connect(sockets, MASTER, NODE)
+            .await
+            .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+        rootfs_builder::probe::probe(
+            &*bus,
+            &registry,
+            &built.definitions,
+            &options,
+            std::future::pending(),
+        )
+        .await
+        .map_err(|error| failed(error.to_string()))
+    };
+    let outcome = tokio::select! {
+        // First: of a node that ended, nothing else is worth saying.
+        biased;
+        words = ended(servant, plan) => Err(failed(words)),
+        found = looking => found,
+    };
+    outcome.map_err(|error| explained(error, servant))
+}
+
+/// Comes back when a node ends that should not, or the container does, with what is to be said about it.
+async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
+    let mut nodes: FuturesUnordered<_> = plan
+        .nodes
+        .iter()
+        .filter(|node| !node.respawn)
+        .map(|node| async move { (node.name.clone(), servant.wait_node(&node.name).await) })
+        .collect();
+    let mut left = plan.nodes.len();
+    let node_ended = async {
+        while let Some((name, exit)) = nodes.next().await {
+            left -= 1;
+            match exit {
+                // Launch files have nodes that do one thing and end.
+                Ok(NodeExit { code: Some(0), .. }) if left > 0 => {}
+                Ok(exit) => {
+                    let how = choreographer::how_it_ended(&exit, &plan.limits);
+                    return format!("{name} {how} before its interface was seen");
+                }
+                // The container's own state says more.
+                Err(_) => {}
+            }
+        }
+        std::future::pending().await
+    };
+    let mut states = servant.state();
+    let over = states.wait_for(|state| {
+        matches!(
+            state,
+            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+        )
+    });
+    tokio::select! {
+        biased;
+        words = node_ended => words,
+        over = over => match over.as_deref() {
+            Ok(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
+                format!("the started image ended before its interface was seen: {reason}")
+            }
+            _ => "the started image was lost by the engine".to_owned(),
+        },
+    }
+}
+
+/// With the last lines that the nodes printed.
+fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
+    match error {
+        Error::Push { message, next, log } if log.is_empty() => {
+            let lines = choreographer::read_log(&servant.log_path(), LOG_LINES, None);
+            let log = lines
+                .into_iter()
+                .map(|line| format!("{}: {}", line.node, line.line))
+                .collect();
+            Error::Push { message, next, log }
+        }
+        other => other,
+    }
+}
+
+async fn spec(
+    pusher: &Pusher,
+    id: &str,
+    built: &BuildOutcome,
+    plan: &Plan,
+    options: &PushOptions,
+) -> Result<Spec, Error> {
+    let store = Arc::clone(&pusher.store);
+    let infos: Vec<_> = built.layers.iter().map(|layer| layer.info).collect();
+    let layers = blocking("extracting layers", move || {
+        Ok(infos
+            .iter()
+            .map(|layer| store.extracted(&layer.diff_id))
+            .collect::<Result<_, _>>()?)
+    })
+    .await?;
+    Ok(Spec {
+        id: format!("{id}-probe"),
+        layers,
+        writable: None,
+        profile: Profile::Servant,
+        limits: choreographer::engine_limits(&options.limits.or(pusher.config.limits)),
+        environment: plan.environment.clone(),
+        nodes: plan.nodes.clone(),
+        owned_directories: Vec::new(),
+        mounts: Vec::new(),
+        resident: crate::shim::resident_config(&plan.parameters),
+    })
+}
+
+/// A servant that ends with this value.
+struct Trial {
+    servant: Option<Arc<dyn Servant>>,
+    tasks: TaskTracker,
+}
+
+impl Trial {
+    async fn end(mut self) -> Result<(), Error> {
+        match self.servant.take() {
+            Some(servant) => Ok(servant.stop().await?),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Drop for Trial {
+    fn drop(&mut self) {
+        let Some(servant) = self.servant.take() else {
+            return;
+        };
+        self.tasks.spawn(async move {
+            if let Err(error) = servant.stop().await {
+                tracing::error!("the probe {} could not be ended: {error}", servant.id());
+            }
+        });
+    }
+}

@@ -1,0 +1,242 @@
+//! The archive of a push: unpacked while it comes in, so that it is never on disk as such.
+
+use std::io::{self, Read};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use api::{PushEvent, Size};
+use axum::body::Body;
+use futures_util::{StreamExt, TryStreamExt};
+use tokio_util::io::{StreamReader, SyncIoBridge};
+use tokio_util::sync::CancellationToken;
+
+use super::Tell;
+use crate::config::Push;
+use crate::errors::Error;
+
+/// How often it is told how far the archive has come.
+const TOLD_EVERY: Duration = Duration::from_millis(500);
+/// How long a refused client is listened to.
+const DISCARD_FOR: Duration = Duration::from_secs(60);
+/// How deep a package.xml is looked for.
+const DEPTH: usize = 6;
+
+/// Unpacks the body into `tree`, which is made.
+pub(super) async fn unpack(
+    body: Body,
+    tree: &Path,
+    limits: &Push,
+    tell: &Tell,
+) -> Result<(), Error> {
+    let received = Arc::new(AtomicU64::new(0));
+    let stream = StreamReader::new(body.into_data_stream().map_err(io::Error::other).boxed());
+    let mut archive = Counted {
+        inner: SyncIoBridge::new(stream),
+        received: Arc::clone(&received),
+        limit: limits.archive.0,
+        exceeded: false,
+    };
+    let unpacked = image::Limits {
+        entries: limits.entries,
+        bytes: limits.unpacked.0,
+        ..image::Limits::default()
+    };
+    let limit = limits.archive;
+    let destination = tree.to_owned();
+    let work = tokio::task::spawn_blocking(move || {
+        let parent = destination.parent().unwrap_or(&destination);
+        std::fs::create_dir_all(parent).map_err(|error| Error::Push {
+            message: format!("cannot make {}: {error}", parent.display()),
+            next: None,
+            log: Vec::new(),
+        })?;
+        let outcome = image::unpack(&mut archive, &destination, &unpacked);
+        if archive.exceeded {
+            return Err(Error::TooLarge { limit });
+        }
+        outcome.map(|_| ()).map_err(refused)
+    });
+    let told = async {
+        let mut ticks = tokio::time::interval(TOLD_EVERY);
+        loop {
+            ticks.tick().await;
+            let done = received.load(Ordering::Relaxed);
+            if done > 0 {
+                tell.event(PushEvent::Progress {
+                    unit: "bytes".to_owned(),
+                    done,
+                    total: None,
+                })
+                .await;
+            }
+        }
+    };
+    tokio::select! {
+        outcome = work => outcome.map_err(|_| Error::Internal("unpacking the archive"))?,
+        () = told => Ok(()),
+    }
+}
+
+fn refused(error: image::Error) -> Error {
+    let next = match &error {
+        image::Error::Archive { .. } => Some(
+            "push a tar archive of a package, workspace or install space that keeps to itself"
+                .to_owned(),
+        ),
+        _ => None,
+    };
+    Error::Push {
+        message: error.to_string(),
+        next,
+        log: Vec::new(),
+    }
+}
+
+/// Reads what a refused client still sends, for a while.
+pub(super) async fn discard(body: Body, limit: Size, ending: CancellationToken) {
+    let mut stream = body.into_data_stream();
+    let read = async {
+        let mut seen = 0;
+        while let Some(Ok(chunk)) = stream.next().await {
+            seen += chunk.len() as u64;
+            if seen > limit.0 {
+                break;
+            }
+        }
+    };
+    tokio::select! {
+        _ = tokio::time::timeout(DISCARD_FOR, read) => {}
+        () = ending.cancelled() => {}
+    }
+}
+
+/// Names of the packages in a tree, as far as they can be read; that of the tree's root first. (The build reads
+/// them strictly; this is for an early word.)
+pub(super) fn packages_of(tree: &Path) -> Vec<String> {
+    let mut names = Vec::new();
+    collect_packages(tree, DEPTH, &mut names);
+    names
+}
+
+fn collect_packages(directory: &Path, depth: usize, names: &mut Vec<String>) {
+    if let Ok(text) = std::fs::read_to_string(directory.join("package.xml")) {
+        names.extend(name_in(&text));
+        return;
+    }
+    if depth == 0 {
+        return;
+    }
+    let Ok(entries) = std::fs::read_dir(directory) else {
+        return;
+    };
+    let mut below: Vec<_> = entries
+        .flatten()
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
+        .map(|entry| entry.path())
+        .collect();
+    below.sort();
+    for directory in below {
+        collect_packages(&directory, depth - 1, names);
+    }
+}
+
+fn name_in(manifest: &str) -> Option<String> {
+    let (_, rest) = manifest.split_once("<name>")?;
+    let (name, _) = rest.split_once("</name>")?;
+    Some(name.trim().to_owned())
+}
+
+/// Counts what is read and ends with an error beyond the limit.
+struct Counted<R> {
+    inner: R,
+    received: Arc<AtomicU64>,
+    limit: u64,
+    exceeded: bool,
+}
+
+impl<R: Read> Read for Counted<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.inner.read(buffer)?;
+        let total = self.received.fetch_add(read as u64, Ordering::Relaxed) + read as u64;
+        if total > self.limit {
+            self.exceeded = true;
+            return Err(io::Error::new(
+                io::ErrorKind::FileTooLarge,
+                "the archive is too big",
+            ));
+        }
+        Ok(read)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::sync::mpsc;
+
+    use super::*;
+
+    fn archive(files: &[(&str, &str)]) -> Vec<u8> {
+        let mut builder = tar::Builder::new(Vec::new());
+        for (name, text) in files {
+            let mut header = tar::Header::new_gnu();
+            header.set_size(text.len() as u64);
+            header.set_mode(0o644);
+            header.set_uid(0);
+            header.set_gid(0);
+            header.set_mtime(0);
+            builder
+                .append_data(&mut header, name, text.as_bytes())
+                .expect("into memory");
+        }
+        builder.into_inner().expect("into memory")
+    }
+
+    async fn unpacked(bytes: Vec<u8>, limits: &Push) -> Result<Vec<String>, Error> {
+        let place = tempfile::tempdir().expect("a directory");
+        let tree = place.path().join("build/pushed");
+        let (sender, _receiver) = mpsc::channel(16);
+        unpack(Body::from(bytes), &tree, limits, &Tell(sender)).await?;
+        Ok(packages_of(&tree))
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn an_archive_becomes_a_tree() {
+        let bytes = archive(&[
+            (
+                "src/one/package.xml",
+                "<package><name> one </name></package>",
+            ),
+            ("src/two/package.xml", "<package><name>two</name></package>"),
+            (
+                "src/two/test/package.xml",
+                "<package><name>not counted</name></package>",
+            ),
+        ]);
+        assert_eq!(
+            unpacked(bytes, &Push::default()).await.expect("good"),
+            ["one", "two"]
+        );
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn an_archive_over_the_limit_is_refused() {
+        let bytes = archive(&[("package.xml", &"x".repeat(10_000))]);
+        let limits = Push {
+            archive: Size(2000),
+            ..Push::default()
+        };
+        let refused = unpacked(bytes, &limits).await.expect_err("too big");
+        assert_eq!(refused.problem().status, 413, "{refused}");
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn what_is_no_archive_is_refused() {
+        let refused = unpacked(b"hello, this is no archive".repeat(100), &Push::default())
+            .await
+            .expect_err("text");
+        assert_eq!(refused.problem().status, 422, "{refused}");
+        assert!(refused.to_string().contains("archive"), "{refused}");
+    }
+}

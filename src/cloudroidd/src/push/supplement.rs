@@ -1,0 +1,243 @@
+//! `--interface FILE`: what to add to the interface that was found, where a node cannot be woken at push.
+//!
+//! ```toml
+//! [[topics]]
+//! name = "/map"
+//! type = "nav_msgs/OccupancyGrid"
+//! direction = "output"
+//! latched = true
+//! [[services]]
+//! name = "/save"
+//! type = "std_srvs/Trigger"
+//! ```
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use package::interface::{Interface, Service, Topic};
+use ros::schema::{Base, MessageType, Registry, SchemaError};
+
+/// Why a supplement is refused.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum SupplementError {
+    /// Neither TOML nor JSON of this form.
+    #[error("{0}")]
+    Unreadable(String),
+    /// Not an absolute name.
+    #[error("{0:?} is not an absolute name; begin it with /")]
+    Relative(String),
+    /// A type that the image does not hold.
+    #[error("{name}: {source}; add the Debian package that holds the type with --with")]
+    Type {
+        /// What has the type.
+        name: String,
+        /// What is missing.
+        source: SchemaError,
+    },
+}
+
+/// Adds the supplement `text` to `interface`. What was found stays as it was found.
+pub(super) fn add(
+    interface: &mut Interface,
+    text: &str,
+    definitions: &BTreeMap<String, String>,
+) -> Result<(), SupplementError> {
+    let supplement = read(text)?;
+    let registry =
+        Registry::from_definitions(definitions).map_err(|source| SupplementError::Type {
+            name: "the image".to_owned(),
+            source,
+        })?;
+    let mut texts = Texts {
+        definitions,
+        used: &mut interface.definitions,
+    };
+    for topic in supplement.topics {
+        absolute(&topic.name)?;
+        let message = registry
+            .message(&topic.type_name)
+            .map_err(unknown(&topic.name))?;
+        texts.message(&message);
+        let known = interface
+            .topics
+            .iter()
+            .any(|found| found.name == topic.name && found.direction == topic.direction);
+        if !known {
+            interface.topics.push(Topic {
+                md5: message.md5().to_owned(),
+                ..topic
+            });
+        }
+    }
+    for service in supplement.services {
+        absolute(&service.name)?;
+        let definition = registry
+            .service(&service.type_name)
+            .map_err(unknown(&service.name))?;
+        texts.own(&service.type_name, "srv");
+        texts.message(&definition.request);
+        texts.message(&definition.response);
+        if interface
+            .services
+            .iter()
+            .all(|found| found.name != service.name)
+        {
+            interface.services.push(Service {
+                md5: definition.md5.clone(),
+                ..service
+            });
+        }
+    }
+    for action in supplement.actions {
+        absolute(&action.name)?;
+        let definition = registry
+            .action(&action.type_name)
+            .map_err(unknown(&action.name))?;
+        texts.own(&action.type_name, "action");
+        for message in [&definition.goal, &definition.result, &definition.feedback] {
+            texts.message(message);
+        }
+        if interface
+            .actions
+            .iter()
+            .all(|found| found.name != action.name)
+        {
+            interface.actions.push(action);
+        }
+    }
+    for parameter in supplement.parameters {
+        absolute(&parameter.name)?;
+        if interface
+            .parameters
+            .iter()
+            .all(|found| found.name != parameter.name)
+        {
+            interface.parameters.push(parameter);
+        }
+    }
+    interface
+        .topics
+        .sort_by(|one, other| one.name.cmp(&other.name));
+    interface
+        .services
+        .sort_by(|one, other| one.name.cmp(&other.name));
+    interface
+        .actions
+        .sort_by(|one, other| one.name.cmp(&other.name));
+    interface
+        .parameters
+        .sort_by(|one, other| one.name.cmp(&other.name));
+    Ok(())
+}
+
+fn read(text: &str) -> Result<Interface, SupplementError> {
+    if text.trim_start().starts_with('{') {
+        return serde_json::from_str(text)
+            .map_err(|error| SupplementError::Unreadable(error.to_string()));
+    }
+    Interface::from_toml(text, Path::new("the file"))
+        .map_err(|error| SupplementError::Unreadable(error.to_string()))
+}
+
+fn absolute(name: &str) -> Result<(), SupplementError> {
+    if name.starts_with('/') && name.len() > 1 {
+        Ok(())
+    } else {
+        Err(SupplementError::Relative(name.to_owned()))
+    }
+}
+
+fn unknown(name: &str) -> impl FnOnce(SchemaError) -> SupplementError {
+    let name = name.to_owned();
+    move |source| SupplementError::Type { name, source }
+}
+
+/// The definitions that are used, with all that they refer to.
+struct Texts<'a> {
+    definitions: &'a BTreeMap<String, String>,
+    used: &'a mut BTreeMap<String, String>,
+}
+
+impl Texts<'_> {
+    fn own(&mut self, type_name: &str, kind: &str) -> bool {
+        let key = type_name.replacen('/', &format!("/{kind}/"), 1);
+        match self.definitions.get(&key) {
+            Some(text) => self.used.insert(key, text.clone()).is_none(),
+            None => false,
+        }
+    }
+
+    fn message(&mut self, message: &MessageType) {
+        self.own(message.name(), "msg");
+        for field in message.fields() {
+            if let Base::Message(inner) = &field.base {
+                self.message(inner);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn definitions() -> BTreeMap<String, String> {
+        let texts = [
+            ("a/msg/Outer", "Inner inner\n"),
+            ("a/msg/Inner", "string text\n"),
+            ("a/srv/Ask", "---\nInner answer\n"),
+        ];
+        texts
+            .map(|(key, text)| (key.to_owned(), text.to_owned()))
+            .into()
+    }
+
+    #[test]
+    fn what_was_not_found_is_added_with_its_definitions() {
+        let mut interface = Interface::default();
+        let text = "[[topics]]\nname = \"/out\"\ntype = \"a/Outer\"\ndirection = \"output\"\n\
+                    [[services]]\nname = \"/ask\"\ntype = \"a/Ask\"\n";
+        add(&mut interface, text, &definitions()).expect("valid");
+        assert_eq!(interface.topics[0].name, "/out");
+        assert_eq!(interface.topics[0].md5.len(), 32);
+        assert_eq!(interface.services[0].type_name, "a/Ask");
+        let keys: Vec<&str> = interface.definitions.keys().map(String::as_str).collect();
+        assert_eq!(keys, ["a/msg/Inner", "a/msg/Outer", "a/srv/Ask"]);
+    }
+
+    #[test]
+    fn json_is_read_too_and_what_was_found_stays() {
+        let mut interface = Interface::default();
+        let text = r#"{"topics": [{"name": "/out", "type": "a/Inner", "direction": "output", "latched": true}]}"#;
+        add(&mut interface, text, &definitions()).expect("valid");
+        let before = interface.clone();
+        add(
+            &mut interface,
+            &text.replace("true", "false"),
+            &definitions(),
+        )
+        .expect("valid");
+        assert_eq!(interface, before);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        for (text, words) in [
+            (
+                "[[topics]]\nname = \"out\"\ntype = \"a/Inner\"\ndirection = \"output\"",
+                "\"out\" is not an absolute name",
+            ),
+            (
+                "[[topics]]\nname = \"/out\"\ntype = \"b/None\"\ndirection = \"output\"",
+                "b/None",
+            ),
+            ("[[topics]]\nname = \"/out\"\ntyp = \"a/Inner\"", "typ"),
+            ("{", "EOF"),
+        ] {
+            let refused = add(&mut Interface::default(), text, &definitions())
+                .expect_err(words)
+                .to_string();
+            assert!(refused.contains(words), "{refused}");
+        }
+    }
+}

@@ -1,0 +1,36 @@
+//! Where the two seams meet: sockets for ROS, opened in the network namespace of a servant.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use servant::endpoint::Endpoint;
+use servant::netns::NetNs;
+use tokio::net::{TcpListener, TcpStream};
+
+/// Sockets inside one servant.
+#[derive(Debug, Clone)]
+pub struct ServantSockets {
+    netns: Arc<NetNs>,
+}
+
+impl ServantSockets {
+    /// Of the servant at `endpoint`.
+    pub fn new(endpoint: &Endpoint) -> ServantSockets {
+        ServantSockets {
+            netns: Arc::clone(&endpoint.netns),
+        }
+    }
+}
+
+#[async_trait]
+impl ros::net::Sockets for ServantSockets {
+    async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
+        self.netns.connect(address).await
+    }
+
+    async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
+        self.netns.listen(address).await
+    }
+}

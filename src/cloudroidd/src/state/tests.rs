@@ -1,0 +1,189 @@
+use super::*;
+
+fn revision(service: &str, image: &str) -> RevisionRecord {
+    RevisionRecord {
+        service: service.into(),
+        number: 0,
+        image: image.into(),
+        published: now(),
+        package: "opencv_apps".into(),
+        source: "--apt opencv_apps".into(),
+        plan: Plan {
+            nodes: vec![servant::spec::NodeSpec {
+                name: "/people_detect".into(),
+                argv: vec!["/usr/lib/opencv_apps/people_detect".into()],
+                environment: Default::default(),
+                directory: String::new(),
+                respawn: false,
+                respawn_delay: 0.0,
+                required: false,
+            }],
+            ..Plan::default()
+        },
+        interface: Default::default(),
+    }
+}
+
+fn state() -> (tempfile::TempDir, State) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let state = State::open(&directory.path().join("cloudroid.db")).expect("a database");
+    (directory, state)
+}
+
+#[test]
+fn a_published_revision_is_read_back_after_a_restart() {
+    let (directory, state) = state();
+    assert_eq!(
+        state
+            .publish(&revision("opencv_apps", "sha256:1"))
+            .expect("published"),
+        1
+    );
+    let second = revision("opencv_apps", "sha256:2");
+    assert_eq!(state.publish(&second).expect("published"), 2);
+    drop(state);
+    let state = State::open(&directory.path().join("cloudroid.db")).expect("the same database");
+    assert_eq!(state.service_names().expect("readable"), ["opencv_apps"]);
+    let current = state
+        .current("opencv_apps")
+        .expect("readable")
+        .expect("there");
+    assert_eq!(
+        current,
+        RevisionRecord {
+            number: 2,
+            ..second
+        }
+    );
+    let numbers: Vec<u64> = state
+        .revisions("opencv_apps")
+        .expect("readable")
+        .iter()
+        .map(|r| r.number)
+        .collect();
+    assert_eq!(numbers, [2, 1]);
+}
+
+#[test]
+fn rolling_back_needs_a_revision_that_exists() {
+    let (_directory, state) = state();
+    state
+        .publish(&revision("a", "sha256:1"))
+        .expect("published");
+    state
+        .publish(&revision("a", "sha256:2"))
+        .expect("published");
+    assert!(state.set_current("a", 1).expect("readable"));
+    assert_eq!(
+        state.current("a").expect("readable").expect("there").image,
+        "sha256:1"
+    );
+    assert!(!state.set_current("a", 7).expect("readable"));
+    assert!(!state.set_current("b", 1).expect("readable"));
+    assert_eq!(
+        state
+            .publish(&revision("a", "sha256:3"))
+            .expect("published"),
+        3,
+        "numbers go on"
+    );
+}
+
+#[test]
+fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
+    let (_directory, state) = state();
+    state
+        .publish(&revision("a", "sha256:1"))
+        .expect("published");
+    assert!(state.remove_service("a").expect("readable"));
+    assert!(!state.remove_service("a").expect("readable"));
+    assert!(state.current("a").expect("readable").is_none());
+    assert!(state.all_revisions().expect("readable").is_empty());
+    assert_eq!(
+        state
+            .publish(&revision("a", "sha256:1"))
+            .expect("published"),
+        2
+    );
+}
+
+#[test]
+fn a_robot_stays_with_whom_it_came_first() {
+    let (_directory, state) = state();
+    let (mine, theirs) = ("m".repeat(64), "t".repeat(64));
+    assert_eq!(
+        state.robot_owner("r1", Some(&mine)).expect("readable"),
+        Some(mine.clone())
+    );
+    assert_eq!(
+        state.robot_owner("r1", Some(&theirs)).expect("readable"),
+        Some(mine.clone())
+    );
+    assert_eq!(
+        state.robot_owner("r1", None).expect("readable"),
+        Some(mine.clone())
+    );
+    assert_eq!(state.robot_owner("r2", None).expect("readable"), None);
+    assert_eq!(
+        state.release_robots(&[theirs.clone()]).expect("readable"),
+        1
+    );
+    assert_eq!(
+        state.robot_owner("r1", Some(&theirs)).expect("readable"),
+        Some(theirs)
+    );
+}
+
+#[test]
+fn servants_are_remembered_until_they_end() {
+    let (_directory, state) = state();
+    let record = ServantRecord {
+        id: "a-1".into(),
+        service: "a".into(),
+        revision: 1,
+        robot: "r1".into(),
+        anonymous: false,
+        created: 5,
+    };
+    state.add_servant(&record).expect("written");
+    assert_eq!(state.servants().expect("readable"), [record]);
+    state.remove_servant("a-1").expect("written");
+    assert!(state.servants().expect("readable").is_empty());
+}
+
+#[test]
+fn the_newest_events_come_oldest_first() {
+    let (_directory, state) = state();
+    for number in 1..=5 {
+        let about = NewEvent {
+            service: Some("a"),
+            ..NewEvent::default()
+        };
+        state
+            .add_event(Level::Info, "test", &format!("number {number}"), &about)
+            .expect("written");
+    }
+    let texts = |since, limit| -> Vec<String> {
+        state
+            .events(since, limit)
+            .expect("readable")
+            .into_iter()
+            .map(|event| event.message)
+            .collect()
+    };
+    assert_eq!(texts(0, 2), ["number 4", "number 5"]);
+    assert_eq!(texts(4, 10), ["number 5"]);
+}
+
+#[test]
+fn a_later_versions_database_is_left_alone() {
+    let (directory, state) = state();
+    drop(state);
+    let path = directory.path().join("cloudroid.db");
+    Connection::open(&path)
+        .expect("a database")
+        .pragma_update(None, "user_version", 99)
+        .expect("written");
+    let refused = State::open(&path).err().expect("too new").to_string();
+    assert!(refused.contains("version 99"), "{refused}");
+}

@@ -1,0 +1,148 @@
+//! The daemon's records as the API shows them.
+
+use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
+use package::interface as recorded;
+
+use crate::errors::Error;
+use crate::portal::App;
+use crate::state::{RevisionRecord, State};
+
+/// The current revision of a service that exists.
+pub fn current(state: &State, name: &str) -> Result<RevisionRecord, Error> {
+    match state.current(name)? {
+        Some(revision) => Ok(revision),
+        None => Err(Error::UnknownService {
+            name: name.to_owned(),
+            exists: state.service_names()?,
+        }),
+    }
+}
+
+/// A service in a list.
+pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
+    let interface = &revision.interface;
+    let servants = app.choreographer.servants();
+    ServiceSummary {
+        name: revision.service.clone(),
+        address: app.address(&revision.service),
+        package: revision.package.clone(),
+        revision: revision.number,
+        image: revision.image.clone(),
+        published: revision.published,
+        topics: interface.topics.len(),
+        services: interface.services.len(),
+        actions: interface.actions.len(),
+        parameters: interface.parameters.len(),
+        servants: servants
+            .iter()
+            .filter(|servant| servant.service() == revision.service)
+            .count(),
+        limits: revision.plan.limits.or(app.config.limits),
+    }
+}
+
+/// A service with everything known of it.
+pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
+    let current = current(&app.state, name)?;
+    let revisions = app.state.revisions(name)?;
+    Ok(ServiceDetail {
+        summary: summary(app, &current),
+        revisions: revisions
+            .into_iter()
+            .map(|revision| Revision {
+                current: revision.number == current.number,
+                number: revision.number,
+                image: revision.image,
+                published: revision.published,
+                source: revision.source,
+            })
+            .collect(),
+        nodes: current
+            .plan
+            .nodes
+            .iter()
+            .map(|node| Node {
+                name: node.name.clone(),
+                argv: node.argv.clone(),
+            })
+            .collect(),
+        interface: interface(&current.interface),
+    })
+}
+
+fn interface(of: &recorded::Interface) -> Interface {
+    Interface {
+        topics: of.topics.iter().map(topic).collect(),
+        services: of
+            .services
+            .iter()
+            .map(|service| api::interface::Service {
+                name: service.name.clone(),
+                type_name: service.type_name.clone(),
+                node: service.node.clone(),
+            })
+            .collect(),
+        actions: of
+            .actions
+            .iter()
+            .map(|action| api::interface::Action {
+                name: action.name.clone(),
+                type_name: action.type_name.clone(),
+                node: action.node.clone(),
+            })
+            .collect(),
+        parameters: of
+            .parameters
+            .iter()
+            .map(|parameter| api::interface::Parameter {
+                name: parameter.name.clone(),
+                value: parameter.value.clone(),
+            })
+            .collect(),
+    }
+}
+
+fn topic(of: &recorded::Topic) -> api::interface::Topic {
+    api::interface::Topic {
+        name: of.name.clone(),
+        type_name: of.type_name.clone(),
+        md5: of.md5.clone(),
+        direction: match of.direction {
+            recorded::Direction::Input => api::interface::Direction::Input,
+            recorded::Direction::Output => api::interface::Direction::Output,
+        },
+        latched: of.latched,
+        lazy: of.lazy,
+    }
+}
+
+/// The daemon at a glance.
+pub fn status(app: &App) -> Result<Status, Error> {
+    let servants = app.choreographer.servants();
+    let (capacity, taken, waiting) = app.choreographer.admission().look();
+    Ok(Status {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        pid: std::process::id(),
+        home: app.home.display().to_string(),
+        listen: app.listen.to_string(),
+        default_service: app.config.default_service.clone(),
+        started: app.started,
+        isolation: Isolation {
+            mode: app.config.isolation.to_string(),
+            cgroup_version: app.machine.cgroup_version,
+            missing: app.machine.missing_limits.clone(),
+        },
+        capacity: Capacity {
+            cpus: capacity.cpus(),
+            memory: capacity.memory,
+            cpus_reserved: taken.cpus(),
+            memory_reserved: taken.memory,
+            waiting,
+        },
+        limits: app.config.limits,
+        services: app.state.service_names()?.len(),
+        servants: servants.len(),
+        connections: servants.iter().map(|servant| servant.connections()).sum(),
+        warnings: app.machine.warnings.clone(),
+    })
+}

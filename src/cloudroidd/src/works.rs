@@ -1,0 +1,59 @@
+//! What makes a container useful to a robot: its ROS, reached from outside, and the bridge before it.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+
+use bridge::{Bridge, BridgeOptions};
+use ros::bus::{Bus, BusError};
+use ros::ros1::Ros1Bus;
+
+use crate::choreographer::{Handle, Inner};
+use crate::config::Config;
+use crate::sockets::ServantSockets;
+
+/// Where every servant's ROS Master listens, as seen from inside.
+pub const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
+/// The name of our node in every servant's graph.
+const NODE: &str = "/cloudroid_bridge";
+
+/// ROS and bridge of one servant.
+pub struct Works {
+    /// Its ROS.
+    pub bus: Arc<dyn Bus>,
+    /// Before it.
+    pub bridge: Arc<Bridge>,
+}
+
+impl Works {
+    /// Connects to the Master of a running container and sets a bridge before it.
+    pub async fn reach(
+        inner: &Inner,
+        handle: &Handle,
+        container: &Arc<dyn servant::engine::Servant>,
+    ) -> Result<Arc<Works>, BusError> {
+        let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
+        let bus: Arc<dyn Bus> = Ros1Bus::connect(sockets, MASTER, NODE).await?;
+        let registry = inner
+            .definitions
+            .registry(&inner.store, &handle.revision)
+            .await;
+        let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));
+        Ok(Arc::new(Works { bus, bridge }))
+    }
+
+    /// Messages dropped because a client or the bridge was slow.
+    pub fn dropped(&self) -> u64 {
+        let metrics = self.bridge.metrics();
+        metrics.dropped.get() + metrics.bus_dropped.get()
+    }
+}
+
+fn bridge_options(config: &Config) -> BridgeOptions {
+    let bytes = |size: api::Size| usize::try_from(size.0).unwrap_or(usize::MAX);
+    BridgeOptions {
+        max_frame: bytes(config.portal.max_frame),
+        max_message: bytes(config.portal.max_message),
+        resume_grace: config.servant.grace.0,
+        ..BridgeOptions::default()
+    }
+}
