@@ -1,1 +1,40 @@
-//! codec
+//! Link codecs: ROS messages in, smaller frames out, and back; nothing lost that must not be.
+//!
+//! ```text
+//!   message (serialized, as it is) ──▶ Encoder ──▶ frame ──▶ Decoder ──▶ the same message
+//!                                        ▲   acknowledge(n)     │
+//!                                        └──────────────────────┘
+//! ```
+//! Pure: no I/O, no threads, no clock; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry their
+//! codec and its version, so codecs can change from message to message.
+//!
+//! Every lossless codec restores the message bit by bit, and one that does not fit a message leaves it to zstd. Every
+//! decoder is safe with any input: it fails or returns a message of the declared size, within the limit it was given.
+
+#![forbid(unsafe_code)]
+
+mod cloud;
+mod codec;
+mod column;
+mod entropy;
+mod error;
+mod generic;
+mod grid;
+mod image;
+mod layout;
+mod padded;
+mod plane8;
+mod predict;
+mod rows;
+mod scale;
+mod scan;
+mod topic;
+mod video;
+mod wide;
+mod wire;
+
+pub use codec::{Codec, UnknownCodec};
+pub use error::Error;
+pub use layout::Schema;
+pub use topic::{Decoded, Decoder, Encoded, Encoder, peek};
+pub use video::VideoOptions;

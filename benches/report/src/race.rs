@@ -1,0 +1,93 @@
+//! Peers measured in turns, so that what disturbs one disturbs all.
+
+use std::time::{Duration, Instant};
+
+/// The times of one runner.
+#[derive(Clone, Debug)]
+pub struct Times {
+    /// Its name.
+    pub name: String,
+    /// Sorted, shortest first.
+    pub sorted: Vec<Duration>,
+}
+
+impl Times {
+    /// The shortest: what the code takes when nothing disturbs it.
+    pub fn best(&self) -> Duration {
+        self.quantile(0.0)
+    }
+
+    /// The middle one.
+    pub fn median(&self) -> Duration {
+        self.quantile(0.5)
+    }
+
+    /// The time that a fraction `0.0..=1.0` of the runs stays below.
+    pub fn quantile(&self, fraction: f64) -> Duration {
+        let last = self.sorted.len().saturating_sub(1);
+        self.sorted.get((fraction * last as f64).round() as usize).copied().unwrap_or_default()
+    }
+
+    /// [`Times::best`] in microseconds.
+    pub fn best_micros(&self) -> f64 {
+        self.best().as_secs_f64() * 1e6
+    }
+
+    /// Megabytes (10⁶) per second at the best time, for `bytes` per run.
+    pub fn megabytes_per_second(&self, bytes: usize) -> f64 {
+        bytes as f64 / 1e6 / self.best().as_secs_f64().max(1e-12)
+    }
+}
+
+/// Runs several things in turns.
+pub struct Race<'a> {
+    rounds: usize,
+    runners: Vec<(String, Box<dyn FnMut() + 'a>)>,
+}
+
+impl<'a> Race<'a> {
+    /// A race of so many rounds, after one that does not count.
+    pub fn new(rounds: usize) -> Self {
+        Self { rounds, runners: Vec::new() }
+    }
+
+    /// Adds a runner. What it computes should go through [`std::hint::black_box`].
+    pub fn add(&mut self, name: impl Into<String>, runner: impl FnMut() + 'a) -> &mut Self {
+        self.runners.push((name.into(), Box::new(runner)));
+        self
+    }
+
+    /// Runs, and returns the times in the order the runners were added.
+    pub fn run(mut self) -> Vec<Times> {
+        let mut times: Vec<Times> =
+            self.runners.iter().map(|(name, _)| Times { name: name.clone(), sorted: Vec::new() }).collect();
+        for round in 0..=self.rounds {
+            for ((_, runner), times) in self.runners.iter_mut().zip(&mut times) {
+                let start = Instant::now();
+                runner();
+                let took = start.elapsed();
+                if round > 0 {
+                    times.sorted.push(took);
+                }
+            }
+        }
+        times.iter_mut().for_each(|times| times.sorted.sort_unstable());
+        times
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runners_take_turns() {
+        let order = std::cell::RefCell::new(String::new());
+        let mut race = Race::new(2);
+        race.add("a", || order.borrow_mut().push('a')).add("b", || order.borrow_mut().push('b'));
+        let times = race.run();
+        assert_eq!(order.into_inner(), "ababab");
+        assert_eq!(times.iter().map(|times| times.sorted.len()).collect::<Vec<_>>(), [2, 2]);
+        assert!(times[0].best() <= times[0].median());
+    }
+}

@@ -1,0 +1,147 @@
+//! Which codecs there are, and how they are named on the wire and in configuration.
+
+use crate::layout::Schema;
+use std::fmt;
+use std::str::FromStr;
+
+/// A way to encode a message.
+///
+/// Written as `raw`, `zlib`, `zlib:9`, `deflate:1`, `zstd:3`, `image`, `grid`, `scan`, `cloud`, `video`.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Codec {
+    /// As it is.
+    Raw,
+    /// RFC 1950 at a level of 0 to 9.
+    Zlib(u8),
+    /// RFC 1951 at a level of 0 to 9.
+    Deflate(u8),
+    /// RFC 8878 at a level of -7 to 22.
+    Zstd(i8),
+    /// `sensor_msgs/Image`, lossless: 8-bit colour, grey and Bayer, 16-bit and float depth.
+    Image,
+    /// `nav_msgs/OccupancyGrid`, lossless, against the last acknowledged grid.
+    Grid,
+    /// `sensor_msgs/LaserScan`, lossless.
+    Scan,
+    /// `sensor_msgs/PointCloud2`, lossless, by field layout.
+    Cloud,
+    /// `sensor_msgs/Image` in colour as H.264: the pixels are lossy, all else is exact.
+    Video,
+}
+
+/// Tag, name, and the codec with its usual level.
+const CODECS: [(u8, &str, Codec); 9] = [
+    (0x00, "raw", Codec::Raw),
+    (0x01, "zlib", Codec::Zlib(6)),
+    (0x02, "deflate", Codec::Deflate(6)),
+    (0x03, "zstd", Codec::Zstd(3)),
+    (0x10, "image", Codec::Image),
+    (0x11, "grid", Codec::Grid),
+    (0x12, "scan", Codec::Scan),
+    (0x13, "cloud", Codec::Cloud),
+    (0x20, "video", Codec::Video),
+];
+
+impl Codec {
+    /// The version of every codec's body; raised when a body changes.
+    pub(crate) const VERSION: u8 = 1;
+
+    fn entry(self) -> (u8, &'static str, Self) {
+        CODECS[match self {
+            Self::Raw => 0,
+            Self::Zlib(_) => 1,
+            Self::Deflate(_) => 2,
+            Self::Zstd(_) => 3,
+            Self::Image => 4,
+            Self::Grid => 5,
+            Self::Scan => 6,
+            Self::Cloud => 7,
+            Self::Video => 8,
+        }]
+    }
+
+    /// The first byte of a frame.
+    pub fn tag(self) -> u8 {
+        self.entry().0
+    }
+
+    /// The name without its level.
+    pub fn name(self) -> &'static str {
+        self.entry().1
+    }
+
+    /// What a frame's tag means; levels are not on the wire and come back as the usual ones.
+    pub fn of_tag(tag: u8) -> Option<Self> {
+        CODECS.iter().find(|&&(known, ..)| known == tag).map(|&(.., codec)| codec)
+    }
+
+    /// The lossless codec made for messages of `schema`; zstd where there is none.
+    pub fn made_for(schema: Schema) -> Self {
+        match schema {
+            Schema::Image => Self::Image,
+            Schema::OccupancyGrid => Self::Grid,
+            Schema::LaserScan => Self::Scan,
+            Schema::PointCloud2 => Self::Cloud,
+            Schema::Other => Self::Zstd(3),
+        }
+    }
+
+    /// Whether a message comes back bit by bit.
+    pub fn is_lossless(self) -> bool {
+        self != Self::Video
+    }
+}
+
+impl fmt::Display for Codec {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Zlib(level) | Self::Deflate(level) => write!(formatter, "{}:{level}", self.name()),
+            Self::Zstd(level) => write!(formatter, "{}:{level}", self.name()),
+            _ => formatter.write_str(self.name()),
+        }
+    }
+}
+
+/// A codec's name that names none.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud or video")]
+pub struct UnknownCodec(pub String);
+
+impl FromStr for Codec {
+    type Err = UnknownCodec;
+
+    fn from_str(text: &str) -> Result<Self, UnknownCodec> {
+        let unknown = || UnknownCodec(text.to_owned());
+        let (name, level) = match text.split_once(':') {
+            Some((name, level)) => (name, Some(level.parse::<i8>().map_err(|_| unknown())?)),
+            None => (text, None),
+        };
+        let named = CODECS.iter().find(|&&(_, known, _)| known == name).ok_or_else(unknown)?.2;
+        let Some(level) = level else { return Ok(named) };
+        match named {
+            Self::Zlib(_) if (0..=9).contains(&level) => Ok(Self::Zlib(level as u8)),
+            Self::Deflate(_) if (0..=9).contains(&level) => Ok(Self::Deflate(level as u8)),
+            Self::Zstd(_) if (-7..=22).contains(&level) => Ok(Self::Zstd(level)),
+            _ => Err(unknown()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_tags_come_back() {
+        for name in ["raw", "zlib:9", "deflate:0", "zstd:-7", "zstd:22", "image", "grid", "scan", "cloud", "video"] {
+            let codec: Codec = name.parse().unwrap();
+            assert_eq!(codec.to_string(), name);
+            assert_eq!(Codec::of_tag(codec.tag()).unwrap().name(), codec.name());
+        }
+        assert_eq!("zlib".parse(), Ok(Codec::Zlib(6)));
+        for name in ["", "gzip", "zlib:10", "zlib:-1", "zstd:23", "image:1", "zstd:x"] {
+            assert_eq!(name.parse::<Codec>(), Err(UnknownCodec(name.to_owned())));
+        }
+        assert_eq!(Codec::of_tag(0xff), None);
+    }
+}

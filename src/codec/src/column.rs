@@ -1,0 +1,502 @@
+//! A column of numbers, integer or float: the common part of depth images, scans and clouds.
+//!
+//! Sensors measure in integers even where drivers publish floats, and often use few of them. So before prediction a
+//! column is mapped to the integers behind it where that is exact: floats that are multiples of a scale to the
+//! multiples, numbers of which only some occur to their rank among those. What does not fit the mapping (no echo, NaN,
+//! infinity) is *missing* from the plane and listed apart.
+//!
+//! Layout: `flags · [scale] · [missing] · [offset] · [ranks] · plane`.
+
+use crate::Error;
+use crate::generic::{self, Zstd};
+use crate::padded::Lanes;
+use crate::predict::{Kind, Sample};
+use crate::scale::Scale;
+use crate::wide::Wide;
+use crate::wire::{Cursor, put_block, put_varint, unzigzag, zigzag};
+
+/// Some samples are missing.
+const MISSING: u8 = 1;
+/// Samples are ranks in a list.
+const RANKS: u8 = 2;
+/// Samples are 32 bits wide, else 16.
+const WIDE: u8 = 4;
+/// Floats are multiples of a scale.
+const SCALED: u8 = 8;
+/// Floats are mapped to integers in their order.
+const ORDERED: u8 = 16;
+
+/// How the samples lie.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Shape {
+    Picture { width: usize, height: usize },
+    Sequence(usize),
+}
+
+impl Shape {
+    pub(crate) fn count(self) -> usize {
+        match self {
+            Self::Picture { width, height } => width * height,
+            Self::Sequence(length) => length,
+        }
+    }
+
+    fn lanes<T: Copy + Default>(self) -> Lanes<T> {
+        match self {
+            Self::Picture { width, height } => Lanes::pictures(1, width, height),
+            Self::Sequence(length) => Lanes::sequence(length),
+        }
+    }
+
+    fn kinds(self) -> &'static [Kind] {
+        match self {
+            Self::Picture { .. } => {
+                &[Kind::West, Kind::North, Kind::Slope, Kind::Plane, Kind::Median, Kind::Middle]
+            }
+            Self::Sequence(_) => &[Kind::West, Kind::North, Kind::Line],
+        }
+    }
+}
+
+/// Fills lanes of one plane from samples in order.
+fn fill<T: Copy + Default>(lanes: &mut Lanes<T>, mut samples: impl Iterator<Item = T>) {
+    for lane in &mut lanes.lanes {
+        for y in 0..lane.height {
+            for (slot, sample) in lane.row_mut(y).iter_mut().zip(&mut samples) {
+                *slot = sample;
+            }
+        }
+    }
+}
+
+/// The order of floats as an order of integers.
+#[inline]
+pub(crate) fn ordered(bits: u32) -> u32 {
+    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
+}
+
+/// The inverse of [`ordered`].
+#[inline]
+pub(crate) fn unordered(order: u32) -> u32 {
+    if order >> 31 == 0 { !order } else { order & !(1 << 31) }
+}
+
+/// Encodes 16-bit integers. Zero is taken for "nothing measured" when all others are far from it.
+pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
+    let (mut zeros, mut smallest) = (0usize, u16::MAX);
+    for &sample in samples {
+        zeros += usize::from(sample == 0);
+        smallest = smallest.min(sample.wrapping_sub(1));
+    }
+    let missing = (zeros > 0 && smallest >= 15).then(|| {
+        let mut lanes = shape.lanes();
+        fill(&mut lanes, samples.iter().map(|&sample| u8::from(sample == 0)));
+        lanes
+    });
+    let flags = if missing.is_some() { MISSING } else { 0 };
+    encode_plane16(samples, missing, flags, &[], shape, out);
+}
+
+/// The ranks of the values of `samples` where `counted` holds, when so few occur that ranks are worth a list.
+fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<u16>)> {
+    let mut present = vec![false; 1 << 16];
+    match missing {
+        None => samples.iter().for_each(|&sample| present[usize::from(sample)] = true),
+        Some(missing) => {
+            for (&sample, &gap) in samples.iter().zip(missing.rows().flatten()) {
+                present[usize::from(sample)] |= gap == 0;
+            }
+        }
+    }
+    let values: Vec<u16> = (0..=u16::MAX).filter(|&value| present[usize::from(value)]).collect();
+    let (first, last) = (values.first()?, values.last()?);
+    let span = usize::from(last - first) + 1;
+    if values.len() * 4 > span * 3 || values.len() * 8 > samples.len() {
+        return None;
+    }
+    let mut rank = vec![0u16; 1 << 16];
+    for (index, &value) in values.iter().enumerate() {
+        rank[usize::from(value)] = index as u16;
+    }
+    Some((values, rank))
+}
+
+fn encode_plane16(
+    samples: &[u16],
+    missing: Option<Lanes<u8>>,
+    flags: u8,
+    preamble: &[u8],
+    shape: Shape,
+    out: &mut Vec<u8>,
+) {
+    let mut lanes = shape.lanes();
+    match ranks(samples, missing.as_ref()) {
+        Some((values, rank)) => {
+            out.push(flags | RANKS);
+            out.extend_from_slice(preamble);
+            let mut steps = Vec::with_capacity(values.len() + 8);
+            let mut last = 0;
+            for &value in &values {
+                put_varint(&mut steps, u64::from(value - last));
+                last = value;
+            }
+            put_varint(out, values.len() as u64);
+            put_packed(&steps, out);
+            fill(&mut lanes, samples.iter().map(|&sample| rank[usize::from(sample)]));
+        }
+        None => {
+            out.push(flags);
+            out.extend_from_slice(preamble);
+            fill(&mut lanes, samples.iter().copied());
+        }
+    }
+    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+}
+
+/// Encodes 32-bit integers.
+pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
+    let smallest = samples.iter().copied().min().unwrap_or(0);
+    let largest = samples.iter().copied().max().unwrap_or(0);
+    let mut preamble = Vec::new();
+    put_varint(&mut preamble, zigzag(i64::from(smallest)));
+    if largest - smallest < 1 << 16 {
+        let samples: Vec<u16> = samples.iter().map(|&sample| (sample - smallest) as u16).collect();
+        encode_plane16(&samples, None, 0, &preamble, shape, out);
+    } else {
+        out.push(WIDE);
+        out.extend_from_slice(&preamble);
+        let mut lanes = shape.lanes();
+        fill(&mut lanes, samples.iter().map(|&sample| sample - smallest));
+        Wide { samples: lanes, missing: None }.encode(shape.kinds(), out);
+    }
+}
+
+/// Encodes differences that are small numbers already.
+pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
+    let mut lanes = shape.lanes();
+    fill(&mut lanes, samples.iter().copied());
+    Wide { samples: lanes, missing: None }.encode(&[Kind::Zero], out);
+}
+
+/// The counterpart of [`encode_differences`].
+pub(crate) fn decode_differences(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+    decode_plane(input, shape, None::<Lanes<u8>>).map(|(samples, _)| samples)
+}
+
+/// Encodes 32-bit floats, given as bits.
+pub(crate) fn encode_floats(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
+    match Scale::find(bits) {
+        Some(scale) => encode_scaled(bits, scale, shape, out),
+        None => encode_ordered(bits, shape, out),
+    }
+}
+
+fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
+    let mut multiples: Vec<i32> = bits.iter().map(|&bits| scale.multiple(bits)).collect();
+    let fits = |multiple: i32| multiple != Scale::NONE;
+    // Zero is taken for "nothing measured" when all others are far from it.
+    if multiples.contains(&0) && multiples.iter().all(|&multiple| multiple == 0 || multiple.unsigned_abs() >= 16) {
+        multiples.iter_mut().filter(|multiple| **multiple == 0).for_each(|multiple| *multiple = Scale::NONE);
+    }
+    let unfit = multiples.iter().filter(|&&multiple| !fits(multiple)).count();
+    let odd = bits.iter().zip(&multiples).filter(|&(&bits, &multiple)| !fits(multiple) && measured(bits)).count();
+    if odd * 16 > bits.len() {
+        return encode_ordered(bits, shape, out);
+    }
+    let smallest = multiples.iter().copied().filter(|&multiple| fits(multiple)).min().unwrap_or(0);
+    let largest = multiples.iter().copied().max().unwrap_or(0).max(smallest);
+    let mut flags = SCALED;
+    let mut preamble = vec![scale.name()];
+    let missing = (unfit > 0).then(|| {
+        flags |= MISSING;
+        let apart = bits.iter().zip(&multiples).filter(|&(_, &multiple)| !fits(multiple)).map(|(&bits, _)| bits);
+        put_apart(apart, &mut preamble);
+        let mut lanes = shape.lanes();
+        fill(&mut lanes, multiples.iter().map(|&multiple| u8::from(!fits(multiple))));
+        lanes
+    });
+    put_varint(&mut preamble, zigzag(i64::from(smallest)));
+    let above = |multiple: i32| if fits(multiple) { multiple.wrapping_sub(smallest) as u32 } else { 0 };
+    if (i64::from(largest) - i64::from(smallest)) < 1 << 16 {
+        let samples: Vec<u16> = multiples.iter().map(|&multiple| above(multiple) as u16).collect();
+        encode_plane16(&samples, missing, flags, &preamble, shape, out);
+    } else {
+        out.push(flags | WIDE);
+        out.extend_from_slice(&preamble);
+        let mut lanes = shape.lanes();
+        fill(&mut lanes, multiples.iter().map(|&multiple| above(multiple)));
+        Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+    }
+}
+
+/// Whether a float is one that a sensor measured rather than a mark for "nothing".
+fn measured(bits: u32) -> bool {
+    let value = f32::from_bits(bits);
+    value.is_finite() && value != 0.0
+}
+
+fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
+    let mut flags = ORDERED | WIDE;
+    let mut preamble = Vec::new();
+    let missing = bits.iter().any(|&bits| !measured(bits)).then(|| {
+        flags |= MISSING;
+        put_apart(bits.iter().copied().filter(|&bits| !measured(bits)), &mut preamble);
+        let mut lanes = shape.lanes();
+        fill(&mut lanes, bits.iter().map(|&bits| u8::from(!measured(bits))));
+        lanes
+    });
+    put_varint(&mut preamble, 0);
+    out.push(flags);
+    out.extend_from_slice(&preamble);
+    let mut lanes = shape.lanes();
+    fill(&mut lanes, bits.iter().map(|&bits| ordered(bits)));
+    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+}
+
+/// Values listed apart: as runs, for they are mostly one and the same.
+fn put_apart(values: impl Iterator<Item = u32>, out: &mut Vec<u8>) {
+    let mut runs = Vec::new();
+    let mut values = values.peekable();
+    while let Some(value) = values.next() {
+        let mut run = 0u64;
+        while values.next_if_eq(&value).is_some() {
+            run += 1;
+        }
+        runs.extend_from_slice(&value.to_le_bytes());
+        put_varint(&mut runs, run);
+    }
+    put_packed(&runs, out);
+}
+
+fn take_apart(input: &mut Cursor<'_>, count: usize) -> Result<Vec<u32>, Error> {
+    let runs = take_packed(input, count.saturating_mul(6) + 16)?;
+    let mut runs = Cursor::new(&runs);
+    let mut values = Vec::new();
+    while runs.remaining() > 0 {
+        let value = runs.u32()?;
+        let run = runs.bounded(count - values.len().min(count))? + 1;
+        if run > count - values.len() {
+            return Err(Error::Corrupt("more values apart than there are"));
+        }
+        values.resize(values.len() + run, value);
+    }
+    Ok(values)
+}
+
+/// A block of bytes, by zstd where that helps.
+pub(crate) fn put_packed(bytes: &[u8], out: &mut Vec<u8>) {
+    put_varint(out, bytes.len() as u64);
+    let mut packed = Vec::new();
+    if bytes.len() > 32 {
+        Zstd::default().compress(bytes, 3, &mut packed);
+    }
+    if packed.is_empty() || packed.len() >= bytes.len() {
+        put_block(out, bytes);
+    } else {
+        put_block(out, &packed);
+    }
+}
+
+/// The counterpart of [`put_packed`], for at most `limit` bytes.
+pub(crate) fn take_packed(input: &mut Cursor<'_>, limit: usize) -> Result<Vec<u8>, Error> {
+    let length = input.bounded(limit)?;
+    let packed = input.block()?;
+    let mut bytes = Vec::new();
+    if packed.len() == length {
+        bytes.extend_from_slice(packed);
+    } else {
+        generic::unzstd(packed, length, &mut bytes)?;
+    }
+    Ok(bytes)
+}
+
+fn decode_plane<T: Sample>(
+    input: &mut Cursor<'_>,
+    shape: Shape,
+    missing: Option<Lanes<u8>>,
+) -> Result<(Vec<T>, Option<Lanes<u8>>), Error> {
+    let mut wide = Wide { samples: shape.lanes::<T>(), missing };
+    wide.decode(input)?;
+    let mut samples = Vec::with_capacity(shape.count());
+    wide.samples.rows().for_each(|row| samples.extend_from_slice(row));
+    Ok((samples, wide.missing))
+}
+
+/// What was read before a plane's samples mean something.
+struct Decoded {
+    flags: u8,
+    scale: Option<Scale>,
+    apart: Vec<u32>,
+    offset: i64,
+    samples: Vec<u32>,
+    missing: Option<Lanes<u8>>,
+}
+
+/// Reads a column; `allowed` are the flags its type can have, `offset` whether one was written.
+fn decode(input: &mut Cursor<'_>, shape: Shape, allowed: u8, listed: bool) -> Result<Decoded, Error> {
+    let flags = input.byte()?;
+    if flags & !allowed != 0 {
+        return Err(Error::Corrupt("a column of another type"));
+    }
+    let scale = if flags & SCALED != 0 { Some(Scale::named(input.byte()?)?) } else { None };
+    let gaps = flags & MISSING != 0;
+    let apart = if gaps && listed { take_apart(input, shape.count())? } else { Vec::new() };
+    let offset = if allowed & WIDE != 0 { unzigzag(input.varint()?) } else { 0 };
+    let missing = gaps.then(|| shape.lanes());
+    if flags & WIDE != 0 {
+        let (samples, missing) = decode_plane::<u32>(input, shape, missing)?;
+        return Ok(Decoded { flags, scale, apart, offset, samples, missing });
+    }
+    let values = if flags & RANKS != 0 { Some(take_ranks(input)?) } else { None };
+    let (samples, missing) = decode_plane::<u16>(input, shape, missing)?;
+    let samples = match values {
+        None => samples.into_iter().map(u32::from).collect(),
+        Some(values) => {
+            samples.into_iter().map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen()).collect()
+        }
+    };
+    Ok(Decoded { flags, scale, apart, offset, samples, missing })
+}
+
+fn take_ranks(input: &mut Cursor<'_>) -> Result<Vec<u16>, Error> {
+    let count = input.bounded(1 << 16)?;
+    let steps = take_packed(input, count * 3)?;
+    let mut steps = Cursor::new(&steps);
+    let mut values = Vec::with_capacity(count);
+    let mut last = 0usize;
+    for _ in 0..count {
+        last += steps.bounded(usize::from(u16::MAX) - last)?;
+        values.push(last as u16);
+    }
+    steps.finish()?;
+    Ok(values)
+}
+
+impl Decoded {
+    /// Puts the values that were listed apart where samples are missing.
+    fn restore(self, mut number: impl FnMut(u32) -> u32) -> Result<Vec<u32>, Error> {
+        let Some(missing) = self.missing else {
+            return Ok(self.samples.into_iter().map(number).collect());
+        };
+        let mut apart = self.apart.into_iter();
+        let mut values = Vec::with_capacity(self.samples.len());
+        for (sample, &gap) in self.samples.into_iter().zip(missing.rows().flatten()) {
+            values.push(match gap {
+                0 => number(sample),
+                _ => apart.next().ok_or(Error::Corrupt("fewer values apart than are missing"))?,
+            });
+        }
+        Ok(values)
+    }
+}
+
+/// The counterpart of [`encode_shorts`].
+pub(crate) fn decode_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
+    let decoded = decode(input, shape, MISSING | RANKS, false)?;
+    let mut samples: Vec<u16> = decoded.samples.iter().map(|&sample| sample as u16).collect();
+    if let Some(missing) = &decoded.missing {
+        for (sample, &gap) in samples.iter_mut().zip(missing.rows().flatten()) {
+            if gap != 0 {
+                *sample = 0;
+            }
+        }
+    }
+    Ok(samples)
+}
+
+/// The counterpart of [`encode_words`].
+pub(crate) fn decode_words(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+    let decoded = decode(input, shape, RANKS | WIDE, false)?;
+    let offset = decoded.offset as u32;
+    decoded.restore(|sample| sample.wrapping_add(offset))
+}
+
+/// The counterpart of [`encode_floats`].
+pub(crate) fn decode_floats(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+    let decoded = decode(input, shape, MISSING | RANKS | WIDE | SCALED | ORDERED, true)?;
+    let offset = decoded.offset as i32;
+    match (decoded.scale, decoded.flags & ORDERED != 0) {
+        (Some(scale), false) => decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset))),
+        (None, true) => decoded.restore(unordered),
+        _ => Err(Error::Corrupt("a column of floats without a mapping")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PICTURE: Shape = Shape::Picture { width: 40, height: 50 };
+
+    fn floats(values: &[f32], shape: Shape) -> usize {
+        let bits: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
+        let mut bytes = Vec::new();
+        encode_floats(&bits, shape, &mut bytes);
+        let mut input = Cursor::new(&bytes);
+        assert_eq!(decode_floats(&mut input, shape).unwrap(), bits);
+        input.finish().unwrap();
+        bytes.len()
+    }
+
+    #[test]
+    fn shorts_with_holes_and_steps_come_back() {
+        for shape in [PICTURE, Shape::Sequence(2000)] {
+            let samples: Vec<u16> =
+                (0..2000u16).map(|index| if index % 11 == 0 { 0 } else { 400 + index / 14 * 5 }).collect();
+            let mut bytes = Vec::new();
+            encode_shorts(&samples, shape, &mut bytes);
+            assert_eq!(bytes[0], MISSING | RANKS);
+            let mut input = Cursor::new(&bytes);
+            assert_eq!(decode_shorts(&mut input, shape).unwrap(), samples);
+            input.finish().unwrap();
+        }
+    }
+
+    #[test]
+    fn words_come_back() {
+        for spread in [1u32, 1000, 2_000_000] {
+            let samples: Vec<u32> = (0..2000u32).map(|index| u32::MAX - index * spread).collect();
+            let mut bytes = Vec::new();
+            encode_words(&samples, PICTURE, &mut bytes);
+            let mut input = Cursor::new(&bytes);
+            assert_eq!(decode_words(&mut input, PICTURE).unwrap(), samples);
+            input.finish().unwrap();
+        }
+    }
+
+    #[test]
+    fn floats_of_all_sorts_come_back() {
+        let millimetres: Vec<f32> = (0..2000).map(|index| (1000 + index % 300) as f32 * 0.001).collect();
+        assert!(floats(&millimetres, PICTURE) < 800);
+        let mut holes = millimetres.clone();
+        holes.iter_mut().step_by(9).for_each(|value| *value = f32::NAN);
+        holes[3] = f32::from_bits(0x7fc0_1234);
+        holes[4] = f32::NEG_INFINITY;
+        holes[5] = 1.234_567_9;
+        floats(&holes, PICTURE);
+        floats(&holes, Shape::Sequence(2000));
+        let rough: Vec<f32> = (0..2000).map(|index| (index as f32).sin() * 1e10).collect();
+        floats(&rough, PICTURE);
+        floats(&rough, Shape::Sequence(2000));
+        floats(&[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX], Shape::Sequence(4));
+        floats(&[], Shape::Sequence(0));
+    }
+
+    #[test]
+    fn the_order_of_floats_is_kept() {
+        let values = [f32::NEG_INFINITY, -2.0, -1.0, -0.0, 0.0, 1e-30, 1.0, f32::INFINITY];
+        let orders = values.map(|value| ordered(value.to_bits()));
+        assert!(orders.windows(2).all(|pair| pair[0] < pair[1]));
+        assert_eq!(orders.map(unordered), values.map(f32::to_bits));
+    }
+
+    #[test]
+    fn a_short_stream_is_an_error() {
+        let samples: Vec<u16> = (0..2000u16).map(|index| index * 13 % 997).collect();
+        let mut bytes = Vec::new();
+        encode_shorts(&samples, PICTURE, &mut bytes);
+        for length in 0..bytes.len() {
+            assert!(decode_shorts(&mut Cursor::new(&bytes[..length]), PICTURE).is_err());
+        }
+    }
+}

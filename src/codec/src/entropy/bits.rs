@@ -1,0 +1,173 @@
+//! Plain bits, written and read from the front.
+
+/// Packs bits low end first.
+#[derive(Default)]
+pub(crate) struct BitWriter {
+    bytes: Vec<u8>,
+    pending: u64,
+    count: u32,
+}
+
+impl BitWriter {
+    /// Appends the low `count` bits of `value`; at most 32, the rest of `value` zero.
+    #[inline]
+    pub(crate) fn put(&mut self, value: u32, count: u32) {
+        debug_assert!(count <= 32 && (count == 32 || value >> count == 0));
+        self.pending |= u64::from(value) << self.count;
+        self.count += count;
+        if self.count >= 32 {
+            self.bytes.extend_from_slice(&(self.pending as u32).to_le_bytes());
+            self.pending >>= 32;
+            self.count -= 32;
+        }
+    }
+
+    /// Elias' gamma code of a number ≥ 1.
+    pub(crate) fn put_gamma(&mut self, value: u32) {
+        let length = 31 - value.leading_zeros();
+        self.put(0, length);
+        self.put(1, 1);
+        self.put(value & !(1 << length), length);
+    }
+
+    /// Rice code: `value >> k` in unary, then the low `k` bits.
+    pub(crate) fn put_rice(&mut self, value: u32, k: u32) {
+        for _ in 0..value >> k {
+            self.put(0, 1);
+        }
+        self.put(1, 1);
+        self.put(value & ((1 << k) - 1), k);
+    }
+
+    pub(crate) fn finish(mut self) -> Vec<u8> {
+        let left = self.count.div_ceil(8) as usize;
+        self.bytes.extend_from_slice(&self.pending.to_le_bytes()[..left]);
+        self.bytes
+    }
+}
+
+/// Reads what [`BitWriter`] wrote. Past the end there are zeros, and [`BitReader::overran`] tells.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct BitReader<'a> {
+    bytes: &'a [u8],
+    next: usize,
+    pending: u64,
+    count: u32,
+    missing: u32,
+}
+
+impl<'a> BitReader<'a> {
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
+        Self { bytes, ..Self::default() }
+    }
+
+    #[inline]
+    fn refill(&mut self) {
+        if let Some(word) = self.bytes.get(self.next..self.next + 4) {
+            let word = u32::from_le_bytes([word[0], word[1], word[2], word[3]]);
+            self.pending |= u64::from(word) << self.count;
+            self.next += 4;
+            self.count += 32;
+        } else {
+            self.refill_tail();
+        }
+    }
+
+    #[cold]
+    fn refill_tail(&mut self) {
+        while self.count <= 32 {
+            match self.bytes.get(self.next) {
+                Some(&byte) => {
+                    self.pending |= u64::from(byte) << self.count;
+                    self.next += 1;
+                }
+                None => self.missing = self.missing.saturating_add(8),
+            }
+            self.count += 8;
+        }
+    }
+
+    /// The next `count` bits; at most 32.
+    #[inline]
+    pub(crate) fn take(&mut self, count: u32) -> u32 {
+        if self.count < count {
+            self.refill();
+        }
+        let value = (self.pending & ((1u64 << count) - 1)) as u32;
+        self.pending >>= count;
+        self.count -= count;
+        value
+    }
+
+    /// Whether more bits were taken than there were.
+    pub(crate) fn overran(&self) -> bool {
+        self.missing > self.count
+    }
+
+    /// The counterpart of [`BitWriter::put_gamma`]; `None` when it is longer than any number.
+    pub(crate) fn take_gamma(&mut self) -> Option<u32> {
+        let mut length = 0;
+        while self.take(1) == 0 {
+            length += 1;
+            if length > 31 || self.overran() {
+                return None;
+            }
+        }
+        Some((1 << length) | self.take(length))
+    }
+
+    /// The counterpart of [`BitWriter::put_rice`]; `None` when the unary part exceeds `limit`.
+    pub(crate) fn take_rice(&mut self, k: u32, limit: u32) -> Option<u32> {
+        let mut high = 0;
+        while self.take(1) == 0 {
+            high += 1;
+            if high > limit >> k || self.overran() {
+                return None;
+            }
+        }
+        Some((high << k) | self.take(k))
+    }
+
+    /// How many bytes were touched, rounded up: where the next block begins.
+    pub(crate) fn used(&self) -> usize {
+        self.next - (self.count.saturating_sub(self.missing) / 8) as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_come_back() {
+        let mut writer = BitWriter::default();
+        for i in 0..200u32 {
+            writer.put(i & ((1 << (i % 20)) - 1), i % 20);
+            writer.put_gamma(i + 1);
+            writer.put_rice(i, 4);
+        }
+        writer.put(u32::MAX, 32);
+        let mut bytes = writer.finish();
+        let length = bytes.len();
+        bytes.push(0xff);
+        let mut reader = BitReader::new(&bytes);
+        for i in 0..200u32 {
+            assert_eq!(reader.take(i % 20), i & ((1 << (i % 20)) - 1));
+            assert_eq!(reader.take_gamma(), Some(i + 1));
+            assert_eq!(reader.take_rice(4, 200), Some(i));
+        }
+        assert_eq!(reader.take(32), u32::MAX);
+        assert_eq!(reader.used(), length);
+        assert!(!reader.overran());
+    }
+
+    #[test]
+    fn reading_past_the_end_is_noticed() {
+        let mut reader = BitReader::new(&[0xff]);
+        assert_eq!(reader.take(8), 0xff);
+        assert!(!reader.overran());
+        assert_eq!(reader.take(1), 0);
+        assert!(reader.overran());
+        assert_eq!(BitReader::new(&[]).take_gamma(), None);
+    }
+}

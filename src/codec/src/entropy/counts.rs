@@ -1,0 +1,176 @@
+//! How often each symbol occurs in each context, made to fit a power of two, and written compactly.
+
+use super::bits::{BitReader, BitWriter};
+use crate::Error;
+
+/// Symbols of one context.
+pub(crate) const SYMBOLS: usize = 256;
+/// Contexts of one model.
+pub(crate) const CONTEXTS: usize = 32;
+/// The largest table: 2^11 states per context.
+pub(crate) const MAX_LOG: u32 = 11;
+
+/// In which order a table lists its symbols: from the likely to the unlikely, so that the list ends early.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Order {
+    /// Symbols are small numbers.
+    Natural,
+    /// Symbols are signed differences modulo 256: 0, -1, 1, -2, 2, …
+    Signed,
+}
+
+impl Order {
+    fn symbol(self, rank: usize) -> usize {
+        match self {
+            Self::Natural => rank,
+            Self::Signed => ((rank >> 1) ^ (0usize.wrapping_sub(rank & 1))) & 0xff,
+        }
+    }
+}
+
+/// Counts of one context: either none at all, or a sum of exactly 2^log.
+pub(crate) type Counts = [u16; SYMBOLS];
+
+/// The table size worth its header for that many symbols.
+pub(crate) fn log_for(symbols: usize) -> u32 {
+    match symbols {
+        0..0x400 => 8,
+        0x400..0x1000 => 9,
+        0x1000..0x4000 => 10,
+        _ => MAX_LOG,
+    }
+}
+
+/// Scales `histogram` to a sum of 2^log, keeping every symbol that occurs. All zero stays all zero.
+pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
+    let mut counts = [0u16; SYMBOLS];
+    let total: u64 = histogram.iter().map(|&count| u64::from(count)).sum();
+    if total == 0 {
+        return counts;
+    }
+    let size = 1i32 << log;
+    let mut left = size;
+    let mut largest = 0;
+    for (symbol, &count) in histogram.iter().enumerate().filter(|&(_, &count)| count > 0) {
+        let scaled = ((u64::from(count) << log) + total / 2) / total;
+        counts[symbol] = scaled.max(1) as u16;
+        left -= i32::from(counts[symbol]);
+        if count > histogram[largest] {
+            largest = symbol;
+        }
+    }
+    if left > 0 {
+        counts[largest] += left as u16;
+    }
+    // Rounding up rare symbols took too much: give it back where a single state matters least.
+    while left < 0 {
+        let richest = (0..SYMBOLS).max_by_key(|&symbol| counts[symbol]).unwrap_or(0);
+        let step = (counts[richest] / 16).clamp(1, (-left) as u16);
+        counts[richest] -= step;
+        left += i32::from(step);
+    }
+    counts
+}
+
+/// Writes the counts of one context: Rice codes whose parameter follows the counts before, runs of zeros apart.
+pub(crate) fn write(counts: &Counts, order: Order, log: u32, out: &mut BitWriter) {
+    let total: u32 = counts.iter().map(|&count| u32::from(count)).sum();
+    out.put(u32::from(total > 0), 1);
+    if total == 0 {
+        return;
+    }
+    let mut left = 1u32 << log;
+    let mut average = left / 4;
+    let mut rank = 0;
+    while left > 0 {
+        let count = u32::from(counts[order.symbol(rank)]);
+        out.put_rice(count, rice_parameter(average));
+        average = (average + count).div_ceil(2);
+        left -= count;
+        rank += 1;
+        if count == 0 {
+            let zeros = (rank..SYMBOLS).take_while(|&rank| counts[order.symbol(rank)] == 0).count();
+            out.put_gamma(zeros as u32 + 1);
+            rank += zeros;
+        }
+    }
+}
+
+/// Reads what [`write`] wrote.
+pub(crate) fn read(order: Order, log: u32, input: &mut BitReader<'_>) -> Result<Counts, Error> {
+    const BAD: Error = Error::Corrupt("a table of counts that does not add up");
+    let mut counts = [0u16; SYMBOLS];
+    if input.take(1) == 0 {
+        return Ok(counts);
+    }
+    let mut left = 1u32 << log;
+    let mut average = left / 4;
+    let mut rank = 0;
+    while left > 0 {
+        if rank >= SYMBOLS || input.overran() {
+            return Err(BAD);
+        }
+        let count = input.take_rice(rice_parameter(average), left).filter(|&count| count <= left).ok_or(BAD)?;
+        counts[order.symbol(rank)] = count as u16;
+        average = (average + count).div_ceil(2);
+        left -= count;
+        rank += 1;
+        if count == 0 {
+            let zeros = input.take_gamma().ok_or(BAD)? as usize - 1;
+            if zeros > SYMBOLS - rank {
+                return Err(BAD);
+            }
+            rank += zeros;
+        }
+    }
+    Ok(counts)
+}
+
+fn rice_parameter(average: u32) -> u32 {
+    let half = average / 2;
+    if half == 0 { 0 } else { 32 - half.leading_zeros() - 1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn round_trip(histogram: &[u32; SYMBOLS], log: u32, order: Order) -> Counts {
+        let counts = normalise(histogram, log);
+        let mut writer = BitWriter::default();
+        write(&counts, order, log, &mut writer);
+        let bytes = writer.finish();
+        let read = read(order, log, &mut BitReader::new(&bytes)).unwrap();
+        assert_eq!(read, counts);
+        counts
+    }
+
+    #[test]
+    fn every_symbol_that_occurs_keeps_a_state() {
+        let mut histogram = [1u32; SYMBOLS];
+        histogram[7] = 1_000_000;
+        for log in [8, 9, 11] {
+            let counts = round_trip(&histogram, log, Order::Natural);
+            assert!(counts.iter().all(|&count| count > 0));
+            assert_eq!(counts.iter().map(|&count| u32::from(count)).sum::<u32>(), 1 << log);
+        }
+    }
+
+    #[test]
+    fn a_single_symbol_and_none_at_all() {
+        let mut histogram = [0u32; SYMBOLS];
+        assert_eq!(round_trip(&histogram, 9, Order::Signed), [0; SYMBOLS]);
+        histogram[255] = 3;
+        assert_eq!(round_trip(&histogram, 9, Order::Signed)[255], 512);
+    }
+
+    #[test]
+    fn signed_order_is_a_permutation() {
+        let mut seen = [false; SYMBOLS];
+        for rank in 0..SYMBOLS {
+            seen[Order::Signed.symbol(rank)] = true;
+        }
+        assert!(seen.iter().all(|&seen| seen));
+        assert_eq!([0, 1, 2].map(|rank| Order::Signed.symbol(rank)), [0, 255, 1]);
+    }
+}

@@ -1,0 +1,52 @@
+//! Why a frame could not be decoded.
+
+/// Encoding never fails; decoding says what is wrong with the frame and what to do about it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    /// The frame ends before its content does.
+    #[error("frame ends early; it was cut on its way")]
+    Truncated,
+    /// The frame contradicts itself.
+    #[error("frame is corrupt: {0}")]
+    Corrupt(&'static str),
+    /// The tag names no codec.
+    #[error("unknown codec tag {0:#04x}; the peer speaks a newer protocol, update this side")]
+    UnknownTag(u8),
+    /// The codec is known, its version is not.
+    #[error("codec `{codec}` in version {version}; this side knows version {known}, update the older side")]
+    Version {
+        /// The codec's name.
+        codec: &'static str,
+        /// The version in the frame.
+        version: u8,
+        /// The version this build knows.
+        known: u8,
+    },
+    /// The message would be larger than allowed. Nothing was allocated for it.
+    #[error("frame declares a message of {declared} bytes, the limit is {limit}; raise the limit or drop the sender")]
+    TooLarge {
+        /// The size declared in the frame.
+        declared: u64,
+        /// The limit given to the decoder.
+        limit: usize,
+    },
+    /// A delta against a grid that was never received or is no longer kept.
+    #[error("delta to message {0}, which is not kept here; ask the sender for a keyframe")]
+    MissingReference(u64),
+    /// A video frame depends on one that was lost.
+    #[error("video frame {0} follows a frame that was lost; ask the sender for a keyframe")]
+    KeyframeNeeded(u64),
+    /// H.264 frames need the cargo feature `video`.
+    #[error("frame is H.264 video and this build has no video; build with the feature `video`")]
+    VideoNotBuilt,
+    /// The video library refused the frame.
+    #[error("video library refused the frame: {0}; ask the sender for a keyframe")]
+    Video(String),
+}
+
+impl Error {
+    /// Whether the sender's next keyframe puts things right.
+    pub fn wants_keyframe(&self) -> bool {
+        matches!(self, Self::MissingReference(_) | Self::KeyframeNeeded(_) | Self::Video(_))
+    }
+}

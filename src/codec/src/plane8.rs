@@ -1,0 +1,276 @@
+//! Planes of 8-bit samples: guess each from its neighbours, code the difference in a context of its surroundings.
+//!
+//! The encoder's first half has no dependence from one sample to the next and is written for the vectoriser; the
+//! decoder has one, and hides it by decoding several lanes in lockstep.
+//!
+//! Layout: `predictor · tables · lane₀ · lane₁ …`, each lane preceded by its length.
+
+use crate::Error;
+use crate::entropy::counts::Order;
+use crate::entropy::tans::{Decoder, Encoder, Histogram, Lane};
+use crate::padded::{Lanes, Padded};
+use crate::predict::{self, Kind, Predictor};
+use crate::wire::{Cursor, put_block};
+
+/// Contexts of one plane; four planes share a model.
+const CONTEXTS: usize = 8;
+/// The unease from which the next context begins.
+const THRESHOLDS: [u16; CONTEXTS - 1] = [1, 3, 6, 10, 17, 30, 56];
+
+/// How many neighbouring contexts a plane of that many samples merges into one (as a shift): tables cost bytes.
+fn merge(samples: usize) -> u32 {
+    match samples {
+        0..0x400 => 3,
+        0x400..0x1000 => 2,
+        0x1000..0x4000 => 1,
+        _ => 0,
+    }
+}
+
+#[inline(always)]
+fn unease(a: i16, b: i16, c: i16, d: i16) -> i16 {
+    (a - c).abs() + (c - b).abs() + (b - d).abs()
+}
+
+/// Encodes all samples; `planes` tells how many of the lanes' models are apart.
+pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
+    lanes.close();
+    let count = lanes.count();
+    let shift = merge(count / planes.max(1));
+    let kind = choose(lanes);
+    out.push(kind as u8);
+    let mut histogram = Histogram::new();
+    let keys: Vec<Vec<u16>> = lanes
+        .lanes
+        .iter()
+        .enumerate()
+        .map(|(index, lane)| {
+            let first = if planes > 1 { (index * CONTEXTS) as u16 } else { 0 };
+            let mut keys = vec![0u16; lane.width * lane.height];
+            for (y, keys) in keys.chunks_exact_mut(lane.width.max(1)).enumerate() {
+                let kind = if y == 0 { Kind::West } else { kind };
+                match kind {
+                    Kind::Median => row_keys::<predict::Median>(lane, y, first, shift, keys),
+                    Kind::Slope => row_keys::<predict::Slope>(lane, y, first, shift, keys),
+                    _ => row_keys::<predict::West>(lane, y, first, shift, keys),
+                }
+                histogram.add(keys);
+            }
+            keys
+        })
+        .collect();
+    let encoder = Encoder::new(&histogram, contexts(planes), Order::Signed, out);
+    for group in lanes.groups() {
+        let keys = &keys[group];
+        match *keys {
+            [ref a] => encoder.encode([a]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b] => encoder.encode([a, b]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c] => encoder.encode([a, b, c]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c, ref d] => encoder.encode([a, b, c, d]).iter().for_each(|lane| put_block(out, lane)),
+            _ => unreachable!("a group has one to four lanes"),
+        }
+    }
+}
+
+fn contexts(planes: usize) -> usize {
+    CONTEXTS * planes.max(1)
+}
+
+/// The predictor with the smaller differences on every eighth row.
+fn choose(lanes: &Lanes<u8>) -> Kind {
+    let mut costs = [0u64; 2];
+    for lane in &lanes.lanes {
+        for y in (1..lane.height).step_by(8) {
+            costs[0] += row_cost::<predict::Median>(lane, y);
+            costs[1] += row_cost::<predict::Slope>(lane, y);
+        }
+    }
+    if costs[0] < costs[1] { Kind::Median } else { Kind::Slope }
+}
+
+fn row_cost<P: Predictor>(lane: &Padded<u8>, y: usize) -> u64 {
+    let [a, b, c, d, v] = lane.neighbours(y);
+    let mut sum = 0u64;
+    for ((((&a, &b), &c), &d), &v) in a.iter().zip(b).zip(c).zip(d).zip(v) {
+        let guess = guess::<P>(a.into(), b.into(), c.into(), d.into());
+        let difference = v.wrapping_sub(guess as u8) as i8;
+        sum += u64::from((u32::from(difference.unsigned_abs()) * 2 + 1).ilog2());
+    }
+    sum
+}
+
+#[inline(always)]
+fn guess<P: Predictor>(a: i16, b: i16, c: i16, d: i16) -> i16 {
+    match P::KIND {
+        Kind::Median => (a + b - c).clamp(a.min(b), a.max(b)),
+        Kind::Slope => ((a + b) >> 1) + ((d - c) >> 2),
+        _ => a,
+    }
+}
+
+/// The keys of row `y`. All slices have one length, so this becomes vector code.
+#[inline(never)]
+fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, keys: &mut [u16]) {
+    let [a, b, c, d, v] = lane.neighbours(y);
+    let width = keys.len();
+    let (a, b, c, d, v) = (&a[..width], &b[..width], &c[..width], &d[..width], &v[..width]);
+    for x in 0..width {
+        let [a, b, c, d, v] = [a[x], b[x], c[x], d[x], v[x]].map(i16::from);
+        let unease = unease(a, b, c, d);
+        let mut context = 0i16;
+        for threshold in THRESHOLDS {
+            context += i16::from(unease >= threshold as i16);
+        }
+        let difference = (v - guess::<P>(a, b, c, d)) & 0xff;
+        keys[x] = (((context as u16) >> shift) + first) << 8 | difference as u16;
+    }
+}
+
+/// Decodes into lanes of the shape they were encoded with.
+pub(crate) fn decode(input: &mut Cursor<'_>, lanes: &mut Lanes<u8>, planes: usize) -> Result<(), Error> {
+    let kind = Kind::read(input.byte()?)?;
+    if !matches!(kind, Kind::Median | Kind::Slope) {
+        return Err(Error::Corrupt("a predictor that 8-bit planes do not use"));
+    }
+    let shift = merge(lanes.count() / planes.max(1));
+    let mut rest = *input;
+    let (tables, used) = Decoder::read(rest.take_rest(), contexts(planes), Order::Signed)?;
+    input.take(used)?;
+    let bases: Vec<[u16; 1024]> = (0..planes.max(1))
+        .map(|plane| {
+            std::array::from_fn(|unease| {
+                let context = THRESHOLDS.iter().filter(|&&threshold| unease >= usize::from(threshold)).count();
+                tables.base(plane * CONTEXTS + (context >> shift))
+            })
+        })
+        .collect();
+    for group in lanes.groups() {
+        let lanes = &mut lanes.lanes[group];
+        match lanes {
+            [a] => decode_group(&tables, kind, &bases, [a], input)?,
+            [a, b] => decode_group(&tables, kind, &bases, [a, b], input)?,
+            [a, b, c] => decode_group(&tables, kind, &bases, [a, b, c], input)?,
+            [a, b, c, d] => decode_group(&tables, kind, &bases, [a, b, c, d], input)?,
+            _ => unreachable!("a group has one to four lanes"),
+        }
+    }
+    Ok(())
+}
+
+fn decode_group<const N: usize>(
+    tables: &Decoder,
+    kind: Kind,
+    bases: &[[u16; 1024]],
+    mut planes: [&mut Padded<u8>; N],
+    input: &mut Cursor<'_>,
+) -> Result<(), Error> {
+    let mut lanes = Vec::with_capacity(N);
+    for _ in 0..N {
+        lanes.push(Lane::new(input.block()?, tables.log)?);
+    }
+    let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else { unreachable!("N lanes were pushed") };
+    let bases: [&[u16; 1024]; N] = std::array::from_fn(|index| &bases[index.min(bases.len() - 1)]);
+    for y in 0..planes[0].height {
+        match if y == 0 { Kind::West } else { kind } {
+            Kind::Median => decode_row::<predict::Median, N>(tables, bases, &mut planes, &mut lanes, y),
+            Kind::Slope => decode_row::<predict::Slope, N>(tables, bases, &mut planes, &mut lanes, y),
+            _ => decode_row::<predict::West, N>(tables, bases, &mut planes, &mut lanes, y),
+        }
+    }
+    lanes.iter().try_for_each(Lane::finish)
+}
+
+#[inline(never)]
+fn decode_row<P: Predictor, const N: usize>(
+    tables: &Decoder,
+    bases: [&[u16; 1024]; N],
+    planes: &mut [&mut Padded<u8>; N],
+    lanes: &mut [Lane<'_>; N],
+    y: usize,
+) {
+    let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
+    let mut rows = planes.each_mut().map(|plane| {
+        plane.close_row_before(y);
+        let (above, here) = plane.samples.split_at_mut(start);
+        (&above[start - lag - 1..start - lag + width + 1], &mut here[..width])
+    });
+    let mut a: [i16; N] = [0; N];
+    let (mut b, mut c) = ([0i16; N], [0i16; N]);
+    for lane in 0..N {
+        c[lane] = rows[lane].0[0].into();
+        b[lane] = rows[lane].0[1].into();
+        a[lane] = if y > 0 { b[lane] } else { 0 };
+    }
+    for x in 0..width {
+        for lane in 0..N {
+            let (above, here) = &mut rows[lane];
+            let d = i16::from(above[x + 2]);
+            let unease = unease(a[lane], b[lane], c[lane], d);
+            let base = bases[lane][unease as usize & 1023];
+            let difference = tables.symbol(base, &mut lanes[lane]);
+            let value = (guess::<P>(a[lane], b[lane], c[lane], d) as u8).wrapping_add(difference);
+            here[x] = value;
+            a[lane] = value.into();
+            c[lane] = b[lane];
+            b[lane] = d;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn round_trip(planes: usize, width: usize, height: usize, sample: impl Fn(usize, usize, usize) -> u8) -> usize {
+        let mut lanes = Lanes::pictures(planes, width, height);
+        for plane in 0..planes {
+            for y in 0..height {
+                for (x, slot) in lanes.row_mut(plane, y).iter_mut().enumerate() {
+                    *slot = sample(plane, x, y);
+                }
+            }
+        }
+        let mut bytes = Vec::new();
+        encode(&mut lanes, planes, &mut bytes);
+        let mut back = Lanes::pictures(planes, width, height);
+        let mut input = Cursor::new(&bytes);
+        decode(&mut input, &mut back, planes).unwrap();
+        input.finish().unwrap();
+        for plane in 0..planes {
+            for y in 0..height {
+                assert_eq!(back.row(plane, y), lanes.row(plane, y), "plane {plane}, row {y}");
+            }
+        }
+        bytes.len()
+    }
+
+    #[test]
+    fn pictures_of_all_shapes_come_back() {
+        for planes in 1..=4 {
+            for (width, height) in [(1, 1), (1, 7), (7, 1), (2, 2), (33, 35), (64, 32), (100, 131)] {
+                round_trip(planes, width, height, |plane, x, y| (x * y * (plane + 3) + x) as u8);
+                round_trip(planes, width, height, |_, x, y| ((x * 2_654_435_761 + y * 40_503) >> 7) as u8);
+            }
+        }
+    }
+
+    #[test]
+    fn a_flat_picture_is_nearly_free() {
+        assert!(round_trip(3, 640, 480, |plane, _, _| 40 * plane as u8) < 400);
+        assert!(round_trip(1, 640, 480, |_, x, _| (x / 4) as u8) < 4000);
+    }
+
+    #[test]
+    fn a_cut_stream_is_an_error() {
+        let mut lanes = Lanes::pictures(1, 40, 40);
+        for y in 0..40 {
+            lanes.row_mut(0, y).iter_mut().enumerate().for_each(|(x, slot)| *slot = (x * y) as u8);
+        }
+        let mut bytes = Vec::new();
+        encode(&mut lanes, 1, &mut bytes);
+        for length in 0..bytes.len() {
+            let mut back = Lanes::pictures(1, 40, 40);
+            assert!(decode(&mut Cursor::new(&bytes[..length]), &mut back, 1).is_err(), "{length}");
+        }
+    }
+}

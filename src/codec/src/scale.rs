@@ -1,0 +1,133 @@
+//! Floats that are integers in disguise: drivers divide or multiply what the sensor counted.
+
+use crate::Error;
+
+/// How a float was made from a whole number.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Scale {
+    name: u8,
+    /// The float is `multiple / divisor`, or …
+    divisor: f32,
+    /// … when not zero, `multiple · factor`.
+    factor: f32,
+}
+
+/// From coarse to fine, so that the first that fits gives the smallest numbers. The position is the name on the wire:
+/// append only.
+const SCALES: [(f32, f32); 26] = [
+    (1.0, 0.0),
+    (2.0, 0.0),
+    (4.0, 0.0),
+    (10.0, 0.0),
+    (10.0, 0.1),
+    (16.0, 0.0),
+    (64.0, 0.0),
+    (100.0, 0.0),
+    (100.0, 0.01),
+    (128.0, 0.0),
+    (200.0, 0.005),
+    (250.0, 0.004),
+    (256.0, 0.0),
+    (500.0, 0.002),
+    (500.0, 0.0),
+    (1000.0, 0.0),
+    (1000.0, 0.001),
+    (1024.0, 0.0),
+    (2000.0, 0.0005),
+    (4000.0, 0.0),
+    (4000.0, 0.00025),
+    (5000.0, 0.0),
+    (5000.0, 0.0002),
+    (10_000.0, 0.0),
+    (10_000.0, 0.0001),
+    (65_536.0, 0.0),
+];
+
+impl Scale {
+    /// The multiple of what is none.
+    pub(crate) const NONE: i32 = i32::MIN;
+    /// Whole numbers up to here are exact in a float.
+    const LARGEST: f64 = 16_777_215.0;
+
+    pub(crate) fn named(name: u8) -> Result<Self, Error> {
+        let &(divisor, factor) = SCALES.get(usize::from(name)).ok_or(Error::Corrupt("an unknown scale"))?;
+        Ok(Self { name, divisor, factor })
+    }
+
+    pub(crate) fn name(self) -> u8 {
+        self.name
+    }
+
+    /// The float of a multiple.
+    #[inline]
+    pub(crate) fn value(self, multiple: i32) -> u32 {
+        let multiple = multiple as f32;
+        let value = if self.factor == 0.0 { multiple / self.divisor } else { multiple * self.factor };
+        value.to_bits()
+    }
+
+    /// The multiple whose float has these very bits, or [`Scale::NONE`].
+    #[inline]
+    pub(crate) fn multiple(self, bits: u32) -> i32 {
+        let scaled = f64::from(f32::from_bits(bits)) * f64::from(self.divisor);
+        // NaN fails the comparison too.
+        if !(-Self::LARGEST..=Self::LARGEST).contains(&scaled) {
+            return Self::NONE;
+        }
+        let multiple = (scaled + 0.5f64.copysign(scaled)) as i32;
+        if self.value(multiple) == bits { multiple } else { Self::NONE }
+    }
+
+    /// The coarsest scale that nearly all of the floats measured are multiples of.
+    pub(crate) fn find(bits: &[u32]) -> Option<Self> {
+        let step = (bits.len() / 256).max(1);
+        let sample: Vec<u32> = bits
+            .iter()
+            .step_by(step)
+            .copied()
+            .filter(|&bits| f32::from_bits(bits).is_finite() && bits << 1 != 0)
+            .collect();
+        (0..SCALES.len() as u8).filter_map(|name| Self::named(name).ok()).find(|scale| {
+            let fit = sample.iter().filter(|&&bits| scale.multiple(bits) != Self::NONE).count();
+            fit * 16 >= sample.len() * 15 && fit > 0
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn multiples_are_found_and_restored() {
+        for name in 0..SCALES.len() as u8 {
+            let scale = Scale::named(name).unwrap();
+            for multiple in [-70_000, -1, 1, 2, 3, 1001, 65_537, 1_000_003] {
+                assert_eq!(scale.multiple(scale.value(multiple)), multiple, "{scale:?}");
+            }
+        }
+        assert!(Scale::named(200).is_err());
+    }
+
+    #[test]
+    fn the_usual_drivers_are_recognised() {
+        let find = |value: fn(u32) -> f32| {
+            let bits: Vec<u32> = (500..1500).map(|count| value(count).to_bits()).collect();
+            Scale::find(&bits).map(|scale| (scale.divisor, scale.factor))
+        };
+        assert_eq!(find(|count| count as f32 * 0.001), Some((1000.0, 0.001)));
+        assert_eq!(find(|count| count as f32 / 1000.0), Some((1000.0, 0.0)));
+        assert_eq!(find(|count| count as f32), Some((1.0, 0.0)));
+        assert_eq!(find(|count| count as f32 / 4.0 / 1000.0), Some((4000.0, 0.0)));
+        assert_eq!(find(|count| (count as f32).sqrt() / 77.0), None);
+        assert_eq!(find(|_| f32::NAN), None);
+    }
+
+    #[test]
+    fn what_is_no_number_is_no_multiple() {
+        let scale = Scale::named(0).unwrap();
+        for value in [f32::NAN, f32::INFINITY, 0.5, 1e9, -0.0] {
+            assert_eq!(scale.multiple(value.to_bits()), Scale::NONE, "{value}");
+        }
+    }
+}
