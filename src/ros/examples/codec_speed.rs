@@ -1,6 +1,6 @@
 //! How fast messages turn into JSON and CBOR and back, beside a plain copy and beside `serde_json::Value`.
 //!
-//!     cargo run --release -p ros --example codec_speed
+//!     cargo run --release -p ros --example codec_speed [PART OF A TITLE]
 //!
 //! MB/s count the serialized ROS message, whichever way it goes; the fastest of several rounds counts, since
 //! everything else on the machine only ever adds.
@@ -17,6 +17,7 @@ const ROUND: Duration = Duration::from_millis(60);
 const ROUNDS: usize = 12;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let only = std::env::args().nth(1);
     let registry = definitions()?;
     println!("{:<44} {:>10} {:>10} {:>9}", "", "ns", "MB/s", "of memcpy");
     for (title, name, bytes) in [
@@ -26,6 +27,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         ("Twist", "geometry_msgs/Twist", twist()),
         ("String of 20", "std_msgs/String", string()),
     ] {
+        if only.as_ref().is_some_and(|only| !title.contains(only)) {
+            continue;
+        }
         measure(title, &*registry.message(name)?, &bytes)?;
     }
     let image = image();

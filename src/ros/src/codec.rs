@@ -16,6 +16,7 @@
 mod cbor_in;
 mod cbor_item;
 mod cbor_out;
+mod digits;
 mod fault;
 mod fill;
 mod float;

@@ -30,23 +30,31 @@ impl Head {
             return Err("the input ends here");
         };
         let (major, info) = (first & 0xe0, first & 0x1f);
-        let width = match info {
-            0..=23 => {
-                return Ok(Head {
-                    major,
-                    info,
-                    value: u64::from(info),
-                    size: 1,
-                });
-            }
-            24..=27 => 1 << (info - 24),
-            INDEFINITE if matches!(major, BYTES | TEXT | ARRAY | MAP | SIMPLE) => 0,
+        let (value, width) = match info {
+            0..=23 => (Some(u64::from(info)), 0),
+            24 => (
+                rest.first_chunk()
+                    .map(|bytes| u8::from_be_bytes(*bytes).into()),
+                1,
+            ),
+            25 => (
+                rest.first_chunk()
+                    .map(|bytes| u16::from_be_bytes(*bytes).into()),
+                2,
+            ),
+            26 => (
+                rest.first_chunk()
+                    .map(|bytes| u32::from_be_bytes(*bytes).into()),
+                4,
+            ),
+            27 => (
+                rest.first_chunk().map(|bytes| u64::from_be_bytes(*bytes)),
+                8,
+            ),
+            INDEFINITE if matches!(major, BYTES | TEXT | ARRAY | MAP | SIMPLE) => (Some(0), 0),
             _ => return Err("a reserved head"),
         };
-        let bytes = rest.get(..width).ok_or("the input ends here")?;
-        let value = bytes
-            .iter()
-            .fold(0, |value, byte| value << 8 | u64::from(*byte));
+        let value = value.ok_or("the input ends here")?;
         Ok(Head {
             major,
             info,

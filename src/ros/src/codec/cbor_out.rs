@@ -60,7 +60,7 @@ struct Cbor<'a> {
 impl Format for Cbor<'_> {
     #[inline]
     fn literal(&mut self, plan: &Plan, literal: &Literal) {
-        self.out.extend_from_slice(plan.cbor(literal));
+        plan.push_cbor(literal, self.out);
     }
 
     #[inline]
@@ -71,8 +71,8 @@ impl Format for Cbor<'_> {
                 head(self.out, UNSIGNED, unsigned(bytes))
             }
             Scalar::I8 | Scalar::I16 | Scalar::I32 | Scalar::I64 => self.integer(signed(bytes)),
-            Scalar::F32 => self.float(26, bytes),
-            Scalar::F64 => self.float(27, bytes),
+            Scalar::F32 => self.float::<4, 5>(26, bytes),
+            Scalar::F64 => self.float::<8, 9>(27, bytes),
             Scalar::Time | Scalar::Duration => {
                 let (secs, nsecs) = bytes.split_at(4);
                 let part = if scalar == Scalar::Time {
@@ -146,9 +146,13 @@ impl Cbor<'_> {
         }
     }
 
-    fn float(&mut self, width: u8, bytes: &[u8]) {
-        self.out.push(SIMPLE | width);
-        self.out.extend(bytes.iter().rev());
+    /// `ITEM` is one more than `WIDTH`.
+    #[inline]
+    fn float<const WIDTH: usize, const ITEM: usize>(&mut self, info: u8, bytes: &[u8]) {
+        let mut item = [SIMPLE | info; ITEM];
+        item[1..].copy_from_slice(&bytes[..WIDTH]);
+        item[1..].reverse();
+        self.out.extend_from_slice(&item);
     }
 }
 

@@ -2,6 +2,8 @@
 //! one exact multiplication or division (Clinger, "How to read floating point numbers accurately", 1990); the rest
 //! goes to the standard library.
 
+use std::str::FromStr;
+
 use crate::codec::number::Decimal;
 
 const POWERS: [f64; 23] = [
@@ -14,7 +16,7 @@ const POWERS: [f64; 23] = [
 pub(crate) fn double(decimal: &Decimal<'_>) -> f64 {
     match exact(decimal) {
         Some(value) => value,
-        None => decimal.text.parse().unwrap_or(f64::INFINITY),
+        None => parse(decimal).unwrap_or(f64::INFINITY),
     }
 }
 
@@ -30,7 +32,13 @@ pub(crate) fn single(decimal: &Decimal<'_>) -> f32 {
             return value as f32;
         }
     }
-    decimal.text.parse().unwrap_or(f32::INFINITY)
+    parse(decimal).unwrap_or(f32::INFINITY)
+}
+
+/// The standard library's way, for which JSON's grammar is a part of its own.
+#[inline(never)]
+fn parse<T: FromStr>(decimal: &Decimal<'_>) -> Option<T> {
+    std::str::from_utf8(decimal.text).ok()?.parse().ok()
 }
 
 /// Where mantissa and power of ten are both exact doubles, their product or quotient is rounded once: correctly.

@@ -28,7 +28,7 @@ struct Json<'a> {
 impl Format for Json<'_> {
     #[inline]
     fn literal(&mut self, plan: &Plan, literal: &Literal) {
-        self.out.extend_from_slice(plan.json(literal));
+        plan.push_json(literal, self.out);
     }
 
     #[inline]

@@ -139,17 +139,14 @@ pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
             Some(b'}' | b']' | b',' | b':') if depth == 0 => {
                 return Err(fail(at, "expected a value"));
             }
+            Some(_) if depth > 0 => at += unstructured_prefix(&input[at..]),
             Some(_) => {
-                let structural = |byte: &u8| matches!(byte, b'"' | b'{' | b'}' | b'[' | b']');
                 let ends = |byte: &u8| {
-                    structural(byte) || *byte == b',' || *byte == b':' || is_space(*byte)
+                    matches!(byte, b'"' | b'{' | b'}' | b'[' | b']' | b',' | b':')
+                        || is_space(*byte)
                 };
                 let rest = &input[at..];
-                at += match depth {
-                    0 => rest.iter().position(ends),
-                    _ => rest.iter().position(structural),
-                }
-                .unwrap_or(rest.len());
+                at += rest.iter().position(ends).unwrap_or(rest.len());
             }
         }
         if depth == 0 {
@@ -158,9 +155,44 @@ pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
     }
 }
 
+/// How many bytes at the beginning are neither quote nor bracket nor brace.
+#[inline]
+fn unstructured_prefix(bytes: &[u8]) -> usize {
+    let mut at = 0;
+    while let Some(chunk) = bytes[at..].first_chunk::<8>() {
+        let word = u64::from_le_bytes(*chunk);
+        // A bracket and its brace differ in one bit.
+        let folded = word | (ONES * 0x20);
+        let open = (folded ^ (ONES * u64::from(b'{'))).wrapping_sub(ONES);
+        let close = (folded ^ (ONES * u64::from(b'}'))).wrapping_sub(ONES);
+        let quote = (word ^ (ONES * u64::from(b'"'))).wrapping_sub(ONES);
+        let found = (open | close | quote) & !word & HIGHS;
+        if found != 0 {
+            return at + (found.trailing_zeros() / 8) as usize;
+        }
+        at += 8;
+    }
+    let structural = |byte: &u8| matches!(byte, b'"' | b'{' | b'}' | b'[' | b']');
+    at + bytes[at..]
+        .iter()
+        .position(structural)
+        .unwrap_or(bytes.len() - at)
+}
+
 /// Where the string that begins at `start` (a quote) ends: after its closing quote.
+#[inline]
 fn string_end(input: &[u8], start: usize) -> Option<usize> {
     let mut at = start + 1;
+    // Most strings are keys: too short to be worth the wide search.
+    let near = input[at..]
+        .iter()
+        .take(16)
+        .position(|byte| matches!(byte, b'"' | b'\\'));
+    match near {
+        Some(near) if input[at + near] == b'"' => return Some(at + near + 1),
+        Some(near) => at += near,
+        None => {}
+    }
     loop {
         at += memchr::memchr2(b'"', b'\\', input.get(at..)?)?;
         match input[at] {

@@ -24,7 +24,15 @@ pub(crate) struct Decimal<'a> {
     /// Neither fraction nor exponent.
     pub(crate) integral: bool,
     /// All of it, in JSON's grammar.
-    pub(crate) text: &'a str,
+    pub(crate) text: &'a [u8],
+}
+
+impl Decimal<'_> {
+    /// As it was written.
+    #[cold]
+    fn as_written(self) -> String {
+        String::from_utf8_lossy(self.text).into_owned()
+    }
 }
 
 /// A numeric type of ROS.
@@ -54,7 +62,7 @@ macro_rules! integers {
                     false => <$type>::try_from(decimal.mantissa).ok(),
                     true => 0i64.checked_sub_unsigned(decimal.mantissa).and_then(|value| value.try_into().ok()),
                 };
-                value.ok_or_else(|| out_of_range::<$type>(decimal.text.to_owned()))
+                value.ok_or_else(|| out_of_range::<$type>(decimal.as_written()))
             }
 
             #[inline]
@@ -109,7 +117,7 @@ macro_rules! floats {
             fn from_decimal(decimal: &Decimal<'_>) -> Result<Self, Fault> {
                 match $convert(decimal) {
                     value if value.is_finite() => Ok(value),
-                    _ => Err(out_of_range::<$type>(decimal.text.to_owned())),
+                    _ => Err(out_of_range::<$type>(decimal.as_written())),
                 }
             }
 
@@ -152,7 +160,7 @@ fn from_written<T: Wire>(decimal: &Decimal<'_>) -> Result<T, Fault> {
     match T::from_number(Number::Float(double(decimal))) {
         Ok(value) if !decimal.integral => Ok(value),
         Err(fault) if !fault.is_out_of_range() => Err(fault),
-        _ => Err(out_of_range::<T>(decimal.text.to_owned())),
+        _ => Err(out_of_range::<T>(decimal.as_written())),
     }
 }
 
