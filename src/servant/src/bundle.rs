@@ -10,7 +10,7 @@ use oci_spec::runtime::{
     SpecBuilder, UserBuilder,
 };
 
-use crate::rootfs::COMPILE_USER;
+use crate::rootfs::{COMPILE_USER, Staged};
 use crate::seccomp;
 use crate::spec::{Profile, Spec};
 
@@ -40,15 +40,10 @@ const READ_ONLY: [&str; 5] = [
     "/proc/sysrq-trigger",
 ];
 
-/// The configuration of the container whose root is mounted at `root`. There is no network namespace in it: the creating
+/// The configuration of the container whose root and volumes are staged. There is no network namespace in it: the creating
 /// process is in the servant's already and the container inherits it. Limits are not in it either: the cgroup is
 /// made, set and read back before.
-pub fn config(
-    spec: &Spec,
-    root: &Path,
-    cgroup: Option<PathBuf>,
-    uid: (u32, u32),
-) -> Result<OciSpec, OciSpecError> {
+pub fn config(spec: &Spec, staged: &Staged, uid: (u32, u32)) -> Result<OciSpec, OciSpecError> {
     let mapping = LinuxIdMappingBuilder::default()
         .container_id(0_u32)
         .host_id(uid.0)
@@ -65,27 +60,31 @@ pub fn config(
     .into_iter()
     .map(|kind| LinuxNamespaceBuilder::default().typ(kind).build())
     .collect::<Result<Vec<_>, _>>()?;
-    let linux = LinuxBuilder::default()
+    let mut linux = LinuxBuilder::default()
         .namespaces(namespaces)
         .uid_mappings(vec![mapping])
         .gid_mappings(vec![mapping])
-        // Empty, not absent: an absent path is one that libcontainer chooses.
-        .cgroups_path(cgroup.unwrap_or_default())
+        // libcontainer sees no cgroups at all (see rootfs.rs). If ever it did, it must not find anybody here: with an
+        // empty path its cleanup would kill every process of the cgroups that its caller is in, up to the host's.
+        .cgroups_path(Path::new("/cloudroid-unused").join(&spec.id))
         .seccomp(seccomp::profile(spec.profile)?)
         .masked_paths(MASKED.map(str::to_owned).to_vec())
         .readonly_paths(READ_ONLY.map(str::to_owned).to_vec())
         .build()?;
+    // The builder's own default asks for a device filter, which takes a cgroup to set it in. There is no device in the container but
+    // those that are bound into it, and without CAP_MKNOD on the host none can be made.
+    linux.set_resources(None);
     SpecBuilder::default()
         .version("1.0.2")
         .hostname(spec.id.clone())
         .root(
             RootBuilder::default()
-                .path(root)
+                .path(&staged.root)
                 .readonly(spec.writable.is_none())
                 .build()?,
         )
         .process(process(spec)?)
-        .mounts(mounts(spec)?)
+        .mounts(mounts(spec, &staged.volumes)?)
         .linux(linux)
         .build()
 }
@@ -147,7 +146,7 @@ fn rlimit(kind: PosixRlimitType, wanted: u64) -> Result<PosixRlimit, OciSpecErro
         .build()
 }
 
-fn mounts(spec: &Spec) -> Result<Vec<Mount>, OciSpecError> {
+fn mounts(spec: &Spec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSpecError> {
     let scratch = spec.limits.memory.map_or(SCRATCH, |bytes| bytes / 2);
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
@@ -198,10 +197,10 @@ fn mounts(spec: &Spec) -> Result<Vec<Mount>, OciSpecError> {
         mounts.push(tmpfs("/root", "700", scratch, &[])?);
         mounts.push(tmpfs("/var/tmp", "1777", scratch, &[])?);
     }
-    for extra in &spec.mounts {
+    for (extra, source) in spec.mounts.iter().zip(volumes) {
         let access = if extra.writable { "rw" } else { "ro" };
         let target = extra.target.to_string_lossy();
-        let source = extra.source.to_string_lossy();
+        let source = source.to_string_lossy();
         mounts.push(mount(
             &target,
             "bind",
@@ -250,8 +249,18 @@ mod tests {
     }
 
     fn json(profile: Profile) -> serde_json::Value {
-        serde_json::to_value(config(&spec(profile), Path::new("/r"), None, (5, 65536)).unwrap())
-            .unwrap()
+        serde_json::to_value(
+            config(
+                &spec(profile),
+                &Staged {
+                    root: "/r".into(),
+                    volumes: vec![],
+                },
+                (5, 65536),
+            )
+            .unwrap(),
+        )
+        .unwrap()
     }
 
     #[test]
@@ -280,6 +289,13 @@ mod tests {
             assert_eq!(config["process"]["noNewPrivileges"], true);
             assert_eq!(config["linux"]["uidMappings"][0]["hostID"], 5);
         }
+    }
+
+    #[test]
+    fn libcontainer_is_given_no_cgroup_to_act_on() {
+        let config = json(Profile::Servant);
+        assert_eq!(config["linux"].get("resources"), None);
+        assert_eq!(config["linux"]["cgroupsPath"], "/cloudroid-unused/x");
     }
 
     #[test]

@@ -80,19 +80,6 @@ impl Cgroup {
         Ok(())
     }
 
-    /// The path of the v2 directory below the root of its hierarchy, as an OCI `cgroupsPath`. None on v1: one path
-    /// cannot name directories below our own cgroup in hierarchies where those differ; there the creating
-    /// process [enters](Self::enter) first and the container stays where it was made.
-    pub fn oci_path(&self) -> Option<PathBuf> {
-        let leaf = (self.version == 2).then(|| self.leaves.first()).flatten()?;
-        let root = leaf
-            .directory
-            .ancestors()
-            .take_while(|path| path.join("cgroup.procs").exists())
-            .last()?;
-        Some(Path::new("/").join(leaf.directory.strip_prefix(root).ok()?))
-    }
-
     /// Sets the limits that are given. A limit that cannot be set is not an error here: what is in force is read back.
     pub fn set(&self, limits: &Limits) -> Enforced {
         if self.version == 2 {
@@ -157,6 +144,7 @@ impl Cgroup {
 
     /// Kills every process in it, waits until there is none, and removes it. Blocks, at most for `patience`.
     pub fn destroy(&self, patience: Duration) -> Result<(), Error> {
+        self.refuse_to_end_ourselves()?;
         let deadline = Instant::now() + patience;
         let mut pause = Duration::from_micros(200);
         while self.leaves.iter().any(|leaf| leaf.directory.exists()) {
@@ -186,6 +174,22 @@ impl Cgroup {
                 .for_each(|leaf| hosts::remove_if_unused(&leaf.directory));
         }
         Ok(())
+    }
+
+    /// A record that names a directory which we are in ourselves is wrong, and following it would end the host's processes.
+    fn refuse_to_end_ourselves(&self) -> Result<(), Error> {
+        let own = std::process::id() as i32;
+        let wrong = self.leaves.iter().find(|leaf| {
+            let processes = read_pids(&leaf.directory);
+            processes.contains(&own) || processes.contains(&1)
+        });
+        wrong.map_or(Ok(()), |leaf| {
+            let reason = "it holds this very process, or the host's first".into();
+            Err(Error::Malformed {
+                path: leaf.directory.clone(),
+                reason,
+            })
+        })
     }
 
     /// Whether any of its directories is there.

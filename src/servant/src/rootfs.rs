@@ -1,5 +1,6 @@
 //! The root of a servant: its layers, each with shifted ids, under one overlay. Made in a mount namespace of the
-//! creating process's own, so that nothing shows on the host and nothing can be left behind.
+//! creating process's own, so that nothing shows on the host and nothing can be left behind; and at a place of that namespace
+//! that the container's root can reach, which the state directory (maybe below `/root`) need not be.
 //!
 //! Only the lower layers are shifted: an upper directory whose mount is shifted makes the overlay read-only, and a shifted
 //! overlay is refused (kernel 6.1 to 6.18). The upper directory belongs to the servant's root instead.
@@ -11,13 +12,15 @@ use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Component, Path, PathBuf};
 
 use nix::mount::{MsFlags, mount};
-use nix::sched::{CloneFlags, unshare};
-use nix::sys::wait::waitpid;
-use nix::unistd::{ForkResult, Gid, Uid};
+use nix::unistd::{Gid, Uid};
 
-use crate::Error;
 use crate::spec::Mount;
-use crate::sys;
+use crate::{Error, sys};
+
+mod skeleton;
+mod stage;
+
+pub use skeleton::make_skeleton;
 
 /// Ids of the user that compiles, inside.
 pub const COMPILE_USER: u32 = 1000;
@@ -25,8 +28,6 @@ pub const COMPILE_USER: u32 = 1000;
 /// What a root is made of.
 #[derive(Debug, Clone, Copy)]
 pub struct Rootfs<'a> {
-    /// The servant's state directory: mount points are made in it.
-    pub directory: &'a Path,
     /// Lowest first.
     pub layers: &'a [PathBuf],
     /// On top of them: mount points, hosts, hostname.
@@ -37,18 +38,23 @@ pub struct Rootfs<'a> {
     pub uid_range: (u32, u32),
 }
 
+/// Where things are for the container to be made of. The paths exist in the mount namespace of the calling process only.
+#[derive(Debug)]
+pub struct Staged {
+    /// The mounted root.
+    pub root: PathBuf,
+    /// The sources of the extra mounts, in their order.
+    pub volumes: Vec<PathBuf>,
+}
+
 impl Rootfs<'_> {
     /// Mounts it and tells where. The calling process must have one thread: it moves to a mount namespace of its own
     /// and changes its working directory.
-    pub fn mount(&self) -> Result<PathBuf, Error> {
-        unshare(CloneFlags::CLONE_NEWNS).map_err(Error::nix("unshare of a mount namespace"))?;
-        let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
-        mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
-            .map_err(Error::nix("making mounts private"))?;
-        let shift = user_namespace(self.uid_range)?;
-        let lower = self.directory.join("lower");
-        let target = self.directory.join("rootfs");
-        for path in [&lower, &target] {
+    pub fn mount(&self, volumes: &[Mount]) -> Result<Staged, Error> {
+        let stage = stage::enter()?;
+        let shift = stage::user_namespace(self.uid_range)?;
+        let (lower, root) = (stage.join("lower"), stage.join("root"));
+        for path in [&lower, &root] {
             make_directory(path)?;
         }
         // The names are short because all of them together must fit into one page.
@@ -61,10 +67,13 @@ impl Rootfs<'_> {
         for (index, layer) in all.enumerate() {
             let place = lower.join(index.to_string());
             make_directory(&place)?;
-            shift_layer(layer, &place, &shift)?;
+            stage::attach_shifted(layer, &place, &shift)?;
             names.insert(0, index.to_string());
         }
-        let mut options = format!("lowerdir={},redirect_dir=off,metacopy=off", names.join(":"));
+        let mut options = format!(
+            "lowerdir={},redirect_dir=nofollow,metacopy=off",
+            names.join(":")
+        );
         let mut flags = MsFlags::MS_NODEV;
         match self.upper {
             None => flags |= MsFlags::MS_RDONLY,
@@ -73,14 +82,21 @@ impl Rootfs<'_> {
         nix::unistd::chdir(&lower).map_err(Error::nix("chdir to the layers"))?;
         mount(
             Some("overlay"),
-            &target,
+            &root,
             Some("overlay"),
             flags,
             Some(options.as_str()),
         )
-        .map_err(|error| Error::file("mount the layers at", &target)(error.into()))?;
+        .map_err(|error| Error::file("mount the layers at", &root)(error.into()))?;
         nix::unistd::chdir("/").map_err(Error::nix("chdir to /"))?;
-        Ok(target)
+        let volumes = volumes.iter().enumerate().map(|(index, volume)| {
+            let place = stage.join(format!("volume{index}"));
+            stage::attach_volume(volume, &place, &shift).map(|()| place)
+        });
+        Ok(Staged {
+            volumes: volumes.collect::<Result<_, _>>()?,
+            root,
+        })
     }
 
     fn upper_options(&self, upper: &Path) -> Result<String, Error> {
@@ -159,79 +175,6 @@ pub fn work_directory(upper: &Path) -> PathBuf {
     upper.with_file_name(format!(".{name}.work"))
 }
 
-/// Fills the top layer: what every servant needs to find in a root that it cannot write.
-pub fn make_skeleton(
-    skeleton: &Path,
-    id: &str,
-    layers: &[PathBuf],
-    mounts: &[Mount],
-) -> Result<(), Error> {
-    make_directory(skeleton)?;
-    for (name, mode) in [
-        ("dev", 0o755),
-        ("etc", 0o755),
-        ("proc", 0o555),
-        ("root", 0o700),
-        ("run", 0o755),
-        ("sys", 0o555),
-        ("tmp", 0o1777),
-        ("var", 0o755),
-        ("var/tmp", 0o1777),
-    ] {
-        let path = skeleton.join(name);
-        make_directory(&path)?;
-        fs::set_permissions(&path, fs::Permissions::from_mode(mode))
-            .map_err(Error::file("change", &path))?;
-    }
-    let hosts = format!(
-        "127.0.0.1\tlocalhost\n127.0.0.1\t{id}\n::1\tlocalhost ip6-localhost ip6-loopback\n"
-    );
-    let files = [
-        ("hosts", hosts),
-        ("hostname", format!("{id}\n")),
-        ("resolv.conf", String::new()),
-    ];
-    for (name, text) in files {
-        let path = skeleton.join("etc").join(name);
-        fs::write(&path, text).map_err(Error::file("write", &path))?;
-    }
-    for mount in mounts {
-        make_mount_point(skeleton, layers, mount)?;
-    }
-    Ok(())
-}
-
-/// A read-only root needs the target to be there. A directory made for it must not hide a link of the layers.
-fn make_mount_point(skeleton: &Path, layers: &[PathBuf], mount: &Mount) -> Result<(), Error> {
-    let inside: PathBuf = mount.target.components().filter_map(normal).collect();
-    for part in inside
-        .ancestors()
-        .filter(|part| !part.as_os_str().is_empty())
-    {
-        let found = layers
-            .iter()
-            .rev()
-            .find_map(|layer| fs::symlink_metadata(layer.join(part)).ok());
-        if found.is_some_and(|metadata| metadata.is_symlink()) {
-            return Err(Error::Malformed {
-                path: mount.target.clone(),
-                reason: format!(
-                    "/{} is a link in the image: mount at the place it leads to",
-                    part.display()
-                ),
-            });
-        }
-    }
-    let path = skeleton.join(&inside);
-    let source = fs::metadata(&mount.source).map_err(Error::file("mount", &mount.source))?;
-    if source.is_dir() {
-        return fs::create_dir_all(&path).map_err(Error::file("make", &path));
-    }
-    let above = path.parent().unwrap_or(skeleton);
-    fs::create_dir_all(above).map_err(Error::file("make", above))?;
-    fs::write(&path, "").map_err(Error::file("make", &path))
-}
-
 fn normal(component: Component<'_>) -> Option<&std::ffi::OsStr> {
     match component {
         Component::Normal(name) => Some(name),
@@ -243,125 +186,5 @@ fn make_directory(path: &Path) -> Result<(), Error> {
     match fs::DirBuilder::new().mode(0o755).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
         result => result.map_err(Error::file("make", path)),
-    }
-}
-
-/// Attaches a read-only copy of `layer` at `place` whose ids are shifted.
-fn shift_layer(layer: &Path, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
-    let copy = sys::clone_mount(layer).map_err(Error::file("open the layer", layer))?;
-    sys::shift_mount(copy.as_fd(), shift.as_fd()).map_err(|source| {
-        match source.raw_os_error() {
-            Some(libc::EINVAL | libc::ENOSYS | libc::EOPNOTSUPP) => Error::IdmapUnsupported {
-                path: layer.into(),
-                filesystem: filesystem_of(layer),
-                source,
-            },
-            _ => Error::file("shift the ids of", layer)(source),
-        }
-    })?;
-    sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a layer at", place))
-}
-
-/// The type of the filesystem that holds `path`, from the mount table.
-fn filesystem_of(path: &Path) -> String {
-    let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
-    let path = path.canonicalize().unwrap_or_else(|_| path.into());
-    let holds = |line: &str| {
-        let (left, right) = line.split_once(" - ")?;
-        let point = left.split(' ').nth(4)?.to_owned();
-        path.starts_with(&point).then(|| {
-            (
-                point.len(),
-                right.split(' ').next().unwrap_or("").to_owned(),
-            )
-        })
-    };
-    // Of mounts at the same place the last is the visible one.
-    let found = table
-        .lines()
-        .filter_map(holds)
-        .max_by_key(|(length, _)| *length);
-    found.map_or_else(|| "an unknown filesystem".into(), |(_, kind)| kind)
-}
-
-/// A user namespace whose root is the first uid of the range. The kernel gives its map to mounts; nobody lives in it.
-fn user_namespace((first, count): (u32, u32)) -> Result<OwnedFd, Error> {
-    let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
-    let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
-    // SAFETY: the calling process has one thread (see Rootfs::mount); the child makes system calls only.
-    match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork"))? {
-        ForkResult::Child => {
-            drop(release);
-            let done = [u8::from(unshare(CloneFlags::CLONE_NEWUSER).is_ok())];
-            let _ = nix::unistd::write(&tell, &done);
-            let _ = nix::unistd::read(&wait, &mut [0]);
-            // SAFETY: ends the child without running what the parent has registered for its own end.
-            unsafe { libc::_exit(0) }
-        }
-        ForkResult::Parent { child } => {
-            drop(tell);
-            let mut done = [0];
-            let read = nix::unistd::read(&unshared, &mut done);
-            let opened = if read == Ok(1) && done == [1] {
-                map_ids(child.as_raw(), first, count)
-            } else {
-                Err(Error::call("unshare of a user namespace")(io::Error::from(
-                    io::ErrorKind::PermissionDenied,
-                )))
-            };
-            drop(release);
-            let _ = waitpid(child, None);
-            opened
-        }
-    }
-}
-
-fn map_ids(pid: i32, first: u32, count: u32) -> Result<OwnedFd, Error> {
-    for file in ["uid_map", "gid_map"] {
-        let path = format!("/proc/{pid}/{file}");
-        fs::write(&path, format!("0 {first} {count}\n")).map_err(Error::file("write", &path))?;
-    }
-    let path = format!("/proc/{pid}/ns/user");
-    Ok(fs::File::open(&path)
-        .map_err(Error::file("open", &path))?
-        .into())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_mount_through_a_link_of_the_image_is_refused() {
-        let home = tempfile::tempdir().unwrap();
-        let layer = home.path().join("layer");
-        fs::create_dir_all(layer.join("usr/lib")).unwrap();
-        std::os::unix::fs::symlink("usr/lib", layer.join("lib")).unwrap();
-        let mount = |target: &str| Mount {
-            source: home.path().into(),
-            target: target.into(),
-            writable: false,
-        };
-        let make = |name: &str, target: &str| {
-            make_skeleton(
-                &home.path().join(name),
-                "x",
-                std::slice::from_ref(&layer),
-                &[mount(target)],
-            )
-        };
-        let error = make("one", "/lib/models").unwrap_err().to_string();
-        assert!(error.contains("/lib is a link in the image"), "{error}");
-        make("two", "/usr/lib/models").unwrap();
-        assert!(home.path().join("two/usr/lib/models").is_dir());
-        assert!(
-            !layer.join("usr/lib/models").exists(),
-            "the layer is not written"
-        );
-    }
-
-    #[test]
-    fn the_filesystem_of_a_path_is_named() {
-        assert_eq!(filesystem_of(Path::new("/proc/self/status")), "proc");
     }
 }

@@ -20,8 +20,12 @@ pub(super) fn read_field(file: &Path, name: &str) -> Option<u64> {
     })
 }
 
-/// The processes of a cgroup directory.
+/// The processes of a cgroup directory. Those of another pid namespace read as 0, which `kill` takes for our own process
+/// group: they are left out.
 pub(super) fn read_pids(directory: &Path) -> Vec<i32> {
     let text = fs::read_to_string(directory.join("cgroup.procs")).unwrap_or_default();
-    text.lines().filter_map(|line| line.parse().ok()).collect()
+    text.lines()
+        .filter_map(|line| line.parse().ok())
+        .filter(|pid| *pid > 0)
+        .collect()
 }

@@ -62,8 +62,7 @@ pub(super) fn fork(
         ForkResult::Child => {
             drop(report);
             let write = Arc::new(File::from(write));
-            // Errors that libcontainer meets in its own children are only logged. On cgroup v1 its cleanup after a failure
-            // kills us, too: then what was logged is all that is known.
+            // Errors that libcontainer meets in its own children are only logged.
             let _ = tracing::subscriber::set_global_default(Complaints(write.clone()));
             let outcome = match create(directory, launch, cgroup, socket) {
                 Ok(init) => Report::Created { init },
@@ -86,12 +85,10 @@ fn create(
     // Opened before anything of the servant is mounted.
     let init = File::open(&launch.init)
         .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
-    let oci_path = cgroup.oci_path();
-    if oci_path.is_none() {
-        cgroup
-            .enter(std::process::id())
-            .map_err(|error| text(&error))?;
-    }
+    // The container stays where it was made, and everything that it is made by is counted already.
+    cgroup
+        .enter(std::process::id())
+        .map_err(|error| text(&error))?;
     let skeleton = directory.join("skeleton");
     make_skeleton(
         &skeleton,
@@ -101,18 +98,19 @@ fn create(
     )
     .map_err(|error| text(&error))?;
     let rootfs = Rootfs {
-        directory,
         layers: &launch.spec.layers,
         skeleton: &skeleton,
         upper: launch.spec.writable.as_deref(),
         uid_range: launch.uid_range,
     };
-    let root = rootfs.mount().map_err(|error| text(&error))?;
+    let staged = rootfs
+        .mount(&launch.spec.mounts)
+        .map_err(|error| text(&error))?;
     rootfs
-        .make_owned(&root, &launch.spec.owned_directories)
+        .make_owned(&staged.root, &launch.spec.owned_directories)
         .map_err(|error| text(&error))?;
-    let config = bundle::config(&launch.spec, &root, oci_path, launch.uid_range)
-        .map_err(|error| text(&error))?;
+    let config =
+        bundle::config(&launch.spec, &staged, launch.uid_range).map_err(|error| text(&error))?;
     let file = directory.join("config.json");
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
     std::fs::write(&file, json)

@@ -1,0 +1,192 @@
+//! The place where a root is put together, and what lets layers belong to other users there.
+
+use std::fs;
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+use std::path::{Path, PathBuf};
+
+use nix::mount::{MntFlags, MsFlags, mount, umount2};
+use nix::sched::{CloneFlags, unshare};
+use nix::sys::wait::waitpid;
+use nix::unistd::ForkResult;
+
+use super::make_directory;
+use crate::spec::Mount;
+use crate::{Error, sys};
+
+/// A directory that every host has and every user can reach, and that must be covered anyway.
+const STAGE: &str = "/sys/fs/cgroup";
+
+/// Moves the calling process to a mount namespace of its own in which `/sys/fs/cgroup` is an empty tmpfs, and nothing is a
+/// cgroup mount any more.
+///
+/// So libcontainer has no cgroup to act on: ours is made, limited and removed by us alone. This is a matter of safety, too. When
+/// a creation fails, libcontainer kills whatever it finds in the cgroup that it takes for the container's, and on cgroup
+/// v1 that can be the root of a hierarchy, with the host's processes (0.7.0, `cleanup_container`).
+pub(super) fn enter() -> Result<PathBuf, Error> {
+    unshare(CloneFlags::CLONE_NEWNS).map_err(Error::nix("unshare of a mount namespace"))?;
+    let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
+    mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
+        .map_err(Error::nix("making mounts private"))?;
+    let points = || {
+        let table = fs::read_to_string("/proc/self/mountinfo")
+            .map_err(Error::file("read", "/proc/self/mountinfo"))?;
+        Ok(cgroup_mounts(&table))
+    };
+    // The deepest first: a mount with others in it is busy.
+    for point in points()?.into_iter().rev() {
+        umount2(&point, MntFlags::MNT_DETACH)
+            .map_err(|error| Error::file("hide the cgroups at", &point)(error.into()))?;
+    }
+    if let Some(left) = points()?.first() {
+        let reason = "a cgroup mount cannot be hidden from the creation of a container".into();
+        return Err(Error::Malformed {
+            path: left.clone(),
+            reason,
+        });
+    }
+    mount(
+        Some("cloudroid"),
+        STAGE,
+        Some("tmpfs"),
+        MsFlags::MS_NODEV,
+        Some("mode=755,size=1m"),
+    )
+    .map_err(|error| Error::file("cover", STAGE)(error.into()))?;
+    Ok(STAGE.into())
+}
+
+/// Where cgroup filesystems are mounted, in the order of their mounting.
+fn cgroup_mounts(mountinfo: &str) -> Vec<PathBuf> {
+    let point = |line: &str| {
+        let (left, right) = line.split_once(" - ")?;
+        right
+            .starts_with("cgroup")
+            .then(|| left.split(' ').nth(4).map(PathBuf::from))
+            .flatten()
+    };
+    mountinfo.lines().filter_map(point).collect()
+}
+
+/// Attaches a read-only copy of `layer` at `place` whose ids are shifted.
+pub(super) fn attach_shifted(layer: &Path, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
+    let copy = sys::clone_mount(layer).map_err(Error::file("open the layer", layer))?;
+    sys::shift_mount(copy.as_fd(), shift.as_fd()).map_err(|source| {
+        let unsupported = matches!(
+            source.raw_os_error(),
+            Some(libc::EINVAL | libc::ENOSYS | libc::EOPNOTSUPP)
+        );
+        if !unsupported {
+            return Error::file("shift the ids of", layer)(source);
+        }
+        Error::IdmapUnsupported {
+            path: layer.into(),
+            filesystem: filesystem_of(layer),
+            source,
+        }
+    })?;
+    sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a layer at", place))
+}
+
+/// Attaches what is to be mounted into the container. A read-only volume has shifted ids where its filesystem can, so that
+/// inside root may read what belongs to root; a writable one never, lest root inside write as root.
+pub(super) fn attach_volume(volume: &Mount, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
+    let source = &volume.source;
+    if fs::metadata(source)
+        .map_err(Error::file("mount", source))?
+        .is_dir()
+    {
+        make_directory(place)?;
+    } else {
+        fs::write(place, "").map_err(Error::file("make", place))?;
+    }
+    if !volume.writable && attach_shifted(source, place, shift).is_ok() {
+        return Ok(());
+    }
+    let copy = sys::clone_mount(source).map_err(Error::file("mount", source))?;
+    sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a volume at", place))
+}
+
+/// The type of the filesystem that holds `path`, from the mount table.
+fn filesystem_of(path: &Path) -> String {
+    let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
+    let path = path.canonicalize().unwrap_or_else(|_| path.into());
+    let holds = |line: &str| {
+        let (left, right) = line.split_once(" - ")?;
+        let point = left.split(' ').nth(4)?.to_owned();
+        path.starts_with(&point).then(|| {
+            (
+                point.len(),
+                right.split(' ').next().unwrap_or("").to_owned(),
+            )
+        })
+    };
+    // Of mounts at the same place the last is the visible one.
+    let found = table
+        .lines()
+        .filter_map(holds)
+        .max_by_key(|(length, _)| *length);
+    found.map_or_else(|| "an unknown filesystem".into(), |(_, kind)| kind)
+}
+
+/// A user namespace whose root is the first uid of the range. The kernel gives its map to mounts; nobody lives in it.
+pub(super) fn user_namespace((first, count): (u32, u32)) -> Result<OwnedFd, Error> {
+    let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
+    let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
+    // SAFETY: the calling process has one thread (see Rootfs::mount); the child makes system calls only.
+    match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork"))? {
+        ForkResult::Child => {
+            drop(release);
+            let done = [u8::from(unshare(CloneFlags::CLONE_NEWUSER).is_ok())];
+            let _ = nix::unistd::write(&tell, &done);
+            let _ = nix::unistd::read(&wait, &mut [0]);
+            // SAFETY: ends the child without running what the parent has registered for its own end.
+            unsafe { libc::_exit(0) }
+        }
+        ForkResult::Parent { child } => {
+            drop(tell);
+            let mut done = [0];
+            let read = nix::unistd::read(&unshared, &mut done);
+            let opened = if read == Ok(1) && done == [1] {
+                map_ids(child.as_raw(), first, count)
+            } else {
+                Err(Error::call("unshare of a user namespace")(io::Error::from(
+                    io::ErrorKind::PermissionDenied,
+                )))
+            };
+            drop(release);
+            let _ = waitpid(child, None);
+            opened
+        }
+    }
+}
+
+fn map_ids(pid: i32, first: u32, count: u32) -> Result<OwnedFd, Error> {
+    for file in ["uid_map", "gid_map"] {
+        let path = format!("/proc/{pid}/{file}");
+        fs::write(&path, format!("0 {first} {count}\n")).map_err(Error::file("write", &path))?;
+    }
+    let path = format!("/proc/{pid}/ns/user");
+    Ok(fs::File::open(&path)
+        .map_err(Error::file("open", &path))?
+        .into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kind_of_cgroup_mount_is_found() {
+        let table = "30 24 0:26 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n31 24 0:27 / /c2 rw x:1 - cgroup2 c rw\n32 1 0:1 / / rw - ext4 /dev/a rw\n";
+        assert_eq!(
+            cgroup_mounts(table),
+            [Path::new("/sys/fs/cgroup/cpu"), Path::new("/c2")]
+        );
+    }
+
+    #[test]
+    fn the_filesystem_of_a_path_is_named() {
+        assert_eq!(filesystem_of(Path::new("/proc/self/status")), "proc");
+    }
+}

@@ -1,0 +1,176 @@
+//! Servants outlive whoever started them.
+
+use servant::engine::{ContainerState, Engine};
+
+use crate::support::*;
+
+#[tokio::test]
+async fn a_servant_is_found_again_by_the_next_daemon() {
+    let world = World::new();
+    let mut spec = spec(vec![node("/stays", &["sleep"]), node("/goes", &["sleep"])]);
+    spec.resident = serde_json::json!("same");
+    let id = spec.id.clone();
+    let first = world.start(spec).await;
+    let (uids, network) = (first.uid_range(), first.endpoint().netns);
+    let enforced = first.enforced();
+    let processes = first.processes().await.unwrap();
+    drop(first);
+    let engine = world.restarted();
+    let mut adopted = within(engine.adopt()).await.unwrap();
+    let second = adopted.pop().expect("one");
+    assert!(adopted.is_empty());
+    assert_eq!(second.id(), id);
+    assert!(matches!(
+        *second.state().borrow(),
+        ContainerState::Running { .. }
+    ));
+    assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
+    assert_eq!(second.endpoint().netns, network);
+    assert_eq!(second.processes().await.unwrap(), processes);
+    assert!(hear(&*second, 11311).await.unwrap().starts_with("\"same\""));
+    second.signal_node("/goes", libc::SIGTERM).await.unwrap();
+    assert_eq!(
+        within(second.wait_node("/goes")).await.unwrap().signal,
+        Some(libc::SIGTERM)
+    );
+    drop(second);
+    // What happened meanwhile is known to the third.
+    let third = within(world.restarted().adopt())
+        .await
+        .unwrap()
+        .pop()
+        .expect("one");
+    assert_eq!(
+        within(third.wait_node("/goes")).await.unwrap().signal,
+        Some(libc::SIGTERM)
+    );
+    world.stop(third).await;
+}
+
+#[tokio::test]
+async fn an_end_while_no_daemon_watched_is_told_and_swept() {
+    let world = World::new();
+    let mut required = node("/required", &["sleep"]);
+    required.required = true;
+    let spec = spec(vec![required]);
+    let id = spec.id.clone();
+    let servant = world.start(spec).await;
+    let pid = servant.processes().await.unwrap()[0];
+    let runtime = world.runtime(&id);
+    let shim = runtime.shim.open().unwrap().expect("it runs");
+    drop(servant);
+    kill(
+        &servant::process::Identity::of(pid)
+            .unwrap()
+            .open()
+            .unwrap()
+            .expect("it runs"),
+    );
+    let mut watched = [nix::poll::PollFd::new(
+        std::os::fd::AsFd::as_fd(&shim),
+        nix::poll::PollFlags::POLLIN,
+    )];
+    assert_eq!(
+        nix::poll::poll(&mut watched, 20_000_u16).unwrap(),
+        1,
+        "the shim ends with its servant"
+    );
+    let adoption = within(world.restarted().adopt_all()).await.unwrap();
+    assert!(
+        adoption.running.is_empty() && adoption.failures.is_empty(),
+        "{adoption:?}"
+    );
+    assert_eq!(adoption.ended[0].id, id);
+    let exit = adoption.ended[0].exit.as_ref().expect("it was written");
+    let ContainerState::Stopped { reason } = &exit.state else {
+        panic!("{exit:?}")
+    };
+    assert!(
+        reason.contains("/required was killed by signal 9"),
+        "{reason}"
+    );
+    assert_eq!(exit.nodes["/required"].ended().unwrap().signal, Some(9));
+    world.assert_gone(&id, &runtime, &[pid]);
+}
+
+#[tokio::test]
+async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
+    let world = World::new();
+    let spec = spec(vec![node("/stubborn", &["stubborn"])]);
+    let id = spec.id.clone();
+    let servant = world.start(spec).await;
+    let mut lines = servant.follow_log(true);
+    lines_until(&mut lines, |line| line.line == "stubborn").await;
+    let processes = servant.processes().await.unwrap();
+    let runtime = world.runtime(&id);
+    let nodes: Vec<_> = processes
+        .iter()
+        .map(|pid| servant::process::Identity::of(*pid).unwrap())
+        .collect();
+    kill(&runtime.shim.open().unwrap().expect("it runs"));
+    let ContainerState::Failed { reason } = ended(&*servant).await else {
+        panic!("it did not fail")
+    };
+    assert!(reason.contains("shim was killed"), "{reason}");
+    let error = servant.usage().await.unwrap_err().to_string();
+    assert!(error.contains("shim was killed"), "{error}");
+    drop(servant);
+    // Init needs no daemon to see that the shim has gone.
+    within(async {
+        while nodes.iter().any(|node| node.open().unwrap().is_some()) {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    let adoption = within(world.restarted().adopt_all()).await.unwrap();
+    assert!(adoption.failures.is_empty(), "{adoption:?}");
+    assert_eq!(
+        adoption
+            .ended
+            .iter()
+            .map(|ended| (ended.id.as_str(), ended.exit.is_some()))
+            .collect::<Vec<_>>(),
+        [(id.as_str(), false)]
+    );
+    world.assert_gone(&id, &runtime, &processes);
+}
+
+#[tokio::test]
+async fn what_a_daemon_left_half_made_is_removed() {
+    let world = World::new();
+    std::fs::create_dir(world.servant_directory("half")).unwrap();
+    std::fs::write(
+        world.servant_directory("half").join("spec.json"),
+        "{ \"half",
+    )
+    .unwrap();
+    let adoption = within(world.engine.adopt_all()).await.unwrap();
+    assert_eq!((adoption.ended.len(), adoption.failures.len()), (1, 0));
+    assert!(!world.servant_directory("half").exists());
+}
+
+#[tokio::test]
+async fn a_pid_that_now_belongs_to_another_is_left_alone() {
+    let world = World::new();
+    let mut bystander = std::process::Command::new("cat")
+        .stdin(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let spec = spec(vec![]);
+    let id = spec.id.clone();
+    let servant = world.start(spec).await;
+    let mut runtime = world.runtime(&id);
+    world.stop(servant).await;
+    runtime.shim.pid = bystander.id() as i32;
+    std::fs::create_dir(world.servant_directory(&id)).unwrap();
+    servant::launch::write(
+        &world.servant_directory(&id).join(servant::launch::RUNTIME),
+        &runtime,
+    )
+    .unwrap();
+    let adoption = within(world.engine.adopt_all()).await.unwrap();
+    assert_eq!(adoption.ended.len(), 1);
+    assert!(bystander.try_wait().unwrap().is_none(), "it still runs");
+    drop(bystander.stdin.take());
+    bystander.wait().unwrap();
+}

@@ -1,0 +1,140 @@
+//! What a node cannot do.
+
+use servant::spec::{Mount, Profile};
+
+use crate::support::*;
+
+#[tokio::test]
+async fn every_process_is_confined_as_seen_from_the_host() {
+    let world = World::new();
+    let servant = world
+        .start(spec(vec![
+            node("/one", &["family"]),
+            node("/two", &["sleep"]),
+        ]))
+        .await;
+    let mut lines = servant.follow_log(true);
+    lines_until(&mut lines, |line| line.line == "family").await;
+    let processes = servant.processes().await.unwrap();
+    assert_eq!(processes.len(), 3, "two nodes and a child");
+    let (first, count) = servant.uid_range();
+    for pid in processes {
+        assert_eq!(status_field(pid, "Seccomp"), "2");
+        assert_eq!(status_field(pid, "NoNewPrivs"), "1");
+        for set in ["CapEff", "CapPrm", "CapBnd", "CapAmb", "CapInh"] {
+            assert_eq!(status_field(pid, set), "0000000000000000", "{set}");
+        }
+        let map = std::fs::read_to_string(format!("/proc/{pid}/uid_map")).unwrap();
+        let map: Vec<u32> = map
+            .split_whitespace()
+            .map(|number| number.parse().unwrap())
+            .collect();
+        assert_eq!(map, [0, first, count]);
+        assert_eq!(
+            status_field(pid, "Uid").split_whitespace().next().unwrap(),
+            first.to_string()
+        );
+        for kind in ["user", "mnt", "pid", "net", "ipc", "uts", "cgroup"] {
+            let namespace =
+                |who: &str| std::fs::read_link(format!("/proc/{who}/ns/{kind}")).unwrap();
+            assert_ne!(namespace(&pid.to_string()), namespace("self"), "{kind}");
+        }
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn no_way_out_is_open() {
+    let world = World::new();
+    let servant = world.start(spec(vec![node("/curious", &["calls"])])).await;
+    let mut lines = servant.follow_log(true);
+    let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
+    assert!(told.len() > 40, "everything was tried: {told:?}");
+    let allowed: Vec<_> = told
+        .iter()
+        .filter(|line| line.line.ends_with("allowed"))
+        .collect();
+    assert!(allowed.is_empty(), "{allowed:#?}");
+    let answer = |name: &str| {
+        told.iter()
+            .find_map(|line| line.line.strip_prefix(name))
+            .unwrap()
+            .to_owned()
+    };
+    assert!(
+        answer("clone3: ").contains("not implemented"),
+        "so that the C library falls back"
+    );
+    assert!(
+        answer("clone with a new user namespace: ").contains("not implemented")
+            || answer("clone with a new user namespace: ").contains("not permitted")
+    );
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn builds_open_no_way_out_either() {
+    let world = World::new();
+    for profile in [Profile::Compile, Profile::Install] {
+        let mut spec = spec(vec![node("/curious", &["calls"])]);
+        spec.profile = profile;
+        spec.writable = Some(world.path("upper"));
+        let servant = world.start(spec).await;
+        let mut lines = servant.follow_log(true);
+        let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
+        let mut allowed = told
+            .iter()
+            .map(|line| line.line.as_str())
+            .filter(|line| line.ends_with("allowed"));
+        // An install writes its root, and that is its purpose.
+        let expected = |line: &str| {
+            profile == Profile::Install && line.starts_with("write /") && !line.contains("/proc")
+        };
+        assert_eq!(allowed.find(|line| !expected(line)), None);
+        world.stop(servant).await;
+    }
+}
+
+#[tokio::test]
+async fn a_volume_is_there_and_read_only() {
+    let world = World::new();
+    let models = world.path("models");
+    std::fs::create_dir(&models).unwrap();
+    std::fs::write(models.join("weights"), "heavy\n").unwrap();
+    let mut spec = spec(vec![
+        node("/reads", &["read", "/opt/models/weights"]),
+        node("/writes", &["write", "/opt/models/x"]),
+    ]);
+    spec.mounts = vec![Mount {
+        source: models.clone(),
+        target: "/opt/models".into(),
+        writable: false,
+    }];
+    let servant = world.start(spec).await;
+    assert_eq!(
+        within(servant.wait_node("/reads")).await.unwrap().code,
+        Some(0)
+    );
+    assert_eq!(
+        within(servant.wait_node("/writes")).await.unwrap().code,
+        Some(libc::EROFS)
+    );
+    world.stop(servant).await;
+    assert!(models.join("weights").exists());
+}
+
+#[tokio::test]
+async fn two_servants_share_nothing_and_their_networks_are_apart() {
+    let world = World::new();
+    let mut first = spec(vec![]);
+    first.resident = serde_json::json!({ "name": "first" });
+    let mut second = spec(vec![]);
+    second.resident = serde_json::json!({ "name": "second" });
+    let (first, second) = (world.start(first).await, world.start(second).await);
+    assert!(hear(&*first, 11311).await.unwrap().contains("first"));
+    assert!(hear(&*second, 11311).await.unwrap().contains("second"));
+    assert_ne!(first.uid_range().0, second.uid_range().0);
+    assert_ne!(first.endpoint().netns, second.endpoint().netns);
+    world.stop(first).await;
+    world.stop(second).await;
+}

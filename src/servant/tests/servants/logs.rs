@@ -1,0 +1,54 @@
+//! What nodes print arrives.
+
+use crate::support::*;
+
+#[tokio::test]
+async fn every_line_arrives_once_and_in_order() {
+    const LINES: u64 = 200_000;
+    let world = World::new();
+    let servant = world
+        .start(spec(vec![node("/talks", &["print", &LINES.to_string()])]))
+        .await;
+    let mut lines = servant.follow_log(true);
+    let reader = tokio::spawn(async move {
+        let mut expected = 0;
+        while let Some(line) = lines.recv().await {
+            assert_eq!(line.line, expected.to_string());
+            expected += 1;
+        }
+        expected
+    });
+    assert_eq!(
+        within(servant.wait_node("/talks")).await.unwrap().code,
+        Some(0)
+    );
+    assert!(servant.log_path().exists());
+    world.stop(servant).await;
+    assert_eq!(
+        within(reader).await.unwrap(),
+        LINES,
+        "also what was read after the end"
+    );
+}
+
+#[tokio::test]
+async fn a_follower_from_now_on_sees_only_what_comes() {
+    let world = World::new();
+    let servant = world
+        .start(spec(vec![node("/early", &["print", "10"])]))
+        .await;
+    let mut all = servant.follow_log(true);
+    lines_until(&mut all, |line| line.line == "9").await;
+    let mut late = servant.follow_log(false);
+    servant
+        .start_node(node("/late", &["print", "2"]))
+        .await
+        .unwrap();
+    let seen = lines_until(&mut late, |line| line.line == "1").await;
+    assert!(
+        seen.iter()
+            .all(|line| line.node == "/late" && line.stream == "stdout"),
+        "{seen:?}"
+    );
+    world.stop(servant).await;
+}

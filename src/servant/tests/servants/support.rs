@@ -1,0 +1,387 @@
+//! A world of one's own for each test: an engine with its own directory, a layer, and the certainty that nothing is left.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::future::Future;
+use std::io::{Read, Write};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::pin::Pin;
+use std::process::Command;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use servant::engine::{ContainerState, Engine, LogLine, Servant};
+use servant::launch::{self, Runtime};
+use servant::local::{Grace, Isolation, LocalEngine, LocalEngineConfig};
+use servant::shim::{Resident, ResidentContext, ResidentError};
+use servant::spec::{Limits, NodeSpec, Profile, Spec};
+
+/// Runs before `main`: a shim must have one thread, and the test harness makes more.
+#[used]
+#[unsafe(link_section = ".init_array")]
+static CHOOSE: extern "C" fn() = choose;
+
+extern "C" fn choose() {
+    let words: Vec<String> = std::env::args().collect();
+    if words
+        .first()
+        .is_some_and(|name| name.ends_with("test-node"))
+    {
+        let status = crate::node::act(&words[1..]);
+        let _ = std::io::stdout().flush();
+        std::process::exit(status);
+    }
+    if let [_, word, directory] = words.as_slice() {
+        if word == "shim" {
+            let status = servant::shim::run(Path::new(directory), Box::new(Greeter::default()));
+            std::process::exit(i32::from(status != std::process::ExitCode::SUCCESS));
+        }
+    }
+}
+
+/// A resident that answers on the ROS Master's port with its configuration and how many processes have ended.
+#[derive(Default)]
+struct Greeter {
+    ended: std::rc::Rc<std::cell::Cell<usize>>,
+}
+
+impl Resident for Greeter {
+    fn start<'a>(
+        &'a mut self,
+        context: &'a ResidentContext,
+    ) -> Pin<Box<dyn Future<Output = Result<(), ResidentError>> + 'a>> {
+        Box::pin(async move {
+            if let Some(reason) = context.config.get("fail") {
+                return Err(reason.to_string().into());
+            }
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:11311").await?;
+            let (config, ended) = (context.config.clone(), self.ended.clone());
+            tokio::task::spawn_local(async move {
+                use tokio::io::AsyncWriteExt;
+                while let Ok((mut stream, _)) = listener.accept().await {
+                    let text = format!("{config} {}", ended.get());
+                    let _ = stream.write_all(text.as_bytes()).await;
+                }
+            });
+            Ok(())
+        })
+    }
+
+    fn process_exited(&mut self, _pid: i32) {
+        self.ended.set(self.ended.get() + 1);
+    }
+}
+
+/// An engine and all that belongs to it.
+pub struct World {
+    pub engine: LocalEngine,
+    home: tempfile::TempDir,
+    config: LocalEngineConfig,
+}
+
+impl World {
+    pub fn new() -> Self {
+        Self::with(|_| {})
+    }
+
+    /// With another configuration than most tests need.
+    pub fn with(change: impl FnOnce(&mut LocalEngineConfig)) -> Self {
+        assert!(
+            nix::unistd::geteuid().is_root(),
+            "these tests start containers: run them as root"
+        );
+        let home =
+            tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a directory for the test");
+        let shim: Vec<OsString> = vec![
+            std::env::current_exe().expect("our own path").into(),
+            "shim".into(),
+        ];
+        let mut config = LocalEngineConfig::new(home.path().join("servants"), shim, init());
+        config.isolation = Isolation::BestEffort;
+        config.grace = Grace {
+            interrupt: Duration::from_millis(300),
+            terminate: Duration::from_millis(300),
+        };
+        change(&mut config);
+        let engine = LocalEngine::new(config.clone()).expect("an engine");
+        Self {
+            engine,
+            home,
+            config,
+        }
+    }
+
+    /// Another engine on the same directory: the daemon after its restart.
+    pub fn restarted(&self) -> LocalEngine {
+        LocalEngine::new(self.config.clone()).expect("an engine")
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.home.path().join(name)
+    }
+
+    pub fn servant_directory(&self, id: &str) -> PathBuf {
+        self.config.home_servants_dir.join(id)
+    }
+
+    pub fn runtime(&self, id: &str) -> Runtime {
+        launch::read(&self.servant_directory(id).join(launch::RUNTIME))
+            .unwrap()
+            .expect("a shim writes it first")
+    }
+
+    pub async fn start(&self, spec: Spec) -> Arc<dyn Servant> {
+        self.engine
+            .start(spec)
+            .await
+            .unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// Ends a servant and looks for what it left.
+    pub async fn stop(&self, servant: Arc<dyn Servant>) {
+        let id = servant.id().to_owned();
+        let runtime = self.runtime(&id);
+        let processes = servant.processes().await.unwrap_or_default();
+        servant
+            .stop()
+            .await
+            .unwrap_or_else(|error| panic!("{error}"));
+        self.assert_gone(&id, &runtime, &processes);
+    }
+
+    pub fn assert_gone(&self, id: &str, runtime: &Runtime, processes: &[i32]) {
+        assert!(
+            !self.servant_directory(id).exists(),
+            "the directory is left"
+        );
+        assert!(!runtime.cgroup.exists(), "the cgroup is left");
+        assert!(runtime.shim.open().unwrap().is_none(), "the shim is left");
+        for pid in processes {
+            let cgroup = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
+            assert!(!cgroup.contains(id), "process {pid} is left");
+        }
+        let mounts = std::fs::read_to_string("/proc/self/mountinfo").unwrap();
+        assert!(!mounts.contains(id), "a mount is left");
+    }
+}
+
+impl Drop for World {
+    /// After a failed test: whatever its servants left. After a good one there is nothing.
+    fn drop(&mut self) {
+        let Ok(entries) = std::fs::read_dir(&self.config.home_servants_dir) else {
+            return;
+        };
+        for entry in entries.flatten() {
+            let Ok(Some(runtime)) = launch::read::<Runtime>(&entry.path().join(launch::RUNTIME))
+            else {
+                continue;
+            };
+            if let Ok(Some(pidfd)) = runtime.shim.open() {
+                kill(&pidfd);
+            }
+            let _ = runtime.cgroup.destroy(Duration::from_secs(5));
+        }
+    }
+}
+
+/// Kills a process and waits for its end.
+pub fn kill(pidfd: &std::os::fd::OwnedFd) {
+    use std::os::fd::AsRawFd;
+    // SAFETY: a null siginfo is allowed.
+    unsafe {
+        libc::syscall(
+            libc::SYS_pidfd_send_signal,
+            pidfd.as_raw_fd(),
+            Signal::SIGKILL as i32,
+            0_usize,
+            0,
+        );
+    }
+    let mut watched = [nix::poll::PollFd::new(
+        pidfd.as_fd(),
+        nix::poll::PollFlags::POLLIN,
+    )];
+    let _ = nix::poll::poll(&mut watched, 5000_u16);
+}
+
+/// A spec of the test layer; the id is unique on the host.
+pub fn spec(nodes: Vec<NodeSpec>) -> Spec {
+    static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+    let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    Spec {
+        id: format!("test-{}-{number}", std::process::id()),
+        layers: vec![layer()],
+        writable: None,
+        profile: Profile::Servant,
+        limits: Limits::default(),
+        environment: [("SHARED".to_owned(), "yes".to_owned())].into(),
+        nodes,
+        owned_directories: vec![],
+        mounts: vec![],
+        resident: serde_json::Value::Null,
+    }
+}
+
+/// A node that does what [`crate::node::act`] knows.
+pub fn node(name: &str, words: &[&str]) -> NodeSpec {
+    let argv = std::iter::once("/test-node")
+        .chain(words.iter().copied())
+        .map(str::to_owned)
+        .collect();
+    NodeSpec {
+        name: name.to_owned(),
+        argv,
+        environment: BTreeMap::new(),
+        directory: String::new(),
+        respawn: false,
+        respawn_delay: 0.0,
+        required: false,
+    }
+}
+
+/// The lines of a log until one that fits has come.
+pub async fn lines_until(
+    lines: &mut tokio::sync::mpsc::Receiver<LogLine>,
+    fits: impl Fn(&LogLine) -> bool,
+) -> Vec<LogLine> {
+    let mut seen = Vec::new();
+    loop {
+        let line = within(lines.recv())
+            .await
+            .unwrap_or_else(|| panic!("the log ended after {seen:?}"));
+        seen.push(line);
+        if seen.last().is_some_and(&fits) {
+            return seen;
+        }
+    }
+}
+
+/// The state in which a servant has ended.
+pub async fn ended(servant: &dyn Servant) -> ContainerState {
+    let mut state = servant.state();
+    let over = |state: &ContainerState| {
+        matches!(
+            state,
+            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
+        )
+    };
+    within(state.wait_for(over)).await.expect("a state").clone()
+}
+
+/// A test that waits for what never comes must fail, not hang.
+pub async fn within<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(Duration::from_secs(60), future)
+        .await
+        .expect("it took more than a minute")
+}
+
+/// What a socket says until it closes.
+pub async fn hear(servant: &dyn Servant, port: u16) -> std::io::Result<String> {
+    use tokio::io::AsyncReadExt;
+    let mut stream = servant
+        .endpoint()
+        .netns
+        .connect(([127, 0, 0, 1], port).into())
+        .await?;
+    let mut text = String::new();
+    stream.read_to_string(&mut text).await?;
+    Ok(text)
+}
+
+/// A layer that holds this very program, as `/test-node`, and the libraries that it is linked with.
+fn layer() -> PathBuf {
+    static LAYER: OnceLock<PathBuf> = OnceLock::new();
+    let make = || {
+        let layer =
+            Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
+        std::fs::create_dir_all(layer.join("lib64")).unwrap();
+        std::fs::create_dir_all(layer.join("usr")).unwrap();
+        copy(&std::env::current_exe().unwrap(), &layer.join("test-node"));
+        let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+        let libraries: std::collections::BTreeSet<_> = maps
+            .lines()
+            .filter_map(|line| line.split_whitespace().nth(5))
+            .filter(|path| path.contains(".so"))
+            .collect();
+        for library in libraries {
+            let inside = layer.join(library.trim_start_matches('/'));
+            copy(Path::new(library), &inside);
+            if library.contains("/ld-linux") {
+                let name = Path::new(library).file_name().unwrap();
+                copy(Path::new(library), &layer.join("lib64").join(name));
+                copy(Path::new(library), &layer.join("lib").join(name));
+            }
+        }
+        // SAFETY: the function ends by itself and unwinds nowhere.
+        unsafe { libc::atexit(remove_layer) };
+        layer
+    };
+    LAYER.get_or_init(make).clone()
+}
+
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+    // A link where it can be one: the program is large.
+    if std::fs::hard_link(from, to).is_err() {
+        std::fs::copy(from, to).unwrap();
+    }
+}
+
+extern "C" fn remove_layer() {
+    let layer =
+        Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(layer);
+}
+
+/// The static init, built once for a test run.
+fn init() -> PathBuf {
+    static INIT: OnceLock<PathBuf> = OnceLock::new();
+    let build = || {
+        if let Some(path) = std::env::var_os("CLOUDROID_INIT") {
+            return path.into();
+        }
+        let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
+            .parent()
+            .expect("tmp is in the target directory");
+        let triple = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
+        let status = Command::new(env!("CARGO"))
+            .args([
+                "build",
+                "--quiet",
+                "--package",
+                "init",
+                "--profile",
+                "init",
+                "--target",
+                &triple,
+            ])
+            .arg("--target-dir")
+            .arg(target)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .env("RUSTFLAGS", "-C target-feature=+crt-static")
+            .status()
+            .expect("cargo");
+        assert!(status.success(), "init could not be built");
+        target.join(triple).join("init/cloudroid-init")
+    };
+    INIT.get_or_init(build).clone()
+}
+
+/// A field of /proc/PID/status.
+pub fn status_field(pid: i32, field: &str) -> String {
+    let mut text = String::new();
+    let path = format!("/proc/{pid}/status");
+    std::fs::File::open(&path)
+        .unwrap()
+        .read_to_string(&mut text)
+        .unwrap();
+    let found = text
+        .lines()
+        .find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    found
+        .unwrap_or_else(|| panic!("{path} has no {field}"))
+        .trim()
+        .to_owned()
+}
