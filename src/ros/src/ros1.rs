@@ -4,6 +4,8 @@ mod bus;
 pub mod master;
 pub mod names;
 mod reply;
+#[cfg(test)]
+mod testing;
 pub mod tcpros;
 pub mod xmlrpc;
 

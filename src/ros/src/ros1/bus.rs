@@ -398,3 +398,6 @@ impl Bus for Ros1Bus {
         self.inner.end();
     }
 }
+
+#[cfg(test)]
+mod tests;

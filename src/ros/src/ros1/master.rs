@@ -279,3 +279,6 @@ fn new_run_id() -> String {
         low & 0xffff_ffff_ffff
     )
 }
+
+#[cfg(test)]
+mod tests;

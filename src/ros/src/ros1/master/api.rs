@@ -160,7 +160,10 @@ impl Api {
             Kind::Publisher => format!("Registered [{node}] as publisher of [{topic}]"),
             _ => format!("Subscribed to [{topic}]"),
         };
-        Ok(Reply::done(message, Value::strings(others.map_err(refusal)?)))
+        Ok(Reply::done(
+            message,
+            Value::strings(others.map_err(refusal)?),
+        ))
     }
 
     fn register_service(&self, args: &mut Args) -> Result<Reply, Reply> {

@@ -110,6 +110,15 @@ impl Notifier {
         }
     }
 
+    /// How many notices the node's task has not taken up.
+    #[cfg(test)]
+    pub(super) fn waiting(&self, api: &str) -> usize {
+        self.queues
+            .lock()
+            .get(api)
+            .map_or(0, |queue| queue.notices.len())
+    }
+
     fn next(&self, api: &str) -> Option<Notice> {
         self.queues.lock().get_mut(api)?.notices.pop_front()
     }

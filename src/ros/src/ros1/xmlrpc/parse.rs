@@ -431,3 +431,6 @@ fn reference(name: &str) -> Option<char> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -230,3 +230,6 @@ async fn gone(reader: &mut Reader, stream: &mut TcpStream) {
     }
     std::future::pending().await
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,181 @@
+//! Peers that lie, stall and break off.
+
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpListener;
+
+use super::*;
+use crate::ros1::tcpros::Header;
+use crate::ros1::testing::TestNode;
+use crate::ros1::xmlrpc::Client;
+
+/// A publisher made by hand: what it sends to one connection after the other.
+async fn publisher(master: &TestMaster, scripts: Vec<Vec<u8>>) -> TestNode {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = i32::from(listener.local_addr().unwrap().port());
+    let place = Value::Array(vec!["TCPROS".into(), "127.0.0.1".into(), port.into()]);
+    let node = TestNode::answering(place).await;
+    let list = ["/liar", "/chat", "std_msgs/String", &node.uri].map(Value::from);
+    master.call("registerPublisher", &list).await;
+    tokio::spawn(async move {
+        for script in scripts {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let mut buffer = bytes::BytesMut::new();
+            Header::read(&mut stream, &mut buffer).await.unwrap();
+            stream.write_all(&script).await.unwrap();
+        }
+        std::future::pending::<()>().await;
+        drop(listener);
+    });
+    node
+}
+
+fn script(after_header: &[u8]) -> Vec<u8> {
+    let header = Header::new([("type", "std_msgs/String"), ("md5sum", "992c")]);
+    let mut bytes = header.encode();
+    bytes.extend_from_slice(after_header);
+    bytes
+}
+
+#[tokio::test]
+async fn a_publisher_that_breaks_off_or_lies_is_tried_again() {
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let scripts = vec![
+        Header::error("not you").encode(),
+        // Not a header; a message longer than allowed; one cut in the middle; and at last a good one.
+        vec![0xff; 8],
+        script(&u32::MAX.to_le_bytes()),
+        script(b"\x05\0\0\0abc"),
+        script(b"\x04\0\0\0good"),
+    ];
+    let node = publisher(&master, scripts).await;
+    let mut subscription = bus.subscribe("/chat", any()).await.unwrap();
+    let message = next(&mut subscription.messages).await;
+    assert_eq!(message.bytes, "good");
+    // It did not say who it is: then its address has to do.
+    assert_eq!(*message.publisher, *node.uri);
+}
+
+#[tokio::test]
+async fn a_publisher_that_stalls_holds_up_no_other() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    // It accepts, and says nothing more; another one's XML-RPC hangs.
+    let _stalled = publisher(&master, vec![vec![]]).await;
+    let hung = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
+    let list = ["/hung", "/chat", "std_msgs/String", &hung_uri].map(Value::from);
+    master.call("registerPublisher", &list).await;
+    let mut subscription = one.subscribe("/chat", any()).await.unwrap();
+    let good = two.advertise("/chat", publishing(true)).await.unwrap();
+    good.publish("here".into());
+    assert_eq!(next_text(&mut subscription.messages).await, "here");
+}
+
+#[tokio::test]
+async fn a_subscriber_that_does_not_read_holds_up_no_other() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let options = AdvertiseOptions {
+        queue: 2,
+        ..publishing(false)
+    };
+    let publisher = one.advertise("/chat", options).await.unwrap();
+    let address: SocketAddr = ([127, 0, 0, 1], one.inner.port).into();
+    let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
+    let header = Header::new([("topic", "/chat"), ("md5sum", "*"), ("callerid", "/lazy")]);
+    header.write(&mut lazy).await.unwrap();
+    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 2).await;
+    let big = Bytes::from(vec![7; 1 << 20]);
+    for _ in 0..100 {
+        publisher.publish(big.clone());
+        next(&mut subscription.messages).await;
+    }
+    // What it does not take is dropped and counted, not kept.
+    assert!(publisher.dropped() > 50, "{}", publisher.dropped());
+    drop(publisher);
+    // Nor does it delay the end for longer than the farewell.
+    let closed = tokio::time::timeout(LONG, one.close()).await;
+    assert!(closed.is_ok());
+}
+
+#[tokio::test]
+async fn a_master_that_refuses_is_quoted() {
+    let refusing = TestNode::answering(Value::Int(0)).await;
+    let address: SocketAddr = refusing.uri["http://".len()..refusing.uri.len() - 1]
+        .parse()
+        .unwrap();
+    // Its answers are no graph.
+    let sockets = Arc::new(HostSockets);
+    let error = Ros1Bus::connect(sockets.clone(), address, "/one").await;
+    let error = error.err().unwrap().to_string();
+    assert!(error.contains("waitGraph"), "{error}");
+    // Nobody there at all.
+    let nobody = Ros1Bus::connect(sockets, ([127, 0, 0, 1], 1).into(), "/one").await;
+    assert!(nobody.err().unwrap().to_string().contains("ROS Master at"));
+    // A refusal of a single call.
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let error = bus.set_param("/", ParamValue::Int(1)).await.unwrap_err();
+    assert!(error.to_string().contains("refused setParam"), "{error}");
+    assert!(error.to_string().contains("dictionary"), "{error}");
+}
+
+#[tokio::test]
+async fn a_failed_registration_leaves_nothing_behind() {
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let address = master.stop().await;
+    assert!(bus.subscribe("/chat", any()).await.is_err());
+    assert!(bus.advertise("/chat", publishing(false)).await.is_err());
+    assert_eq!(bus.inner.subscriptions.lock().len(), 0);
+    assert_eq!(bus.inner.publications.lock().len(), 0);
+    let fresh = crate::ros1::master::Master::new(Default::default());
+    let master = TestMaster::with(fresh, Some(address)).await;
+    let _subscription = bus.subscribe("/chat", any()).await.unwrap();
+    master
+        .until(|graph| graph.topics.contains_key("/chat"))
+        .await;
+}
+
+#[tokio::test]
+async fn the_slave_api_answers_what_tools_ask() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let _subscription = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    let client = Client::new(Arc::new(HostSockets), one.uri()).unwrap();
+    let ask = async |method: &str, args: &[Value]| {
+        let answer = client.call(method, args, LONG).await.unwrap();
+        answer.as_array().unwrap().to_vec()
+    };
+    let caller = [Value::from("/tool")];
+    let publications = ask("getPublications", &caller).await;
+    let wanted = Value::Array(vec![Value::strings(["/chat", "std_msgs/String"])]);
+    assert_eq!(publications[2], wanted);
+    let info = ask("getBusInfo", &caller).await;
+    let row = info[2].as_array().unwrap()[0].as_array().unwrap();
+    assert_eq!(row[1..5], ["/two", "o", "TCPROS", "/chat"].map(Value::from));
+    assert_eq!(ask("getBusStats", &caller).await[0], 1.into());
+    assert_eq!(ask("getPid", &caller).await[0], 1.into());
+    let master_uri = ask("getMasterUri", &caller).await;
+    assert_eq!(master_uri[2], format!("http://{}/", master.address).into());
+    let udp = Value::Array(vec![Value::strings(["UDPROS"])]);
+    let declined = ask(
+        "requestTopic",
+        &["/tool".into(), "/chat".into(), udp.clone()],
+    )
+    .await;
+    assert_eq!(declined[0], 0.into());
+    let unknown = ask("requestTopic", &["/tool".into(), "/none".into(), udp]).await;
+    assert!(unknown[1].as_str().unwrap().contains("does not publish"));
+    assert_eq!(ask("publisherUpdate", &caller).await[0], (-1).into());
+    // Told to end, the bus passes it on and lives.
+    ask("shutdown", &["/tool".into(), "enough".into()]).await;
+    let mut asked = one.shutdown_requested();
+    let reason = asked.wait_for(Option::is_some).await.unwrap().clone();
+    assert_eq!(reason.as_deref(), Some("enough"));
+    assert_eq!(ask("getPid", &caller).await[0], 1.into());
+}

@@ -1,0 +1,332 @@
+use super::*;
+use crate::ros1::master::{Master, MasterOptions};
+
+#[tokio::test]
+async fn messages_go_from_bus_to_bus_with_their_type() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    // The subscription comes first: the publisher is connected when it registers.
+    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    connected(&*publisher, 1).await;
+    publisher.publish("a".into());
+    publisher.publish(Bytes::from(vec![b'x'; 1_000_000]));
+    publisher.publish("".into());
+    let message = next(&mut subscription.messages).await;
+    assert_eq!(
+        (&message.bytes[..], &*message.publisher),
+        (&b"a"[..], "/one")
+    );
+    assert_eq!(*message.wire_type, text_type("992c"));
+    assert_eq!(
+        next(&mut subscription.messages).await.bytes.len(),
+        1_000_000
+    );
+    assert_eq!(next(&mut subscription.messages).await.bytes.len(), 0);
+    drop(publisher);
+    master
+        .until(|graph| graph.topics["/chat"].publishers.is_empty())
+        .await;
+    drop(subscription);
+    master
+        .until(|graph| graph.topics.is_empty() && graph.nodes.is_empty())
+        .await;
+}
+
+#[tokio::test]
+async fn what_is_queued_is_sent_before_a_publisher_ends() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    connected(&*publisher, 1).await;
+    for n in 0..100u8 {
+        publisher.publish(Bytes::from(vec![n; 10_000]));
+    }
+    drop(publisher);
+    for n in 0..100u8 {
+        assert_eq!(next(&mut subscription.messages).await.bytes[0], n);
+    }
+}
+
+#[tokio::test]
+async fn a_bus_does_not_hear_itself() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let mut echo = one.subscribe("/chat", any()).await.unwrap();
+    let ours = one.advertise("/chat", publishing(true)).await.unwrap();
+    let theirs = two.advertise("/chat", publishing(true)).await.unwrap();
+    let mut other = two.subscribe("/chat", any()).await.unwrap();
+    ours.publish("mine".into());
+    theirs.publish("yours".into());
+    assert_eq!(next_text(&mut other.messages).await, "mine");
+    assert_eq!(next_text(&mut echo.messages).await, "yours");
+    assert!(echo.messages.is_empty() && other.messages.is_empty());
+}
+
+#[tokio::test]
+async fn every_latching_publisher_is_replayed_to_every_newcomer() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    // Two handles of one bus keep a message each, so do two buses.
+    let first = one.advertise("/tf_static", publishing(true)).await.unwrap();
+    let second = one.advertise("/tf_static", publishing(true)).await.unwrap();
+    let third = two.advertise("/tf_static", publishing(true)).await.unwrap();
+    first.publish("old".into());
+    first.publish("first".into());
+    second.publish("second".into());
+    third.publish("third".into());
+    let three = join(&master, "/three").await;
+    let hear = async || {
+        let mut subscription = three.subscribe("/tf_static", any()).await.unwrap();
+        let mut heard = Vec::new();
+        for _ in 0..2 {
+            let message = next(&mut subscription.messages).await;
+            assert!(message.latching);
+            heard.push(message.bytes);
+        }
+        heard.push(next(&mut subscription.messages).await.bytes);
+        heard.sort();
+        (subscription, heard)
+    };
+    let (_subscription, heard) = hear().await;
+    assert_eq!(heard, ["first", "second", "third"]);
+    // A later local subscription shares the connections; the last of each publisher is kept for it.
+    let mut later = three.subscribe("/tf_static", any()).await.unwrap();
+    let mut again = [
+        next(&mut later.messages).await,
+        next(&mut later.messages).await,
+    ];
+    again.sort_by(|a, b| a.publisher.cmp(&b.publisher));
+    assert_eq!(&*again[0].publisher, "/one");
+    assert_eq!(again[1].bytes, "third");
+    // What a publisher latched goes with it.
+    drop(third);
+    until(&three, |graph| {
+        graph.topics["/tf_static"].publishers == ["/one"]
+    })
+    .await;
+    let released = async {
+        while three.inner.subscriptions.lock()["/tf_static"].links().len() > 1 {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(LONG, released).await.unwrap();
+    let mut last = three.subscribe("/tf_static", any()).await.unwrap();
+    assert_eq!(&*next(&mut last.messages).await.publisher, "/one");
+    assert!(last.messages.is_empty());
+}
+
+#[tokio::test]
+async fn local_subscriptions_share_one_connection() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let mut first = two.subscribe("/chat", any()).await.unwrap();
+    let mut second = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    publisher.publish("both".into());
+    assert_eq!(next_text(&mut first.messages).await, "both");
+    assert_eq!(next_text(&mut second.messages).await, "both");
+    assert_eq!(*publisher.subscribers().borrow(), 1);
+    drop(first);
+    publisher.publish("one".into());
+    assert_eq!(next_text(&mut second.messages).await, "one");
+    drop(second);
+    connected(&*publisher, 0).await;
+    // And again at once, while the end of the former is perhaps still under way.
+    let mut third = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    publisher.publish("back".into());
+    assert_eq!(next_text(&mut third.messages).await, "back");
+}
+
+#[tokio::test]
+async fn a_slow_receiver_loses_the_oldest_and_knows_how_many() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let options = SubscribeOptions { queue: 3, ..any() };
+    let mut slow = two.subscribe("/chat", options).await.unwrap();
+    let mut quick = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    for n in 0..10u8 {
+        publisher.publish(Bytes::from(vec![n]));
+    }
+    for n in 0..10u8 {
+        assert_eq!(next(&mut quick.messages).await.bytes[0], n);
+    }
+    assert_eq!(slow.dropped.load(Ordering::Relaxed), 7);
+    assert_eq!(next(&mut slow.messages).await.bytes[0], 7);
+}
+
+#[tokio::test]
+async fn different_definitions_do_not_meet() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let options = SubscribeOptions {
+        wire_type: Some(text_type("0000")),
+        queue: 10,
+    };
+    let mut wrong = two.subscribe("/chat", options).await.unwrap();
+    let direct = link::connect(&two.inner, "/chat", one.uri(), &text_type("0000")).await;
+    let refusal = direct.err().unwrap().to_string();
+    assert!(
+        refusal.contains("992c") && refusal.contains("0000"),
+        "{refusal}"
+    );
+    // Beside one that takes anything, it still gets nothing of the other type.
+    let mut right = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    publisher.publish("text".into());
+    assert_eq!(next_text(&mut right.messages).await, "text");
+    assert!(wrong.messages.try_recv().is_none());
+    // Nor may one side advertise a topic as two things.
+    let options = AdvertiseOptions {
+        wire_type: text_type("0000"),
+        ..publishing(false)
+    };
+    let error = one.advertise("/chat", options).await.err().unwrap();
+    assert!(matches!(error, BusError::TypeMismatch { .. }), "{error}");
+}
+
+#[tokio::test]
+async fn types_are_asked_of_publishers_and_of_subscribers() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let error = two.topic_type("/chat").await.unwrap_err();
+    assert!(matches!(error, BusError::NoTopic(_)), "{error}");
+    let options = SubscribeOptions {
+        wire_type: Some(text_type("992c")),
+        queue: 1,
+    };
+    let subscription = one.subscribe("/chat", options).await.unwrap();
+    let asked = two.topic_type("/chat").await.unwrap();
+    assert_eq!(
+        (asked.name.as_str(), asked.md5.as_str()),
+        ("std_msgs/String", "992c")
+    );
+    // Nothing of the question remains.
+    master
+        .until(|graph| graph.topics["/chat"].publishers.is_empty())
+        .await;
+    drop(subscription);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    assert_eq!(two.topic_type("/chat").await.unwrap(), text_type("992c"));
+    assert_eq!(one.topic_type("/chat").await.unwrap(), text_type("992c"));
+    drop(publisher);
+    // Someone who takes anything can only say that.
+    let _relay = one.subscribe("/any", any()).await.unwrap();
+    assert_eq!(two.topic_type("/any").await.unwrap().md5, "*");
+}
+
+#[tokio::test]
+async fn a_master_that_forgot_is_told_again() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    let address = master.stop().await;
+    let master = TestMaster::with(Master::new(MasterOptions::default()), Some(address)).await;
+    master
+        .until(|graph| {
+            graph
+                .topics
+                .get("/chat")
+                .is_some_and(|topic| topic.publishers == ["/one"] && topic.subscribers == ["/two"])
+        })
+        .await;
+    publisher.publish("still here".into());
+    assert_eq!(next_text(&mut subscription.messages).await, "still here");
+    // Newcomers find each other as before.
+    let three = join(&master, "/three").await;
+    let mut late = three.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 2).await;
+    publisher.publish("welcome".into());
+    assert_eq!(next_text(&mut late.messages).await, "welcome");
+}
+
+#[tokio::test]
+async fn what_the_master_has_too_much_is_taken_back() {
+    let master = TestMaster::start().await;
+    let one = join(&master, "/one").await;
+    let list = ["/one", "/ghost", "a/B", one.uri()].map(Value::from);
+    master.call("registerPublisher", &list).await;
+    master
+        .until(|graph| !graph.topics.contains_key("/ghost"))
+        .await;
+}
+
+#[tokio::test]
+async fn the_graph_follows_and_close_takes_everything_back() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(true)).await.unwrap();
+    publisher.publish("last words".into());
+    let mut own = one.subscribe("/other", any()).await.unwrap();
+    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    until(&two, |graph| graph.topics.contains_key("/other")).await;
+    one.set_param("/p", ParamValue::Int(1)).await.unwrap();
+    until(&two, |graph| graph.parameters.contains_key("/p")).await;
+    connected(&*publisher, 1).await;
+    one.close().await;
+    assert_eq!(next_text(&mut subscription.messages).await, "last words");
+    until(&two, |graph| !graph.nodes.contains_key("/one")).await;
+    assert!(own.messages.recv().await.is_none());
+    publisher.publish("into the void".into());
+    let late = one.subscribe("/chat", any()).await;
+    assert!(matches!(late, Err(BusError::Closed)));
+}
+
+#[tokio::test]
+async fn parameters_are_read_and_written() {
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let map = ParamValue::Map(
+        [
+            ("a".to_owned(), ParamValue::Double(0.5)),
+            (
+                "b".to_owned(),
+                ParamValue::List(vec![ParamValue::Bool(true)]),
+            ),
+        ]
+        .into(),
+    );
+    bus.set_param("/ns", map.clone()).await.unwrap();
+    assert_eq!(bus.get_param("/ns").await.unwrap(), map);
+    assert!(bus.has_param("/ns/a").await.unwrap());
+    let found = bus.search_param("/ns/deeper", "a").await.unwrap();
+    assert_eq!(found.as_deref(), Some("/ns/a"));
+    assert_eq!(bus.search_param("/", "a").await.unwrap(), None);
+    assert!(
+        bus.param_names()
+            .await
+            .unwrap()
+            .contains(&"/ns/b".to_owned())
+    );
+    bus.delete_param("/ns").await.unwrap();
+    for gone in [
+        bus.get_param("/ns/a").await.err(),
+        bus.delete_param("/ns").await.err(),
+    ] {
+        assert!(matches!(gone, Some(BusError::NoParam(_))));
+    }
+    let wide = ParamValue::Map([("w".to_owned(), ParamValue::Int(1 << 40))].into());
+    let error = bus.set_param("/ns", wide).await.unwrap_err().to_string();
+    assert!(error.contains("/ns") && error.contains("w: "), "{error}");
+}
+
+#[tokio::test]
+async fn only_absolute_names_are_taken() {
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    for name in ["", "relative", "/a b", "~private", "/a//b"] {
+        let error = bus.subscribe(name, any()).await.err().unwrap();
+        assert!(matches!(error, BusError::BadName(_)), "{name}: {error}");
+    }
+    let sockets = Arc::new(HostSockets);
+    let nameless = Ros1Bus::connect(sockets, master.address, "one").await;
+    assert!(matches!(nameless, Err(BusError::BadName(_))));
+}

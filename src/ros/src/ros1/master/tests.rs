@@ -1,0 +1,427 @@
+use super::*;
+use crate::net::HostSockets;
+use crate::ros1::testing::{LONG, TestMaster, TestNode, args};
+use crate::ros1::xmlrpc::Client;
+
+/// An address at which nobody is.
+const NOWHERE: &str = "http://127.0.0.1:1/";
+
+fn strings(texts: &[&str]) -> Value {
+    Value::strings(texts.iter().copied())
+}
+
+#[tokio::test]
+async fn registrations_are_seen_by_all_lookups() {
+    let master = TestMaster::start().await;
+    let call = |method: &'static str, list: Vec<Value>| {
+        let master = &master;
+        async move { master.call(method, &list).await }
+    };
+    let subscribe = args(["/s", "/t", "*", "http://127.0.0.1:2/"]);
+    let answer = call("registerSubscriber", subscribe.into()).await;
+    assert_eq!((answer.0, answer.2), (1, strings(&[])));
+    let publish = args(["/p", "t", "std_msgs/String", NOWHERE]);
+    let answer = call("registerPublisher", publish.into()).await;
+    assert_eq!(answer.2, strings(&["http://127.0.0.1:2/"]));
+    let service = args(["/p", "/p/do", "rosrpc://127.0.0.1:9", NOWHERE]);
+    call("registerService", service.into()).await;
+
+    let pair = Value::Array(vec![strings(&["/t", "std_msgs/String"])]);
+    let topics = call("getPublishedTopics", args(["/x", ""]).into()).await;
+    assert_eq!(topics.2, pair);
+    let none = call("getPublishedTopics", args(["/x", "/other"]).into()).await;
+    assert_eq!(none.2, Value::Array(vec![]));
+    assert_eq!(call("getTopicTypes", args(["/x"]).into()).await.2, pair);
+    let state = call("getSystemState", args(["/x"]).into()).await.2;
+    let row = |name: &str, node: &str| {
+        Value::Array(vec![Value::Array(vec![name.into(), strings(&[node])])])
+    };
+    let wanted = [row("/t", "/p"), row("/t", "/s"), row("/p/do", "/p")];
+    assert_eq!(state, Value::Array(wanted.into()));
+    let node = call("lookupNode", args(["/x", "/p"]).into()).await;
+    assert_eq!((node.0, node.2), (1, NOWHERE.into()));
+    assert_eq!(call("lookupNode", args(["/x", "/q"]).into()).await.0, -1);
+    let found = call("lookupService", args(["/x", "/p/do"]).into()).await;
+    assert_eq!(found.2, "rosrpc://127.0.0.1:9".into());
+    assert_eq!(
+        call("lookupService", args(["/x", "/no"]).into()).await.0,
+        -1
+    );
+
+    let graph = master.master.graph();
+    assert_eq!(graph.topics["/t"].publishers, ["/p"]);
+    assert_eq!(graph.services["/p/do"], "/p");
+
+    let gone = call(
+        "unregisterService",
+        args(["/p", "/p/do", "rosrpc://other:9"]).into(),
+    )
+    .await;
+    assert_eq!((gone.0, gone.2), (1, 0.into()));
+    let gone = call(
+        "unregisterService",
+        args(["/p", "/p/do", "rosrpc://127.0.0.1:9"]).into(),
+    );
+    assert_eq!(gone.await.2, 1.into());
+    let gone = call(
+        "unregisterPublisher",
+        args(["/p", "/t", "http://127.0.0.1:7/"]).into(),
+    );
+    assert_eq!(gone.await.2, 0.into());
+    let gone = call("unregisterPublisher", args(["/p", "/t", NOWHERE]).into());
+    assert_eq!(gone.await.2, 1.into());
+    assert!(!master.master.graph().nodes.contains_key("/p"));
+}
+
+#[tokio::test]
+async fn the_callers_mistakes_are_named() {
+    let master = TestMaster::start().await;
+    for (method, list, wanted) in [
+        ("registerPublisher", vec![], "caller_id is missing"),
+        ("registerPublisher", vec![Value::Int(1)], "must be a string"),
+        (
+            "registerPublisher",
+            args(["/p", "/t", "a/B", "not an address"]).into(),
+            "http:// address",
+        ),
+        (
+            "registerPublisher",
+            args(["/p", "/t", "a/B", NOWHERE, "more"]).into(),
+            "arity",
+        ),
+        (
+            "registerService",
+            args(["/p", "/s", "http://h:1", NOWHERE]).into(),
+            "rosrpc://",
+        ),
+        (
+            "registerSubscriber",
+            args(["/p", "", "*", NOWHERE]).into(),
+            "empty",
+        ),
+        ("lookupNode", args(["/p", "/a\nb"]).into(), "no ROS name"),
+        ("setParam", args(["/p", "/"]).into(), "value is missing"),
+        ("setParam", args(["/p", "/", "x"]).into(), "dictionary"),
+        ("getParam", args(["/p", "/nothing"]).into(), "not set"),
+        ("deleteParam", args(["/p", "/nothing"]).into(), "not set"),
+        ("searchParam", args(["/p", "~x"]).into(), "cannot search"),
+        ("shutdown", args(["/p", "now"]).into(), "no node can end it"),
+    ] {
+        let (code, message, _) = master.call(method, &list).await;
+        assert_eq!(code, -1, "{method} {list:?}");
+        assert!(message.contains(wanted), "{method}: {message}");
+    }
+    let uri = format!("http://{}/", master.address);
+    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let fault = client.call("sing", &[], LONG).await.unwrap_err();
+    assert!(fault.to_string().contains("sing is not known"), "{fault}");
+    assert_eq!(master.master.graph().nodes.len(), 0);
+}
+
+#[tokio::test]
+async fn subscribers_hear_of_publishers_that_come_and_go() {
+    let master = TestMaster::start().await;
+    let mut node = TestNode::start().await;
+    master
+        .call("registerSubscriber", &args(["/s", "/t", "*", &node.uri]))
+        .await;
+    master
+        .call("registerPublisher", &args(["/p", "/t", "a/B", NOWHERE]))
+        .await;
+    let update = |publishers: &[&str]| {
+        let list = vec!["/master".into(), "/t".into(), strings(publishers)];
+        ("publisherUpdate".to_owned(), list)
+    };
+    assert_eq!(node.next().await, update(&[NOWHERE]));
+    master
+        .call("unregisterPublisher", &args(["/p", "/t", NOWHERE]))
+        .await;
+    assert_eq!(node.next().await, update(&[]));
+}
+
+#[tokio::test]
+async fn a_hung_node_delays_nobody_else_and_gets_the_newest_in_the_end() {
+    let master = TestMaster::start().await;
+    let mut node = TestNode::start().await;
+    // It has a listening socket, but answers nothing.
+    let hung = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
+    master
+        .call("registerSubscriber", &args(["/hung", "/t", "*", &hung_uri]))
+        .await;
+    master
+        .call("registerSubscriber", &args(["/s", "/t", "*", &node.uri]))
+        .await;
+    for port in 10..20 {
+        let (name, uri) = (format!("/p{port}"), format!("http://127.0.0.1:{port}/"));
+        master
+            .call("registerPublisher", &args([&name, "/t", "a/B", &uri]))
+            .await;
+    }
+    let ten = |list: &[Value]| list[2].as_array().unwrap().len() == 10;
+    while !ten(&node.next().await.1) {}
+    // Of ten changes, the hung node is owed the call under way and the newest state, not ten calls.
+    let queues = master.master.inner.notifier.waiting(&hung_uri);
+    assert!(queues <= 1, "{queues} notices wait");
+}
+
+#[tokio::test]
+async fn a_name_belongs_to_who_came_last() {
+    let master = TestMaster::start().await;
+    let mut old = TestNode::start().await;
+    let mut new = TestNode::start().await;
+    let mut watcher = TestNode::start().await;
+    master
+        .call("registerSubscriber", &args(["/w", "/t", "*", &watcher.uri]))
+        .await;
+    master
+        .call("registerPublisher", &args(["/n", "/t", "a/B", &old.uri]))
+        .await;
+    master
+        .call(
+            "registerSubscriber",
+            &args(["/n", "/other", "a/B", &new.uri]),
+        )
+        .await;
+    let (method, list) = old.next().await;
+    assert_eq!(method, "shutdown");
+    assert!(list[1].as_str().unwrap().contains("same name"));
+    let first = watcher.next().await.1[2].clone();
+    let last = if first == strings(&[]) {
+        first
+    } else {
+        watcher.next().await.1[2].clone()
+    };
+    assert_eq!(last, strings(&[]), "the old one's topic is gone");
+    // On its way out the old one registers once more: that must not end the new one.
+    let (code, message, _) = master
+        .call("subscribeParam", &args(["/n", &old.uri, "/p"]))
+        .await;
+    assert_eq!(code, -1, "{message}");
+    assert_eq!(master.master.graph().nodes["/n"], new.uri);
+    assert!(new.calls.try_recv().is_err());
+    // When the new one has gone, the address is free again.
+    master
+        .call("unregisterSubscriber", &args(["/n", "/other", &new.uri]))
+        .await;
+    let again = args(["/n", "/t", "a/B", &old.uri]);
+    assert_eq!(master.call("registerPublisher", &again).await.0, 1);
+}
+
+#[tokio::test]
+async fn the_dead_are_dropped_and_the_living_stay() {
+    let master = TestMaster::start().await;
+    let mut living = TestNode::start().await;
+    let dying = TestNode::start().await;
+    let hung = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
+    master
+        .call(
+            "registerSubscriber",
+            &args(["/living", "/t", "*", &living.uri]),
+        )
+        .await;
+    master
+        .call(
+            "registerPublisher",
+            &args(["/dying", "/t", "a/B", &dying.uri]),
+        )
+        .await;
+    master
+        .call(
+            "registerSubscriber",
+            &args(["/dying", "/u", "a/B", &dying.uri]),
+        )
+        .await;
+    let service = ["/dying", "/do", "rosrpc://127.0.0.1:9", &dying.uri];
+    master.call("registerService", &args(service)).await;
+    master
+        .call("subscribeParam", &args(["/dying", &dying.uri, "/k"]))
+        .await;
+    master
+        .call(
+            "registerPublisher",
+            &args(["/hung", "/v", "a/B", &hung_uri]),
+        )
+        .await;
+    assert_eq!(living.next().await.1[2], strings(&[&dying.uri]));
+    assert_eq!(master.master.process_exited().await, Vec::<String>::new());
+    dying.die().await;
+    assert_eq!(master.master.process_exited().await, ["/dying"]);
+    assert_eq!(living.next().await.1[2], strings(&[]));
+    let graph = master.master.graph();
+    let nodes: Vec<_> = graph.nodes.keys().collect();
+    assert_eq!(nodes, ["/hung", "/living"]);
+    assert_eq!(graph.services.len(), 0);
+    assert!(!graph.topics.contains_key("/u"));
+    let watchers = master
+        .master
+        .inner
+        .state
+        .lock()
+        .registry
+        .parameter_watchers();
+    assert_eq!(watchers.len(), 0);
+}
+
+#[tokio::test]
+async fn parameters_are_kept_told_and_their_use_remembered() {
+    let master = TestMaster::start().await;
+    let mut node = TestNode::start().await;
+    let subscribed = master
+        .call("subscribeParam", &args(["/ns/n", &node.uri, "~speed"]))
+        .await;
+    assert_eq!(subscribed.2, Value::Struct(BTreeMap::new()));
+    let set = ["/setter".into(), "/ns/n/speed".into(), Value::Double(1.5)];
+    assert_eq!(master.call("setParam", &set).await.0, 1);
+    let update = vec!["/master".into(), "/ns/n/speed/".into(), Value::Double(1.5)];
+    assert_eq!(node.next().await, ("paramUpdate".to_owned(), update));
+    let get = |caller: &'static str, key: &'static str| {
+        let master = &master;
+        async move { master.call("getParam", &args([caller, key])).await }
+    };
+    assert_eq!(get("/ns/n", "~speed").await.2, Value::Double(1.5));
+    assert_eq!(get("/ns/x", "n/speed").await.2, Value::Double(1.5));
+    let whole = get("/x", "/ns").await.2;
+    assert_eq!(
+        whole.get("n").unwrap().get("speed"),
+        Some(&Value::Double(1.5))
+    );
+    let has = master.call("hasParam", &args(["/x", "/nothing"])).await;
+    assert_eq!(has.2, false.into());
+    let found = master
+        .call("searchParam", &args(["/ns/n/deep", "speed"]))
+        .await;
+    assert_eq!(found.2, "/ns/n/speed".into());
+    let names = master
+        .call("getParamNames", &args(["/x"]))
+        .await
+        .2
+        .to_strings();
+    assert_eq!(
+        names,
+        ["/ns/n/speed", "/rosdistro", "/rosversion", "/run_id"]
+    );
+    master.call("deleteParam", &args(["/setter", "/ns"])).await;
+    assert_eq!(node.next().await.1[2], Value::Struct(BTreeMap::new()));
+
+    let uses = master.master.graph().parameters;
+    assert_eq!(uses["/ns/n/speed"].written_by, ["/setter"]);
+    assert_eq!(
+        uses["/ns/n/speed"].read_by,
+        ["/ns/n", "/ns/x", "/ns/n/deep"]
+    );
+    assert_eq!(uses["/nothing"].read_by, ["/x"]);
+}
+
+#[tokio::test]
+async fn many_calls_in_one_are_answered_one_by_one() {
+    let master = TestMaster::start().await;
+    let one = |method: &str, list: Vec<Value>| {
+        let members = [
+            ("methodName".to_owned(), Value::from(method)),
+            ("params".to_owned(), Value::Array(list)),
+        ];
+        Value::Struct(members.into())
+    };
+    let calls = Value::Array(vec![
+        one("setParam", args(["/x", "/a", "b"]).into()),
+        one("getParam", args(["/x", "/a"]).into()),
+        one("system.multicall", vec![Value::Array(vec![])]),
+        Value::Int(1),
+    ]);
+    let uri = format!("http://{}/", master.address);
+    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let answers = client
+        .call("system.multicall", &[calls], LONG)
+        .await
+        .unwrap();
+    let answers = answers.as_array().unwrap();
+    let got = answers[1].as_array().unwrap()[0].as_array().unwrap();
+    assert_eq!(got[2], "b".into());
+    assert!(answers[2].get("faultString").is_some());
+    assert!(answers[3].get("faultString").is_some());
+    let methods = client.call("system.listMethods", &[], LONG).await.unwrap();
+    assert!(
+        methods
+            .to_strings()
+            .contains(&"registerPublisher".to_owned())
+    );
+}
+
+#[tokio::test]
+async fn the_graph_is_waited_for() {
+    let master = TestMaster::start().await;
+    let wait = |known: i32, seconds: i32| {
+        let master = &master;
+        async move {
+            let list = ["/b".into(), known.into(), seconds.into()];
+            let (_, _, value) = master.call(graph::WAIT_GRAPH, &list).await;
+            graph::from_value(&value).unwrap()
+        }
+    };
+    let (now, run_id) = wait(-1, 60).await;
+    assert_eq!(run_id, master.master.run_id());
+    let known = graph::wire_generation(now.generation);
+    let list = args(["/p", "/t", "a/B", NOWHERE]);
+    let (later, _) = tokio::join!(wait(known, 60), master.call("registerPublisher", &list));
+    assert_eq!(later.0.topics["/t"].type_name, "a/B");
+    let known = graph::wire_generation(later.0.generation);
+    // The same once more is no news, so the time-out answers, with everything.
+    let (same, _) = tokio::join!(wait(known, 1), master.call("registerPublisher", &list));
+    assert_eq!(same.0, later.0);
+}
+
+#[tokio::test]
+async fn a_restored_master_knows_what_the_first_knew() {
+    let options = || MasterOptions {
+        parameters: BTreeMap::from([("/mine".to_owned(), ParamValue::Int(5))]),
+        ..MasterOptions::default()
+    };
+    let master = TestMaster::with(Master::new(options()), None).await;
+    let mut node = TestNode::start().await;
+    master
+        .call("registerSubscriber", &args(["/s", "/t", "*", &node.uri]))
+        .await;
+    master.call("getParam", &args(["/s", "/mine"])).await;
+    let text = serde_json::to_string(&master.master.snapshot()).unwrap();
+    let (graph, run_id) = (master.master.graph(), master.master.run_id().to_owned());
+    let address = master.stop().await;
+    let restored = Master::restore(options(), serde_json::from_str(&text).unwrap());
+    let master = TestMaster::with(restored, Some(address)).await;
+    let now = master.master.graph();
+    assert_eq!((now.topics, now.nodes), (graph.topics, graph.nodes));
+    assert_eq!(now.parameters, graph.parameters);
+    assert_eq!(master.master.run_id(), run_id);
+    assert_eq!(
+        master.call("getParam", &args(["/s", "mine"])).await.2,
+        5.into()
+    );
+    // And it goes on with the old one's duties.
+    master
+        .call("registerPublisher", &args(["/p", "/t", "a/B", NOWHERE]))
+        .await;
+    assert_eq!(node.next().await.0, "publisherUpdate");
+}
+
+#[tokio::test]
+async fn a_node_gone_wild_finds_the_end_of_our_patience() {
+    let mut registry = Registry::default();
+    let mut notices = Vec::new();
+    let mut register = |number: usize| {
+        let name = format!("/t{number}");
+        let by = ("/n", NOWHERE);
+        registry.register(
+            registry::Kind::Publisher,
+            &name,
+            "a/B",
+            by,
+            "",
+            &mut notices,
+        )
+    };
+    let refused = (0..100_000).find_map(|number| register(number).err());
+    assert_eq!(refused, Some(registry::Refused::Full));
+    let reason = refused.unwrap().to_string();
+    assert!(reason.contains("50000"), "{reason}");
+}
