@@ -149,7 +149,10 @@ impl Store {
                 continue;
             };
             let tree = self.tree_path(&diff_id);
-            let boot = files::read_whole(&path, 4096)?.unwrap_or_default();
+            // A flush that is through takes the mark away, perhaps just now: then the tree is whole.
+            let Some(boot) = files::read_whole(&path, 4096)? else {
+                continue;
+            };
             if boot == this_boot.as_bytes() {
                 if tree.exists() {
                     self.flush_later(diff_id);
