@@ -137,7 +137,7 @@ pub trait Servant: Send + Sync + 'static {
     async fn processes(&self) -> Result<Vec<i32>, crate::Error>;
     /// Usage now.
     async fn usage(&self) -> Result<Usage, crate::Error>;
-    /// Starts one more node.
+    /// Starts one more node; returns when its program is executed, or with the reason why it could not be.
     async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
     /// Sends a signal to a node.
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), crate::Error>;

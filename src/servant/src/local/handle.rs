@@ -45,6 +45,8 @@ pub struct LocalServant {
     requests: Requests,
     known: Arc<Known>,
     listener: JoinHandle<()>,
+    /// Followers of the log that may still have a file to open.
+    followers: watch::Sender<()>,
 }
 
 impl Drop for LocalServant {
@@ -184,6 +186,7 @@ fn connect(
         requests,
         known,
         listener,
+        followers: watch::Sender::new(()),
     }))
 }
 
@@ -398,7 +401,12 @@ impl Servant for LocalServant {
     }
 
     fn follow_log(&self, from_start: bool) -> mpsc::Receiver<LogLine> {
-        logs::follow(self.log_path(), from_start, ended(self.state()))
+        logs::follow(
+            self.log_path(),
+            from_start,
+            ended(self.state()),
+            self.followers.subscribe(),
+        )
     }
 
     fn uid_range(&self) -> (u32, u32) {
@@ -418,10 +426,9 @@ impl Servant for LocalServant {
             let _ = sys::pidfd_send_signal(self.shim.as_fd(), libc::SIGKILL);
             let _ = wait_for_end(&self.shim, FINISH).await;
         }
-        // Its last words are taken in before they are swept away.
-        let mut state = self.known.state.subscribe();
-        let _ = tokio::time::timeout(ANSWER, ended(state.clone())).await;
-        state.mark_unchanged();
+        // Its last words are taken in, and its log opened by those who read it, before both are swept away.
+        let _ = tokio::time::timeout(ANSWER, ended(self.known.state.subscribe())).await;
+        let _ = tokio::time::timeout(ANSWER, self.followers.closed()).await;
         sweep::sweep(&self.id, &self.directory).await
     }
 }

@@ -1,8 +1,10 @@
 //! Reading a log while it is written and rotated.
+//!
+//! Two tasks: one opens each file as soon as it is there and never waits for anybody; the other reads them in order, as
+//! slowly as its receiver likes. So neither a rotation nor the removal of the log can take away what was not read yet.
 
-use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{self, Read};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::os::fd::{AsFd, AsRawFd, RawFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -11,30 +13,46 @@ use std::time::SystemTime;
 use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
-use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TryRecvError;
+use tokio::sync::{mpsc, watch};
 
 use super::{Record, rotated};
 use crate::engine::LogLine;
 
+/// Lines that may wait for the receiver.
+const AHEAD: usize = 256;
+/// Bytes read at once.
+const BLOCK: usize = 64 * 1024;
+
 /// Every line of the log at `path`, from the first that is still there or from now on. It ends, after the last line, when
-/// `ended` completes: that must not be before the last line was written. The log may be removed meanwhile.
+/// `ended` completes: that must not be before the last line was written. From when `guard` is dropped on, the log may be removed.
 pub fn follow(
     path: PathBuf,
     from_start: bool,
     ended: impl Future<Output = ()> + Send + 'static,
+    guard: impl Send + 'static,
 ) -> mpsc::Receiver<LogLine> {
-    let (sender, receiver) = mpsc::channel(256);
+    let (sender, receiver) = mpsc::channel(AHEAD);
+    let (files, opened) = mpsc::unbounded_channel();
+    let changes = watch::Sender::new(());
+    let changed = changes.subscribe();
     // Opened here and not in the task: what is written after this function has returned is surely seen.
-    let follower = Follower::open(&path, from_start);
-    tokio::spawn(async move {
-        match follower {
-            Ok(follower) => follower.run(&sender, ended).await,
-            Err(error) => {
-                let line = format!("could not follow {}: {error}", path.display());
-                let _ = sender.send(note(line)).await;
-            }
+    match Discovery::open(&path, from_start, files) {
+        Ok(discovery) => {
+            tokio::spawn(async move {
+                discovery.run(&changes, ended).await;
+                drop(guard);
+            });
+            tokio::spawn(read(opened, changed, sender));
         }
-    });
+        Err(error) => {
+            // The channel is empty: there is room for the one line.
+            let _ = sender.try_send(note(format!(
+                "could not follow {}: {error}",
+                path.display()
+            )));
+        }
+    }
     receiver
 }
 
@@ -47,190 +65,190 @@ impl AsRawFd for Watch {
     }
 }
 
-struct Follower {
+struct Discovery {
     path: PathBuf,
     watch: AsyncFd<Watch>,
-    /// Files still to be read, the oldest first; each is opened as soon as it is known, so that a later rotation
-    /// cannot take it away.
-    files: VecDeque<File>,
-    /// What was read of the first file and is not a whole line yet.
-    rest: Vec<u8>,
-    /// The number that the next line should have; none before the first.
-    expected: Option<u64>,
+    files: mpsc::UnboundedSender<File>,
+    /// The youngest file that is known. Held open, so that its inode cannot become another file's.
+    last: Option<File>,
 }
 
-impl Follower {
-    fn open(path: &Path, from_start: bool) -> io::Result<Self> {
+impl Discovery {
+    fn open(path: &Path, from_start: bool, files: mpsc::UnboundedSender<File>) -> io::Result<Self> {
         let inotify = Inotify::init(InitFlags::IN_CLOEXEC | InitFlags::IN_NONBLOCK)?;
         let directory = path.parent().unwrap_or(Path::new("/"));
         let events =
             AddWatchFlags::IN_MODIFY | AddWatchFlags::IN_CREATE | AddWatchFlags::IN_ONLYDIR;
         inotify.add_watch(directory, events)?;
-        let watch = {
-            // SAFETY: the descriptor is owned by what is registered, and nothing else closes it.
-            unsafe { AsyncFd::register_with_interest(Watch(inotify), Interest::READABLE) }?
-        };
-        let mut follower = Self {
+        // SAFETY: the descriptor is owned by what is registered, and nothing else closes it.
+        let watch = unsafe { AsyncFd::register_with_interest(Watch(inotify), Interest::READABLE) }?;
+        let mut discovery = Self {
             path: path.into(),
             watch,
-            files: VecDeque::new(),
-            rest: Vec::new(),
-            expected: None,
+            files,
+            last: None,
         };
-        follower.discover()?;
-        if !from_start {
-            follower.skip_all()?;
+        if from_start {
+            discovery.look()?;
+        } else if let Some(mut file) = existing(path)? {
+            file.seek(SeekFrom::End(0))?;
+            discovery.pass_on(file)?;
         }
-        Ok(follower)
+        Ok(discovery)
     }
 
-    /// Opens the files that are new: the current one, and the rotated one when it is younger than what we know.
-    fn discover(&mut self) -> io::Result<()> {
-        let last = self.files.back().map(inode).transpose()?;
-        // A rotation may happen between the two calls: the older file is opened again until both fit together.
+    async fn run(mut self, changes: &watch::Sender<()>, ended: impl Future<Output = ()>) {
+        let mut ended = std::pin::pin!(ended);
+        loop {
+            let over = tokio::select! {
+                _ = self.watch.readable() => false,
+                () = &mut ended => true,
+                () = changes.closed() => return,
+            };
+            // What happened is looked up in the directory; the events only say when. Read until there are no more, or the
+            // next wait would return at once.
+            let read = |watch: &Watch| watch.0.read_events().map_err(io::Error::from);
+            while self.watch.try_io(Interest::READABLE, read).is_ok() {}
+            // A failure to open shows as a gap in the numbers.
+            let _ = self.look();
+            if over {
+                return;
+            }
+            changes.send_replace(());
+        }
+    }
+
+    /// Passes on the files that are new: the current one, and the rotated one when it is younger than what is known.
+    fn look(&mut self) -> io::Result<()> {
+        let last = self.last.as_ref().map(inode).transpose()?;
+        // A rotation may happen between the calls: they are repeated until they fit together.
         for _ in 0..10 {
             let older = existing(&rotated(&self.path))?;
             let current = existing(&self.path)?;
             let again = existing(&rotated(&self.path))?;
-            let ids = |file: &Option<File>| file.as_ref().map(inode).transpose();
-            if ids(&older)? != ids(&again)? {
+            let id = |file: &Option<File>| file.as_ref().map(inode).transpose();
+            if id(&older)? != id(&again)? {
                 continue;
             }
-            if last.is_some() && ids(&current)? == last {
+            if last.is_some() && id(&current)? == last {
                 return Ok(());
             }
-            // Known already when the last we know has just become the older one; its reading goes on.
-            let new = older.filter(|file| inode(file).ok() != last);
-            self.files.extend(new.into_iter().chain(current));
+            for file in older.into_iter().chain(current) {
+                if Some(inode(&file)?) != last {
+                    self.pass_on(file)?;
+                }
+            }
             return Ok(());
         }
         Ok(())
     }
 
-    fn skip_all(&mut self) -> io::Result<()> {
-        use std::io::{Seek, SeekFrom};
-        self.files.drain(..self.files.len().saturating_sub(1));
-        if let Some(file) = self.files.front_mut() {
-            file.seek(SeekFrom::End(0))?;
-        }
+    fn pass_on(&mut self, file: File) -> io::Result<()> {
+        self.last = Some(file.try_clone()?);
+        // Nobody reads any more: run ends by itself.
+        let _ = self.files.send(file);
         Ok(())
     }
+}
 
-    async fn run(mut self, sender: &mpsc::Sender<LogLine>, ended: impl Future<Output = ()>) {
-        let mut ended = std::pin::pin!(ended);
-        let mut over = false;
-        loop {
-            match self.read_lines() {
-                Ok(lines) if !lines.is_empty() => {
-                    for line in lines {
-                        if self.send(sender, line).await.is_err() {
-                            return;
-                        }
+/// Reads the files in their order.
+async fn read(
+    mut opened: mpsc::UnboundedReceiver<File>,
+    mut changed: watch::Receiver<()>,
+    sender: mpsc::Sender<LogLine>,
+) {
+    let Some(mut file) = opened.recv().await else {
+        return;
+    };
+    let mut next = None;
+    let mut complete = false;
+    let mut cutter = Cutter::default();
+    loop {
+        changed.mark_unchanged();
+        let lines = match cutter.read(&mut file) {
+            Ok(lines) => lines,
+            Err(error) => vec![note(format!("the log could not be read on: {error}"))],
+        };
+        let Some(lines) = (!lines.is_empty()).then_some(lines) else {
+            // The end, for now. Nothing more is written to a file once a younger one is known, nor once the log is complete:
+            // but that must have been known before the last read.
+            if let Some(younger) = next.take() {
+                file = younger;
+                cutter.rest.clear();
+                continue;
+            }
+            match opened.try_recv() {
+                Ok(younger) => next = Some(younger),
+                Err(TryRecvError::Disconnected) if complete => return,
+                Err(TryRecvError::Disconnected) => complete = true,
+                Err(TryRecvError::Empty) => {
+                    tokio::select! {
+                        // An error means that the log is complete, which the next round sees.
+                        _ = changed.changed() => {}
+                        () = sender.closed() => return,
                     }
-                    continue;
-                }
-                Ok(_) if over => return,
-                Ok(_) => {}
-                Err(error) => {
-                    let _ = sender
-                        .send(note(format!(
-                            "could not read {}: {error}",
-                            self.path.display()
-                        )))
-                        .await;
-                    return;
                 }
             }
-            tokio::select! {
-                _ = self.watch.readable() => {}
-                // One more round reads what was written before the end.
-                () = &mut ended => over = true,
-                () = sender.closed() => return,
-            }
-            self.note_changes();
-        }
-    }
-
-    /// Sends one line, and keeps opening new files while the receiver is slow.
-    async fn send(
-        &mut self,
-        sender: &mpsc::Sender<LogLine>,
-        record: Record<'static>,
-    ) -> Result<(), ()> {
-        let missed = self
-            .expected
-            .map_or(0, |expected| record.number.saturating_sub(expected));
-        self.expected = Some(record.number + 1);
-        let mut lines = Vec::new();
-        if missed > 0 {
-            lines.push(note(format!(
-                "{missed} lines were lost here: the log was rotated before they were read"
-            )));
-        }
-        lines.push(LogLine {
-            time: record.time,
-            node: record.node.into_owned(),
-            stream: record.stream.into_owned(),
-            line: record.line.into_owned(),
-        });
+            continue;
+        };
         for line in lines {
-            let permit = loop {
-                tokio::select! {
-                    biased;
-                    permit = sender.reserve() => break permit.map_err(|_| ())?,
-                    _ = self.watch.readable() => self.note_changes(),
-                }
-            };
-            permit.send(line);
+            if sender.send(line).await.is_err() {
+                return;
+            }
         }
-        Ok(())
     }
+}
 
-    fn note_changes(&mut self) {
-        // What happened is looked up in the directory; the events only say when. Read until there are no more, or the next
-        // wait would return at once.
-        let read = |watch: &Watch| watch.0.read_events().map_err(io::Error::from);
-        while self.watch.try_io(Interest::READABLE, read).is_ok() {}
-        // A failure to open shows as a gap in the numbers.
-        let _ = self.discover();
-    }
+/// Makes lines of blocks.
+#[derive(Default)]
+struct Cutter {
+    /// What was read and is not a whole line yet.
+    rest: Vec<u8>,
+    /// The number that the next line should have; none before the first.
+    expected: Option<u64>,
+}
 
-    /// The lines that are complete in at most one block of the oldest file.
-    fn read_lines(&mut self) -> io::Result<Vec<Record<'static>>> {
-        let mut block = vec![0; 64 * 1024];
+impl Cutter {
+    /// The lines that are whole in the next block; none at the end of the file.
+    fn read(&mut self, file: &mut File) -> io::Result<Vec<LogLine>> {
+        let mut block = vec![0; BLOCK];
         loop {
-            let Some(file) = self.files.front_mut() else {
-                return Ok(Vec::new());
-            };
             let length = file.read(&mut block)?;
             if length == 0 {
-                if self.files.len() == 1 {
-                    return Ok(Vec::new());
-                }
-                // A younger file was known before this read, so nothing more is written to this one.
-                self.files.pop_front();
-                self.rest.clear();
-                continue;
+                return Ok(Vec::new());
             }
             self.rest.extend_from_slice(&block[..length]);
             let Some(end) = self.rest.iter().rposition(|byte| *byte == b'\n') else {
                 continue;
             };
             let whole: Vec<u8> = self.rest.drain(..=end).collect();
-            let lines = whole
-                .split(|byte| *byte == b'\n')
-                .filter(|line| !line.is_empty());
-            let records: Vec<_> = lines.filter_map(parse).collect();
-            if !records.is_empty() {
-                return Ok(records);
+            let mut lines = Vec::new();
+            for text in whole.split(|byte| *byte == b'\n') {
+                // A line that is not ours was written by hand; it is passed over.
+                let Ok(record) = serde_json::from_slice::<Record<'_>>(text) else {
+                    continue;
+                };
+                let missed = self
+                    .expected
+                    .map_or(0, |expected| record.number.saturating_sub(expected));
+                self.expected = Some(record.number + 1);
+                if missed > 0 {
+                    lines.push(note(format!(
+                        "{missed} lines were lost here: the log was rotated before they were read"
+                    )));
+                }
+                lines.push(LogLine {
+                    time: record.time,
+                    node: record.node.into_owned(),
+                    stream: record.stream.into_owned(),
+                    line: record.line.into_owned(),
+                });
+            }
+            if !lines.is_empty() {
+                return Ok(lines);
             }
         }
     }
-}
-
-fn parse(line: &[u8]) -> Option<Record<'static>> {
-    // A line that is not ours was written by hand; it is passed over.
-    serde_json::from_slice::<Record<'static>>(line).ok()
 }
 
 fn existing(path: &Path) -> io::Result<Option<File>> {
@@ -276,17 +294,16 @@ mod tests {
         let mut writer = Writer::create(&path, 4000).unwrap();
         writer.append("/a", "stdout", "0");
         let (end, ended) = oneshot::channel::<()>();
-        let lines = follow(path.clone(), true, async { drop(ended.await) });
-        let reader = tokio::spawn(all(lines));
+        let lines = follow(path.clone(), true, async { drop(ended.await) }, ());
         for number in 1..500 {
             writer.append("/a", "stdout", &number.to_string());
-            // Lets the reader run, as it does beside another process.
+            // Lets the discovery run, as it does beside another process. Nobody receives yet.
             tokio::task::yield_now().await;
             tokio::task::yield_now().await;
         }
         end.send(()).unwrap();
         let expected: Vec<_> = (0..500).map(|number| number.to_string()).collect();
-        assert_eq!(reader.await.unwrap(), expected);
+        assert_eq!(all(lines).await, expected);
         assert!(rotated(&path).exists(), "it was rotated");
     }
 
@@ -297,11 +314,32 @@ mod tests {
         let mut writer = Writer::create(&path, 1 << 20).unwrap();
         writer.append("/a", "stdout", "before");
         let (end, ended) = oneshot::channel::<()>();
-        let lines = follow(path.clone(), false, async { drop(ended.await) });
+        let lines = follow(path.clone(), false, async { drop(ended.await) }, ());
         writer.append("/a", "stderr", "after");
         drop(home);
         end.send(()).unwrap();
         assert_eq!(all(lines).await, ["after"]);
+    }
+
+    #[tokio::test]
+    async fn once_the_guard_is_dropped_the_log_may_go() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("log.jsonl");
+        let mut writer = Writer::create(&path, 200).unwrap();
+        writer.append("/a", "stdout", "first");
+        let guards = watch::Sender::new(());
+        let (end, ended) = oneshot::channel::<()>();
+        let lines = follow(
+            path.clone(),
+            true,
+            async { drop(ended.await) },
+            guards.subscribe(),
+        );
+        writer.append("/a", "stdout", "second, rotated");
+        end.send(()).unwrap();
+        guards.closed().await;
+        drop(home);
+        assert_eq!(all(lines).await, ["first", "second, rotated"]);
     }
 
     #[tokio::test]
@@ -310,7 +348,7 @@ mod tests {
         let path = home.path().join("log.jsonl");
         let mut writer = Writer::create(&path, 400).unwrap();
         writer.append("/a", "stdout", "0");
-        let lines = follow(path.clone(), true, std::future::ready(()));
+        let lines = follow(path.clone(), true, std::future::ready(()), ());
         for number in 1..100 {
             writer.append("/a", "stdout", &number.to_string());
         }

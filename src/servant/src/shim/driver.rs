@@ -1,5 +1,6 @@
 //! The shim's event loop. Everything that happens enters one queue; this one task changes the servant's state.
 
+use std::collections::BTreeMap;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::time::Duration;
 
@@ -82,6 +83,10 @@ struct Driver {
     /// How it is to end, once that is decided.
     verdict: Option<ContainerState>,
     oom_seen: u64,
+    /// Who waits for the answer to a start, by its number.
+    waiting: BTreeMap<u32, (u64, u64)>,
+    /// Signals for nodes that are being started.
+    early_signals: Vec<(String, i32)>,
 }
 
 /// Runs until the servant has ended.
@@ -132,6 +137,8 @@ impl Driver {
             stopping: None,
             verdict: None,
             oom_seen: 0,
+            waiting: BTreeMap::new(),
+            early_signals: Vec::new(),
             begun,
             inputs,
             queue,
@@ -186,9 +193,9 @@ impl Driver {
         self.listen_to_init();
         self.set_state(ContainerState::Running { init_pid: init });
         for node in self.begun.launch.spec.nodes.clone() {
-            if let Err(reason) = self.add_node(node).await {
-                return Err(reason);
-            }
+            let name = node.name.clone();
+            self.nodes.add(node)?;
+            self.start_node(&name).await;
         }
         // What was needed to get here is not needed to stay.
         self.begun.launch.spec.layers = Vec::new();
@@ -242,8 +249,9 @@ impl Driver {
             Input::Connected(stream) => self.clients.add(stream, &self.hello()),
             Input::Disconnected(client) => self.clients.remove(client),
             Input::Request(client, request) => {
-                let outcome = self.obey(request.command).await;
-                self.clients.answer(client, request.id, outcome);
+                if let Some(outcome) = self.obey(client, request.id, request.command).await {
+                    self.clients.answer(client, request.id, outcome);
+                }
             }
             Input::Init(reply, fd) => self.init_said(reply, fd).await,
             Input::Reaped(pid, status) => {
@@ -260,50 +268,69 @@ impl Driver {
         false
     }
 
-    async fn obey(&mut self, command: Command) -> Result<(), String> {
+    /// None: the answer comes later.
+    async fn obey(
+        &mut self,
+        client: u64,
+        request: u64,
+        command: Command,
+    ) -> Option<Result<(), String>> {
         match command {
             Command::Stop => {
                 self.stop("stopped").await;
-                Ok(())
+                Some(Ok(()))
             }
-            _ if self.stopping.is_some() || self.init.is_none() => Err("it is ending".into()),
-            Command::StartNode(node) => self.add_node(node).await,
-            Command::SignalNode { node, signal } => {
-                let pid = self.nodes.inside(&node)?;
-                self.link
-                    .signal(pid, signal, Scope::Group)
-                    .await
-                    .map_err(|error| error.to_string())
+            _ if self.stopping.is_some() || self.init.is_none() => Some(Err("it is ending".into())),
+            Command::StartNode(node) => {
+                let name = node.name.clone();
+                if let Err(reason) = self.nodes.add(node) {
+                    return Some(Err(reason));
+                }
+                let (number, spec) = self.nodes.start(&name)?;
+                self.waiting.insert(number, (client, request));
+                self.ask_for(number, &spec).await;
+                None
             }
+            Command::SignalNode { node, signal } if self.nodes.is_starting(&node) => {
+                self.early_signals.push((node, signal));
+                Some(Ok(()))
+            }
+            Command::SignalNode { node, signal } => Some(self.signal(&node, signal).await),
             Command::SetLimits(limits) => {
                 let enforced = self.begun.cgroup.set(&limits);
                 self.begun.enforced = enforced.clone();
                 self.clients.tell(&FromShim::Enforced {
                     enforced: enforced.clone(),
                 });
-                match cgroup::missing(&limits, &enforced.limits).as_slice() {
-                    [] => Ok(()),
-                    missing => Err(format!(
-                        "the kernel did not take the new {}",
-                        missing.join(", ")
-                    )),
-                }
+                Some(
+                    match cgroup::missing(&limits, &enforced.limits).as_slice() {
+                        [] => Ok(()),
+                        missing => Err(format!(
+                            "the kernel did not take the new {}",
+                            missing.join(", ")
+                        )),
+                    },
+                )
             }
         }
     }
 
-    async fn add_node(&mut self, node: NodeSpec) -> Result<(), String> {
-        let name = node.name.clone();
-        self.nodes.add(node)?;
-        self.start_node(&name).await;
-        Ok(())
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+        let pid = self.nodes.inside(node)?;
+        self.link
+            .signal(pid, signal, Scope::Group)
+            .await
+            .map_err(|error| error.to_string())
     }
 
     async fn start_node(&mut self, name: &str) {
-        let Some((number, spec)) = self.nodes.start(name) else {
-            return;
-        };
-        if let Err(reason) = self.ask_init(number, &spec).await {
+        if let Some((number, spec)) = self.nodes.start(name) {
+            self.ask_for(number, &spec).await;
+        }
+    }
+
+    async fn ask_for(&mut self, number: u32, spec: &NodeSpec) {
+        if let Err(reason) = self.ask_init(number, spec).await {
             self.start_failed(number, reason).await;
         }
     }
@@ -348,7 +375,9 @@ impl Driver {
                 // Gone already: then its number on the host is of no use to anybody.
                 let host = fd.as_ref().and_then(process::pid_of).unwrap_or(0);
                 if let Some(event) = self.nodes.started(id, pid, host) {
-                    self.tell_node(event);
+                    self.tell_node(event.clone());
+                    self.answer_start(id, Ok(()));
+                    self.deliver_early_signals(event.node()).await;
                 }
                 if self.stopping.is_some() {
                     // It was on its way when the stop began.
@@ -369,6 +398,24 @@ impl Driver {
         }
     }
 
+    fn answer_start(&mut self, number: u32, outcome: Result<(), String>) {
+        if let Some((client, request)) = self.waiting.remove(&number) {
+            self.clients.answer(client, request, outcome);
+        }
+    }
+
+    async fn deliver_early_signals(&mut self, started: &str) {
+        let (now, later) = std::mem::take(&mut self.early_signals)
+            .into_iter()
+            .partition(|(node, _)| node == started);
+        self.early_signals = later;
+        let now: Vec<(String, i32)> = now;
+        for (node, signal) in now {
+            // It has ended already: then there is nobody to signal.
+            let _ = self.signal(&node, signal).await;
+        }
+    }
+
     /// Whether this end goes with a kill that the kernel has counted since the last one. A shell tells 137 for a child that was
     /// killed.
     fn was_out_of_memory(&mut self, status: i32) -> bool {
@@ -386,6 +433,8 @@ impl Driver {
     async fn start_failed(&mut self, number: u32, reason: String) {
         if let Some((event, consequence)) = self.nodes.failed(number, reason.clone()) {
             self.tell_node(event.clone());
+            self.answer_start(number, Err(reason.clone()));
+            self.early_signals.retain(|(node, _)| node != event.node());
             let exit = NodeExit {
                 code: None,
                 signal: None,
@@ -537,6 +586,13 @@ impl Driver {
             };
             if let Some((event, _)) = self.nodes.exited(pid, exit) {
                 self.tell_node(event);
+            }
+        }
+        for number in self.nodes.starting() {
+            let reason = "its init ended before it was executed".to_owned();
+            if let Some((event, _)) = self.nodes.failed(number, reason.clone()) {
+                self.tell_node(event);
+                self.answer_start(number, Err(reason));
             }
         }
         let limit = self.memory_limit();

@@ -50,7 +50,7 @@ impl Nodes {
                 spec.name
             ));
         }
-        let starting = self.starting.values().any(|name| *name == spec.name);
+        let starting = self.is_starting(&spec.name);
         let running = self
             .known
             .get(&spec.name)
@@ -168,6 +168,16 @@ impl Nodes {
             .filter_map(|(name, node)| Some((name.clone(), node.inside?)))
             .collect();
         (running, self.starting.len())
+    }
+
+    /// Whether init has yet to answer for it.
+    pub(super) fn is_starting(&self, name: &str) -> bool {
+        self.starting.values().any(|starting| starting == name)
+    }
+
+    /// Numbers of the starts that init has not answered.
+    pub(super) fn starting(&self) -> Vec<u32> {
+        self.starting.keys().copied().collect()
     }
 
     /// Pid inside of a node.

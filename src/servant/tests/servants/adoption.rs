@@ -13,7 +13,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let first = world.start(spec).await;
     let (uids, network) = (first.uid_range(), first.endpoint().netns);
     let enforced = first.enforced();
-    let processes = first.processes().await.unwrap();
+    let processes = processes(&*first, 2).await;
     drop(first);
     let engine = world.restarted();
     let mut adopted = within(engine.adopt()).await.unwrap();
@@ -26,7 +26,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     ));
     assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
     assert_eq!(second.endpoint().netns, network);
-    assert_eq!(second.processes().await.unwrap(), processes);
+    assert_eq!(second.processes().await.unwrap(), processes, "the same");
     assert!(hear(&*second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
     assert_eq!(
@@ -55,7 +55,7 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
     let spec = spec(vec![required]);
     let id = spec.id.clone();
     let servant = world.start(spec).await;
-    let pid = servant.processes().await.unwrap()[0];
+    let pid = processes(&*servant, 1).await[0];
     let runtime = world.runtime(&id);
     let shim = runtime.shim.open().unwrap().expect("it runs");
     drop(servant);
@@ -101,7 +101,7 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     let servant = world.start(spec).await;
     let mut lines = servant.follow_log(true);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
-    let processes = servant.processes().await.unwrap();
+    let processes = processes(&*servant, 2).await;
     let runtime = world.runtime(&id);
     let nodes: Vec<_> = processes
         .iter()

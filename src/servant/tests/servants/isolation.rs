@@ -15,7 +15,7 @@ async fn every_process_is_confined_as_seen_from_the_host() {
         .await;
     let mut lines = servant.follow_log(true);
     lines_until(&mut lines, |line| line.line == "family").await;
-    let processes = servant.processes().await.unwrap();
+    let processes = processes(&*servant, 3).await;
     assert_eq!(processes.len(), 3, "two nodes and a child");
     let (first, count) = servant.uid_range();
     for pid in processes {

@@ -18,7 +18,7 @@ async fn stop_leaves_nothing_of_nodes_that_do_not_want_to_end() {
         .await;
     let mut lines = servant.follow_log(true);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
-    assert_eq!(servant.processes().await.unwrap().len(), 3);
+    assert_eq!(processes(&*servant, 3).await.len(), 3);
     let state = servant.state();
     world.stop(servant).await;
     assert_eq!(
@@ -197,7 +197,8 @@ async fn orphans_are_reaped_and_the_resident_is_told_of_every_end() {
 #[tokio::test]
 async fn a_killed_init_is_a_failure() {
     let world = World::new();
-    let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    let servant = world.start(spec(vec![])).await;
+    servant.start_node(node("/a", &["sleep"])).await.unwrap();
     let ContainerState::Running { init_pid } = *servant.state().borrow() else {
         panic!("it runs")
     };

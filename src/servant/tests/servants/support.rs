@@ -258,6 +258,20 @@ pub async fn lines_until(
     }
 }
 
+/// The processes of a servant, once there are so many.
+pub async fn processes(servant: &dyn Servant, count: usize) -> Vec<i32> {
+    within(async {
+        loop {
+            let processes = servant.processes().await.unwrap();
+            if processes.len() >= count {
+                return processes;
+            }
+            tokio::task::yield_now().await;
+        }
+    })
+    .await
+}
+
 /// The state in which a servant has ended.
 pub async fn ended(servant: &dyn Servant) -> ContainerState {
     let mut state = servant.state();
@@ -298,7 +312,11 @@ fn layer() -> PathBuf {
             Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
         std::fs::create_dir_all(layer.join("lib64")).unwrap();
         std::fs::create_dir_all(layer.join("usr")).unwrap();
-        copy(&std::env::current_exe().unwrap(), &layer.join("test-node"));
+        let own = std::env::current_exe().unwrap();
+        // A link where it can be one: the program is large.
+        if std::fs::hard_link(&own, layer.join("test-node")).is_err() {
+            copy(&own, &layer.join("test-node"));
+        }
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         let libraries: std::collections::BTreeSet<_> = maps
             .lines()
@@ -308,6 +326,14 @@ fn layer() -> PathBuf {
         for library in libraries {
             let inside = layer.join(library.trim_start_matches('/'));
             copy(Path::new(library), &inside);
+            // The file is libx.so.1.2.3, but libx.so.1 is what a program asks for.
+            if let Some((stem, version)) = library.split_once(".so.") {
+                let major = version.split('.').next().unwrap_or(version);
+                copy(
+                    Path::new(library),
+                    &layer.join(format!("{}.so.{major}", stem.trim_start_matches('/'))),
+                );
+            }
             if library.contains("/ld-linux") {
                 let name = Path::new(library).file_name().unwrap();
                 copy(Path::new(library), &layer.join("lib64").join(name));
@@ -323,10 +349,7 @@ fn layer() -> PathBuf {
 
 fn copy(from: &Path, to: &Path) {
     std::fs::create_dir_all(to.parent().unwrap()).unwrap();
-    // A link where it can be one: the program is large.
-    if std::fs::hard_link(from, to).is_err() {
-        std::fs::copy(from, to).unwrap();
-    }
+    std::fs::copy(from, to).unwrap();
 }
 
 extern "C" fn remove_layer() {
