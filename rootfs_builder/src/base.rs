@@ -50,6 +50,8 @@ pub struct Definition {
     pub suite: String,
     /// Which ROS its packages speak.
     pub ros: RosFlavour,
+    /// What `$ROS_DISTRO` stands for in the conditions of a package.xml: `noetic`.
+    pub ros_distribution: String,
     /// What every image has.
     pub runtime: Runtime,
     /// Environment of every process.
@@ -205,7 +207,7 @@ pub(crate) fn is_debian_name(name: &str) -> bool {
 mod tests {
     use super::*;
 
-    const SMALLEST: &str = "summary = \"x\"\ndistribution = \"debian\"\nsuite = \"bookworm\"\nros = \"ros1\"\n\
+    const SMALLEST: &str = "summary = \"x\"\ndistribution = \"debian\"\nsuite = \"bookworm\"\nros = \"ros1\"\nros_distribution = \"noetic\"\n\
         [runtime]\npackages = [\"libroscpp4d\"]\n[build]\npackages = []\nprefix = \"/opt/x\"\n";
 
     fn ours() -> PathBuf {
@@ -234,13 +236,13 @@ mod tests {
     fn mistakes_are_named_with_their_line() {
         parse(SMALLEST).expect("valid");
         let cases = [
-            (SMALLEST.replace("prefix", "prefixx"), "line 9"),
-            (SMALLEST.replace("libroscpp4d", "Lib Roscpp"), "line 6"),
-            (SMALLEST.replace("/opt/x", "/opt/../x"), "line 9"),
-            (SMALLEST.replace("[\"libroscpp4d\"]", "[]"), "line 5"),
+            (SMALLEST.replace("prefix", "prefixx"), "line 10"),
+            (SMALLEST.replace("libroscpp4d", "Lib Roscpp"), "line 7"),
+            (SMALLEST.replace("/opt/x", "/opt/../x"), "line 10"),
+            (SMALLEST.replace("[\"libroscpp4d\"]", "[]"), "line 6"),
             (SMALLEST.replace("ros1", "ros7"), "line 4"),
-            (format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"), "line 11"),
-            (format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"), "line 11"),
+            (format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"), "line 12"),
+            (format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"), "line 12"),
         ];
         for (text, line) in cases {
             let problem = parse(&text).expect_err("a mistake");

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use package::workspace::Pushed;
 use image::{ImageSpec, LayerInfo, Store};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
@@ -54,6 +55,11 @@ pub struct Builder {
     archives: tokio::sync::Mutex<HashMap<String, Arc<Archive>>>,
 }
 
+enum What<'a> {
+    Tree(Pushed),
+    Packaged(&'a str),
+}
+
 /// What the three ways of pushing have in common while they work.
 pub(crate) struct Build<'a> {
     pub(crate) shop: Workshop,
@@ -99,19 +105,18 @@ impl Builder {
         let site = Site::new(&self.config.build_dir, &request.id, self.config.engine.clone())?;
         let shop = Workshop { site, layers: self.layers.clone(), turns: self.turns.clone() };
         // Before anything is downloaded: what was pushed may not be a package at all.
-        let tree = match &request.source {
-            Source::Tree(path) => Some(pushed::analyse(path)?),
-            Source::Packaged(_) => None,
+        let what = match &request.source {
+            Source::Tree(path) => What::Tree(pushed::inspect(path, &base)?),
+            Source::Packaged(name) => What::Packaged(name),
         };
         let archive = self.archive(&shop, &base, progress).await?;
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let build = Build { shop, base, archive, base_layer, request, progress, log };
-        let made = match (&request.source, tree) {
-            (Source::Tree(_), Some(pushed::Pushed::Source(tree))) => source::build(&build, tree).await?,
-            (Source::Tree(_), Some(pushed::Pushed::InstallSpace(tree))) => prebuilt::build(&build, tree).await?,
-            (Source::Packaged(name), _) => packaged::build(&build, name).await?,
-            (Source::Tree(path), None) => packaged::build(&build, &path.to_string_lossy()).await?,
+        let made = match what {
+            What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
+            What::Tree(Pushed::Installed(space)) => prebuilt::build(&build, space).await?,
+            What::Packaged(name) => packaged::build(&build, name).await?,
         };
         build.finish(made, hold).await
     }
@@ -258,9 +263,9 @@ impl Build<'_> {
         for name in ["HOME", "ROS_LOG_DIR", "ROS_HOME", "ROS_MASTER_URI", "ROS_HOSTNAME"] {
             environment.remove(name);
         }
-        let prefix = made.prefix.clone();
+        let shares = pushed::shares(made.prefix.as_deref());
         let definitions =
-            tokio::task::spawn_blocking(move || pushed::definitions(&trees, prefix.as_deref())).await??;
+            tokio::task::spawn_blocking(move || package::definitions::read(&trees, &shares)).await??;
         let package = made.packages.first().cloned().unwrap_or_default();
         let spec = ImageSpec {
             layers: infos,

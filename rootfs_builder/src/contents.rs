@@ -110,12 +110,6 @@ impl Contents {
         fields.filter(|(_, rest)| rest.split('\t').next() == Some(deb)).map(|(name, _)| name).collect()
     }
 
-    /// All ROS packages, sorted.
-    pub fn ros_names(&self) -> Vec<&str> {
-        let mut names: Vec<&str> = self.with_prefix("r").filter_map(|rest| rest.split('\t').next()).collect();
-        names.dedup();
-        names
-    }
 }
 
 /// Changes when the lists do.
@@ -307,7 +301,6 @@ mod tests {
         assert_eq!(nodelet["libnodelet-dev"], [Part::CMake].into());
         assert!(contents.ros_package("nodele").is_empty());
         assert_eq!(contents.ros_packages_in("python3-nodelet"), ["nodelet"]);
-        assert_eq!(contents.ros_names(), ["nodelet"]);
     }
 
     #[test]

@@ -128,6 +128,20 @@ pub enum Error {
     /// The running package does not show what it should.
     #[error("{0}")]
     Probe(#[from] crate::probe::ProbeError),
+    /// The pushed tree is not what it should be.
+    #[error(transparent)]
+    Package(#[from] package::Error),
+    /// An install space that cannot be where it was built for.
+    #[error(
+        "the install space was built for {prefix}, where a servant has scratch space: build it with another prefix, \
+         such as -DCMAKE_INSTALL_PREFIX=/opt/{package}", prefix = prefix.display()
+    )]
+    Prefix {
+        /// Where it wants to be.
+        prefix: PathBuf,
+        /// One of its packages.
+        package: String,
+    },
     /// The image store.
     #[error(transparent)]
     Image(#[from] image::Error),

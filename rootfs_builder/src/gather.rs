@@ -66,7 +66,7 @@ pub(crate) async fn gather(
         for (deb, file) in debs.iter().zip(files) {
             let development = deb.name.ends_with("-dev");
             let members = tokio::task::spawn_blocking(move || deb::members(&file, deb::wanted_of_development)).await??;
-            let told = tell(&members);
+            let told = tell(&members, base);
             queue.extend(told.ros_packages);
             wanted.warnings.extend(told.warnings);
             for library in told.plugins {
@@ -100,7 +100,7 @@ struct Told {
     warnings: Vec<String>,
 }
 
-fn tell(members: &[Member]) -> Told {
+fn tell(members: &[Member], base: &Base) -> Told {
     let mut told = Told::default();
     let texts: BTreeMap<&Path, &[u8]> = members
         .iter()
@@ -112,9 +112,9 @@ fn tell(members: &[Member]) -> Told {
     for (path, bytes) in &texts {
         let Ok(text) = std::str::from_utf8(bytes) else { continue };
         if path.file_name().is_some_and(|name| name == "package.xml") && path.components().count() == 4 {
-            match manifest::run_dependencies(text) {
+            match manifest::run_dependencies(text, path, base) {
                 Ok(names) => told.ros_packages.extend(names),
-                Err(problem) => told.warnings.push(format!("{} of the archive: {problem}", path.display())),
+                Err(problem) => told.warnings.push(format!("in the archive: {problem}")),
             }
         } else if path.extension().is_some_and(|extension| extension == "xml") {
             // A plugin list may be exported by a package.xml of another Debian package; they all look alike.
@@ -151,7 +151,9 @@ mod tests {
 
     #[test]
     fn manifests_and_plugin_lists_are_heard() {
-        let told = tell(&[
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        let members = [
             file(
                 "usr/share/x/package.xml",
                 "<package><name>x</name><version>1.0.0</version><description>d</description>\
@@ -160,7 +162,8 @@ mod tests {
             ),
             file("usr/share/x/nodelet_plugins.xml", "<library path=\"lib/libx_nodelets\"><class/></library>"),
             file("usr/share/x/launch/other.xml", "<launch/>"),
-        ]);
+        ];
+        let told = tell(&members, &base);
         assert!(told.ros_packages.contains("nodelet") && !told.ros_packages.contains("rostest"), "{told:?}");
         assert_eq!(told.plugins, ["libx_nodelets.so".to_owned()].into());
     }

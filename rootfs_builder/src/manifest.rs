@@ -1,37 +1,22 @@
 //! What `package.xml` files and plugin lists say, as far as a build asks.
 
 use std::collections::BTreeSet;
+use std::path::Path;
+
+use package::condition::Variables;
+use package::manifest::{Kind, Manifest};
+
+use crate::base::Base;
 
 
 /// rosdep keys and ROS packages that running the package of this package.xml needs.
-pub(crate) fn run_dependencies(text: &str) -> Result<BTreeSet<String>, String> {
-    Ok(pushed_package(text, Default::default())?.run)
-}
-
-pub(crate) fn pushed_package(text: &str, path: std::path::PathBuf) -> Result<crate::pushed::PushedPackage, String> {
-    let document = roxmltree::Document::parse(text).map_err(|e| e.to_string())?;
-    let root = document.root_element();
-    let texts = |names: &[&str]| -> BTreeSet<String> {
-        root.children()
-            .filter(|n| names.contains(&n.tag_name().name()))
-            .filter_map(|n| n.text())
-            .map(|t| t.trim().to_owned())
-            .collect()
-    };
-    let one = |name: &str| texts(&[name]).pop_first().unwrap_or_default();
-    let build_type = root
-        .descendants()
-        .find(|n| n.has_tag_name("build_type"))
-        .and_then(|n| n.text())
-        .unwrap_or("catkin")
-        .trim()
-        .to_owned();
-    Ok(crate::pushed::PushedPackage {
-        unit: crate::compile::Unit { name: one("name"), path, build_type },
-        version: one("version"),
-        build: texts(&["depend", "build_depend", "buildtool_depend", "build_export_depend"]),
-        run: texts(&["depend", "exec_depend", "run_depend"]),
-    })
+pub(crate) fn run_dependencies(
+    text: &str,
+    path: &Path,
+    base: &Base,
+) -> Result<BTreeSet<String>, package::Error> {
+    let manifest = Manifest::parse(text, path, &Variables::ros1(&base.ros_distribution))?;
+    Ok(manifest.needs(&[Kind::Exec]).into_iter().map(str::to_owned).collect())
 }
 
 /// File names (`libx.so`) of the libraries of a plugin list (pluginlib: one `library`, or several in

@@ -1,7 +1,10 @@
 //! An install space that was compiled elsewhere: placed where it was compiled for.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fs;
+use std::path::Path;
+
+use package::workspace::InstallSpace;
 
 use crate::builder::{Build, Parts};
 use crate::cache::Entry;
@@ -10,32 +13,38 @@ use crate::error::{Error, IoAt};
 use crate::install::{Made, set_mode};
 use crate::key::{self, Key};
 use crate::keys::{self, Asked};
-use crate::pushed::InstallSpace;
-use crate::source;
+use crate::{pushed, source};
+
+/// Where a servant has scratch space: what an image holds there cannot be seen.
+const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
 
 /// Packs it and finds what it needs.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Parts, Error> {
-    let own: BTreeSet<String> = space.packages.iter().map(|package| package.unit.name.clone()).collect();
-    let mut asked = Asked::default();
-    for package in &space.packages {
-        for key in &package.run {
-            asked.run.entry(key.clone()).or_default().insert(package.unit.name.clone());
-        }
+    // Without a prefix nothing in it cares where it is.
+    let prefix = space.prefix.clone().unwrap_or_else(|| build.base.build.prefix.clone());
+    let packages = pushed::by_importance(&space.packages);
+    let usable = prefix.is_absolute() && prefix != Path::new("/");
+    if !usable || HIDDEN.iter().any(|hidden| prefix.starts_with(hidden)) {
+        return Err(Error::Prefix { prefix, package: packages.first().cloned().unwrap_or_default() });
     }
+    let (own, asked) = (pushed::names(&space.packages), pushed::asked(&space.packages));
+    // Compiled already: what it was compiled with is of no interest.
+    let asked = Asked { build: BTreeMap::new(), ..asked };
     let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
-    let package = packed(build, &space).await?;
-    let mut needed = BTreeSet::new();
-    if let Some(layer) = package.layer {
-        needed = source::needed_by(build, &layer).await?;
-    }
-    let dependencies = source::dependencies(build, &resolved, &needed, &build.on_base()).await?;
-    let version = space.packages.first().map_or_else(String::new, |package| package.version.clone());
-    let packages = space.packages.into_iter().map(|package| package.unit.name).collect();
-    Ok(Parts { packages, version, dependencies, package: Some(package), prefix: Some(space.prefix) })
+    let package = packed(build, &space, &prefix).await?;
+    let needed = source::needed_by(build, package.layer.as_ref()).await?;
+    let dependencies = source::dependencies(build, &resolved, &needed).await?;
+    Ok(Parts {
+        packages,
+        version: pushed::version(&space.packages),
+        dependencies,
+        package: Some(package),
+        prefix: Some(prefix),
+    })
 }
 
-async fn packed(build: &Build<'_>, space: &InstallSpace) -> Result<Made, Error> {
-    let (root, prefix) = (space.root.clone(), space.prefix.clone());
+async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<Made, Error> {
+    let root = space.root.clone();
     let hashed = root.clone();
     let content = tokio::task::spawn_blocking(move || key::tree(&hashed)).await??;
     let key = Key::new("prebuilt")
@@ -49,7 +58,7 @@ async fn packed(build: &Build<'_>, space: &InstallSpace) -> Result<Made, Error> 
     }
     build.progress.step("packing the install space").await;
     let tree = shop.site.fresh("prebuilt")?;
-    let target = tree.join(prefix.strip_prefix("/").unwrap_or(&prefix));
+    let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
     fs::create_dir_all(&parent).at("making", &parent)?;
     for directory in parent.ancestors().take_while(|directory| directory.starts_with(&tree)) {
@@ -60,7 +69,7 @@ async fn packed(build: &Build<'_>, space: &InstallSpace) -> Result<Made, Error> 
     let opened = target.clone();
     tokio::task::spawn_blocking(move || compile::open_up(&opened)).await??;
     let layer = compile::pack(shop, &build.base, &tree).await?;
-    let made_from = space.packages.iter().map(|package| package.unit.name.clone()).collect();
+    let made_from = pushed::names(&space.packages).into_iter().collect();
     shop.keep(&key, Entry { layer: Some(layer), made_from }).await?;
     Ok(Made { layer: Some(layer), cached: false })
 }

@@ -1,115 +1,149 @@
 //! What was pushed, as far as a build asks.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use crate::compile::Unit;
-use crate::error::{Error, IoAt};
-use crate::manifest;
+use package::condition::Variables;
+use package::manifest::Kind;
+use package::workspace::{self, Package, Pushed};
 
-/// The two kinds of trees.
-pub(crate) enum Pushed {
-    /// To be compiled.
-    Source(SourceTree),
-    /// Compiled elsewhere.
-    InstallSpace(InstallSpace),
-}
-
-/// One package or a workspace of several.
-pub(crate) struct SourceTree {
-    pub(crate) root: PathBuf,
-    /// In the order of compiling.
-    pub(crate) packages: Vec<PushedPackage>,
-}
-
-/// An install space.
-pub(crate) struct InstallSpace {
-    pub(crate) root: PathBuf,
-    /// Where it was compiled for.
-    pub(crate) prefix: PathBuf,
-    pub(crate) packages: Vec<PushedPackage>,
-}
-
-/// A package of either.
-pub(crate) struct PushedPackage {
-    pub(crate) unit: Unit,
-    pub(crate) version: String,
-    /// rosdep keys and ROS packages asked for while compiling.
-    pub(crate) build: BTreeSet<String>,
-    /// The same at run time.
-    pub(crate) run: BTreeSet<String>,
-}
+use crate::base::Base;
+use crate::error::Error;
+use crate::keys::Asked;
 
 /// Looks at a pushed tree.
-pub(crate) fn analyse(root: &Path) -> Result<Pushed, Error> {
-    provisional::analyse(root)
-}
-
-/// Texts of the definitions in an image: below `/usr/share` and an install space.
-pub(crate) fn definitions(trees: &[PathBuf], prefix: Option<&Path>) -> Result<BTreeMap<String, String>, Error> {
-    let mut found = BTreeMap::new();
-    for share in [Some(Path::new("/usr")), prefix].into_iter().flatten().map(|prefix| prefix.join("share")) {
-        for tree in trees {
-            let share = tree.join(share.strip_prefix("/").unwrap_or(&share));
-            for package in fs::read_dir(&share).into_iter().flatten().flatten() {
-                let name = package.file_name().to_string_lossy().into_owned();
-                for kind in ["msg", "srv", "action"] {
-                    for file in fs::read_dir(package.path().join(kind)).into_iter().flatten().flatten() {
-                        let path = file.path();
-                        if path.extension().is_some_and(|extension| extension == kind)
-                            && let Some(stem) = path.file_stem().and_then(|stem| stem.to_str())
-                        {
-                            let text = fs::read(&path).at("reading", &path)?;
-                            let text = String::from_utf8_lossy(&text).into_owned();
-                            found.insert(format!("{name}/{kind}/{stem}"), text);
-                        }
-                    }
-                }
+pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
+    let pushed = workspace::inspect(root, &Variables::ros1(&base.ros_distribution))?;
+    if let Pushed::Source(sources) = &pushed {
+        for Package { manifest, .. } in &sources.packages {
+            if !matches!(manifest.build_type.as_str(), "catkin" | "cmake") {
+                return Err(Error::BuildType {
+                    package: manifest.name.clone(),
+                    build_type: manifest.build_type.clone(),
+                    base: base.name.clone(),
+                });
             }
         }
     }
-    Ok(found)
+    Ok(pushed)
 }
 
-mod provisional {
+/// What its packages need from elsewhere.
+pub(crate) fn asked(packages: &[Package]) -> Asked {
+    let mut asked = Asked::default();
+    for external in workspace::external(packages) {
+        let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
+        if needs(&[Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport]) {
+            asked.build.insert(external.name.clone(), external.needed_by.clone());
+        }
+        if needs(&[Kind::Exec]) {
+            asked.run.insert(external.name.clone(), external.needed_by.clone());
+        }
+    }
+    asked
+}
+
+/// Names of packages.
+pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
+    packages.iter().map(|package| package.manifest.name.clone()).collect()
+}
+
+/// The package that a push is about, and the others after it: the one that none of the others needs, the last in
+/// the order of building when there are several.
+pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
+    let mut names: Vec<String> = packages
+        .iter()
+        .rev()
+        .filter(|package| !package.manifest.metapackage)
+        .chain(packages.iter().filter(|package| package.manifest.metapackage))
+        .map(|package| package.manifest.name.clone())
+        .collect();
+    let needed = |name: &String| {
+        packages
+            .iter()
+            .any(|package| package.manifest.dependencies.iter().any(|need| need.name == *name))
+    };
+    // Stable: within either kind the order stays.
+    names.sort_by_key(needed);
+    names
+}
+
+/// The version of that package.
+pub(crate) fn version(packages: &[Package]) -> String {
+    let first = by_importance(packages).into_iter().next();
+    let package = packages.iter().find(|package| Some(&package.manifest.name) == first.as_ref());
+    package.map_or_else(String::new, |package| package.manifest.version.clone())
+}
+
+/// Where definitions are looked for, the package's own first.
+pub(crate) fn shares(prefix: Option<&Path>) -> Vec<String> {
+    let own = prefix.map(|prefix| prefix.join("share"));
+    let all = own.into_iter().chain([PathBuf::from("/usr/share")]);
+    all.map(|share| share.to_string_lossy().trim_start_matches('/').to_owned()).collect()
+}
+
+#[cfg(test)]
+mod tests {
     use super::*;
 
-    pub(super) fn analyse(root: &Path) -> Result<Pushed, Error> {
-        let mut packages = Vec::new();
-        for entry in walkdir::WalkDir::new(root).sort_by_file_name() {
-            let entry = entry.map_err(|e| Error::io("reading", root, e.into()))?;
-            if entry.file_name() == "package.xml" {
-                let text = fs::read_to_string(entry.path()).at("reading", entry.path())?;
-                let relative = entry.path().parent().unwrap().strip_prefix(root).unwrap().to_owned();
-                packages.push(manifest::pushed_package(&text, relative).map_err(|problem| Error::BadBase {
-                    path: entry.path().to_owned(),
-                    problem,
-                })?);
-            }
+    fn workspace(packages: &[(&str, &str)]) -> (tempfile::TempDir, Pushed) {
+        let root = tempfile::tempdir().expect("a directory");
+        for (name, rest) in packages {
+            let directory = root.path().join("src").join(name);
+            std::fs::create_dir_all(&directory).expect("made");
+            let text = format!(
+                "<package format=\"2\"><name>{name}</name><version>1.2.3</version><description>d</description>\
+                 <maintainer email=\"a@b.invalid\">m</maintainer><license>l</license>{rest}</package>"
+            );
+            std::fs::write(directory.join("package.xml"), text).expect("written");
         }
-        if packages.is_empty() {
-            return Err(Error::BadBase { path: root.to_owned(), problem: "there is no package.xml".into() });
-        }
-        if root.join("setup.sh").is_file() && root.join("share").is_dir() {
-            let text = fs::read_to_string(root.join("_setup_util.py")).unwrap_or_default();
-            let prefix = text
-                .lines()
-                .find_map(|l| l.trim().strip_prefix("CMAKE_PREFIX_PATH = r'")?.split(['\'', ';']).next().map(PathBuf::from))
-                .unwrap_or_else(|| "/opt/cloudroid/install".into());
-            return Ok(Pushed::InstallSpace(InstallSpace { root: root.to_owned(), prefix, packages }));
-        }
-        // Topological.
-        let names: BTreeSet<String> = packages.iter().map(|p| p.unit.name.clone()).collect();
-        let mut ordered: Vec<PushedPackage> = Vec::new();
-        while !packages.is_empty() {
-            let done: BTreeSet<String> = ordered.iter().map(|p| p.unit.name.clone()).collect();
-            let at = packages
-                .iter()
-                .position(|p| p.build.union(&p.run).all(|k| !names.contains(k) || done.contains(k)))
-                .unwrap_or(0);
-            ordered.push(packages.remove(at));
-        }
-        Ok(Pushed::Source(SourceTree { root: root.to_owned(), packages: ordered }))
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        let pushed = inspect(root.path(), &base).expect("a workspace");
+        (root, pushed)
+    }
+
+    #[test]
+    fn the_package_that_nobody_needs_is_the_one_meant() {
+        let (_root, pushed) = workspace(&[
+            ("app", "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
+            ("app_msgs", "<depend>std_msgs</depend>"),
+        ]);
+        assert_eq!(by_importance(pushed.packages()), ["app", "app_msgs"]);
+        assert_eq!(version(pushed.packages()), "1.2.3");
+    }
+
+    #[test]
+    fn needs_are_sorted_by_when_they_matter() {
+        let (_root, pushed) = workspace(&[
+            ("app", "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
+            ("app_msgs", "<build_depend>message_generation</build_depend><depend>std_msgs</depend>"),
+        ]);
+        let asked = asked(pushed.packages());
+        assert_eq!(asked.build.keys().collect::<Vec<_>>(), ["message_generation", "std_msgs"]);
+        assert_eq!(asked.run.keys().collect::<Vec<_>>(), ["python3-numpy", "std_msgs"]);
+        assert!(asked.run["std_msgs"].contains("app_msgs"));
+    }
+
+    #[test]
+    fn what_this_base_cannot_build_is_refused() {
+        let root = tempfile::tempdir().expect("a directory");
+        std::fs::write(
+            root.path().join("package.xml"),
+            "<package format=\"3\"><name>p</name><version>1.0.0</version><description>d</description>\
+             <maintainer email=\"a@b.invalid\">m</maintainer><license>l</license>\
+             <export><build_type>ament_cmake</build_type></export></package>",
+        )
+        .expect("written");
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        let error = inspect(root.path(), &base).expect_err("ROS 2").to_string();
+        assert!(error.contains("build type ament_cmake"), "{error}");
+    }
+
+    #[test]
+    fn own_definitions_come_first() {
+        assert_eq!(shares(Some(Path::new("/opt/x"))), ["opt/x/share", "usr/share"]);
+        assert_eq!(shares(None), ["usr/share"]);
     }
 }

@@ -11,51 +11,40 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use package::workspace::Workspace;
+
 use crate::builder::{Build, Parts};
 use crate::cache::Entry;
 use crate::compile::{self, Unit};
 use crate::error::Error;
 use crate::install::Made;
 use crate::key::{self, Key};
-use crate::keys::{self, Asked, Resolved};
-use crate::pushed::SourceTree;
-use crate::{elf, packaged};
+use crate::keys::{self, Resolved};
+use crate::{elf, packaged, pushed};
 
 /// Compiles and packs.
-pub(crate) async fn build(build: &Build<'_>, tree: SourceTree) -> Result<Parts, Error> {
-    for package in &tree.packages {
-        if !matches!(package.unit.build_type.as_str(), "catkin" | "cmake") {
-            return Err(Error::BuildType {
-                package: package.unit.name.clone(),
-                build_type: package.unit.build_type.clone(),
-                base: build.base.name.clone(),
-            });
-        }
-    }
-    let own: BTreeSet<String> = tree.packages.iter().map(|package| package.unit.name.clone()).collect();
-    let mut asked = Asked::default();
-    for package in &tree.packages {
-        let name = &package.unit.name;
-        for key in &package.build {
-            asked.build.entry(key.clone()).or_default().insert(name.clone());
-        }
-        for key in &package.run {
-            asked.run.entry(key.clone()).or_default().insert(name.clone());
-        }
-    }
+pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Parts, Error> {
+    let (own, asked) = (pushed::names(&workspace.packages), pushed::asked(&workspace.packages));
     let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
-    let units: Vec<Unit> = tree.packages.iter().map(|package| package.unit.clone()).collect();
-    let package = compiled(build, &tree.root, &units, &resolved).await?;
-    let mut needed = BTreeSet::new();
-    if let Some(layer) = package.layer {
-        needed = needed_by(build, &layer).await?;
-    }
-    let dependencies = dependencies(build, &resolved, &needed, &build.on_base()).await?;
-    let mut packages: Vec<String> = tree.packages.iter().map(|package| package.unit.name.clone()).collect();
-    // In the order of compiling the last depends on the others: it is the one meant.
-    packages.reverse();
-    let version = tree.packages.last().map_or_else(String::new, |package| package.version.clone());
-    Ok(Parts { packages, version, dependencies, package: Some(package), prefix: Some(build.base.build.prefix.clone()) })
+    let units: Vec<Unit> = workspace
+        .packages
+        .iter()
+        .map(|package| Unit {
+            name: package.manifest.name.clone(),
+            path: package.path.clone(),
+            build_type: package.manifest.build_type.clone(),
+        })
+        .collect();
+    let package = compiled(build, &workspace.root, &units, &resolved).await?;
+    let needed = needed_by(build, package.layer.as_ref()).await?;
+    let dependencies = dependencies(build, &resolved, &needed).await?;
+    Ok(Parts {
+        packages: pushed::by_importance(&workspace.packages),
+        version: pushed::version(&workspace.packages),
+        dependencies,
+        package: Some(package),
+        prefix: Some(build.base.build.prefix.clone()),
+    })
 }
 
 /// The package layer: from the cache when the same sources were compiled with the same packages before.
@@ -88,8 +77,11 @@ async fn compiled(build: &Build<'_>, root: &Path, units: &[Unit], resolved: &Res
 }
 
 /// Libraries that a package layer needs from elsewhere.
-pub(crate) async fn needed_by(build: &Build<'_>, layer: &image::LayerInfo) -> Result<BTreeSet<String>, Error> {
-    let trees = build.shop.extracted(std::slice::from_ref(layer)).await?;
+pub(crate) async fn needed_by(
+    build: &Build<'_>,
+    layer: Option<&image::LayerInfo>,
+) -> Result<BTreeSet<String>, Error> {
+    let trees = build.shop.extracted(layer.map_or(&[], std::slice::from_ref)).await?;
     tokio::task::spawn_blocking(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {
@@ -105,8 +97,8 @@ pub(crate) async fn dependencies(
     build: &Build<'_>,
     resolved: &Resolved,
     libraries: &BTreeSet<String>,
-    below: &[image::LayerInfo],
 ) -> Result<Made, Error> {
+    let below = build.on_base();
     let (mut roots, mut debs) = build.extra_packages()?;
     roots.extend(resolved.run_ros.iter().cloned());
     let wanted = packaged::wanted(build, &roots).await?;
@@ -114,7 +106,7 @@ pub(crate) async fn dependencies(
     debs.extend(resolved.run.iter().cloned());
     let (found, missing) = build.archive.libraries(libraries);
     debs.extend(found.into_values());
-    let trees = build.shop.extracted(below).await?;
+    let trees = build.shop.extracted(&below).await?;
     for name in missing {
         // Not in the index, perhaps in an image all the same: a link that a package's script made.
         if !library_in(&trees, &name) {
@@ -122,7 +114,7 @@ pub(crate) async fn dependencies(
             build.progress.warn(text).await;
         }
     }
-    build.add("dependencies", below, &debs, wanted.extras).await
+    build.add("dependencies", &below, &debs, wanted.extras).await
 }
 
 fn library_in(trees: &[PathBuf], name: &str) -> bool {
