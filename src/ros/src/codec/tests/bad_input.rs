@@ -94,6 +94,26 @@ fn a_publish_that_does_not_fit_names_the_field_and_the_reason() {
             "field data of std_msgs/UInt8: 1e999 does not fit into uint8",
         ),
         (
+            "std_msgs/UInt8",
+            r#"{"data":256.0}"#,
+            "field data of std_msgs/UInt8: 256.0 does not fit into uint8",
+        ),
+        (
+            "std_msgs/Int8",
+            r#"{"data":-129.0}"#,
+            "field data of std_msgs/Int8: -129.0 does not fit into int8",
+        ),
+        (
+            "std_msgs/Int64",
+            r#"{"data":9223372036854775808.0}"#,
+            "field data of std_msgs/Int64: 9223372036854775808.0 does not fit into int64",
+        ),
+        (
+            "std_msgs/UInt64",
+            r#"{"data":1.8446744073709551616e19}"#,
+            "field data of std_msgs/UInt64: 1.8446744073709551616e19 does not fit into uint64",
+        ),
+        (
             "std_msgs/Int8",
             r#"{"data":-129}"#,
             "field data of std_msgs/Int8: -129 does not fit into int8",
@@ -427,4 +447,11 @@ fn output_beyond_the_limit_is_refused() {
     )
     .unwrap_err();
     assert_eq!(error.kind, CodecErrorKind::TooLarge(DEFAULT_MAX_BYTES));
+    let mut out = Vec::new();
+    let options = FillOptions {
+        max_bytes: 500,
+        ..FillOptions::default()
+    };
+    assert!(from_json(&amplifier, b"{\"x\":[{}]}", &mut out, &options).is_err());
+    assert!(out.capacity() < 1000, "reserved before it was refused");
 }
