@@ -25,6 +25,7 @@
 
 #![forbid(unsafe_code)]
 
+mod acks;
 mod actionlib;
 mod bridge;
 mod client;

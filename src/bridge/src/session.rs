@@ -1,7 +1,6 @@
 //! One socket: moves frames between it and its client, in one task, so that nothing is handed over between threads
 //! on the way.
 
-use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
 use std::pin::Pin;
 use std::sync::Arc;
@@ -14,6 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Sleep, timeout};
 
 use crate::SessionEnd;
+use crate::acks::Acks;
 use crate::client::{Client, Inbox};
 use crate::cut::Cuts;
 use crate::outbox::{Control, Goodbye, Outgoing, TopicKey};
@@ -28,8 +28,6 @@ const READ_BATCH: usize = 64;
 const ROUNDS: usize = 16;
 /// While so many answers wait nothing more is read from the client.
 const CONTROL_HIGH: usize = 256;
-/// Answers kept until the client is known to have them.
-const MAX_UNACKNOWLEDGED: usize = 1024;
 
 /// The socket, its client and what lies between.
 pub(crate) struct Session<S> {
@@ -41,9 +39,7 @@ pub(crate) struct Session<S> {
     cuts: Cuts,
     heard: Instant,
     ping_at: Option<Instant>,
-    pings: u64,
-    /// Answers sent, by the ping that followed them.
-    unacknowledged: VecDeque<(u64, Control)>,
+    acks: Acks,
     /// Reading was put off because answers wait.
     held_back: bool,
     timer: Pin<Box<Sleep>>,
@@ -56,8 +52,8 @@ enum Stop {
     Client { code: u16, reason: String },
     /// It is to be closed; `readable` unless the client's bytes can no longer be told apart.
     Close { code: u16, reason: String, readable: bool },
-    /// The socket is of no more use.
-    Lost(String),
+    /// The socket is of no more use. `heard_all`: the client ended it in good order, having read what was sent.
+    Lost { reason: String, heard_all: bool },
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
@@ -71,8 +67,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             cuts: Cuts::default(),
             heard: now,
             ping_at: (!options.ping_interval.is_zero()).then(|| now + options.ping_interval),
-            pings: 0,
-            unacknowledged: VecDeque::new(),
+            acks: Acks::default(),
             held_back: false,
             timer: Box::pin(tokio::time::sleep_until(now.into())),
             timer_at: None,
@@ -93,7 +88,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             if self.socket.queued() == 0 {
                 return Poll::Ready(Ok(()));
             }
-            self.request_acknowledgement();
             ready!(self.socket.poll_flush(cx))?;
         }
     }
@@ -113,7 +107,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             let frame = match next {
                 None => return self.next_fragment(),
                 Some(Outgoing::Control(control)) => {
-                    self.remember(&control);
+                    self.remember(&control, now);
                     let cut = self.cuts.cut(&control.frame, control.fragment_size, None);
                     (!cut).then_some(control.frame)
                 }
@@ -162,33 +156,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         }
     }
 
-    /// Keeps an answer until a pong shows that the client has it.
-    fn remember(&mut self, control: &Control) {
+    /// Keeps an answer until the client is known to have it.
+    fn remember(&mut self, control: &Control, now: Instant) {
         if control.answer && self.client.is_resumable() {
-            if self.unacknowledged.len() >= MAX_UNACKNOWLEDGED {
-                self.unacknowledged.pop_front();
-            }
-            self.unacknowledged.push_back((self.pings + 1, control.clone()));
-        }
-    }
-
-    fn request_acknowledgement(&mut self) {
-        if self.unacknowledged.back().is_some_and(|(ping, _)| *ping > self.pings) {
-            self.ping();
+            self.acks.sent(control.clone(), now);
         }
     }
 
     fn ping(&mut self) {
-        self.pings += 1;
-        self.socket.queue(frame::PING, Bytes::copy_from_slice(&self.pings.to_be_bytes()));
-    }
-
-    fn pong(&mut self, payload: &[u8]) {
-        if let Ok(number) = payload.try_into().map(u64::from_be_bytes) {
-            while self.unacknowledged.front().is_some_and(|(ping, _)| *ping <= number) {
-                self.unacknowledged.pop_front();
-            }
-        }
+        let payload = self.acks.ping();
+        self.socket.queue(frame::PING, Bytes::copy_from_slice(&payload));
     }
 
     /// Takes frames from the client. Ready when a batch was taken, pending when none is there.
@@ -204,7 +181,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 Err(WsError::Refused { code, reason }) => {
                     return Poll::Ready(Err(Stop::Close { code, reason, readable: false }));
                 }
-                Err(error) => return Poll::Ready(Err(Stop::Lost(error.to_string()))),
+                Err(error) => {
+                    let heard_all = matches!(error, WsError::Eof);
+                    return Poll::Ready(Err(Stop::Lost { reason: error.to_string(), heard_all }));
+                }
             };
             self.heard = now;
             self.take(message)?;
@@ -234,7 +214,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             // Pongs that a client does not read pile up no higher than this.
             Message::Ping(payload) if self.socket.queued() < SOCKET_FULL => self.socket.queue(frame::PONG, payload),
             Message::Ping(_) => {}
-            Message::Pong(payload) => self.pong(&payload),
+            Message::Pong(payload) => self.acks.pong(&payload),
             Message::Close(code, reason) => return Err(Stop::Client { code, reason }),
         }
         Ok(())
@@ -249,15 +229,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             let reason = format!("nothing was heard for {} s, not even a pong", silent.as_secs());
             return Err(Stop::Close { code: 1001, reason, readable: true });
         }
-        if self.ping_at.is_some_and(|at| at <= now) {
-            // Behind a blocked message a ping would only pile up.
-            if self.socket.queued() < SOCKET_FULL {
-                self.ping();
-            }
+        let regular = self.ping_at.is_some_and(|at| at <= now);
+        // Behind a blocked message a ping would only pile up.
+        if self.socket.queued() < SOCKET_FULL && (regular || self.acks.ping_due().is_some_and(|at| at <= now)) {
+            self.ping();
+        }
+        if regular {
             self.ping_at = Some(now + interval);
         }
         let idle_at = (!idle.is_zero()).then(|| self.heard + idle);
-        Ok([self.ping_at, idle_at, self.client.outbox.next_due()].into_iter().flatten().min())
+        let ack_at = self.acks.ping_due().filter(|at| *at > now);
+        Ok([self.ping_at, idle_at, ack_at, self.client.outbox.next_due()].into_iter().flatten().min())
     }
 
     /// Ready when it is time.
@@ -292,7 +274,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 Err(stop) => return Poll::Ready(stop),
             };
             let written = match self.write(cx, now) {
-                Poll::Ready(Err(error)) => return Poll::Ready(Stop::Lost(error.to_string())),
+                Poll::Ready(Err(error)) => {
+                    return Poll::Ready(Stop::Lost { reason: error.to_string(), heard_all: false });
+                }
                 written => written,
             };
             let more = read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
@@ -308,25 +292,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     pub(crate) async fn run(mut self) -> SessionEnd {
         let stop = poll_fn(|cx| self.step(cx)).await;
         let patience = self.client.shared.options.close_timeout;
-        let end = match stop {
-            Stop::Lost(reason) => SessionEnd::Lost(reason),
+        // What is still in our own buffer has certainly not arrived.
+        let arrived = self.socket.queued() == 0;
+        let (end, heard_all) = match stop {
+            Stop::Lost { reason, heard_all } => (SessionEnd::Lost(reason), heard_all && arrived),
             Stop::Client { code, reason } => {
                 self.socket.queue_close(code, "");
                 let answered = poll_fn(|cx| self.socket.poll_flush(cx));
                 // A client that does not wait for the answer is gone all the same.
                 let _ = timeout(patience, answered).await;
-                SessionEnd::Client { code, reason }
+                (SessionEnd::Client { code, reason }, arrived)
             }
             Stop::Close { code, reason, readable } => {
                 self.last_words(code, &reason);
                 // A client that does not take its leave in time is left alone.
-                let _ = timeout(patience, self.socket.leave(readable)).await;
-                SessionEnd::Closed { code, reason }
+                let left = timeout(patience, self.socket.leave(readable)).await;
+                (SessionEnd::Closed { code, reason }, matches!(left, Ok(Ok(()))))
             }
         };
-        if self.client.is_resumable() {
-            let unacknowledged = std::mem::take(&mut self.unacknowledged);
-            self.client.outbox.again(unacknowledged.into_iter().map(|(_, control)| control));
+        if !heard_all {
+            self.client.outbox.again(self.acks.take());
         }
         end
     }
@@ -339,7 +324,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         // A client that reads nothing need not be told more, one that has another socket hears it there.
         if code != 1008 && code != 4001 {
             while let Some(control) = self.client.outbox.next_control() {
-                self.remember(&control);
+                self.remember(&control, Instant::now());
                 self.socket.queue(control.frame.opcode(), control.frame.bytes);
             }
         }

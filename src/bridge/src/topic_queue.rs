@@ -1,12 +1,15 @@
 //! What waits for one client on one topic: newest wins, bounded in messages and bytes, no faster than asked for.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rosbridge::{Compression, Id};
 
 use crate::sample::Sample;
+
+/// Latching publishers remembered.
+const MAX_MET: usize = 1024;
 
 /// What one `subscribe` asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,13 +56,21 @@ pub(crate) struct Pushed {
     pub(crate) dropped_bytes: usize,
 }
 
+struct Waiting {
+    sample: Arc<Sample>,
+    /// No throttle rate holds it back: what a latching publisher last said, for a newcomer.
+    first: bool,
+}
+
 /// The queue.
 pub(crate) struct TopicQueue {
     /// The topic as the client wrote it.
     pub(crate) topic: Arc<str>,
     pub(crate) wishes: Wishes,
     limits: QueueLimits,
-    samples: VecDeque<Arc<Sample>>,
+    samples: VecDeque<Waiting>,
+    /// Latching publishers whose first message has been queued.
+    met: HashSet<Arc<str>>,
     pub(crate) bytes: usize,
     /// When the throttle rate lets the next one through.
     next_at: Option<Instant>,
@@ -78,6 +89,7 @@ impl TopicQueue {
             wishes,
             limits,
             samples: VecDeque::new(),
+            met: HashSet::new(),
             bytes: 0,
             next_at: None,
             complained: None,
@@ -90,31 +102,25 @@ impl TopicQueue {
         self.samples.len() <= 1
     }
 
-    /// Queues a sample. `replay`: it is an old one for a newcomer, which no throttle rate holds back.
+    /// Queues a sample. `replay`: it is an old one for a newcomer.
     pub(crate) fn push(&mut self, sample: Arc<Sample>, replay: bool, now: Instant) -> Pushed {
+        let first = self.is_first(&sample, replay);
         let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
-        if throttles && !replay {
+        if throttles && !first {
             if self.next_at.is_some_and(|at| now < at) {
                 return Pushed { throttled: true, ..Pushed::default() };
             }
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
         self.bytes += sample.bytes.len();
-        self.samples.push_back(sample);
-        let longest = match self.wishes.queue_length {
-            0 => self.limits.messages,
-            length => length.min(self.limits.messages),
-        };
+        if first {
+            let at = self.samples.iter().take_while(|waiting| waiting.first).count();
+            self.samples.insert(at, Waiting { sample, first });
+        } else {
+            self.samples.push_back(Waiting { sample, first });
+        }
         let mut pushed = Pushed::default();
-        while self.samples.len() > longest || (self.bytes > self.limits.bytes && self.samples.len() > 1) {
-            // The last message of a latching publisher may never come again: drop it last.
-            if self.samples.len() <= self.limits.messages && self.samples.iter().all(|sample| sample.latching) {
-                let publishers = self.samples.iter().map(|sample| &sample.publisher);
-                let distinct = publishers.collect::<std::collections::HashSet<_>>().len();
-                if distinct == self.samples.len() && self.bytes <= self.limits.bytes {
-                    break;
-                }
-            }
+        while self.is_over() {
             let Some(lost) = self.drop_one() else { break };
             pushed.dropped += 1;
             pushed.dropped_bytes += lost;
@@ -122,31 +128,54 @@ impl TopicQueue {
         pushed
     }
 
+    fn is_first(&mut self, sample: &Sample, replay: bool) -> bool {
+        if !sample.latching {
+            return replay;
+        }
+        // Publishers whose names never end must not fill the memory.
+        if self.met.len() >= MAX_MET {
+            self.met.clear();
+        }
+        self.met.insert(sample.publisher.clone()) || replay
+    }
+
+    fn is_over(&self) -> bool {
+        if self.bytes > self.limits.bytes && self.samples.len() > 1 {
+            return true;
+        }
+        // What latching publishers said first does not count: it may never come again.
+        let firsts = self.samples.iter().take_while(|waiting| waiting.first).count();
+        let asked = match self.wishes.queue_length {
+            0 => self.limits.messages,
+            length => length.min(self.limits.messages),
+        };
+        self.samples.len() - firsts > asked || self.samples.len() > self.limits.messages
+    }
+
     /// Drops the oldest sample that can be spared; gives its size.
     pub(crate) fn drop_one(&mut self) -> Option<usize> {
         let spare = (0..self.samples.len()).find(|&at| {
-            let sample = &self.samples[at];
-            !sample.latching || self.samples.range(at + 1..).any(|later| later.publisher == sample.publisher)
+            let sample = &self.samples[at].sample;
+            let newer = |later: &Waiting| later.sample.publisher == sample.publisher;
+            !sample.latching || self.samples.range(at + 1..).any(newer)
         });
-        let lost = self.samples.remove(spare.unwrap_or(0))?;
+        let lost = self.samples.remove(spare.unwrap_or(0))?.sample;
         self.bytes -= lost.bytes.len();
         Some(lost.bytes.len())
     }
 
     /// When the next sample may be sent; `None` while there is none.
     pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
-        if self.samples.is_empty() || self.busy {
-            return None;
-        }
-        let held_back = self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
+        let next = self.samples.front().filter(|_| !self.busy)?;
+        let held_back = !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
         Some(self.next_at.filter(|at| held_back && *at > now).unwrap_or(now))
     }
 
     /// The next sample to send.
     pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<Sample>> {
-        let sample = self.samples.pop_front()?;
+        let Waiting { sample, first } = self.samples.pop_front()?;
         self.bytes -= sample.bytes.len();
-        if self.wishes.queue_length > 0 {
+        if self.wishes.queue_length > 0 && !first {
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
         Some(sample)

@@ -24,7 +24,7 @@ fn queue(throttle: u64, length: usize) -> TopicQueue {
 }
 
 fn sizes(queue: &TopicQueue) -> Vec<usize> {
-    queue.samples.iter().map(|sample| sample.bytes.len()).collect()
+    queue.samples.iter().map(|waiting| waiting.sample.bytes.len()).collect()
 }
 
 #[test]
@@ -57,7 +57,7 @@ fn without_a_queue_a_throttle_leaves_messages_out() {
     assert!(queue.push(sample("/p", false, 2), false, now + 99 * ms).throttled);
     assert!(!queue.push(sample("/p", false, 3), true, now + 99 * ms).throttled);
     assert!(!queue.push(sample("/p", false, 4), false, now + 100 * ms).throttled);
-    assert_eq!(sizes(&queue), [1, 3, 4]);
+    assert_eq!(sizes(&queue), [3, 1, 4]);
     assert_eq!(queue.due(now), Some(now));
 }
 
@@ -76,14 +76,21 @@ fn with_a_queue_a_throttle_spreads_messages() {
 }
 
 #[test]
-fn the_last_of_each_latching_publisher_is_dropped_last() {
+fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
     let now = Instant::now();
-    let mut queue = queue(0, 1);
+    let mut queue = queue(60_000, 1);
     for publisher in ["/a", "/b", "/c"] {
-        assert_eq!(queue.push(sample(publisher, true, 1), true, now).dropped, 0);
+        assert_eq!(queue.push(sample(publisher, true, 1), false, now).dropped, 0);
     }
-    assert_eq!(queue.push(sample("/b", true, 2), false, now).dropped, 1);
-    assert_eq!(sizes(&queue), [1, 1, 2]);
+    assert_eq!(queue.push(sample("/b", true, 2), false, now).dropped, 0);
+    assert_eq!(queue.push(sample("/b", true, 3), false, now).dropped, 2);
+    assert_eq!(sizes(&queue), [1, 1, 3], "of a publisher of whom a newer one is there the older give way");
+    for _ in 0..3 {
+        assert_eq!(queue.due(now), Some(now));
+        queue.pop(now);
+    }
+    queue.push(sample("/b", true, 4), false, now);
+    assert_eq!(queue.due(now), Some(now + Duration::from_secs(60)));
 }
 
 #[test]

@@ -240,8 +240,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     pub(crate) async fn leave(&mut self, readable: bool) -> Result<(), WsError> {
         poll_fn(|cx| self.poll_flush(cx)).await?;
         if readable {
-            while !matches!(poll_fn(|cx| self.poll_next(cx)).await?, Message::Close(..)) {}
-            return Ok(());
+            loop {
+                match poll_fn(|cx| self.poll_next(cx)).await {
+                    Ok(Message::Close(..)) | Err(WsError::Eof) => return Ok(()),
+                    Ok(_) => {}
+                    Err(error) => return Err(error),
+                }
+            }
         }
         poll_fn(|cx| Pin::new(&mut self.io).poll_shutdown(cx)).await?;
         loop {
