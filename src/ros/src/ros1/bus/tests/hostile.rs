@@ -1,6 +1,6 @@
 //! Peers that lie, stall and break off.
 
-use tokio::io::AsyncWriteExt as _;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 
 use super::*;
@@ -57,6 +57,16 @@ async fn a_publisher_that_breaks_off_or_lies_is_tried_again() {
 }
 
 #[tokio::test]
+async fn a_publisher_that_does_not_check_types_is_checked() {
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let node = publisher(&master, vec![script(b"")]).await;
+    let met = link::connect(&bus.inner, "/chat", &node.uri, &text_type("0000")).await;
+    let error = met.err().unwrap();
+    assert!(matches!(error, BusError::TypeMismatch { .. }), "{error}");
+}
+
+#[tokio::test]
 async fn a_publisher_that_stalls_holds_up_no_other() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
@@ -95,7 +105,16 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     // What it does not take is dropped and counted, not kept.
     assert!(publisher.dropped() > 50, "{}", publisher.dropped());
     drop(publisher);
-    // Nor does it delay the end for longer than the farewell.
+    // What is still queued for it is sent if it reads at last, then it is let go.
+    let mut rest = Vec::new();
+    let read = tokio::time::timeout(LONG, lazy.read_to_end(&mut rest)).await;
+    assert!(read.is_ok() && rest.len() > 1 << 20);
+    // A publisher's end does not wait for the like of it for longer than the farewell.
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
+    header.write(&mut lazy).await.unwrap();
+    connected(&*publisher, 2).await;
+    (0..20).for_each(|_| publisher.publish(big.clone()));
     let closed = tokio::time::timeout(LONG, one.close()).await;
     assert!(closed.is_ok());
 }

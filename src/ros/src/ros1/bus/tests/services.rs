@@ -128,13 +128,17 @@ async fn scripted(master: &TestMaster, scripts: Vec<Script>) -> (TestNode, Arc<A
                 count.fetch_add(1, Ordering::Relaxed);
                 continue;
             }
-            let Script::Answer(answers) = script else {
+            let slams = matches!(script, Script::AnswerAndSlam(_));
+            let (Script::Answer(answers) | Script::AnswerAndSlam(answers)) = script else {
                 continue;
             };
             for bytes in answers {
                 frames.next(&mut stream).await.unwrap();
                 count.fetch_add(1, Ordering::Relaxed);
                 stream.write_all(bytes).await.unwrap();
+            }
+            if slams {
+                stream.readable().await.unwrap();
             }
         }
     });
@@ -144,6 +148,8 @@ async fn scripted(master: &TestMaster, scripts: Vec<Script>) -> (TestNode, Arc<A
 enum Script {
     /// Answers that many calls with these bytes, then closes.
     Answer(Vec<&'static [u8]>),
+    /// The same, but closes only when the next request is there, without reading it.
+    AnswerAndSlam(Vec<&'static [u8]>),
     /// Takes the request and closes.
     HangUp,
     /// Says no to the header.
@@ -156,7 +162,11 @@ const OK: &[u8] = b"\x01\x02\0\0\0ok";
 async fn a_kept_connection_that_was_closed_is_replaced_unnoticed() {
     let master = TestMaster::start().await;
     let one = join(&master, "/one").await;
-    let scripts = (0..20).map(|_| Script::Answer(vec![OK])).collect();
+    let scripts = (0..20).map(|n| match n % 2 {
+        0 => Script::Answer(vec![OK]),
+        _ => Script::AnswerAndSlam(vec![OK]),
+    });
+    let scripts = scripts.collect();
     let (_node, taken) = scripted(&master, scripts).await;
     for _ in 0..20 {
         assert_eq!(one.call("/echo", "x".into(), LONG).await.unwrap(), "ok");
