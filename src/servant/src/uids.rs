@@ -28,7 +28,7 @@ pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
         .open(path)
         .map_err(Error::file("open", path))?
         .into();
-    let first = base.next_multiple_of(RANGE) / RANGE;
+    let first = base.div_ceil(RANGE);
     let end = if base < END {
         END / RANGE
     } else {

@@ -4,6 +4,7 @@ use std::os::fd::OwnedFd;
 
 use servant::engine::{ContainerState, Engine, NodeEvent};
 use servant::process::Identity;
+use servant::spec::Mount;
 
 use crate::support::*;
 
@@ -255,6 +256,39 @@ async fn what_cannot_start_says_why_and_leaves_nothing() {
         .to_string();
     assert!(error.contains("exists already"), "{error}");
     world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn a_creation_that_libcontainer_fails_harms_nobody() {
+    let world = World::new();
+    let mut bystander = std::process::Command::new("cat")
+        .stdin(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut spec = spec(vec![]);
+    // No directory can be made there, which libcontainer finds out half-way.
+    spec.mounts = vec![Mount {
+        source: "/usr".into(),
+        target: "/proc/nowhere".into(),
+        writable: false,
+    }];
+    let id = spec.id.clone();
+    let error = world
+        .engine
+        .start(spec)
+        .await
+        .map(|_| ())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("failed to create container"), "{error}");
+    assert!(!world.servant_directory(&id).exists());
+    // Its cleanup kills what it takes for the container's processes.
+    assert!(
+        bystander.try_wait().unwrap().is_none(),
+        "a process of the host was killed"
+    );
+    drop(bystander.stdin.take());
+    bystander.wait().unwrap();
 }
 
 #[tokio::test]

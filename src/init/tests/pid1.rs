@@ -1,0 +1,219 @@
+//! The real init, as the first process of a pid namespace. Needs root.
+
+use std::io::Read;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::process::{Child, Command, Stdio};
+
+use init::socket::{self, MAX_FDS};
+use init::{Reply, Request, Scope, Stage, StartRequest};
+
+const INIT: &str = env!("CARGO_BIN_EXE_cloudroid-init");
+
+struct Init {
+    socket: Option<OwnedFd>,
+    process: Child,
+}
+
+impl Init {
+    fn start() -> Self {
+        let mut pair = [-1; 2];
+        let kind = libc::SOCK_SEQPACKET | libc::SOCK_CLOEXEC;
+        // SAFETY: two places for two descriptors.
+        assert_eq!(
+            unsafe { libc::socketpair(libc::AF_UNIX, kind, 0, pair.as_mut_ptr()) },
+            0
+        );
+        // SAFETY: made just now, owned by nobody else.
+        let [ours, theirs] = pair.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
+        // What never comes must fail, not hang.
+        let patience = libc::timeval {
+            tv_sec: 30,
+            tv_usec: 0,
+        };
+        let length = size_of::<libc::timeval>() as libc::socklen_t;
+        // SAFETY: a live structure of the stated length.
+        let set = unsafe {
+            let value = std::ptr::addr_of!(patience).cast();
+            libc::setsockopt(
+                ours.as_raw_fd(),
+                libc::SOL_SOCKET,
+                libc::SO_RCVTIMEO,
+                value,
+                length,
+            )
+        };
+        assert_eq!(set, 0);
+        let process = Command::new("unshare")
+            .args(["--pid", "--fork", "--kill-child", INIT])
+            .stdin(Stdio::from(theirs))
+            .spawn()
+            .expect("unshare, of util-linux; run this test as root");
+        let init = Self {
+            socket: Some(ours),
+            process,
+        };
+        assert_eq!(init.receive().0, Reply::Ready);
+        init
+    }
+
+    fn fd(&self) -> i32 {
+        self.socket.as_ref().expect("not closed yet").as_raw_fd()
+    }
+
+    fn receive(&self) -> (Reply, Option<OwnedFd>) {
+        let (mut bytes, mut fds) = ([0; 64], [-1; MAX_FDS]);
+        let (length, count) = socket::receive(self.fd(), &mut bytes, &mut fds).expect("an answer");
+        // SAFETY: received just now, owned by nobody else.
+        let fd = (count > 0).then(|| unsafe { OwnedFd::from_raw_fd(fds[0]) });
+        (Reply::decode(&bytes[..length]).expect("one of ours"), fd)
+    }
+
+    /// Asks for a shell script; what it prints can be read from what is returned.
+    fn shell(&self, id: u32, script: &str) -> std::fs::File {
+        self.run(id, &["/bin/sh", "-c", script], "/")
+    }
+
+    fn run(&self, id: u32, argv: &[&str], directory: &str) -> std::fs::File {
+        let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
+        let environment = ["GREETING=hello".to_owned()];
+        let request = StartRequest {
+            id,
+            identity: None,
+            directory,
+            argv: &argv,
+            environment: &environment,
+        };
+        let mut pipe = [-1; 2];
+        // SAFETY: two places for two descriptors.
+        assert_eq!(
+            unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) },
+            0
+        );
+        // SAFETY: made just now, owned by nobody else.
+        let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
+        socket::send(
+            self.fd(),
+            &request.encode().unwrap(),
+            &[write.as_raw_fd(), write.as_raw_fd()],
+        )
+        .unwrap();
+        read.into()
+    }
+
+    fn started(&self, id: u32) -> i32 {
+        match self.receive() {
+            (Reply::Started { id: told, pid }, Some(_pidfd)) if told == id => pid,
+            other => panic!("not started but {other:?}"),
+        }
+    }
+
+    fn exited(&self, pid: i32) -> i32 {
+        match self.receive().0 {
+            Reply::Exited { pid: told, status } if told == pid => status,
+            other => panic!("no end of {pid} but {other:?}"),
+        }
+    }
+}
+
+impl Drop for Init {
+    fn drop(&mut self) {
+        self.socket = None;
+        let _ = self.process.wait();
+    }
+}
+
+#[test]
+fn it_runs_programs_and_tells_how_they_end() {
+    let init = Init::start();
+    let mut printed = init.shell(1, "echo $GREETING $(pwd); cat; exit 3");
+    let pid = init.started(1);
+    assert_eq!(init.exited(pid), 3 << 8);
+    let mut text = String::new();
+    printed.read_to_string(&mut text).unwrap();
+    assert_eq!(text, "hello /\n", "and its standard input was empty");
+}
+
+#[test]
+fn what_cannot_be_executed_is_told_apart_with_its_error() {
+    let init = Init::start();
+    init.run(1, &["/no/such/program"], "/");
+    assert_eq!(
+        init.receive().0,
+        Reply::Failed {
+            id: 1,
+            errno: libc::ENOENT,
+            stage: Stage::Execute
+        }
+    );
+    init.run(2, &["/bin/sh"], "/no/such/directory");
+    assert_eq!(
+        init.receive().0,
+        Reply::Failed {
+            id: 2,
+            errno: libc::ENOENT,
+            stage: Stage::Directory
+        }
+    );
+    socket::send(init.fd(), b"nonsense", &[]).unwrap();
+    init.shell(3, "exit 0");
+    assert_eq!(init.exited(init.started(3)), 0, "nonsense is passed over");
+}
+
+#[test]
+fn programs_begin_with_ordinary_signals_and_a_session_of_their_own() {
+    let init = Init::start();
+    // Our own process ignores SIGPIPE, as every Rust program does.
+    init.shell(1, "kill -PIPE $$; exit 0");
+    let pid = init.started(1);
+    assert_eq!(init.exited(pid), libc::SIGPIPE);
+    init.shell(2, "trap '' INT; sleep 60 & wait");
+    let pid = init.started(2);
+    socket::send(
+        init.fd(),
+        &Request::signal(pid, libc::SIGKILL, Scope::Group),
+        &[],
+    )
+    .unwrap();
+    assert_eq!(init.exited(pid) & 0x7f, libc::SIGKILL);
+    let orphan = init.receive().0;
+    assert!(
+        matches!(
+            orphan,
+            Reply::Exited {
+                status: libc::SIGKILL,
+                ..
+            }
+        ),
+        "its child, in the same group: {orphan:?}"
+    );
+}
+
+#[test]
+fn orphans_are_reaped_and_told() {
+    let init = Init::start();
+    init.shell(1, "(sleep 0.1; exit 7) & exit 0");
+    let pid = init.started(1);
+    assert_eq!(init.exited(pid), 0);
+    assert!(matches!(
+        init.receive().0,
+        Reply::Exited { status: 0x700, .. }
+    ));
+}
+
+#[test]
+fn when_the_socket_closes_everything_ends() {
+    let mut init = Init::start();
+    let mut printed = init.shell(1, "trap '' INT TERM HUP; setsid sleep 600 & sleep 600");
+    init.started(1);
+    init.socket = None;
+    assert!(init.process.wait().unwrap().success());
+    let mut text = String::new();
+    printed.read_to_string(&mut text).unwrap();
+    assert_eq!(text, "", "and nobody holds the other end of the pipe");
+}
+
+#[test]
+fn it_is_pid_1_or_nothing() {
+    let status = Command::new(INIT).stdin(Stdio::null()).status().unwrap();
+    assert_eq!(status.code(), Some(64));
+}
