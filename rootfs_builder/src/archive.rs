@@ -55,14 +55,24 @@ impl Archive {
     }
 
     /// What to install to run with a ROS package, and which development packages hold files of it besides.
-    pub(crate) fn to_run(&self, ros_package: &str) -> Carried {
+    pub(crate) fn to_run(&self, ros_package: &str, depth: Depth) -> Carried {
         let mut carried = Carried::default();
         for (deb, parts) in self.contents.ros_package(ros_package) {
-            let only_cmake = parts.iter().all(|part| *part == Part::CMake);
-            match deb.ends_with("-dev") {
-                true if !only_cmake => carried.unpack.insert(deb),
-                false if !only_cmake => carried.install.insert(deb),
-                _ => false,
+            let wanted = match depth {
+                Depth::Itself { python } => {
+                    let only_python = parts.iter().all(|part| *part == Part::Python);
+                    parts.iter().any(|part| *part != Part::CMake) && (python || !only_python)
+                }
+                Depth::Needed => {
+                    let useful = [Part::Manifest, Part::Programs, Part::Definitions, Part::Share];
+                    useful.iter().any(|part| parts.contains(part)) && !deb.starts_with("python3-")
+                }
+                Depth::Beyond => parts.contains(&Part::Definitions) && !deb.ends_with("-dev"),
+            };
+            match (wanted, deb.ends_with("-dev")) {
+                (true, true) => carried.unpack.insert(deb),
+                (true, false) => carried.install.insert(deb),
+                (false, _) => false,
             };
         }
         carried
@@ -89,6 +99,21 @@ impl Archive {
         }
         (found, missing)
     }
+}
+
+/// How far a ROS package is from what was asked for. The further, the more of it is left to the dependencies that
+/// Debian's maintainers wrote down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Depth {
+    /// Asked for: all of it, its Python module only if wanted.
+    Itself {
+        /// Whether Python code uses it.
+        python: bool,
+    },
+    /// An exec dependency of that: what a launch file, a plugin loader or rospack may look for.
+    Needed,
+    /// Further away: the definitions of messages.
+    Beyond,
 }
 
 /// Debian packages of one ROS package.

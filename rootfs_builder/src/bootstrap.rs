@@ -33,6 +33,8 @@ pub(crate) fn tree_options(base: &Base) -> TreeOptions {
     TreeOptions {
         exclude: base.strip.paths.iter().map(|path| path.trim_start_matches('/').to_owned()).collect(),
         mtime: Mtime::Clamp(EPOCH),
+        // Hundreds of megabytes: four times as fast as the default level, and a fifth larger.
+        level: 1,
         ..TreeOptions::default()
     }
 }

@@ -198,7 +198,7 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
 /// Packs an install space.
 pub(crate) async fn pack(shop: &Workshop, base: &Base, tree: &Path) -> Result<LayerInfo, Error> {
     let store = shop.layers.store().clone();
-    let (tree, options) = (tree.to_owned(), TreeOptions { exclude: Vec::new(), ..tree_options(base) });
+    let (tree, options) = (tree.to_owned(), TreeOptions { exclude: Vec::new(), level: 6, ..tree_options(base) });
     Ok(tokio::task::spawn_blocking(move || store.layer_from_tree(&tree, &options)).await??)
 }
 

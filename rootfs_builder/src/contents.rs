@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -56,7 +56,7 @@ impl Part {
 pub type Carriers = BTreeMap<String, BTreeSet<Part>>;
 
 /// Raise it when the file's format or what is kept changes.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 impl Contents {
     /// Opens the boiled-down file of these lists, made now below `cache` if it is not there. Blocking: a few
@@ -136,30 +136,57 @@ fn sweep(cache: &Path, keep: &Path) {
     }
 }
 
-/// Two passes, all lists at once: which ROS packages there are, then what of theirs is where.
+/// What a line of a list is about, as it is there: names are cut out of the line.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum What<'a> {
+    Library(&'a [u8]),
+    /// If there is a ROS package of this name, it is one of its parts.
+    Ros(&'a [u8], Part),
+}
+
+/// The same, kept.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+enum Kept {
+    Library(Vec<u8>),
+    Ros(Vec<u8>, Part),
+}
+
+/// One pass over all lists at once, one thread each. Which names are ROS packages is known only at the end; what
+/// might be theirs is little once repetitions are left out.
 fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
-    let names: BTreeSet<String> = each(lists, |path, _| {
-        let name = path.strip_prefix("usr/share/")?.strip_suffix("/package.xml")?;
-        (!name.contains('/')).then(|| name.to_owned())
-    })?
-    .into_iter()
-    .collect();
-    let found = each(lists, |path, debs| {
-        let what = classify(path, &names)?;
-        Some((what, debs.to_owned()))
+    let found = std::thread::scope(|scope| {
+        let threads: Vec<_> = lists.iter().map(|list| scope.spawn(move || scan(list))).collect();
+        let mut all = BTreeSet::new();
+        for thread in threads {
+            match thread.join() {
+                Ok(kept) => all.extend(kept?),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        Ok::<_, Error>(all)
     })?;
+    let ros: BTreeSet<&[u8]> = found
+        .iter()
+        .filter_map(|(kept, _)| match kept {
+            Kept::Ros(name, Part::Manifest) => Some(name.as_slice()),
+            _ => None,
+        })
+        .collect();
     let mut lines = BTreeSet::new();
     let mut parts: BTreeMap<(String, String), BTreeSet<Part>> = BTreeMap::new();
-    for (what, debs) in found {
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    for (kept, debs) in &found {
         // `section/name,section/name`
+        let debs = text(debs);
         for deb in debs.split(',').filter_map(|entry| entry.rsplit('/').next()) {
-            match &what {
-                What::Library(name) => {
-                    lines.insert(format!("l{name}\t{deb}"));
+            match kept {
+                Kept::Library(name) => {
+                    lines.insert(format!("l{}\t{deb}", text(name)));
                 }
-                What::Ros(name, part) => {
-                    parts.entry((name.clone(), deb.to_owned())).or_default().insert(*part);
+                Kept::Ros(name, part) if ros.contains(name.as_slice()) => {
+                    parts.entry((text(name), deb.to_owned())).or_default().insert(*part);
                 }
+                Kept::Ros(..) => {}
             }
         }
     }
@@ -170,77 +197,96 @@ fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
     Ok(lines.into_iter().collect())
 }
 
-/// Reads all lists, one thread each, and keeps what `pick` makes of their lines.
-fn each<T: Send>(lists: &[PathBuf], pick: impl Fn(&str, &str) -> Option<T> + Sync) -> Result<Vec<T>, Error> {
-    let pick = &pick;
-    let read = move |list: &Path| -> Result<Vec<T>, Error> {
-        let file = File::open(list).at("reading", list)?;
-        let mut reader = BufReader::with_capacity(1 << 18, MultiGzDecoder::new(file));
-        let mut kept = Vec::new();
-        let mut line = Vec::new();
-        while reader.read_until(b'\n', &mut line).at("reading", list)? > 0 {
-            // Most lines are of no interest; look at the first bytes before anything else.
-            if (line.starts_with(b"usr/") || line.starts_with(b"lib"))
-                && let Ok(text) = std::str::from_utf8(&line)
-                && let Some((path, debs)) = text.trim_end().rsplit_once([' ', '\t'])
-                && let Some(value) = pick(path.trim_end(), debs)
-            {
-                kept.push(value);
-            }
-            line.clear();
+/// Reads one list in large pieces: it has millions of lines, nearly all of no interest.
+fn scan(list: &Path) -> Result<Vec<(Kept, Vec<u8>)>, Error> {
+    let file = File::open(list).at("reading", list)?;
+    let mut reader = MultiGzDecoder::new(BufReader::with_capacity(1 << 18, file));
+    let mut kept: Vec<(Kept, Vec<u8>)> = Vec::new();
+    let mut buffer = vec![0; 1 << 20];
+    let mut filled = 0;
+    loop {
+        let read = reader.read(&mut buffer[filled..]).at("reading", list)?;
+        if read == 0 {
+            break;
         }
-        Ok(kept)
+        filled += read;
+        let mut start = 0;
+        for end in memchr::memchr_iter(b'\n', &buffer[..filled]) {
+            keep(&buffer[start..end], &mut kept);
+            start = end + 1;
+        }
+        buffer.copy_within(start..filled, 0);
+        filled -= start;
+        if filled == buffer.len() {
+            // A line without end is none of ours.
+            filled = 0;
+        }
+    }
+    keep(&buffer[..filled], &mut kept);
+    Ok(kept)
+}
+
+/// Keeps a line if it is of interest and says something that the one before did not.
+fn keep(line: &[u8], kept: &mut Vec<(Kept, Vec<u8>)>) {
+    let Some(what) = classify(line) else { return };
+    let Some(space) = memchr::memrchr2(b' ', b'\t', line) else { return };
+    let debs = &line[space + 1..];
+    let same = kept.last().is_some_and(|(last, of)| {
+        of == debs
+            && match (last, what) {
+                (Kept::Library(name), What::Library(new)) => name == new,
+                (Kept::Ros(name, part), What::Ros(new, new_part)) => *part == new_part && name == new,
+                _ => false,
+            }
+    });
+    if same {
+        return;
+    }
+    let what = match what {
+        What::Library(name) => Kept::Library(name.to_owned()),
+        What::Ros(name, part) => Kept::Ros(name.to_owned(), part),
     };
-    std::thread::scope(|scope| {
-        let threads: Vec<_> = lists.iter().map(|list| scope.spawn(move || read(list))).collect();
-        let mut all = Vec::new();
-        for thread in threads {
-            match thread.join() {
-                Ok(kept) => all.extend(kept?),
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
-        }
-        Ok(all)
-    })
+    kept.push((what, debs.to_owned()));
 }
 
-enum What {
-    Library(String),
-    Ros(String, Part),
+/// Up to the first `/`, and after it.
+fn cut(path: &[u8]) -> Option<(&[u8], &[u8])> {
+    let at = memchr::memchr(b'/', path)?;
+    Some((&path[..at], &path[at + 1..]))
 }
 
-fn classify(path: &str, ros: &BTreeSet<String>) -> Option<What> {
-    if let Some(rest) = path.strip_prefix("usr/share/") {
-        let (name, rest) = rest.split_once('/')?;
-        let part = match rest.split_once('/').map_or(rest, |(first, _)| first) {
-            "package.xml" => Part::Manifest,
-            "msg" | "srv" | "action" => Part::Definitions,
-            "cmake" => Part::CMake,
+fn classify(line: &[u8]) -> Option<What<'_>> {
+    if let Some(rest) = line.strip_prefix(b"usr/share/") {
+        let (name, rest) = cut(rest)?;
+        let part = match cut(rest) {
+            Some((b"msg" | b"srv" | b"action", _)) => Part::Definitions,
+            Some((b"cmake", _)) => Part::CMake,
+            // Below the directory, not in one below it. Behind it come spaces and a section with a slash.
+            _ if rest.starts_with(b"package.xml ") || rest.starts_with(b"package.xml\t") => Part::Manifest,
             _ => Part::Share,
         };
-        return ros.contains(name).then(|| What::Ros(name.to_owned(), part));
+        return Some(What::Ros(name, part));
     }
-    if let Some(rest) = path.strip_prefix("usr/lib/python3/dist-packages/") {
-        let name = rest.split('/').next()?;
-        return ros.contains(name).then(|| What::Ros(name.to_owned(), Part::Python));
+    if let Some(rest) = line.strip_prefix(b"usr/lib/python3/dist-packages/") {
+        return Some(What::Ros(cut(rest)?.0, Part::Python));
     }
-    let rest = path.strip_prefix("usr/lib/").or_else(|| path.strip_prefix("lib/"))?;
-    let (first, inner) = rest.split_once('/').unwrap_or(("", rest));
-    if let Some(below) = inner.strip_prefix("cmake/").filter(|_| first == triplet()) {
-        let name = below.split('/').next()?;
-        return ros.contains(name).then(|| What::Ros(name.to_owned(), Part::CMake));
+    let rest = line.strip_prefix(b"usr/lib/").or_else(|| line.strip_prefix(b"lib/"))?;
+    let end = memchr::memchr2(b' ', b'\t', rest)?;
+    let path = &rest[..end];
+    let own = triplet().as_bytes();
+    let (first, inner) = cut(path).unwrap_or((b"", path));
+    if !first.is_empty() && first != own {
+        return Some(What::Ros(first, Part::Programs));
     }
-    if first.is_empty() || first == triplet() {
-        let name = match inner.split_once('/') {
-            None => inner,
-            // Where alternatives find them.
-            Some(("blas" | "lapack", name)) => name,
-            Some(_) => return None,
-        };
-        let library = name.ends_with(".so") || name.contains(".so.");
-        return (library && !name.contains('/')).then(|| What::Library(name.to_owned()));
-    }
-    ros.contains(first).then(|| What::Ros(first.to_owned(), Part::Programs))
+    let name = match cut(inner) {
+        None => inner,
+        Some((b"cmake", below)) => return Some(What::Ros(cut(below)?.0, Part::CMake)),
+        // Where alternatives find them, and where Debian puts plugins of ROS packages.
+        Some((b"blas" | b"lapack" | b"ros", name)) => name,
+        Some(_) => return None,
+    };
+    let library = name.ends_with(b".so") || memchr::memmem::find(name, b".so.").is_some();
+    (library && !name.contains(&b'/')).then_some(What::Library(name))
 }
 
 /// This machine's directory below `/usr/lib`.

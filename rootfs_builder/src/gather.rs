@@ -7,13 +7,14 @@
 //!
 //! 1. Every Debian package that holds a part of a ROS package is wanted: to be installed, or, if it is a development
 //!    package, to give its files without its dependencies.
-//! 2. Every ROS package that a `package.xml` so found names as an exec dependency is wanted, too.
+//! 2. Every ROS package that a `package.xml` so found names as an exec dependency is wanted, too, the less of it the
+//!    further away it is (see [`Depth`]).
 //! 3. Every library that a plugin list so found names is wanted, too.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::archive::Archive;
+use crate::archive::{Archive, Depth};
 use crate::base::Base;
 use crate::contents::Part;
 use crate::deb::{self, Content, Member};
@@ -32,50 +33,56 @@ pub(crate) struct Wanted {
     pub(crate) warnings: Vec<String>,
 }
 
-/// Walks from `roots` (ROS packages).
+/// Walks from `roots` (ROS packages). `python`: whether the roots' Python modules are wanted.
 pub(crate) async fn gather(
     archive: &Archive,
     base: &Base,
     roots: &BTreeSet<String>,
+    python: bool,
     progress: &Progress,
 ) -> Result<Wanted, Error> {
     let mut wanted = Wanted::default();
     let (mut seen, mut looked_into) = (BTreeSet::new(), BTreeSet::new());
-    let mut queue: VecDeque<String> = roots.iter().cloned().collect();
-    while !queue.is_empty() {
-        // All that is known at this moment in one go: one call of apt, not one for each.
+    let mut next = roots.clone();
+    let mut depth = Depth::Itself { python };
+    while !next.is_empty() {
+        // All of one depth in one go: one call of apt, not one for each.
         let mut round = BTreeSet::new();
-        for name in std::mem::take(&mut queue) {
+        for name in std::mem::take(&mut next) {
             let ignored = base.ros_packages.ignore.contains(&name) && !roots.contains(&name);
             if ignored || !seen.insert(name.clone()) {
                 continue;
             }
-            let carried = archive.to_run(&name);
-            wanted.install.extend(carried.install.iter().cloned());
-            let tells = archive.contents.ros_package(&name).into_iter();
-            let tells = tells.filter(|(_, parts)| parts.contains(&Part::Manifest) || parts.contains(&Part::Share));
-            round.extend(tells.map(|(deb, _)| deb));
-            round.extend(carried.unpack);
+            let carried = archive.to_run(&name, depth);
+            wanted.install.extend(carried.install);
+            if depth != Depth::Beyond {
+                let tells = archive.contents.ros_package(&name).into_iter();
+                let tells = tells
+                    .filter(|(_, parts)| parts.contains(&Part::Manifest) || parts.contains(&Part::Share));
+                round.extend(tells.map(|(deb, _)| deb));
+                round.extend(carried.unpack);
+            }
         }
         round.retain(|deb| looked_into.insert(deb.clone()));
-        if round.is_empty() {
-            continue;
-        }
         let debs = archive.apt.candidates(&round).await?;
         let files = archive.apt.download(&debs, progress).await?;
         for (deb, file) in debs.iter().zip(files) {
-            let development = deb.name.ends_with("-dev");
-            let members = tokio::task::spawn_blocking(move || deb::members(&file, deb::wanted_of_development)).await??;
+            let members =
+                tokio::task::spawn_blocking(move || deb::members(&file, deb::wanted_of_development)).await??;
             let told = tell(&members, base);
-            queue.extend(told.ros_packages);
+            next.extend(told.ros_packages);
             wanted.warnings.extend(told.warnings);
             for library in told.plugins {
                 want_plugin(archive, &library, &members, &mut wanted);
             }
-            if development {
+            if deb.name.ends_with("-dev") {
                 wanted.extras.extend(members);
             }
         }
+        depth = match depth {
+            Depth::Itself { .. } => Depth::Needed,
+            Depth::Needed | Depth::Beyond => Depth::Beyond,
+        };
     }
     wanted.extras.sort_by(|a, b| a.path.cmp(&b.path));
     wanted.extras.dedup_by(|later, first| later.path == first.path);

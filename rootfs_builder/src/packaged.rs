@@ -29,7 +29,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     }
     roots.extend(packages.iter().cloned());
     build.progress.step(&format!("looking up what {name} needs")).await;
-    let wanted = wanted(build, &roots).await?;
+    let wanted = wanted(build, &roots, true).await?;
     debs.extend(wanted.install);
     debs.extend(build.request.map.values().flat_map(|debs| debs.split([',', ' '])).map(str::to_owned));
     debs.remove("");
@@ -47,19 +47,24 @@ struct Note {
 }
 
 /// Gathers from these ROS packages.
-pub(crate) async fn wanted(build: &Build<'_>, roots: &BTreeSet<String>) -> Result<Wanted, Error> {
+pub(crate) async fn wanted(
+    build: &Build<'_>,
+    roots: &BTreeSet<String>,
+    python: bool,
+) -> Result<Wanted, Error> {
     if roots.is_empty() {
         return Ok(Wanted::default());
     }
     let key = Key::new("gathered")
         .with("archive", &build.archive.stamp)
         .with_all("ignore", &build.base.ros_packages.ignore)
+        .with("python", [u8::from(python)])
         .with_all("root", roots)
         .finish();
     let note: Note = match build.shop.layers.note(&key) {
         Some(note) => note,
         None => {
-            let found = gather::gather(&build.archive, &build.base, roots, build.progress).await?;
+            let found = gather::gather(&build.archive, &build.base, roots, python, build.progress).await?;
             let note = Note { install: found.install, extras: found.extras, warnings: found.warnings };
             build.shop.layers.keep_note(&key, &note)?;
             note

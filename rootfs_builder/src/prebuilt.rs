@@ -31,9 +31,10 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
     // Compiled already: what it was compiled with is of no interest.
     let asked = Asked { build: BTreeMap::new(), ..asked };
     let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
+    let python = pushed::has_python(&space.root);
     let package = packed(build, &space, &prefix).await?;
     let needed = source::needed_by(build, package.layer.as_ref()).await?;
-    let dependencies = source::dependencies(build, &resolved, &needed).await?;
+    let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
     Ok(Parts {
         packages,
         version: pushed::version(&space.packages),

@@ -137,13 +137,15 @@ async fn look(
     let eager = inputs(&watch.borrow_and_update(), &options.own_name);
     // Subscribing may wake inputs, and those may make the node publish more.
     let mut subscriptions: BTreeMap<String, Subscription> = BTreeMap::new();
+    let mut tried = BTreeSet::new();
     loop {
         let graph = watch.borrow_and_update().clone();
-        let new: Vec<String> =
-            outputs(&graph, &options.own_name).into_iter().filter(|topic| !subscriptions.contains_key(topic)).collect();
-        if new.is_empty() && !subscriptions.is_empty() {
+        let mut new = outputs(&graph, &options.own_name);
+        new.retain(|topic| tried.insert(topic.clone()));
+        if new.is_empty() {
             break;
         }
+        let asked = Instant::now();
         for topic in &new {
             match bus.subscribe(topic, SubscribeOptions { wire_type: None, queue: 1 }).await {
                 Ok(subscription) => {
@@ -152,10 +154,13 @@ async fn look(
                 Err(error) => warnings.push(format!("{topic} cannot be subscribed to: {error}")),
             }
         }
-        still(&mut watch, options).await?;
-        if new.iter().all(|topic| !subscriptions.contains_key(topic)) {
-            break;
+        // A publisher that answers this has been connected to; what it then does takes about as long as it took to
+        // answer. On a busy machine that is more than usual.
+        for topic in &new {
+            let _ = bus.topic_type(topic).await;
         }
+        let settle = (asked.elapsed() * 2).clamp(options.settle, options.restless);
+        still(&mut watch, &ProbeOptions { settle, ..options.clone() }).await?;
     }
     let graph = watch.borrow_and_update().clone();
     let latched = subscriptions.iter_mut().filter_map(|(topic, subscription)| {

@@ -1,6 +1,8 @@
 //! What was pushed, as far as a build asks.
 
 use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use package::condition::Variables;
@@ -75,6 +77,31 @@ pub(crate) fn version(packages: &[Package]) -> String {
     package.map_or_else(String::new, |package| package.manifest.version.clone())
 }
 
+/// Whether anything in a tree is Python that runs: not what only builds (`setup.py`, dynamic_reconfigure's `.cfg`), nor
+/// the modules that catkin generates for messages.
+pub(crate) fn has_python(root: &Path) -> bool {
+    let generated = |path: &Path| {
+        let parent = path.parent().and_then(Path::file_name).unwrap_or_default();
+        let setup = path.file_name().is_some_and(|name| name == "setup.py" || name == "_setup_util.py");
+        setup || ["msg", "srv", "cfg", "test", "tests"].iter().any(|name| parent == *name)
+    };
+    let runs = |path: &Path| {
+        let extension = path.extension().unwrap_or_default();
+        if extension == "py" {
+            return std::fs::metadata(path).is_ok_and(|about| about.len() > 0);
+        }
+        let mut start = [0; 64];
+        let read = File::open(path).and_then(|mut file| file.read(&mut start)).unwrap_or(0);
+        let first = start[..read].split(|byte| *byte == b'\n').next().unwrap_or_default();
+        extension != "cfg" && first.starts_with(b"#!") && first.windows(6).any(|word| word == b"python")
+    };
+    walkdir::WalkDir::new(root)
+        .into_iter()
+        .flatten()
+        .filter(|entry| entry.file_type().is_file() && !generated(entry.path()))
+        .any(|entry| runs(entry.path()))
+}
+
 /// Where definitions are looked for, the package's own first.
 pub(crate) fn shares(prefix: Option<&Path>) -> Vec<String> {
     let own = prefix.map(|prefix| prefix.join("share"));
@@ -139,6 +166,24 @@ mod tests {
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
         let error = inspect(root.path(), &base).expect_err("ROS 2").to_string();
         assert!(error.contains("build type ament_cmake"), "{error}");
+    }
+
+    #[test]
+    fn python_that_runs_is_told_from_python_that_builds() {
+        let root = tempfile::tempdir().expect("a directory");
+        let write = |path: &str, text: &str| {
+            let path = root.path().join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, text).expect("written");
+        };
+        write("setup.py", "from distutils import setup");
+        write("cfg/X.cfg", "#!/usr/bin/env python\n");
+        write("lib/python3/dist-packages/x/__init__.py", "");
+        write("lib/python3/dist-packages/x/msg/_Y.py", "class Y: pass");
+        write("src/x.cpp", "int main() {}");
+        assert!(!has_python(root.path()));
+        write("scripts/node", "#!/usr/bin/env python3\n");
+        assert!(has_python(root.path()));
     }
 
     #[test]

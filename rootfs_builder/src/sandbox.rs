@@ -75,11 +75,13 @@ impl Finished {
 }
 
 impl Site {
-    /// Makes the directory, which must not exist yet: below `root`, named `id`.
+    /// Makes the directory below `root`, named `id`. The caller may have put the pushed tree there already; it
+    /// goes with all the rest.
     pub(crate) fn new(root: &Path, id: &str, engine: Arc<dyn Engine>) -> Result<Self, Error> {
         let directory = root.join(id);
-        fs::create_dir_all(root).at("making", root)?;
-        fs::create_dir(&directory).at("making", &directory)?;
+        fs::create_dir_all(&directory).at("making", &directory)?;
+        // What others may read in it is nobody's business out here.
+        crate::install::set_mode(&directory, 0o700)?;
         Ok(Self { id: id.to_owned(), directory, engine, running: Arc::default() })
     }
 

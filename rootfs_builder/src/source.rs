@@ -37,7 +37,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
         .collect();
     let package = compiled(build, &workspace.root, &units, &resolved).await?;
     let needed = needed_by(build, package.layer.as_ref()).await?;
-    let dependencies = dependencies(build, &resolved, &needed).await?;
+    let dependencies = dependencies(build, &resolved, &needed, pushed::has_python(&workspace.root)).await?;
     Ok(Parts {
         packages: pushed::by_importance(&workspace.packages),
         version: pushed::version(&workspace.packages),
@@ -97,11 +97,12 @@ pub(crate) async fn dependencies(
     build: &Build<'_>,
     resolved: &Resolved,
     libraries: &BTreeSet<String>,
+    python: bool,
 ) -> Result<Made, Error> {
     let below = build.on_base();
     let (mut roots, mut debs) = build.extra_packages()?;
     roots.extend(resolved.run_ros.iter().cloned());
-    let wanted = packaged::wanted(build, &roots).await?;
+    let wanted = packaged::wanted(build, &roots, python).await?;
     debs.extend(wanted.install);
     debs.extend(resolved.run.iter().cloned());
     let (found, missing) = build.archive.libraries(libraries);

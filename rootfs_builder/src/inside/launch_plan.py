@@ -25,19 +25,31 @@ class Refused(Exception):
 
 def source_setup(prefix):
     """The environment that the install space's own setup.sh makes, as far as it differs."""
-    if not prefix or not os.path.exists(os.path.join(prefix, "setup.sh")):
+    if not prefix:
         return {}
-    script = '. "$0/setup.sh" >&2 && exec env -0'
-    result = subprocess.run(["/bin/sh", "-c", script, prefix], stdout=subprocess.PIPE, check=False)
-    if result.returncode != 0:
-        raise Refused("setup", file=os.path.join(prefix, "setup.sh"), status=result.returncode)
-    found = {}
-    for item in result.stdout.decode("utf-8", "replace").split("\0"):
-        name, equals, value = item.partition("=")
-        if equals and name not in ("PWD", "OLDPWD", "SHLVL", "_") and os.environ.get(name) != value:
-            found[name] = value
-    os.environ.update(found)
-    return found
+    before = dict(os.environ)
+    if os.path.exists(os.path.join(prefix, "setup.sh")):
+        script = '. "$0/setup.sh" >&2 && exec env -0'
+        result = subprocess.run(["/bin/sh", "-c", script, prefix], stdout=subprocess.PIPE, check=False)
+        if result.returncode != 0:
+            raise Refused("setup", file=os.path.join(prefix, "setup.sh"), status=result.returncode)
+        for item in result.stdout.decode("utf-8", "replace").split("\0"):
+            name, equals, value = item.partition("=")
+            if equals and name not in ("PWD", "OLDPWD", "SHLVL", "_"):
+                os.environ[name] = value
+    # What a hook of roslib adds where it is installed beside the others, and what a space without setup.sh needs.
+    for name, directory in (
+        ("CMAKE_PREFIX_PATH", ""),
+        ("ROS_PACKAGE_PATH", "share"),
+        ("PYTHONPATH", "lib/python3/dist-packages"),
+        ("LD_LIBRARY_PATH", "lib"),
+        ("PATH", "bin"),
+    ):
+        path = os.path.join(prefix, directory).rstrip("/")
+        known = [p for p in os.environ.get(name, "").split(":") if p]
+        if os.path.isdir(path) and path not in known:
+            os.environ[name] = ":".join([path] + known)
+    return {name: value for name, value in os.environ.items() if before.get(name) != value}
 
 
 def is_executable(path):

@@ -178,10 +178,7 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
     for (name, uses) in &graph.parameters {
         let others = |nodes: &[String]| -> Vec<String> { nodes.iter().filter(|node| *node != own).cloned().collect() };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
-        let plumbing = matches!(name.as_str(), "/run_id" | "/rosdistro" | "/rosversion" | "/use_sim_time")
-            || name.starts_with("/roslaunch")
-            || name == "/tcp_keepalive"
-            || name == "/enable_statistics";
+        let plumbing = is_plumbing(name);
         if plumbing || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
@@ -189,6 +186,20 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
         parameters.push(Parameter { name: name.clone(), value, read_by, written_by });
     }
     parameters
+}
+
+/// What every roscpp or rospy node asks for.
+fn is_plumbing(name: &str) -> bool {
+    const NAMES: [&str; 7] = [
+        "/run_id",
+        "/rosdistro",
+        "/rosversion",
+        "/use_sim_time",
+        "/tcp_keepalive",
+        "/enable_statistics",
+        "/rosout_disable_topics_generation",
+    ];
+    NAMES.contains(&name) || ["/roslaunch/", "/statistics_window_"].iter().any(|start| name.starts_with(start))
 }
 
 fn json(value: &ParamValue) -> serde_json::Value {
