@@ -23,7 +23,7 @@ use crate::launch::{self, Ask, LaunchPlan};
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest, Source};
 use crate::sandbox::Site;
 use crate::workshop::{Turns, Workshop};
-use crate::{packaged, prebuilt, pushed, source, sources};
+use crate::{keys, packaged, prebuilt, pushed, source, sources};
 
 /// The base taken when none is named.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -110,6 +110,15 @@ impl Builder {
             Source::Packaged(name) => What::Packaged(name),
         };
         let archive = self.archive(&shop, &base, progress).await?;
+        if let What::Tree(pushed) = &what {
+            // What nothing provides is said now, not after minutes of preparations.
+            let own = pushed::names(pushed.packages());
+            let mut asked = pushed::asked(pushed.packages());
+            if matches!(pushed, Pushed::Installed(_)) {
+                asked.build.clear();
+            }
+            keys::resolve(&archive, &base, &request.map, &own, &asked)?;
+        }
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let build = Build { shop, base, archive, base_layer, request, progress, log };
