@@ -14,14 +14,14 @@ use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::process::{Command, ExitCode};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use ros::bus::ParamValue;
 use ros::net::{LoopbackSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
-use rootfs_builder::probe::{ProbeOptions, probe};
+use rootfs_builder::probe::{ProbeOptions, Work, probe};
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, Config, PushRequest, Source, Sources};
 use servant::engine::{Engine, Servant};
 use servant::local::{LocalEngine, LocalEngineConfig};
@@ -246,7 +246,7 @@ async fn look(
             println!("        {}: {}", line.node, line.line);
         }
     });
-    let found = watch(outcome, &*servant).await;
+    let found = watch(outcome, &servant).await;
     servant.stop().await?;
     printer.await?;
     let found = found?;
@@ -272,7 +272,7 @@ async fn look(
     Ok(())
 }
 
-async fn watch(outcome: &BuildOutcome, servant: &dyn Servant) -> Result<rootfs_builder::probe::Found, Failure> {
+async fn watch(outcome: &BuildOutcome, servant: &Arc<dyn Servant>) -> Result<rootfs_builder::probe::Found, Failure> {
     let bus = Ros1Bus::connect(Arc::new(Inside(servant.endpoint().netns)), MASTER.parse()?, OWN_NAME).await?;
     let registry = Registry::from_definitions(&outcome.definitions)?;
     let names = outcome.plan.nodes.iter().map(|node| node.name.clone()).collect();
@@ -283,5 +283,11 @@ async fn watch(outcome: &BuildOutcome, servant: &dyn Servant) -> Result<rootfs_b
         let ((name, exit), ..) = futures_util::future::select_all(ends).await;
         format!("node {name} ended: {exit:?}")
     };
-    Ok(probe(&*bus, &registry, &outcome.definitions, &ProbeOptions::new(names, OWN_NAME), exited).await?)
+    let asked = servant.clone();
+    let work = Work::new(move || {
+        let servant = asked.clone();
+        async move { servant.usage().await.ok().map(|usage| Duration::from_micros(usage.cpu_usec)) }
+    });
+    let options = ProbeOptions { work: Some(work), ..ProbeOptions::new(names, OWN_NAME) };
+    Ok(probe(&*bus, &registry, &outcome.definitions, &options, exited).await?)
 }

@@ -17,6 +17,7 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::future::BoxFuture;
 use package::interface::Interface;
 use ros::bus::{Bus, Graph, SubscribeOptions, Subscription};
 use ros::schema::Registry;
@@ -82,6 +83,29 @@ pub struct ProbeOptions {
     pub settle: Duration,
     /// At most so long for it to become still, each time.
     pub restless: Duration,
+    /// Tells how much the nodes have worked: those that work have not settled (they load models, say). None: not
+    /// known.
+    pub work: Option<Work>,
+}
+
+/// Asks for the CPU time that the nodes have used so far; none where it cannot be told.
+#[derive(Clone)]
+pub struct Work(Arc<dyn Fn() -> BoxFuture<'static, Option<Duration>> + Send + Sync>);
+
+impl Work {
+    /// Asked several times a second at most.
+    pub fn new<F>(ask: impl Fn() -> F + Send + Sync + 'static) -> Self
+    where
+        F: Future<Output = Option<Duration>> + Send + 'static,
+    {
+        Self(Arc::new(move || Box::pin(ask())))
+    }
+}
+
+impl std::fmt::Debug for Work {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Work")
+    }
 }
 
 impl ProbeOptions {
@@ -93,6 +117,14 @@ impl ProbeOptions {
             patience: Duration::from_secs(60),
             settle: Duration::from_millis(700),
             restless: Duration::from_secs(15),
+            work: None,
+        }
+    }
+
+    async fn worked(&self) -> Option<Duration> {
+        match &self.work {
+            Some(work) => (work.0)().await,
+            None => None,
         }
     }
 }
@@ -196,22 +228,60 @@ async fn registered(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOpti
 }
 
 /// Waits until nothing changes any more; false when it did not come to rest in time.
+///
+/// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to.
 async fn still(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOptions) -> Result<bool, ProbeError> {
-    let limit = Instant::now() + options.restless;
+    let begun = Instant::now();
+    let limit = begun + options.restless;
+    // Some nodes work all the time; that alone is not worth the whole wait.
+    let working_limit = begun + options.restless / 3;
     let mut shape = shape(&watch.borrow_and_update());
-    let mut until = Instant::now() + options.settle;
+    let mut since = Instant::now();
+    let mut worked = options.worked().await;
     loop {
-        match timeout_at(until.min(limit), changed(watch)).await {
-            Err(_) => return Ok(until <= limit),
-            Ok(result) => result?,
+        match timeout_at((since + options.settle).min(limit), changed(watch)).await {
+            Ok(result) => {
+                result?;
+                // Parameters that a node reads again and again change the graph's generation and nothing here.
+                let now = self::shape(&watch.borrow_and_update());
+                if now == shape {
+                    continue;
+                }
+                shape = now;
+            }
+            Err(_) => {
+                let now = Instant::now();
+                let work = options.worked().await;
+                let busy = match (worked, work) {
+                    (Some(before), Some(after)) => after.saturating_sub(before) * 3 > now - since,
+                    _ => false,
+                };
+                worked = work;
+                let bare = shows_nothing(&watch.borrow(), options);
+                if now >= limit {
+                    return Ok(bare || !busy);
+                }
+                if !bare && (!busy || now >= working_limit) {
+                    return Ok(true);
+                }
+            }
         }
-        // Parameters that a node reads again and again change the graph's generation and nothing here.
-        let now = self::shape(&watch.borrow_and_update());
-        if now != shape {
-            shape = now;
-            until = Instant::now() + options.settle;
-        }
+        since = Instant::now();
     }
+}
+
+/// Whether some node that must be there has registered nothing but what every node has.
+fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
+    const SERVICES: [&str; 5] = ["get_loggers", "set_logger_level", "load_nodelet", "unload_nodelet", "list"];
+    options.nodes.iter().any(|node| {
+        let topics = graph.topics.iter().any(|(name, topic)| {
+            !is_plumbing(name) && (topic.publishers.contains(node) || topic.subscribers.contains(node))
+        });
+        let services = graph.services.iter().any(|(name, server)| {
+            server == node && !name.rsplit('/').next().is_some_and(|last| SERVICES.contains(&last))
+        });
+        !topics && !services
+    })
 }
 
 type Shape = (BTreeMap<String, ros::bus::TopicNodes>, BTreeMap<String, String>, BTreeSet<String>, usize);

@@ -124,6 +124,57 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
 }
 
 #[tokio::test]
+async fn a_node_that_still_works_is_waited_for() {
+    let lab = Lab::new().await;
+    let _first = lab.advertises("/first", lab.wire("std_msgs/String"), false).await;
+    let bus = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker").await.expect("joined");
+    // Asked a third time it is done, and only then shows its last topic.
+    let (node, wire) = (lab.node.clone(), lab.wire("std_msgs/String"));
+    let asked = Arc::new(std::sync::atomic::AtomicU32::new(0));
+    let late = Arc::new(tokio::sync::Mutex::new(None));
+    let kept = late.clone();
+    let work = Work::new(move || {
+        let (node, wire_type, late) = (node.clone(), wire.clone(), late.clone());
+        let times = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        async move {
+            if times == 2 {
+                let options = AdvertiseOptions { wire_type, latch: false, queue: 1 };
+                *late.lock().await = Some(node.advertise("/last", options).await.expect("advertised"));
+            }
+            Some(Duration::from_secs(times.min(2).into()))
+        }
+    });
+    let options = ProbeOptions {
+        settle: Duration::from_millis(100),
+        work: Some(work),
+        ..ProbeOptions::new(vec!["/package".into()], "/looker")
+    };
+    let found = probe(&*bus, &lab.registry, &lab.definitions, &options, std::future::pending()).await.expect("found");
+    let names: Vec<_> = found.interface.topics.iter().map(|topic| topic.name.as_str()).collect();
+    assert_eq!(names, ["/first", "/last"]);
+    bus.close().await;
+    drop(kept);
+    lab.ends().await;
+}
+
+#[tokio::test]
+async fn a_node_that_shows_nothing_yet_is_waited_for() {
+    let lab = Lab::new().await;
+    let (node, wire_type) = (lab.node.clone(), lab.wire("std_msgs/String"));
+    let rosout = lab.advertises("/rosout", wire_type.clone(), false).await;
+    let mut listeners = rosout.subscribers();
+    let showing = tokio::spawn(async move {
+        // Long after the graph was still for a while.
+        let _ = tokio::time::timeout(Duration::from_millis(600), listeners.wait_for(|count| *count > 0)).await;
+        node.advertise("/late", AdvertiseOptions { wire_type, latch: false, queue: 1 }).await.expect("advertised")
+    });
+    let found = lab.probed(&["/package"], std::future::pending()).await.expect("found");
+    assert_eq!(found.interface.topics[0].name, "/late");
+    drop(showing.await);
+    lab.ends().await;
+}
+
+#[tokio::test]
 async fn five_topics_are_an_action() {
     let lab = Lab::new().await;
     let turn = lab.registry.action("lab/Turn").expect("defined");
