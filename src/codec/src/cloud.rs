@@ -34,7 +34,8 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
     let points: &[u8] = if row == layout.row_step {
         data
     } else {
-        data.chunks_exact(layout.row_step).for_each(|line| packed.extend_from_slice(&line[..row]));
+        data.chunks_exact(layout.row_step)
+            .for_each(|line| packed.extend_from_slice(&line[..row]));
         &packed
     };
     for offset in gaps(layout) {
@@ -55,14 +56,18 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
                 column::encode_words(&words(points, layout, field.offset), shape, out);
             }
             (_, Number::Short) => {
-                let at = |point: &[u8]| u16::from_le_bytes([point[field.offset], point[field.offset + 1]]);
+                let at = |point: &[u8]| {
+                    u16::from_le_bytes([point[field.offset], point[field.offset + 1]])
+                };
                 let samples: Vec<u16> = points.chunks_exact(layout.point_step).map(at).collect();
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
             (_, Number::Byte) => {
-                let samples: Vec<u16> =
-                    points.chunks_exact(layout.point_step).map(|point| point[field.offset].into()).collect();
+                let samples: Vec<u16> = points
+                    .chunks_exact(layout.point_step)
+                    .map(|point| point[field.offset].into())
+                    .collect();
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
@@ -88,7 +93,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
     out.resize(first + layout.row_step * layout.height, 0);
     let row = layout.width * layout.point_step;
     take_padding(input, &mut out[first..], row, layout.row_step)?;
-    let mut points = Points { data: &mut out[first..], layout: &layout };
+    let mut points = Points {
+        data: &mut out[first..],
+        layout: &layout,
+    };
     for offset in gaps(&layout) {
         take_gap(input, &mut points, offset)?;
     }
@@ -109,7 +117,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
             }
             (_, Number::Short) => {
                 let samples = take_shorts(input, shape)?;
-                points.put(field.offset, samples.iter().map(|sample| sample.to_le_bytes()));
+                points.put(
+                    field.offset,
+                    samples.iter().map(|sample| sample.to_le_bytes()),
+                );
                 known.add_ring(field, samples);
             }
             (_, Number::Byte) => {
@@ -121,7 +132,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
                 for offset in [0, 4] {
                     numbers(input)?;
                     let samples = column::decode_words(input, shape)?;
-                    points.put(field.offset + offset, samples.into_iter().map(u32::to_le_bytes));
+                    points.put(
+                        field.offset + offset,
+                        samples.into_iter().map(u32::to_le_bytes),
+                    );
                 }
             }
         }
@@ -131,12 +145,19 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
 }
 
 fn numbers(input: &mut Cursor<'_>) -> Result<(), Error> {
-    if input.byte()? == NUMBERS { Ok(()) } else { Err(Error::Corrupt("a column told in an unknown way")) }
+    if input.byte()? == NUMBERS {
+        Ok(())
+    } else {
+        Err(Error::Corrupt("a column told in an unknown way"))
+    }
 }
 
 fn shape(layout: &Cloud) -> Shape {
     if layout.height > 1 {
-        Shape::Picture { width: layout.width, height: layout.height }
+        Shape::Picture {
+            width: layout.width,
+            height: layout.height,
+        }
     } else {
         Shape::Sequence(layout.width)
     }
@@ -164,7 +185,9 @@ fn gaps(layout: &Cloud) -> Vec<usize> {
     for field in &layout.fields {
         free[field.offset..field.offset + field.number.bytes()].fill(false);
     }
-    (0..layout.point_step).filter(|&offset| free[offset]).collect()
+    (0..layout.point_step)
+        .filter(|&offset| free[offset])
+        .collect()
 }
 
 fn words(points: &[u8], layout: &Cloud, offset: usize) -> Vec<u32> {
@@ -187,7 +210,10 @@ impl Points<'_> {
     fn put<const N: usize>(&mut self, offset: usize, mut samples: impl Iterator<Item = [u8; N]>) {
         let row = self.layout.width * self.layout.point_step;
         for line in self.data.chunks_exact_mut(self.layout.row_step) {
-            for (point, sample) in line[..row].chunks_exact_mut(self.layout.point_step).zip(&mut samples) {
+            for (point, sample) in line[..row]
+                .chunks_exact_mut(self.layout.point_step)
+                .zip(&mut samples)
+            {
                 point[offset..offset + N].copy_from_slice(&sample);
             }
         }
@@ -196,13 +222,22 @@ impl Points<'_> {
 
 /// One byte of every point that no field describes: mostly the same.
 fn put_gap(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) {
-    let mut bytes = points.iter().skip(offset).step_by(layout.point_step).copied();
+    let mut bytes = points
+        .iter()
+        .skip(offset)
+        .step_by(layout.point_step)
+        .copied();
     let first = bytes.clone().next().unwrap_or(0);
     if bytes.all(|byte| byte == first) {
         out.extend_from_slice(&[0, first]);
     } else {
         out.push(1);
-        let bytes: Vec<u8> = points.iter().skip(offset).step_by(layout.point_step).copied().collect();
+        let bytes: Vec<u8> = points
+            .iter()
+            .skip(offset)
+            .step_by(layout.point_step)
+            .copied()
+            .collect();
         put_packed(&bytes, out);
     }
 }
@@ -232,7 +267,12 @@ fn put_colours(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) 
         let (x, y) = (index % layout.width, index / layout.width);
         let colour = &point[offset..offset + 4];
         let green = colour[1];
-        let planes = [colour[0].wrapping_sub(green), green, colour[2].wrapping_sub(green), colour[3]];
+        let planes = [
+            colour[0].wrapping_sub(green),
+            green,
+            colour[2].wrapping_sub(green),
+            colour[3],
+        ];
         for (plane, value) in planes.into_iter().enumerate() {
             lanes.row_mut(plane, y)[x] = value;
         }
@@ -248,7 +288,11 @@ fn colour_lanes(layout: &Cloud) -> Lanes<u8> {
     }
 }
 
-fn take_colours(input: &mut Cursor<'_>, points: &mut Points<'_>, offset: usize) -> Result<(), Error> {
+fn take_colours(
+    input: &mut Cursor<'_>,
+    points: &mut Points<'_>,
+    offset: usize,
+) -> Result<(), Error> {
     let mut lanes = colour_lanes(points.layout);
     plane8::decode(input, &mut lanes, 4)?;
     let (width, height) = (points.layout.width, points.layout.height);
@@ -259,7 +303,12 @@ fn take_colours(input: &mut Cursor<'_>, points: &mut Points<'_>, offset: usize) 
             let rows: [&[u8]; 4] = std::array::from_fn(|plane| lanes.row(plane, y));
             (0..width).map(move |x| {
                 let green = rows[1][x];
-                [rows[0][x].wrapping_add(green), green, rows[2][x].wrapping_add(green), rows[3][x]]
+                [
+                    rows[0][x].wrapping_add(green),
+                    green,
+                    rows[2][x].wrapping_add(green),
+                    rows[3][x],
+                ]
             })
         }),
     );
@@ -276,7 +325,11 @@ fn successors(samples: &[u16]) -> Option<Vec<u32>> {
             let guess = std::mem::replace(&mut next[usize::from(last)], sample);
             last = sample;
             hits += usize::from(guess == sample);
-            if guess == sample { 0 } else { u32::from(sample) + 1 }
+            if guess == sample {
+                0
+            } else {
+                u32::from(sample) + 1
+            }
         })
         .collect();
     (hits * 8 > samples.len() * 7).then_some(differences)

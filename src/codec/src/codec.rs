@@ -72,7 +72,10 @@ impl Codec {
 
     /// What a frame's tag means; levels are not on the wire and come back as the usual ones.
     pub fn of_tag(tag: u8) -> Option<Self> {
-        CODECS.iter().find(|&&(known, ..)| known == tag).map(|&(.., codec)| codec)
+        CODECS
+            .iter()
+            .find(|&&(known, ..)| known == tag)
+            .map(|&(.., codec)| codec)
     }
 
     /// The lossless codec made for messages of `schema`; zstd where there is none.
@@ -95,7 +98,9 @@ impl Codec {
 impl fmt::Display for Codec {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Zlib(level) | Self::Deflate(level) => write!(formatter, "{}:{level}", self.name()),
+            Self::Zlib(level) | Self::Deflate(level) => {
+                write!(formatter, "{}:{level}", self.name())
+            }
             Self::Zstd(level) => write!(formatter, "{}:{level}", self.name()),
             _ => formatter.write_str(self.name()),
         }
@@ -104,7 +109,9 @@ impl fmt::Display for Codec {
 
 /// A codec's name that names none.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud or video")]
+#[error(
+    "`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud or video"
+)]
 pub struct UnknownCodec(pub String);
 
 impl FromStr for Codec {
@@ -116,7 +123,11 @@ impl FromStr for Codec {
             Some((name, level)) => (name, Some(level.parse::<i8>().map_err(|_| unknown())?)),
             None => (text, None),
         };
-        let named = CODECS.iter().find(|&&(_, known, _)| known == name).ok_or_else(unknown)?.2;
+        let named = CODECS
+            .iter()
+            .find(|&&(_, known, _)| known == name)
+            .ok_or_else(unknown)?
+            .2;
         let Some(level) = level else { return Ok(named) };
         match named {
             Self::Zlib(_) if (0..=9).contains(&level) => Ok(Self::Zlib(level as u8)),
@@ -133,13 +144,26 @@ mod tests {
 
     #[test]
     fn names_and_tags_come_back() {
-        for name in ["raw", "zlib:9", "deflate:0", "zstd:-7", "zstd:22", "image", "grid", "scan", "cloud", "video"] {
+        for name in [
+            "raw",
+            "zlib:9",
+            "deflate:0",
+            "zstd:-7",
+            "zstd:22",
+            "image",
+            "grid",
+            "scan",
+            "cloud",
+            "video",
+        ] {
             let codec: Codec = name.parse().unwrap();
             assert_eq!(codec.to_string(), name);
             assert_eq!(Codec::of_tag(codec.tag()).unwrap().name(), codec.name());
         }
         assert_eq!("zlib".parse(), Ok(Codec::Zlib(6)));
-        for name in ["", "gzip", "zlib:10", "zlib:-1", "zstd:23", "image:1", "zstd:x"] {
+        for name in [
+            "", "gzip", "zlib:10", "zlib:-1", "zstd:23", "image:1", "zstd:x",
+        ] {
             assert_eq!(name.parse::<Codec>(), Err(UnknownCodec(name.to_owned())));
         }
         assert_eq!(Codec::of_tag(0xff), None);

@@ -50,9 +50,14 @@ impl Shape {
 
     fn kinds(self) -> &'static [Kind] {
         match self {
-            Self::Picture { .. } => {
-                &[Kind::West, Kind::North, Kind::Slope, Kind::Plane, Kind::Median, Kind::Middle]
-            }
+            Self::Picture { .. } => &[
+                Kind::West,
+                Kind::North,
+                Kind::Slope,
+                Kind::Plane,
+                Kind::Median,
+                Kind::Middle,
+            ],
             Self::Sequence(_) => &[Kind::West, Kind::North, Kind::Line],
         }
     }
@@ -72,13 +77,21 @@ fn fill<T: Copy + Default>(lanes: &mut Lanes<T>, mut samples: impl Iterator<Item
 /// The order of floats as an order of integers.
 #[inline]
 pub(crate) fn ordered(bits: u32) -> u32 {
-    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
+    if bits >> 31 == 0 {
+        bits | 1 << 31
+    } else {
+        !bits
+    }
 }
 
 /// The inverse of [`ordered`].
 #[inline]
 pub(crate) fn unordered(order: u32) -> u32 {
-    if order >> 31 == 0 { !order } else { order & !(1 << 31) }
+    if order >> 31 == 0 {
+        !order
+    } else {
+        order & !(1 << 31)
+    }
 }
 
 /// Encodes 16-bit integers. Zero is taken for "nothing measured" when all others are far from it.
@@ -90,7 +103,10 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     }
     let missing = (zeros > 0 && smallest >= 15).then(|| {
         let mut lanes = shape.lanes();
-        fill(&mut lanes, samples.iter().map(|&sample| u8::from(sample == 0)));
+        fill(
+            &mut lanes,
+            samples.iter().map(|&sample| u8::from(sample == 0)),
+        );
         lanes
     });
     let flags = if missing.is_some() { MISSING } else { 0 };
@@ -101,14 +117,18 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
 fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<u16>)> {
     let mut present = vec![false; 1 << 16];
     match missing {
-        None => samples.iter().for_each(|&sample| present[usize::from(sample)] = true),
+        None => samples
+            .iter()
+            .for_each(|&sample| present[usize::from(sample)] = true),
         Some(missing) => {
             for (&sample, &gap) in samples.iter().zip(missing.rows().flatten()) {
                 present[usize::from(sample)] |= gap == 0;
             }
         }
     }
-    let values: Vec<u16> = (0..=u16::MAX).filter(|&value| present[usize::from(value)]).collect();
+    let values: Vec<u16> = (0..=u16::MAX)
+        .filter(|&value| present[usize::from(value)])
+        .collect();
     let (first, last) = (values.first()?, values.last()?);
     let span = usize::from(last - first) + 1;
     if values.len() * 4 > span * 3 || values.len() * 8 > samples.len() {
@@ -142,7 +162,10 @@ fn encode_plane16(
             }
             put_varint(out, values.len() as u64);
             put_packed(&steps, out);
-            fill(&mut lanes, samples.iter().map(|&sample| rank[usize::from(sample)]));
+            fill(
+                &mut lanes,
+                samples.iter().map(|&sample| rank[usize::from(sample)]),
+            );
         }
         None => {
             out.push(flags);
@@ -150,7 +173,11 @@ fn encode_plane16(
             fill(&mut lanes, samples.iter().copied());
         }
     }
-    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+    Wide {
+        samples: lanes,
+        missing,
+    }
+    .encode(shape.kinds(), out);
 }
 
 /// Encodes 32-bit integers.
@@ -160,14 +187,21 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut preamble = Vec::new();
     put_varint(&mut preamble, zigzag(i64::from(smallest)));
     if largest - smallest < 1 << 16 {
-        let samples: Vec<u16> = samples.iter().map(|&sample| (sample - smallest) as u16).collect();
+        let samples: Vec<u16> = samples
+            .iter()
+            .map(|&sample| (sample - smallest) as u16)
+            .collect();
         encode_plane16(&samples, None, 0, &preamble, shape, out);
     } else {
         out.push(WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
         fill(&mut lanes, samples.iter().map(|&sample| sample - smallest));
-        Wide { samples: lanes, missing: None }.encode(shape.kinds(), out);
+        Wide {
+            samples: lanes,
+            missing: None,
+        }
+        .encode(shape.kinds(), out);
     }
 }
 
@@ -175,7 +209,11 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
 pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut lanes = shape.lanes();
     fill(&mut lanes, samples.iter().copied());
-    Wide { samples: lanes, missing: None }.encode(&[Kind::Zero], out);
+    Wide {
+        samples: lanes,
+        missing: None,
+    }
+    .encode(&[Kind::Zero], out);
 }
 
 /// The counterpart of [`encode_differences`].
@@ -195,37 +233,79 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     let mut multiples: Vec<i32> = bits.iter().map(|&bits| scale.multiple(bits)).collect();
     let fits = |multiple: i32| multiple != Scale::NONE;
     // Zero is taken for "nothing measured" when all others are far from it.
-    if multiples.contains(&0) && multiples.iter().all(|&multiple| multiple == 0 || multiple.unsigned_abs() >= 16) {
-        multiples.iter_mut().filter(|multiple| **multiple == 0).for_each(|multiple| *multiple = Scale::NONE);
+    if multiples.contains(&0)
+        && multiples
+            .iter()
+            .all(|&multiple| multiple == 0 || multiple.unsigned_abs() >= 16)
+    {
+        multiples
+            .iter_mut()
+            .filter(|multiple| **multiple == 0)
+            .for_each(|multiple| *multiple = Scale::NONE);
     }
-    let unfit = multiples.iter().filter(|&&multiple| !fits(multiple)).count();
-    let odd = bits.iter().zip(&multiples).filter(|&(&bits, &multiple)| !fits(multiple) && measured(bits)).count();
+    let unfit = multiples
+        .iter()
+        .filter(|&&multiple| !fits(multiple))
+        .count();
+    let odd = bits
+        .iter()
+        .zip(&multiples)
+        .filter(|&(&bits, &multiple)| !fits(multiple) && measured(bits))
+        .count();
     if odd * 16 > bits.len() {
         return encode_ordered(bits, shape, out);
     }
-    let smallest = multiples.iter().copied().filter(|&multiple| fits(multiple)).min().unwrap_or(0);
+    let smallest = multiples
+        .iter()
+        .copied()
+        .filter(|&multiple| fits(multiple))
+        .min()
+        .unwrap_or(0);
     let largest = multiples.iter().copied().max().unwrap_or(0).max(smallest);
     let mut flags = SCALED;
     let mut preamble = vec![scale.name()];
     let missing = (unfit > 0).then(|| {
         flags |= MISSING;
-        let apart = bits.iter().zip(&multiples).filter(|&(_, &multiple)| !fits(multiple)).map(|(&bits, _)| bits);
+        let apart = bits
+            .iter()
+            .zip(&multiples)
+            .filter(|&(_, &multiple)| !fits(multiple))
+            .map(|(&bits, _)| bits);
         put_apart(apart, &mut preamble);
         let mut lanes = shape.lanes();
-        fill(&mut lanes, multiples.iter().map(|&multiple| u8::from(!fits(multiple))));
+        fill(
+            &mut lanes,
+            multiples.iter().map(|&multiple| u8::from(!fits(multiple))),
+        );
         lanes
     });
     put_varint(&mut preamble, zigzag(i64::from(smallest)));
-    let above = |multiple: i32| if fits(multiple) { multiple.wrapping_sub(smallest) as u32 } else { 0 };
+    let above = |multiple: i32| {
+        if fits(multiple) {
+            multiple.wrapping_sub(smallest) as u32
+        } else {
+            0
+        }
+    };
     if (i64::from(largest) - i64::from(smallest)) < 1 << 16 {
-        let samples: Vec<u16> = multiples.iter().map(|&multiple| above(multiple) as u16).collect();
+        let samples: Vec<u16> = multiples
+            .iter()
+            .map(|&multiple| above(multiple) as u16)
+            .collect();
         encode_plane16(&samples, missing, flags, &preamble, shape, out);
     } else {
         out.push(flags | WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        fill(&mut lanes, multiples.iter().map(|&multiple| above(multiple)));
-        Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+        fill(
+            &mut lanes,
+            multiples.iter().map(|&multiple| above(multiple)),
+        );
+        Wide {
+            samples: lanes,
+            missing,
+        }
+        .encode(shape.kinds(), out);
     }
 }
 
@@ -240,9 +320,15 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut preamble = Vec::new();
     let missing = bits.iter().any(|&bits| !measured(bits)).then(|| {
         flags |= MISSING;
-        put_apart(bits.iter().copied().filter(|&bits| !measured(bits)), &mut preamble);
+        put_apart(
+            bits.iter().copied().filter(|&bits| !measured(bits)),
+            &mut preamble,
+        );
         let mut lanes = shape.lanes();
-        fill(&mut lanes, bits.iter().map(|&bits| u8::from(!measured(bits))));
+        fill(
+            &mut lanes,
+            bits.iter().map(|&bits| u8::from(!measured(bits))),
+        );
         lanes
     });
     put_varint(&mut preamble, 0);
@@ -250,7 +336,11 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     out.extend_from_slice(&preamble);
     let mut lanes = shape.lanes();
     fill(&mut lanes, bits.iter().map(|&bits| ordered(bits)));
-    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
+    Wide {
+        samples: lanes,
+        missing,
+    }
+    .encode(shape.kinds(), out);
 }
 
 /// Values listed apart: as runs, for they are mostly one and the same.
@@ -315,10 +405,15 @@ fn decode_plane<T: Sample>(
     shape: Shape,
     missing: Option<Lanes<u8>>,
 ) -> Result<(Vec<T>, Option<Lanes<u8>>), Error> {
-    let mut wide = Wide { samples: shape.lanes::<T>(), missing };
+    let mut wide = Wide {
+        samples: shape.lanes::<T>(),
+        missing,
+    };
     wide.decode(input)?;
     let mut samples = Vec::with_capacity(shape.count());
-    wide.samples.rows().for_each(|row| samples.extend_from_slice(row));
+    wide.samples
+        .rows()
+        .for_each(|row| samples.extend_from_slice(row));
     Ok((samples, wide.missing))
 }
 
@@ -333,29 +428,65 @@ struct Decoded {
 }
 
 /// Reads a column; `allowed` are the flags its type can have, `offset` whether one was written.
-fn decode(input: &mut Cursor<'_>, shape: Shape, allowed: u8, listed: bool) -> Result<Decoded, Error> {
+fn decode(
+    input: &mut Cursor<'_>,
+    shape: Shape,
+    allowed: u8,
+    listed: bool,
+) -> Result<Decoded, Error> {
     let flags = input.byte()?;
     if flags & !allowed != 0 {
         return Err(Error::Corrupt("a column of another type"));
     }
-    let scale = if flags & SCALED != 0 { Some(Scale::named(input.byte()?)?) } else { None };
+    let scale = if flags & SCALED != 0 {
+        Some(Scale::named(input.byte()?)?)
+    } else {
+        None
+    };
     let gaps = flags & MISSING != 0;
-    let apart = if gaps && listed { take_apart(input, shape.count())? } else { Vec::new() };
-    let offset = if allowed & WIDE != 0 { unzigzag(input.varint()?) } else { 0 };
+    let apart = if gaps && listed {
+        take_apart(input, shape.count())?
+    } else {
+        Vec::new()
+    };
+    let offset = if allowed & WIDE != 0 {
+        unzigzag(input.varint()?)
+    } else {
+        0
+    };
     let missing = gaps.then(|| shape.lanes());
     if flags & WIDE != 0 {
         let (samples, missing) = decode_plane::<u32>(input, shape, missing)?;
-        return Ok(Decoded { flags, scale, apart, offset, samples, missing });
+        return Ok(Decoded {
+            flags,
+            scale,
+            apart,
+            offset,
+            samples,
+            missing,
+        });
     }
-    let values = if flags & RANKS != 0 { Some(take_ranks(input)?) } else { None };
+    let values = if flags & RANKS != 0 {
+        Some(take_ranks(input)?)
+    } else {
+        None
+    };
     let (samples, missing) = decode_plane::<u16>(input, shape, missing)?;
     let samples = match values {
         None => samples.into_iter().map(u32::from).collect(),
-        Some(values) => {
-            samples.into_iter().map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen()).collect()
-        }
+        Some(values) => samples
+            .into_iter()
+            .map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen())
+            .collect(),
     };
-    Ok(Decoded { flags, scale, apart, offset, samples, missing })
+    Ok(Decoded {
+        flags,
+        scale,
+        apart,
+        offset,
+        samples,
+        missing,
+    })
 }
 
 fn take_ranks(input: &mut Cursor<'_>) -> Result<Vec<u16>, Error> {
@@ -383,7 +514,9 @@ impl Decoded {
         for (sample, &gap) in self.samples.into_iter().zip(missing.rows().flatten()) {
             values.push(match gap {
                 0 => number(sample),
-                _ => apart.next().ok_or(Error::Corrupt("fewer values apart than are missing"))?,
+                _ => apart
+                    .next()
+                    .ok_or(Error::Corrupt("fewer values apart than are missing"))?,
             });
         }
         Ok(values)
@@ -393,7 +526,11 @@ impl Decoded {
 /// The counterpart of [`encode_shorts`].
 pub(crate) fn decode_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
     let decoded = decode(input, shape, MISSING | RANKS, false)?;
-    let mut samples: Vec<u16> = decoded.samples.iter().map(|&sample| sample as u16).collect();
+    let mut samples: Vec<u16> = decoded
+        .samples
+        .iter()
+        .map(|&sample| sample as u16)
+        .collect();
     if let Some(missing) = &decoded.missing {
         for (sample, &gap) in samples.iter_mut().zip(missing.rows().flatten()) {
             if gap != 0 {
@@ -413,10 +550,17 @@ pub(crate) fn decode_words(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u
 
 /// The counterpart of [`encode_floats`].
 pub(crate) fn decode_floats(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
-    let decoded = decode(input, shape, MISSING | RANKS | WIDE | SCALED | ORDERED, true)?;
+    let decoded = decode(
+        input,
+        shape,
+        MISSING | RANKS | WIDE | SCALED | ORDERED,
+        true,
+    )?;
     let offset = decoded.offset as i32;
     match (decoded.scale, decoded.flags & ORDERED != 0) {
-        (Some(scale), false) => decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset))),
+        (Some(scale), false) => {
+            decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset)))
+        }
         (None, true) => decoded.restore(unordered),
         _ => Err(Error::Corrupt("a column of floats without a mapping")),
     }
@@ -426,7 +570,10 @@ pub(crate) fn decode_floats(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<
 mod tests {
     use super::*;
 
-    const PICTURE: Shape = Shape::Picture { width: 40, height: 50 };
+    const PICTURE: Shape = Shape::Picture {
+        width: 40,
+        height: 50,
+    };
 
     fn floats(values: &[f32], shape: Shape) -> usize {
         let bits: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
@@ -441,8 +588,15 @@ mod tests {
     #[test]
     fn shorts_with_holes_and_steps_come_back() {
         for shape in [PICTURE, Shape::Sequence(2000)] {
-            let samples: Vec<u16> =
-                (0..2000u16).map(|index| if index % 11 == 0 { 0 } else { 400 + index / 14 * 5 }).collect();
+            let samples: Vec<u16> = (0..2000u16)
+                .map(|index| {
+                    if index % 11 == 0 {
+                        0
+                    } else {
+                        400 + index / 14 * 5
+                    }
+                })
+                .collect();
             let mut bytes = Vec::new();
             encode_shorts(&samples, shape, &mut bytes);
             assert_eq!(bytes[0], MISSING | RANKS);
@@ -455,7 +609,9 @@ mod tests {
     #[test]
     fn words_come_back() {
         for spread in [1u32, 1000, 2_000_000] {
-            let samples: Vec<u32> = (0..2000u32).map(|index| u32::MAX - index * spread).collect();
+            let samples: Vec<u32> = (0..2000u32)
+                .map(|index| u32::MAX - index * spread)
+                .collect();
             let mut bytes = Vec::new();
             encode_words(&samples, PICTURE, &mut bytes);
             let mut input = Cursor::new(&bytes);
@@ -466,10 +622,15 @@ mod tests {
 
     #[test]
     fn floats_of_all_sorts_come_back() {
-        let millimetres: Vec<f32> = (0..2000).map(|index| (1000 + index % 300) as f32 * 0.001).collect();
+        let millimetres: Vec<f32> = (0..2000)
+            .map(|index| (1000 + index % 300) as f32 * 0.001)
+            .collect();
         assert!(floats(&millimetres, PICTURE) < 800);
         let mut holes = millimetres.clone();
-        holes.iter_mut().step_by(9).for_each(|value| *value = f32::NAN);
+        holes
+            .iter_mut()
+            .step_by(9)
+            .for_each(|value| *value = f32::NAN);
         holes[3] = f32::from_bits(0x7fc0_1234);
         holes[4] = f32::NEG_INFINITY;
         holes[5] = 1.234_567_9;
@@ -478,13 +639,25 @@ mod tests {
         let rough: Vec<f32> = (0..2000).map(|index| (index as f32).sin() * 1e10).collect();
         floats(&rough, PICTURE);
         floats(&rough, Shape::Sequence(2000));
-        floats(&[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX], Shape::Sequence(4));
+        floats(
+            &[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX],
+            Shape::Sequence(4),
+        );
         floats(&[], Shape::Sequence(0));
     }
 
     #[test]
     fn the_order_of_floats_is_kept() {
-        let values = [f32::NEG_INFINITY, -2.0, -1.0, -0.0, 0.0, 1e-30, 1.0, f32::INFINITY];
+        let values = [
+            f32::NEG_INFINITY,
+            -2.0,
+            -1.0,
+            -0.0,
+            0.0,
+            1e-30,
+            1.0,
+            f32::INFINITY,
+        ];
         let orders = values.map(|value| ordered(value.to_bits()));
         assert!(orders.windows(2).all(|pair| pair[0] < pair[1]));
         assert_eq!(orders.map(unordered), values.map(f32::to_bits));

@@ -13,7 +13,9 @@ pub enum Error {
     #[error("unknown codec tag {0:#04x}; the peer speaks a newer protocol, update this side")]
     UnknownTag(u8),
     /// The codec is known, its version is not.
-    #[error("codec `{codec}` in version {version}; this side knows version {known}, update the older side")]
+    #[error(
+        "codec `{codec}` in version {version}; this side knows version {known}, update the older side"
+    )]
     Version {
         /// The codec's name.
         codec: &'static str,
@@ -23,7 +25,9 @@ pub enum Error {
         known: u8,
     },
     /// The message would be larger than allowed. Nothing was allocated for it.
-    #[error("frame declares a message of {declared} bytes, the limit is {limit}; raise the limit or drop the sender")]
+    #[error(
+        "frame declares a message of {declared} bytes, the limit is {limit}; raise the limit or drop the sender"
+    )]
     TooLarge {
         /// The size declared in the frame.
         declared: u64,
@@ -47,6 +51,9 @@ pub enum Error {
 impl Error {
     /// Whether the sender's next keyframe puts things right.
     pub fn wants_keyframe(&self) -> bool {
-        matches!(self, Self::MissingReference(_) | Self::KeyframeNeeded(_) | Self::Video(_))
+        matches!(
+            self,
+            Self::MissingReference(_) | Self::KeyframeNeeded(_) | Self::Video(_)
+        )
     }
 }

@@ -20,7 +20,12 @@ pub(crate) fn deflate(message: &[u8], level: u32, header: bool, out: &mut Vec<u8
 }
 
 /// Appends exactly `length` bytes to `out`.
-pub(crate) fn inflate(data: &[u8], length: usize, header: bool, out: &mut Vec<u8>) -> Result<(), Error> {
+pub(crate) fn inflate(
+    data: &[u8],
+    length: usize,
+    header: bool,
+    out: &mut Vec<u8>,
+) -> Result<(), Error> {
     const BAD: Error = Error::Corrupt("a deflate stream that does not hold what it declares");
     let mut stream = Decompress::new(header);
     let first = out.len();
@@ -32,7 +37,9 @@ pub(crate) fn inflate(data: &[u8], length: usize, header: bool, out: &mut Vec<u8
     out.reserve_exact(length + 1);
     loop {
         let before = (stream.total_in(), stream.total_out());
-        let status = stream.decompress_vec(&data[before.0 as usize..], out, FlushDecompress::Finish).map_err(|_| BAD)?;
+        let status = stream
+            .decompress_vec(&data[before.0 as usize..], out, FlushDecompress::Finish)
+            .map_err(|_| BAD)?;
         if status == Status::StreamEnd {
             break;
         }
@@ -40,7 +47,11 @@ pub(crate) fn inflate(data: &[u8], length: usize, header: bool, out: &mut Vec<u8
             return Err(BAD);
         }
     }
-    if out.len() - first == length && stream.total_in() as usize == data.len() { Ok(()) } else { Err(BAD) }
+    if out.len() - first == length && stream.total_in() as usize == data.len() {
+        Ok(())
+    } else {
+        Err(BAD)
+    }
 }
 
 /// A zstd context that is kept from message to message: setting one up costs more than a small message.
@@ -52,13 +63,21 @@ pub(crate) struct Zstd {
 impl Zstd {
     /// Appends `message` compressed at `level` to `out`.
     pub(crate) fn compress(&mut self, message: &[u8], level: i32, out: &mut Vec<u8>) {
-        if self.context.as_ref().is_none_or(|(current, _)| *current != level) {
+        if self
+            .context
+            .as_ref()
+            .is_none_or(|(current, _)| *current != level)
+        {
             match zstd::bulk::Compressor::new(level) {
                 Ok(compressor) => self.context = Some((level, compressor)),
-                Err(error) => unreachable!("zstd clamps levels, and memory is checked elsewhere: {error}"),
+                Err(error) => {
+                    unreachable!("zstd clamps levels, and memory is checked elsewhere: {error}")
+                }
             }
         }
-        let Some((_, compressor)) = &mut self.context else { unreachable!("set above") };
+        let Some((_, compressor)) = &mut self.context else {
+            unreachable!("set above")
+        };
         let first = out.len();
         out.resize(first + zstd::zstd_safe::compress_bound(message.len()), 0);
         match compressor.compress_to_buffer(message, &mut out[first..]) {
@@ -94,7 +113,12 @@ mod tests {
 
     #[test]
     fn bytes_come_back() {
-        for message in [&b""[..], b"a", &[7; 100_000], &(0..=255).collect::<Vec<u8>>()] {
+        for message in [
+            &b""[..],
+            b"a",
+            &[7; 100_000],
+            &(0..=255).collect::<Vec<u8>>(),
+        ] {
             for header in [false, true] {
                 let mut frame = Vec::new();
                 deflate(message, 6, header, &mut frame);

@@ -41,12 +41,14 @@ struct Kept {
 impl Kept {
     /// How many cells this grid lies right of and above `other`, when both have one raster.
     fn offset_in(&self, other: &Grid) -> Option<(i64, i64)> {
-        if self.layout.resolution.to_bits() != other.resolution.to_bits() || other.resolution <= 0.0 {
+        if self.layout.resolution.to_bits() != other.resolution.to_bits() || other.resolution <= 0.0
+        {
             return None;
         }
         let mut offset = [0i64; 2];
         for (axis, offset) in offset.iter_mut().enumerate() {
-            let cells = (self.layout.origin[axis] - other.origin[axis]) / f64::from(other.resolution);
+            let cells =
+                (self.layout.origin[axis] - other.origin[axis]) / f64::from(other.resolution);
             if !cells.is_finite() || cells.abs() > 1e6 || (cells - cells.round()).abs() > 0.01 {
                 return None;
             }
@@ -72,7 +74,8 @@ impl Kept {
             let target = y as i64 + dy;
             if (0..layout.height as i64).contains(&target) {
                 let start = target as usize * layout.width + (from + dx) as usize;
-                cells[start..start + (to - from) as usize].copy_from_slice(&row[from as usize..to as usize]);
+                cells[start..start + (to - from) as usize]
+                    .copy_from_slice(&row[from as usize..to as usize]);
             }
         }
         cells
@@ -90,12 +93,21 @@ pub(crate) struct GridEncoder {
 
 impl GridEncoder {
     /// Appends the body of `message`, which has `layout`, to `out`.
-    pub(crate) fn encode(&mut self, message: &[u8], layout: &Grid, sequence: u64, out: &mut Vec<u8>) {
+    pub(crate) fn encode(
+        &mut self,
+        message: &[u8],
+        layout: &Grid,
+        sequence: u64,
+        out: &mut Vec<u8>,
+    ) {
         let (head, cells) = message.split_at(layout.head);
         put_block(out, head);
         let keep = self.keeps(sequence);
         let background = background(cells);
-        let base = self.base.as_ref().and_then(|base| Some((base, base.offset_in(layout)?)));
+        let base = self
+            .base
+            .as_ref()
+            .and_then(|base| Some((base, base.offset_in(layout)?)));
         if let Some((base, offset)) = base {
             out.extend_from_slice(&[DELTA, keep.into()]);
             put_varint(out, base.sequence);
@@ -123,7 +135,11 @@ impl GridEncoder {
             let mut copy = std::mem::take(&mut self.spare);
             copy.clear();
             copy.extend_from_slice(cells);
-            self.pending.push(Kept { sequence, layout: *layout, cells: copy });
+            self.pending.push(Kept {
+                sequence,
+                layout: *layout,
+                cells: copy,
+            });
         }
     }
 
@@ -132,7 +148,11 @@ impl GridEncoder {
         if self.pending.len() < PENDING {
             return true;
         }
-        if self.pending.iter().all(|kept| kept.sequence + PATIENCE <= sequence) {
+        if self
+            .pending
+            .iter()
+            .all(|kept| kept.sequence + PATIENCE <= sequence)
+        {
             self.spare = self.pending.remove(0).cells;
             return true;
         }
@@ -141,7 +161,13 @@ impl GridEncoder {
 
     /// The peer has decoded the grid `sequence`.
     pub(crate) fn acknowledge(&mut self, sequence: u64) {
-        let Some(position) = self.pending.iter().position(|kept| kept.sequence == sequence) else { return };
+        let Some(position) = self
+            .pending
+            .iter()
+            .position(|kept| kept.sequence == sequence)
+        else {
+            return;
+        };
         let mut done = self.pending.drain(..=position);
         let base = done.next_back();
         if let Some(older) = done.next() {
@@ -165,7 +191,9 @@ fn background(cells: &[u8]) -> u8 {
     for &cell in cells.iter().step_by((cells.len() / 4096).max(1)) {
         seen[usize::from(cell)] += 1;
     }
-    (0..=255u8).max_by_key(|&cell| seen[usize::from(cell)]).unwrap_or(0)
+    (0..=255u8)
+        .max_by_key(|&cell| seen[usize::from(cell)])
+        .unwrap_or(0)
 }
 
 /// The decoder's memory.
@@ -198,7 +226,12 @@ impl GridDecoder {
                 out.resize(first + size, background);
                 let cells = &mut out[first..];
                 if mode == PLAIN {
-                    cells::decode(input.take_rest(), &layout, cells::Base::Plain(background), cells)?;
+                    cells::decode(
+                        input.take_rest(),
+                        &layout,
+                        cells::Base::Plain(background),
+                        cells,
+                    )?;
                 } else {
                     let mut lanes = Lanes::pictures(1, layout.width, layout.height);
                     plane8::decode(input, &mut lanes, 1)?;
@@ -220,18 +253,32 @@ impl GridDecoder {
                 out.extend_from_slice(head);
                 if kept.covers(&layout, offset) {
                     out.extend_from_slice(&kept.cells);
-                    cells::decode(input.take_rest(), &layout, cells::Base::Grid(&kept.cells), &mut out[first..])?;
+                    cells::decode(
+                        input.take_rest(),
+                        &layout,
+                        cells::Base::Grid(&kept.cells),
+                        &mut out[first..],
+                    )?;
                 } else {
                     let moved = kept.moved(&layout, offset, background);
                     out.extend_from_slice(&moved);
-                    cells::decode(input.take_rest(), &layout, cells::Base::Grid(&moved), &mut out[first..])?;
+                    cells::decode(
+                        input.take_rest(),
+                        &layout,
+                        cells::Base::Grid(&moved),
+                        &mut out[first..],
+                    )?;
                 }
                 self.kept.retain(|kept| kept.sequence >= base);
             }
             _ => return Err(Error::Corrupt("a grid told in an unknown way")),
         }
         if keep {
-            self.keep(Kept { sequence, layout, cells: out[first..].to_vec() });
+            self.keep(Kept {
+                sequence,
+                layout,
+                cells: out[first..].to_vec(),
+            });
         }
         Ok(())
     }
@@ -258,7 +305,9 @@ pub(crate) mod tests {
         message.extend_from_slice(&0.05f32.to_le_bytes());
         message.extend_from_slice(&width.to_le_bytes());
         message.extend_from_slice(&height.to_le_bytes());
-        origin.iter().for_each(|number| message.extend_from_slice(&number.to_le_bytes()));
+        origin
+            .iter()
+            .for_each(|number| message.extend_from_slice(&number.to_le_bytes()));
         message.extend_from_slice(&[9; 40]);
         message.extend_from_slice(&(cells.len() as u32).to_le_bytes());
         message.extend_from_slice(cells);
@@ -286,21 +335,33 @@ pub(crate) mod tests {
 
     impl Link {
         fn new() -> Self {
-            Self { encoder: GridEncoder::default(), decoder: GridDecoder::default(), sequence: 0 }
+            Self {
+                encoder: GridEncoder::default(),
+                decoder: GridDecoder::default(),
+                sequence: 0,
+            }
         }
 
         fn encode(&mut self, message: &[u8]) -> Vec<u8> {
             self.sequence += 1;
             let mut body = Vec::new();
             let layout = Grid::read(message, message.len()).unwrap();
-            self.encoder.encode(message, &layout, self.sequence, &mut body);
+            self.encoder
+                .encode(message, &layout, self.sequence, &mut body);
             body
         }
 
         fn send(&mut self, message: &[u8]) -> usize {
             let body = self.encode(message);
             let mut back = Vec::new();
-            self.decoder.decode(&mut Cursor::new(&body), self.sequence, message.len(), &mut back).unwrap();
+            self.decoder
+                .decode(
+                    &mut Cursor::new(&body),
+                    self.sequence,
+                    message.len(),
+                    &mut back,
+                )
+                .unwrap();
             assert!(back == message);
             body.len()
         }
@@ -344,7 +405,8 @@ pub(crate) mod tests {
         let old = room(200, 200, 150, 60);
         let mut grown = vec![255u8; 300 * 260];
         for y in 0..200 {
-            grown[(y + 20) * 300 + 40..(y + 20) * 300 + 240].copy_from_slice(&old[y * 200..(y + 1) * 200]);
+            grown[(y + 20) * 300 + 40..(y + 20) * 300 + 240]
+                .copy_from_slice(&old[y * 200..(y + 1) * 200]);
         }
         assert!(link.send(&message(300, 260, [-2.0, -1.0], &grown)) < 140);
         link.encoder.acknowledge(2);
@@ -357,7 +419,9 @@ pub(crate) mod tests {
     #[test]
     fn shades_and_odd_values_come_back() {
         let mut link = Link::new();
-        let shades: Vec<u8> = (0..120 * 100).map(|index| (index % 120 + index / 120 / 2) as u8 % 101).collect();
+        let shades: Vec<u8> = (0..120 * 100)
+            .map(|index| (index % 120 + index / 120 / 2) as u8 % 101)
+            .collect();
         link.send(&message(120, 100, [0.0, 0.0], &shades));
         link.encoder.acknowledge(1);
         let mut changed = shades.clone();

@@ -18,7 +18,9 @@ pub(crate) fn encode(message: &[u8], layout: &Image, out: &mut Vec<u8>) {
     put_padding(data, layout.row(), layout.step, out);
     match layout.pixel {
         Pixel::Bytes(channels) => encode_colour(data, layout, channels, out),
-        Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => encode_bayer(data, layout, out),
+        Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => {
+            encode_bayer(data, layout, out)
+        }
         Pixel::Bayer => encode_colour(data, layout, 1, out),
         Pixel::Short => column::encode_shorts(&shorts(data, layout), shape(layout), out),
         Pixel::Word => column::encode_words(&words(data, layout), shape(layout), out),
@@ -39,11 +41,17 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
     take_padding(input, data, layout.row(), layout.step)?;
     match layout.pixel {
         Pixel::Bytes(channels) => decode_colour(input, data, &layout, channels),
-        Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => decode_bayer(input, data, &layout),
+        Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => {
+            decode_bayer(input, data, &layout)
+        }
         Pixel::Bayer => decode_colour(input, data, &layout, 1),
         Pixel::Short => {
             let samples = column::decode_shorts(input, shape(&layout))?;
-            let order = if layout.big_endian { u16::to_be_bytes } else { u16::to_le_bytes };
+            let order = if layout.big_endian {
+                u16::to_be_bytes
+            } else {
+                u16::to_le_bytes
+            };
             put_samples(data, &layout, samples.into_iter().map(order));
             Ok(())
         }
@@ -52,7 +60,11 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
                 Pixel::Word => column::decode_words(input, shape(&layout))?,
                 _ => column::decode_floats(input, shape(&layout))?,
             };
-            let order = if layout.big_endian { u32::to_be_bytes } else { u32::to_le_bytes };
+            let order = if layout.big_endian {
+                u32::to_be_bytes
+            } else {
+                u32::to_le_bytes
+            };
             put_samples(data, &layout, samples.into_iter().map(order));
             Ok(())
         }
@@ -60,7 +72,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
 }
 
 fn shape(layout: &Image) -> Shape {
-    Shape::Picture { width: layout.width, height: layout.height }
+    Shape::Picture {
+        width: layout.width,
+        height: layout.height,
+    }
 }
 
 fn rows<'a>(data: &'a [u8], layout: &Image) -> impl Iterator<Item = &'a [u8]> {
@@ -69,7 +84,11 @@ fn rows<'a>(data: &'a [u8], layout: &Image) -> impl Iterator<Item = &'a [u8]> {
 }
 
 fn shorts(data: &[u8], layout: &Image) -> Vec<u16> {
-    let order = if layout.big_endian { u16::from_be_bytes } else { u16::from_le_bytes };
+    let order = if layout.big_endian {
+        u16::from_be_bytes
+    } else {
+        u16::from_le_bytes
+    };
     let mut samples = Vec::with_capacity(layout.width * layout.height);
     for row in rows(data, layout) {
         samples.extend(row.chunks_exact(2).map(|bytes| order([bytes[0], bytes[1]])));
@@ -78,15 +97,26 @@ fn shorts(data: &[u8], layout: &Image) -> Vec<u16> {
 }
 
 fn words(data: &[u8], layout: &Image) -> Vec<u32> {
-    let order = if layout.big_endian { u32::from_be_bytes } else { u32::from_le_bytes };
+    let order = if layout.big_endian {
+        u32::from_be_bytes
+    } else {
+        u32::from_le_bytes
+    };
     let mut samples = Vec::with_capacity(layout.width * layout.height);
     for row in rows(data, layout) {
-        samples.extend(row.chunks_exact(4).map(|bytes| order([bytes[0], bytes[1], bytes[2], bytes[3]])));
+        samples.extend(
+            row.chunks_exact(4)
+                .map(|bytes| order([bytes[0], bytes[1], bytes[2], bytes[3]])),
+        );
     }
     samples
 }
 
-fn put_samples<const N: usize>(data: &mut [u8], layout: &Image, mut samples: impl Iterator<Item = [u8; N]>) {
+fn put_samples<const N: usize>(
+    data: &mut [u8],
+    layout: &Image,
+    mut samples: impl Iterator<Item = [u8; N]>,
+) {
     let row = layout.row();
     for line in data.chunks_exact_mut(layout.step) {
         for (slot, sample) in line[..row].chunks_exact_mut(N).zip(&mut samples) {
@@ -100,7 +130,8 @@ fn decorrelates(data: &[u8], layout: &Image, channels: usize) -> bool {
     let (mut apart, mut together) = (0u64, 0u64);
     for row in rows(data, layout).step_by(16) {
         for pair in row.windows(2 * channels).step_by(channels * 3) {
-            let step = |channel: usize| i32::from(pair[channels + channel]) - i32::from(pair[channel]);
+            let step =
+                |channel: usize| i32::from(pair[channels + channel]) - i32::from(pair[channel]);
             for channel in [0, 2] {
                 apart += u64::from(step(channel).unsigned_abs());
                 together += u64::from((step(channel) - step(1)).unsigned_abs());
@@ -127,19 +158,31 @@ fn encode_colour(data: &[u8], layout: &Image, channels: usize, out: &mut Vec<u8>
 
 fn split_row<const C: usize>(row: &[u8], lanes: &mut Lanes<u8>, y: usize, decorrelate: bool) {
     let width = row.len() / C;
-    let mut channels = lanes.lanes.iter_mut().map(|lane| &mut lane.row_mut(y)[..width]);
-    let mut channels: [&mut [u8]; C] = std::array::from_fn(|_| channels.next().unwrap_or_default());
+    let mut channels = lanes
+        .lanes
+        .iter_mut()
+        .map(|lane| &mut lane.row_mut(y)[..width]);
+    let channels: [&mut [u8]; C] = std::array::from_fn(|_| channels.next().unwrap_or_default());
     let green = if decorrelate { 0xff } else { 0 };
     for (x, pixel) in row.chunks_exact(C).enumerate() {
         for channel in 0..C {
             // Green and alpha stay as they are.
-            let reference = if channel == 0 || channel == 2 { pixel[1] & green } else { 0 };
+            let reference = if channel == 0 || channel == 2 {
+                pixel[1] & green
+            } else {
+                0
+            };
             channels[channel][x] = pixel[channel].wrapping_sub(reference);
         }
     }
 }
 
-fn decode_colour(input: &mut Cursor<'_>, data: &mut [u8], layout: &Image, channels: usize) -> Result<(), Error> {
+fn decode_colour(
+    input: &mut Cursor<'_>,
+    data: &mut [u8],
+    layout: &Image,
+    channels: usize,
+) -> Result<(), Error> {
     let decorrelated = match input.byte()? {
         0 => false,
         1 if channels >= 3 => true,
@@ -166,7 +209,11 @@ fn join_row<const C: usize>(row: &mut [u8], lanes: &Lanes<u8>, y: usize, decorre
     let green = if decorrelated { 0xff } else { 0 };
     for (x, pixel) in row.chunks_exact_mut(C).enumerate() {
         for channel in 0..C {
-            let reference = if channel == 0 || channel == 2 { channels[1][x] & green } else { 0 };
+            let reference = if channel == 0 || channel == 2 {
+                channels[1][x] & green
+            } else {
+                0
+            };
             pixel[channel] = channels[channel][x].wrapping_add(reference);
         }
     }

@@ -124,7 +124,15 @@ impl Image {
             && step.checked_mul(height)? == data
             && head.checked_add(data)? == total;
         let red_first = !encoding.starts_with(b"bgr");
-        fits.then_some(Self { head, width, height, step, big_endian, pixel, red_first })
+        fits.then_some(Self {
+            head,
+            width,
+            height,
+            step,
+            big_endian,
+            pixel,
+            red_first,
+        })
     }
 
     /// Bytes of a row that are samples; the rest of `step` is padding.
@@ -163,7 +171,13 @@ impl Grid {
             && height > 0
             && width.checked_mul(height)? == cells
             && head.checked_add(cells)? == total;
-        fits.then_some(Self { head, width, height, resolution, origin })
+        fits.then_some(Self {
+            head,
+            width,
+            height,
+            resolution,
+            origin,
+        })
     }
 }
 
@@ -184,8 +198,15 @@ impl Scan {
         input.take(7 * 4).ok()?;
         let ranges = size(&mut input)?;
         let head = head.len() - input.remaining();
-        let rest = total.checked_sub(head)?.checked_sub(ranges.checked_mul(4)?)?.checked_sub(4)?;
-        (rest % 4 == 0).then_some(Self { head, ranges, intensities: rest / 4 })
+        let rest = total
+            .checked_sub(head)?
+            .checked_sub(ranges.checked_mul(4)?)?
+            .checked_sub(4)?;
+        (rest % 4 == 0).then_some(Self {
+            head,
+            ranges,
+            intensities: rest / 4,
+        })
     }
 
     /// Where the intensities' length lies.
@@ -269,8 +290,12 @@ impl Cloud {
         let data = size(&mut input)?;
         let head = head.len() - input.remaining();
         fields.sort_by_key(|field| field.offset);
-        let apart = fields.windows(2).all(|pair| pair[0].offset + pair[0].number.bytes() <= pair[1].offset);
-        let inside = fields.last().is_none_or(|last| last.offset + last.number.bytes() <= point_step);
+        let apart = fields
+            .windows(2)
+            .all(|pair| pair[0].offset + pair[0].number.bytes() <= pair[1].offset);
+        let inside = fields
+            .last()
+            .is_none_or(|last| last.offset + last.number.bytes() <= point_step);
         let fits = !big_endian
             && apart
             && inside
@@ -280,7 +305,14 @@ impl Cloud {
             && width.checked_mul(point_step)? <= row_step
             && row_step.checked_mul(height)? == data
             && head.checked_add(data)?.checked_add(1)? == total;
-        fits.then_some(Self { head, width, height, point_step, row_step, fields })
+        fits.then_some(Self {
+            head,
+            width,
+            height,
+            point_step,
+            row_step,
+            fields,
+        })
     }
 
     fn read_field(input: &mut Cursor<'_>, fields: &mut Vec<Field>) -> Option<()> {
@@ -308,7 +340,11 @@ impl Cloud {
                 return None;
             }
             let offset = offset.checked_add(index * number.bytes())?;
-            fields.push(Field { offset, number, meaning });
+            fields.push(Field {
+                offset,
+                number,
+                meaning,
+            });
         }
         Some(())
     }

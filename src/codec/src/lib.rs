@@ -6,13 +6,15 @@
 //!                                        └──────────────────────┘
 //! ```
 //! Pure: no I/O, no threads, no clock; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry their
-//! codec and its version, so codecs can change from message to message.
+//! codec and its version, so codecs can change from message to message: [`Auto`] chooses
+//! them.
 //!
 //! Every lossless codec restores the message bit by bit, and one that does not fit a message leaves it to zstd. Every
 //! decoder is safe with any input: it fails or returns a message of the declared size, within the limit it was given.
 
 #![forbid(unsafe_code)]
 
+mod auto;
 mod cloud;
 mod codec;
 mod column;
@@ -33,6 +35,7 @@ mod video;
 mod wide;
 mod wire;
 
+pub use auto::{Auto, Choice, Estimate, Reason};
 pub use codec::{Codec, UnknownCodec};
 pub use error::Error;
 pub use layout::Schema;

@@ -19,11 +19,21 @@ pub(crate) struct Padded<T> {
 impl<T: Copy + Default> Padded<T> {
     pub(crate) fn picture(width: usize, height: usize) -> Self {
         let lag = width + 2;
-        Self { width, height, lag, samples: vec![T::default(); lag * (height + 1) + 2] }
+        Self {
+            width,
+            height,
+            lag,
+            samples: vec![T::default(); lag * (height + 1) + 2],
+        }
     }
 
     pub(crate) fn sequence(length: usize) -> Self {
-        Self { width: length, height: usize::from(length > 0), lag: 2, samples: vec![T::default(); length + 4] }
+        Self {
+            width: length,
+            height: usize::from(length > 0),
+            lag: 2,
+            samples: vec![T::default(); length + 4],
+        }
     }
 
     /// Where the samples of row `y` begin.
@@ -47,7 +57,11 @@ impl<T: Copy + Default> Padded<T> {
     pub(crate) fn close_row(&mut self, y: usize) {
         if self.height > 1 && self.width > 0 {
             let start = self.start(y);
-            self.samples[start - 1] = if y > 0 { self.samples[start - self.lag] } else { T::default() };
+            self.samples[start - 1] = if y > 0 {
+                self.samples[start - self.lag]
+            } else {
+                T::default()
+            };
             self.samples[start + self.width] = self.samples[start + self.width - 1];
         }
     }
@@ -75,7 +89,13 @@ impl<T: Copy + Default> Padded<T> {
     pub(crate) fn neighbours(&self, y: usize) -> [&[T]; 5] {
         let (start, lag, width) = (self.start(y), self.lag, self.width);
         let from = |first: usize| &self.samples[first..first + width];
-        [from(start - 1), from(start - lag), from(start - lag - 1), from(start - lag + 1), from(start)]
+        [
+            from(start - 1),
+            from(start - lag),
+            from(start - lag - 1),
+            from(start - lag + 1),
+            from(start),
+        ]
     }
 }
 
@@ -95,39 +115,67 @@ pub(crate) const STRIPES: usize = 4;
 impl<T: Copy + Default> Lanes<T> {
     pub(crate) fn pictures(planes: usize, width: usize, height: usize) -> Self {
         if planes != 1 || height < 8 * STRIPES {
-            let lanes = (0..planes).map(|_| Padded::picture(width, height)).collect();
-            return Self { lanes, stripe: height.max(1), stripes: 1 };
+            let lanes = (0..planes)
+                .map(|_| Padded::picture(width, height))
+                .collect();
+            return Self {
+                lanes,
+                stripe: height.max(1),
+                stripes: 1,
+            };
         }
         let stripe = height / STRIPES;
-        let mut lanes: Vec<_> = (0..STRIPES).map(|_| Padded::picture(width, stripe)).collect();
+        let mut lanes: Vec<_> = (0..STRIPES)
+            .map(|_| Padded::picture(width, stripe))
+            .collect();
         if height % STRIPES > 0 {
             lanes.push(Padded::picture(width, height % STRIPES));
         }
-        Self { stripes: lanes.len(), lanes, stripe }
+        Self {
+            stripes: lanes.len(),
+            lanes,
+            stripe,
+        }
     }
 
     pub(crate) fn sequence(length: usize) -> Self {
         if length < 1024 {
-            return Self { lanes: vec![Padded::sequence(length)], stripe: length.max(1), stripes: 1 };
+            return Self {
+                lanes: vec![Padded::sequence(length)],
+                stripe: length.max(1),
+                stripes: 1,
+            };
         }
         let stripe = length / STRIPES;
         let mut lanes: Vec<_> = (0..STRIPES).map(|_| Padded::sequence(stripe)).collect();
         if length % STRIPES > 0 {
             lanes.push(Padded::sequence(length % STRIPES));
         }
-        Self { stripes: lanes.len(), lanes, stripe }
+        Self {
+            stripes: lanes.len(),
+            lanes,
+            stripe,
+        }
     }
 
     /// Several sequences of one length, a lane each.
     pub(crate) fn sequences(count: usize, length: usize) -> Self {
         let lanes = (0..count).map(|_| Padded::sequence(length)).collect();
-        Self { lanes, stripe: 1, stripes: 1 }
+        Self {
+            lanes,
+            stripe: 1,
+            stripes: 1,
+        }
     }
 
     /// Which lanes run in lockstep: groups of equal shape.
     pub(crate) fn groups(&self) -> Vec<std::ops::Range<usize>> {
         let count = self.lanes.len();
-        if self.stripes > STRIPES { vec![0..STRIPES, STRIPES..count] } else { std::iter::once(0..count).collect() }
+        if self.stripes > STRIPES {
+            vec![0..STRIPES, STRIPES..count]
+        } else {
+            std::iter::once(0..count).collect()
+        }
     }
 
     pub(crate) fn row(&self, plane: usize, y: usize) -> &[T] {
@@ -136,18 +184,6 @@ impl<T: Copy + Default> Lanes<T> {
 
     pub(crate) fn row_mut(&mut self, plane: usize, y: usize) -> &mut [T] {
         self.lanes[plane * self.stripes + y / self.stripe].row_mut(y % self.stripe)
-    }
-
-    /// Fills a sequence.
-    pub(crate) fn fill(&mut self, samples: &[T]) {
-        let mut rest = samples;
-        for lane in &mut self.lanes {
-            let (front, back) = rest.split_at(lane.width.min(rest.len()));
-            if lane.height > 0 {
-                lane.row_mut(0).copy_from_slice(front);
-            }
-            rest = back;
-        }
     }
 
     /// Sets all margins, once the samples are in.
@@ -161,7 +197,9 @@ impl<T: Copy + Default> Lanes<T> {
 
     /// All samples, lane by lane, row by row: for a single plane or sequence this is their order.
     pub(crate) fn rows(&self) -> impl Iterator<Item = &[T]> {
-        self.lanes.iter().flat_map(|lane| (0..lane.height).map(move |y| lane.row(y)))
+        self.lanes
+            .iter()
+            .flat_map(|lane| (0..lane.height).map(move |y| lane.row(y)))
     }
 
     pub(crate) fn count(&self) -> usize {
@@ -199,8 +237,14 @@ mod tests {
         plane.row_mut(1).copy_from_slice(&[4, 5, 6]);
         plane.close_row(0);
         plane.close_row(1);
-        assert_eq!(plane.neighbours(0), [&[0, 1, 2], &[0, 0, 0], &[0, 0, 0], &[0, 0, 0], &[1, 2, 3]]);
-        assert_eq!(plane.neighbours(1), [&[1, 4, 5], &[1, 2, 3], &[0, 1, 2], &[2, 3, 3], &[4, 5, 6]]);
+        assert_eq!(
+            plane.neighbours(0),
+            [&[0, 1, 2], &[0, 0, 0], &[0, 0, 0], &[0, 0, 0], &[1, 2, 3]]
+        );
+        assert_eq!(
+            plane.neighbours(1),
+            [&[1, 4, 5], &[1, 2, 3], &[0, 1, 2], &[2, 3, 3], &[4, 5, 6]]
+        );
     }
 
     #[test]
@@ -208,7 +252,10 @@ mod tests {
         for length in [0, 1, 1023, 1024, 1027] {
             let samples: Vec<u32> = (0..length).collect();
             let mut lanes = Lanes::sequence(samples.len());
-            lanes.fill(&samples);
+            let mut rest = samples.iter().copied();
+            for lane in &mut lanes.lanes {
+                (0..lane.height).for_each(|y| lane.row_mut(y).fill_with(|| rest.next().unwrap()));
+            }
             assert_eq!(lanes.rows().flatten().copied().collect::<Vec<_>>(), samples);
         }
     }

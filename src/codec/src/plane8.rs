@@ -45,7 +45,11 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
         .iter()
         .enumerate()
         .map(|(index, lane)| {
-            let first = if planes > 1 { (index * CONTEXTS) as u16 } else { 0 };
+            let first = if planes > 1 {
+                (index * CONTEXTS) as u16
+            } else {
+                0
+            };
             let mut keys = vec![0u16; lane.width * lane.height];
             for (y, keys) in keys.chunks_exact_mut(lane.width.max(1)).enumerate() {
                 let kind = if y == 0 { Kind::West } else { kind };
@@ -63,10 +67,22 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
     for group in lanes.groups() {
         let keys = &keys[group];
         match *keys {
-            [ref a] => encoder.encode([a]).iter().for_each(|lane| put_block(out, lane)),
-            [ref a, ref b] => encoder.encode([a, b]).iter().for_each(|lane| put_block(out, lane)),
-            [ref a, ref b, ref c] => encoder.encode([a, b, c]).iter().for_each(|lane| put_block(out, lane)),
-            [ref a, ref b, ref c, ref d] => encoder.encode([a, b, c, d]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a] => encoder
+                .encode([a])
+                .iter()
+                .for_each(|lane| put_block(out, lane)),
+            [ref a, ref b] => encoder
+                .encode([a, b])
+                .iter()
+                .for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c] => encoder
+                .encode([a, b, c])
+                .iter()
+                .for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c, ref d] => encoder
+                .encode([a, b, c, d])
+                .iter()
+                .for_each(|lane| put_block(out, lane)),
             _ => unreachable!("a group has one to four lanes"),
         }
     }
@@ -85,7 +101,11 @@ fn choose(lanes: &Lanes<u8>) -> Kind {
             costs[1] += row_cost::<predict::Slope>(lane, y);
         }
     }
-    if costs[0] < costs[1] { Kind::Median } else { Kind::Slope }
+    if costs[0] < costs[1] {
+        Kind::Median
+    } else {
+        Kind::Slope
+    }
 }
 
 fn row_cost<P: Predictor>(lane: &Padded<u8>, y: usize) -> u64 {
@@ -113,7 +133,13 @@ fn guess<P: Predictor>(a: i16, b: i16, c: i16, d: i16) -> i16 {
 fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, keys: &mut [u16]) {
     let [a, b, c, d, v] = lane.neighbours(y);
     let width = keys.len();
-    let (a, b, c, d, v) = (&a[..width], &b[..width], &c[..width], &d[..width], &v[..width]);
+    let (a, b, c, d, v) = (
+        &a[..width],
+        &b[..width],
+        &c[..width],
+        &d[..width],
+        &v[..width],
+    );
     for x in 0..width {
         let [a, b, c, d, v] = [a[x], b[x], c[x], d[x], v[x]].map(i16::from);
         let unease = unease(a, b, c, d);
@@ -127,7 +153,11 @@ fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, k
 }
 
 /// Decodes into lanes of the shape they were encoded with.
-pub(crate) fn decode(input: &mut Cursor<'_>, lanes: &mut Lanes<u8>, planes: usize) -> Result<(), Error> {
+pub(crate) fn decode(
+    input: &mut Cursor<'_>,
+    lanes: &mut Lanes<u8>,
+    planes: usize,
+) -> Result<(), Error> {
     let kind = Kind::read(input.byte()?)?;
     if !matches!(kind, Kind::Median | Kind::Slope) {
         return Err(Error::Corrupt("a predictor that 8-bit planes do not use"));
@@ -139,7 +169,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, lanes: &mut Lanes<u8>, planes: usiz
     let bases: Vec<[u16; 1024]> = (0..planes.max(1))
         .map(|plane| {
             std::array::from_fn(|unease| {
-                let context = THRESHOLDS.iter().filter(|&&threshold| unease >= usize::from(threshold)).count();
+                let context = THRESHOLDS
+                    .iter()
+                    .filter(|&&threshold| unease >= usize::from(threshold))
+                    .count();
                 tables.base(plane * CONTEXTS + (context >> shift))
             })
         })
@@ -168,12 +201,18 @@ fn decode_group<const N: usize>(
     for _ in 0..N {
         lanes.push(Lane::new(input.block()?, tables.log)?);
     }
-    let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else { unreachable!("N lanes were pushed") };
+    let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else {
+        unreachable!("N lanes were pushed")
+    };
     let bases: [&[u16; 1024]; N] = std::array::from_fn(|index| &bases[index.min(bases.len() - 1)]);
     for y in 0..planes[0].height {
         match if y == 0 { Kind::West } else { kind } {
-            Kind::Median => decode_row::<predict::Median, N>(tables, bases, &mut planes, &mut lanes, y),
-            Kind::Slope => decode_row::<predict::Slope, N>(tables, bases, &mut planes, &mut lanes, y),
+            Kind::Median => {
+                decode_row::<predict::Median, N>(tables, bases, &mut planes, &mut lanes, y)
+            }
+            Kind::Slope => {
+                decode_row::<predict::Slope, N>(tables, bases, &mut planes, &mut lanes, y)
+            }
             _ => decode_row::<predict::West, N>(tables, bases, &mut planes, &mut lanes, y),
         }
     }
@@ -192,7 +231,10 @@ fn decode_row<P: Predictor, const N: usize>(
     let mut rows = planes.each_mut().map(|plane| {
         plane.close_row_before(y);
         let (above, here) = plane.samples.split_at_mut(start);
-        (&above[start - lag - 1..start - lag + width + 1], &mut here[..width])
+        (
+            &above[start - lag - 1..start - lag + width + 1],
+            &mut here[..width],
+        )
     });
     let mut a: [i16; N] = [0; N];
     let (mut b, mut c) = ([0i16; N], [0i16; N]);
@@ -221,7 +263,12 @@ fn decode_row<P: Predictor, const N: usize>(
 mod tests {
     use super::*;
 
-    fn round_trip(planes: usize, width: usize, height: usize, sample: impl Fn(usize, usize, usize) -> u8) -> usize {
+    fn round_trip(
+        planes: usize,
+        width: usize,
+        height: usize,
+        sample: impl Fn(usize, usize, usize) -> u8,
+    ) -> usize {
         let mut lanes = Lanes::pictures(planes, width, height);
         for plane in 0..planes {
             for y in 0..height {
@@ -238,7 +285,11 @@ mod tests {
         input.finish().unwrap();
         for plane in 0..planes {
             for y in 0..height {
-                assert_eq!(back.row(plane, y), lanes.row(plane, y), "plane {plane}, row {y}");
+                assert_eq!(
+                    back.row(plane, y),
+                    lanes.row(plane, y),
+                    "plane {plane}, row {y}"
+                );
             }
         }
         bytes.len()
@@ -247,9 +298,21 @@ mod tests {
     #[test]
     fn pictures_of_all_shapes_come_back() {
         for planes in 1..=4 {
-            for (width, height) in [(1, 1), (1, 7), (7, 1), (2, 2), (33, 35), (64, 32), (100, 131)] {
-                round_trip(planes, width, height, |plane, x, y| (x * y * (plane + 3) + x) as u8);
-                round_trip(planes, width, height, |_, x, y| ((x * 2_654_435_761 + y * 40_503) >> 7) as u8);
+            for (width, height) in [
+                (1, 1),
+                (1, 7),
+                (7, 1),
+                (2, 2),
+                (33, 35),
+                (64, 32),
+                (100, 131),
+            ] {
+                round_trip(planes, width, height, |plane, x, y| {
+                    (x * y * (plane + 3) + x) as u8
+                });
+                round_trip(planes, width, height, |_, x, y| {
+                    ((x * 2_654_435_761 + y * 40_503) >> 7) as u8
+                });
             }
         }
     }
@@ -264,13 +327,20 @@ mod tests {
     fn a_cut_stream_is_an_error() {
         let mut lanes = Lanes::pictures(1, 40, 40);
         for y in 0..40 {
-            lanes.row_mut(0, y).iter_mut().enumerate().for_each(|(x, slot)| *slot = (x * y) as u8);
+            lanes
+                .row_mut(0, y)
+                .iter_mut()
+                .enumerate()
+                .for_each(|(x, slot)| *slot = (x * y) as u8);
         }
         let mut bytes = Vec::new();
         encode(&mut lanes, 1, &mut bytes);
         for length in 0..bytes.len() {
             let mut back = Lanes::pictures(1, 40, 40);
-            assert!(decode(&mut Cursor::new(&bytes[..length]), &mut back, 1).is_err(), "{length}");
+            assert!(
+                decode(&mut Cursor::new(&bytes[..length]), &mut back, 1).is_err(),
+                "{length}"
+            );
         }
     }
 }

@@ -37,7 +37,10 @@ impl Kind {
     ];
 
     pub(crate) fn read(byte: u8) -> Result<Self, Error> {
-        Self::ALL.get(usize::from(byte)).copied().ok_or(Error::Corrupt("an unknown predictor"))
+        Self::ALL
+            .get(usize::from(byte))
+            .copied()
+            .ok_or(Error::Corrupt("an unknown predictor"))
     }
 }
 
@@ -106,7 +109,9 @@ pub(crate) fn guess<P: Predictor>(a: i32, b: i32, c: i32, d: i32) -> i32 {
         Kind::Slope => ((a + b) >> 1) + ((d - c) >> 2),
         Kind::Plane => a + b - c,
         Kind::Median => (a + b - c).clamp(a.min(b), a.max(b)),
-        Kind::Middle => middle_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)]),
+        Kind::Middle => {
+            middle_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)])
+        }
         Kind::Line => 2 * a - b,
     }
 }
@@ -172,7 +177,9 @@ impl Sample for u32 {
         let unease = if matches!(P::KIND, Kind::Zero) {
             a.saturating_add(b)
         } else {
-            a.abs_diff(c).saturating_add(c.abs_diff(b)).saturating_add(b.abs_diff(d))
+            a.abs_diff(c)
+                .saturating_add(c.abs_diff(b))
+                .saturating_add(b.abs_diff(d))
         };
         ((32 - unease.leading_zeros()) as u16).min(EASE - 1)
     }
@@ -219,9 +226,15 @@ mod tests {
                 for &b in &samples {
                     for &c in &samples {
                         let d = a ^ b;
-                        assert_eq!(u32::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d), v);
+                        assert_eq!(
+                            u32::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d),
+                            v
+                        );
                         let [v, a, b, c, d] = [v, a, b, c, d].map(|sample| sample as u16);
-                        assert_eq!(u16::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d), v);
+                        assert_eq!(
+                            u16::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d),
+                            v
+                        );
                         assert!(u16::context::<P>(a, b, c, d) < EASE);
                     }
                 }

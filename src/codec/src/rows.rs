@@ -9,7 +9,11 @@ pub(crate) fn put_padding(data: &[u8], row: usize, step: usize, out: &mut Vec<u8
     if row == step {
         return;
     }
-    let padding: Vec<u8> = data.chunks_exact(step).flat_map(|line| &line[row..]).copied().collect();
+    let padding: Vec<u8> = data
+        .chunks_exact(step)
+        .flat_map(|line| &line[row..])
+        .copied()
+        .collect();
     if padding.iter().all(|&byte| byte == 0) {
         out.push(0);
     } else {
@@ -19,19 +23,29 @@ pub(crate) fn put_padding(data: &[u8], row: usize, step: usize, out: &mut Vec<u8
 }
 
 /// Reads what [`put_padding`] wrote into `data`.
-pub(crate) fn take_padding(input: &mut Cursor<'_>, data: &mut [u8], row: usize, step: usize) -> Result<(), Error> {
+pub(crate) fn take_padding(
+    input: &mut Cursor<'_>,
+    data: &mut [u8],
+    row: usize,
+    step: usize,
+) -> Result<(), Error> {
     if row == step {
         return Ok(());
     }
     match input.byte()? {
-        0 => data.chunks_exact_mut(step).for_each(|line| line[row..].fill(0)),
+        0 => data
+            .chunks_exact_mut(step)
+            .for_each(|line| line[row..].fill(0)),
         1 => {
             let size = (step - row) * (data.len() / step);
             let padding = take_packed(input, size)?;
             if padding.len() != size {
                 return Err(Error::Corrupt("padding of another size"));
             }
-            for (line, padding) in data.chunks_exact_mut(step).zip(padding.chunks_exact(step - row)) {
+            for (line, padding) in data
+                .chunks_exact_mut(step)
+                .zip(padding.chunks_exact(step - row))
+            {
                 line[row..].copy_from_slice(padding);
             }
         }

@@ -50,8 +50,14 @@ impl Scale {
     const LARGEST: f64 = 16_777_215.0;
 
     pub(crate) fn named(name: u8) -> Result<Self, Error> {
-        let &(divisor, factor) = SCALES.get(usize::from(name)).ok_or(Error::Corrupt("an unknown scale"))?;
-        Ok(Self { name, divisor, factor })
+        let &(divisor, factor) = SCALES
+            .get(usize::from(name))
+            .ok_or(Error::Corrupt("an unknown scale"))?;
+        Ok(Self {
+            name,
+            divisor,
+            factor,
+        })
     }
 
     pub(crate) fn name(self) -> u8 {
@@ -62,7 +68,11 @@ impl Scale {
     #[inline]
     pub(crate) fn value(self, multiple: i32) -> u32 {
         let multiple = multiple as f32;
-        let value = if self.factor == 0.0 { multiple / self.divisor } else { multiple * self.factor };
+        let value = if self.factor == 0.0 {
+            multiple / self.divisor
+        } else {
+            multiple * self.factor
+        };
         value.to_bits()
     }
 
@@ -75,7 +85,11 @@ impl Scale {
             return Self::NONE;
         }
         let multiple = (scaled + 0.5f64.copysign(scaled)) as i32;
-        if self.value(multiple) == bits { multiple } else { Self::NONE }
+        if self.value(multiple) == bits {
+            multiple
+        } else {
+            Self::NONE
+        }
     }
 
     /// The coarsest scale that nearly all of the floats measured are multiples of.
@@ -87,10 +101,15 @@ impl Scale {
             .copied()
             .filter(|&bits| f32::from_bits(bits).is_finite() && bits << 1 != 0)
             .collect();
-        (0..SCALES.len() as u8).filter_map(|name| Self::named(name).ok()).find(|scale| {
-            let fit = sample.iter().filter(|&&bits| scale.multiple(bits) != Self::NONE).count();
-            fit * 16 >= sample.len() * 15 && fit > 0
-        })
+        (0..SCALES.len() as u8)
+            .filter_map(|name| Self::named(name).ok())
+            .find(|scale| {
+                let fit = sample
+                    .iter()
+                    .filter(|&&bits| scale.multiple(bits) != Self::NONE)
+                    .count();
+                fit * 16 >= sample.len() * 15 && fit > 0
+            })
     }
 }
 
@@ -118,7 +137,10 @@ mod tests {
         assert_eq!(find(|count| count as f32 * 0.001), Some((1000.0, 0.001)));
         assert_eq!(find(|count| count as f32 / 1000.0), Some((1000.0, 0.0)));
         assert_eq!(find(|count| count as f32), Some((1.0, 0.0)));
-        assert_eq!(find(|count| count as f32 / 4.0 / 1000.0), Some((4000.0, 0.0)));
+        assert_eq!(
+            find(|count| count as f32 / 4.0 / 1000.0),
+            Some((4000.0, 0.0))
+        );
         assert_eq!(find(|count| (count as f32).sqrt() / 77.0), None);
         assert_eq!(find(|_| f32::NAN), None);
     }

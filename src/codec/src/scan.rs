@@ -15,8 +15,16 @@ pub(crate) fn encode(message: &[u8], layout: &Scan, out: &mut Vec<u8>) -> Option
         return None;
     }
     put_block(out, &message[..layout.head]);
-    column::encode_floats(&words(&message[layout.head..middle]), Shape::Sequence(layout.ranges), out);
-    column::encode_floats(&words(&message[middle + 4..]), Shape::Sequence(layout.intensities), out);
+    column::encode_floats(
+        &words(&message[layout.head..middle]),
+        Shape::Sequence(layout.ranges),
+        out,
+    );
+    column::encode_floats(
+        &words(&message[middle + 4..]),
+        Shape::Sequence(layout.intensities),
+        out,
+    );
     Some(())
 }
 
@@ -36,5 +44,8 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
 }
 
 pub(crate) fn words(bytes: &[u8]) -> Vec<u32> {
-    bytes.chunks_exact(4).map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect()
+    bytes
+        .chunks_exact(4)
+        .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
+        .collect()
 }

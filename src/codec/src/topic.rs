@@ -37,7 +37,13 @@ pub struct Encoder {
 impl Encoder {
     /// An encoder for messages of `schema`. Lossy codecs fall back until [`Encoder::allow_video`].
     pub fn new(schema: Schema) -> Self {
-        Self { schema, sequence: 0, zstd: Zstd::default(), grid: GridEncoder::default(), video: None }
+        Self {
+            schema,
+            sequence: 0,
+            zstd: Zstd::default(),
+            grid: GridEncoder::default(),
+            video: None,
+        }
     }
 
     /// Allows H.264. Without the cargo feature `video` it still falls back.
@@ -78,7 +84,11 @@ impl Encoder {
             self.put_header(used, message, out);
             out.extend_from_slice(message);
         }
-        Encoded { codec: used, sequence: self.sequence, bytes: out.len() - first }
+        Encoded {
+            codec: used,
+            sequence: self.sequence,
+            bytes: out.len() - first,
+        }
     }
 
     fn put_header(&self, codec: Codec, message: &[u8], out: &mut Vec<u8>) {
@@ -95,14 +105,23 @@ impl Encoder {
             (Codec::Zlib(level), _) => generic::deflate(message, level.into(), true, out),
             (Codec::Deflate(level), _) => generic::deflate(message, level.into(), false, out),
             (Codec::Zstd(level), _) => self.zstd.compress(message, level.into(), out),
-            (Codec::Image, Schema::Image) => image::encode(message, &Image::read(message, total)?, out),
-            (Codec::Grid, Schema::OccupancyGrid) => {
-                self.grid.encode(message, &Grid::read(message, total)?, self.sequence, out);
+            (Codec::Image, Schema::Image) => {
+                image::encode(message, &Image::read(message, total)?, out)
             }
-            (Codec::Scan, Schema::LaserScan) => scan::encode(message, &Scan::read(message, total)?, out)?,
-            (Codec::Cloud, Schema::PointCloud2) => cloud::encode(message, &Cloud::read(message, total)?, out),
+            (Codec::Grid, Schema::OccupancyGrid) => {
+                self.grid
+                    .encode(message, &Grid::read(message, total)?, self.sequence, out);
+            }
+            (Codec::Scan, Schema::LaserScan) => {
+                scan::encode(message, &Scan::read(message, total)?, out)?
+            }
+            (Codec::Cloud, Schema::PointCloud2) => {
+                cloud::encode(message, &Cloud::read(message, total)?, out)
+            }
             (Codec::Video, Schema::Image) => {
-                self.video.as_mut()?.encode(message, &Image::read(message, total)?, self.sequence, out)?;
+                self.video
+                    .as_mut()?
+                    .encode(message, &Image::read(message, total)?, out)?;
             }
             _ => return None,
         }
@@ -153,7 +172,11 @@ pub struct Decoder {
 impl Decoder {
     /// A decoder of messages of at most `limit` bytes.
     pub fn new(limit: usize) -> Self {
-        Self { limit, grid: GridDecoder::default(), video: VideoDecoder::default() }
+        Self {
+            limit,
+            grid: GridDecoder::default(),
+            video: VideoDecoder::default(),
+        }
     }
 
     /// Appends the message of `frame` to `out`; on an error `out` is as before.
@@ -171,10 +194,17 @@ impl Decoder {
         let (decoded, version) = header(&mut input)?;
         let (codec, sequence, total) = (decoded.codec, decoded.sequence, decoded.bytes);
         if version != Codec::VERSION {
-            return Err(Error::Version { codec: codec.name(), version, known: Codec::VERSION });
+            return Err(Error::Version {
+                codec: codec.name(),
+                version,
+                known: Codec::VERSION,
+            });
         }
         if total > self.limit {
-            return Err(Error::TooLarge { declared: total as u64, limit: self.limit });
+            return Err(Error::TooLarge {
+                declared: total as u64,
+                limit: self.limit,
+            });
         }
         let first = out.len();
         match codec {
@@ -186,7 +216,7 @@ impl Decoder {
             Codec::Grid => self.grid.decode(&mut input, sequence, total, out)?,
             Codec::Scan => scan::decode(&mut input, total, out)?,
             Codec::Cloud => cloud::decode(&mut input, total, out)?,
-            Codec::Video => self.video.decode(&mut input, sequence, total, out)?,
+            Codec::Video => self.video.decode(&mut input, total, out)?,
         }
         input.finish()?;
         if out.len() - first == total {
@@ -209,5 +239,12 @@ fn header(input: &mut Cursor<'_>) -> Result<(Decoded, u8), Error> {
     let version = input.byte()?;
     let sequence = input.varint()?;
     let bytes = usize::try_from(input.varint()?).unwrap_or(usize::MAX);
-    Ok((Decoded { codec, sequence, bytes }, version))
+    Ok((
+        Decoded {
+            codec,
+            sequence,
+            bytes,
+        },
+        version,
+    ))
 }

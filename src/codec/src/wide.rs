@@ -27,7 +27,10 @@ fn token(residual: u32) -> (u8, u32) {
         return (residual as u8, 0);
     }
     let octave = residual.ilog2();
-    ((16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8, octave - 2)
+    (
+        (16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8,
+        octave - 2,
+    )
 }
 
 /// Per token: the smallest residual, and how many plain bits tell the rest.
@@ -62,13 +65,19 @@ pub(crate) struct Wide<T> {
 impl<T: Sample> Wide<T> {
     /// Gives every missing sample the value left of it.
     fn bridge(&mut self) {
-        let Some(missing) = &mut self.missing else { return };
+        let Some(missing) = &mut self.missing else {
+            return;
+        };
         missing.close();
         for (plane, gaps) in self.samples.lanes.iter_mut().zip(&missing.lanes) {
             for y in 0..plane.height {
                 plane.close_row_before(y);
                 let start = plane.start(y);
-                let mut last = if y > 0 { plane.samples[start - plane.lag] } else { T::default() };
+                let mut last = if y > 0 {
+                    plane.samples[start - plane.lag]
+                } else {
+                    T::default()
+                };
                 for (sample, &gap) in plane.row_mut(y).iter_mut().zip(gaps.row(y)) {
                     if gap != 0 {
                         *sample = last;
@@ -134,7 +143,11 @@ impl<T: Sample> Wide<T> {
             }
             cost
         };
-        kinds.iter().copied().min_by_key(|&kind| cost(kind)).unwrap_or(Kind::West)
+        kinds
+            .iter()
+            .copied()
+            .min_by_key(|&kind| cost(kind))
+            .unwrap_or(Kind::West)
     }
 
     /// Decodes into samples (and gaps) of the shape they were encoded with.
@@ -150,7 +163,10 @@ impl<T: Sample> Wide<T> {
             tables,
         };
         for group in self.samples.groups() {
-            let gaps = self.missing.as_mut().map(|missing| &mut missing.lanes[group.clone()]);
+            let gaps = self
+                .missing
+                .as_mut()
+                .map(|missing| &mut missing.lanes[group.clone()]);
             let planes = &mut self.samples.lanes[group];
             match (planes, gaps) {
                 ([a], None) => model.group::<T, 1>(kind, [a], None, input)?,
@@ -168,7 +184,11 @@ impl<T: Sample> Wide<T> {
 
 /// In the first row of a picture there is nothing above to guess from.
 fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
-    if y == 0 && height > 1 && kind != Kind::Zero { Kind::West } else { kind }
+    if y == 0 && height > 1 && kind != Kind::Zero {
+        Kind::West
+    } else {
+        kind
+    }
 }
 
 fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize) -> u64 {
@@ -242,22 +262,38 @@ impl Model {
             lanes.push(Lane::new(input.block()?, self.tables.log)?);
             *plain = BitReader::new(input.block()?);
         }
-        let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else { unreachable!("N lanes were pushed") };
+        let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else {
+            unreachable!("N lanes were pushed")
+        };
         for y in 0..planes[0].height {
             let kind = row_kind(kind, y, planes[0].height);
             match &mut gaps {
-                None => with_predictor!(kind, row_all::<T, N>(self, &mut planes, &mut lanes, &mut plain, y)),
-                Some(gaps) => with_predictor!(kind, row_gaps::<T, N>(self, &mut planes, gaps, &mut lanes, &mut plain, y)),
+                None => with_predictor!(
+                    kind,
+                    row_all::<T, N>(self, &mut planes, &mut lanes, &mut plain, y)
+                ),
+                Some(gaps) => with_predictor!(
+                    kind,
+                    row_gaps::<T, N>(self, &mut planes, gaps, &mut lanes, &mut plain, y)
+                ),
             }
         }
         lanes.iter().try_for_each(Lane::finish)?;
-        if plain.iter().any(BitReader::overran) { Err(Error::Truncated) } else { Ok(()) }
+        if plain.iter().any(BitReader::overran) {
+            Err(Error::Truncated)
+        } else {
+            Ok(())
+        }
     }
 
     #[inline(always)]
     fn residual(&self, token: u8, plain: &mut BitReader<'_>) -> u32 {
         let (smallest, bits) = self.residuals[usize::from(token)];
-        if bits == 0 { smallest } else { smallest | plain.take(bits) }
+        if bits == 0 {
+            smallest
+        } else {
+            smallest | plain.take(bits)
+        }
     }
 }
 
@@ -313,10 +349,21 @@ fn row_gaps<P: Predictor, T: Sample, const N: usize>(
     for at in start..start + width {
         for lane in 0..N {
             let samples = &mut planes[lane].samples;
-            let [a, b, c, d] = [samples[at - 1], samples[at - lag], samples[at - lag - 1], samples[at + 1 - lag]];
+            let [a, b, c, d] = [
+                samples[at - 1],
+                samples[at - lag],
+                samples[at - lag - 1],
+                samples[at + 1 - lag],
+            ];
             let (left, above) = (gaps[lane].samples[at - 1], gaps[lane].samples[at - lag]);
-            let context = if left | above == 0 { T::context::<P>(a, b, c, d) } else { gap_context(left, above) };
-            let token = model.tables.symbol(model.bases[usize::from(context)], &mut lanes[lane]);
+            let context = if left | above == 0 {
+                T::context::<P>(a, b, c, d)
+            } else {
+                gap_context(left, above)
+            };
+            let token = model
+                .tables
+                .symbol(model.bases[usize::from(context)], &mut lanes[lane]);
             if token == MISSING {
                 samples[at] = a;
                 gaps[lane].samples[at] = 1;
@@ -331,8 +378,15 @@ fn row_gaps<P: Predictor, T: Sample, const N: usize>(
 mod tests {
     use super::*;
 
-    const KINDS: [Kind; 7] =
-        [Kind::West, Kind::North, Kind::Slope, Kind::Plane, Kind::Median, Kind::Middle, Kind::Line];
+    const KINDS: [Kind; 7] = [
+        Kind::West,
+        Kind::North,
+        Kind::Slope,
+        Kind::Plane,
+        Kind::Median,
+        Kind::Middle,
+        Kind::Line,
+    ];
 
     #[test]
     fn tokens_name_every_residual() {
@@ -340,7 +394,11 @@ mod tests {
         for residual in (0..70_000).chain([1 << 20, 1 << 31, u32::MAX]) {
             let (token, bits) = token(residual);
             assert!(usize::from(token) <= LAST_TOKEN);
-            let low = if bits == 0 { 0 } else { residual & ((1 << bits) - 1) };
+            let low = if bits == 0 {
+                0
+            } else {
+                residual & ((1 << bits) - 1)
+            };
             assert_eq!(table[usize::from(token)], (residual - low, bits));
         }
     }
@@ -351,7 +409,10 @@ mod tests {
         kinds: &[Kind],
         sample: impl Fn(usize) -> Option<T>,
     ) -> usize {
-        let mut wide = Wide { samples: shape(), missing: gaps() };
+        let mut wide = Wide {
+            samples: shape(),
+            missing: gaps(),
+        };
         let mut index = 0;
         for lane in 0..wide.samples.lanes.len() {
             for y in 0..wide.samples.lanes[lane].height {
@@ -367,11 +428,20 @@ mod tests {
         }
         let mut bytes = Vec::new();
         wide.encode(kinds, &mut bytes);
-        let mut back = Wide { samples: shape(), missing: gaps() };
+        let mut back = Wide {
+            samples: shape(),
+            missing: gaps(),
+        };
         let mut input = Cursor::new(&bytes);
         back.decode(&mut input).unwrap();
         input.finish().unwrap();
-        let gaps: Vec<u8> = back.missing.iter().flat_map(Lanes::rows).flatten().copied().collect();
+        let gaps: Vec<u8> = back
+            .missing
+            .iter()
+            .flat_map(Lanes::rows)
+            .flatten()
+            .copied()
+            .collect();
         for (index, &value) in back.samples.rows().flatten().enumerate() {
             if gaps.get(index).is_some_and(|&gap| gap != 0) {
                 assert_eq!(sample(index), None);
@@ -388,19 +458,30 @@ mod tests {
             for kind in KINDS {
                 let size = width * height;
                 let noise = |index: usize| (index as u32).wrapping_mul(2_654_435_761);
-                round_trip(|| Lanes::pictures(1, width, height), || None, &[kind], |index| {
-                    Some((noise(index) >> 20) as u16 + index as u16)
-                });
-                round_trip(|| Lanes::pictures(1, width, height), || None, &[kind], |index| Some(noise(index)));
+                round_trip(
+                    || Lanes::pictures(1, width, height),
+                    || None,
+                    &[kind],
+                    |index| Some((noise(index) >> 20) as u16 + index as u16),
+                );
+                round_trip(
+                    || Lanes::pictures(1, width, height),
+                    || None,
+                    &[kind],
+                    |index| Some(noise(index)),
+                );
                 round_trip(
                     || Lanes::pictures(1, width, height),
                     || Some(Lanes::pictures(1, width, height)),
                     &[kind],
                     |index| (noise(index) >> 30 != 0).then(|| noise(index) >> 3),
                 );
-                round_trip(|| Lanes::sequence(size), || Some(Lanes::sequence(size)), &KINDS, |index| {
-                    (index % 7 != 0).then_some(index as u16)
-                });
+                round_trip(
+                    || Lanes::sequence(size),
+                    || Some(Lanes::sequence(size)),
+                    &KINDS,
+                    |index| (index % 7 != 0).then_some(index as u16),
+                );
             }
         }
     }
@@ -413,7 +494,8 @@ mod tests {
             &KINDS,
             |index| {
                 let (x, y) = (index % 640, index / 640);
-                (!(200..300).contains(&x) || !(100..200).contains(&y)).then_some((3 * x + 5 * y) as u16)
+                (!(200..300).contains(&x) || !(100..200).contains(&y))
+                    .then_some((3 * x + 5 * y) as u16)
             },
         );
         assert!(size < 5000, "{size}");
@@ -421,15 +503,28 @@ mod tests {
 
     #[test]
     fn a_cut_stream_is_an_error() {
-        let mut wide = Wide { samples: Lanes::pictures(1, 40, 40), missing: None };
+        let mut wide = Wide {
+            samples: Lanes::pictures(1, 40, 40),
+            missing: None,
+        };
         for y in 0..40 {
-            wide.samples.row_mut(0, y).iter_mut().enumerate().for_each(|(x, slot)| *slot = (x * y * y) as u16);
+            wide.samples
+                .row_mut(0, y)
+                .iter_mut()
+                .enumerate()
+                .for_each(|(x, slot)| *slot = (x * y * y) as u16);
         }
         let mut bytes = Vec::new();
         wide.encode(&KINDS, &mut bytes);
         for length in 0..bytes.len() {
-            let mut back = Wide { samples: Lanes::<u16>::pictures(1, 40, 40), missing: None };
-            assert!(back.decode(&mut Cursor::new(&bytes[..length])).is_err(), "{length}");
+            let mut back = Wide {
+                samples: Lanes::<u16>::pictures(1, 40, 40),
+                missing: None,
+            };
+            assert!(
+                back.decode(&mut Cursor::new(&bytes[..length])).is_err(),
+                "{length}"
+            );
         }
     }
 }

@@ -94,7 +94,11 @@ impl<'a> Cursor<'a> {
 
     /// Fails when bytes are left over: a frame is read to its end or not at all.
     pub(crate) fn finish(self) -> Result<(), Error> {
-        if self.rest.is_empty() { Ok(()) } else { Err(Error::Corrupt("bytes after the end")) }
+        if self.rest.is_empty() {
+            Ok(())
+        } else {
+            Err(Error::Corrupt("bytes after the end"))
+        }
     }
 }
 
@@ -124,8 +128,17 @@ mod tests {
         let mut bytes = Vec::new();
         put_varint(&mut bytes, 10);
         bytes.extend_from_slice(b"short");
-        assert!(matches!(Cursor::new(&bytes).block(), Err(Error::Corrupt(_))));
-        assert!(matches!(Cursor::new(&[0x80; 12]).varint(), Err(Error::Corrupt(_))));
-        assert!(matches!(Cursor::new(&[0x80]).varint(), Err(Error::Truncated)));
+        assert!(matches!(
+            Cursor::new(&bytes).block(),
+            Err(Error::Corrupt(_))
+        ));
+        assert!(matches!(
+            Cursor::new(&[0x80; 12]).varint(),
+            Err(Error::Corrupt(_))
+        ));
+        assert!(matches!(
+            Cursor::new(&[0x80]).varint(),
+            Err(Error::Truncated)
+        ));
     }
 }

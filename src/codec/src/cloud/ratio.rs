@@ -46,14 +46,21 @@ pub(super) struct Guess {
     sharing: Sharing,
 }
 
-const REFERENCES: [Reference; 4] = [Reference::Last, Reference::First, Reference::Second, Reference::Both];
+const REFERENCES: [Reference; 4] = [
+    Reference::Last,
+    Reference::First,
+    Reference::Second,
+    Reference::Both,
+];
 const SHARINGS: [Sharing; 4] = [Sharing::All, Sharing::Column, Sharing::Row, Sharing::Ring];
 
 impl Guess {
     fn all() -> impl Iterator<Item = Self> {
-        REFERENCES
-            .into_iter()
-            .flat_map(|reference| SHARINGS.into_iter().map(move |sharing| Self { reference, sharing }))
+        REFERENCES.into_iter().flat_map(|reference| {
+            SHARINGS
+                .into_iter()
+                .map(move |sharing| Self { reference, sharing })
+        })
     }
 
     /// Whether it is of use at all, with what is known.
@@ -141,7 +148,14 @@ impl<'a> Tracker<'a> {
             (Reference::Last, _) | (_, Sharing::All) => 1,
             _ => 32,
         };
-        Self { guess, known, width, learned: vec![Learned::default(); slots], last: Learned::default(), memory }
+        Self {
+            guess,
+            known,
+            width,
+            learned: vec![Learned::default(); slots],
+            last: Learned::default(),
+            memory,
+        }
     }
 
     #[inline(always)]
@@ -150,7 +164,11 @@ impl<'a> Tracker<'a> {
             Sharing::All => 0,
             Sharing::Column => index % self.width,
             Sharing::Row => index / self.width,
-            Sharing::Ring => self.known.ring.as_ref().map_or(0, |ring| usize::from(ring[index])),
+            Sharing::Ring => self
+                .known
+                .ring
+                .as_ref()
+                .map_or(0, |ring| usize::from(ring[index])),
         }
     }
 
@@ -164,7 +182,11 @@ impl<'a> Tracker<'a> {
             learned.quotient = self.last.quotient;
         }
         let usable = reference.is_finite() && reference != 0.0;
-        let guessed = if usable { ((learned.quotient * reference) as f32).to_bits() } else { bits };
+        let guessed = if usable {
+            ((learned.quotient * reference) as f32).to_bits()
+        } else {
+            bits
+        };
         let truth = f64::from(f32::from_bits(tell(guessed)));
         if usable && truth.is_finite() {
             learned.points = (learned.points + 1).min(self.memory);
@@ -232,7 +254,9 @@ fn size(difference: u32) -> u64 {
 fn plain_cost(bits: &[u32], shape: Shape) -> u64 {
     let sample = &bits[..bits.len().min(SAMPLE)];
     if let Some(scale) = crate::scale::Scale::find(sample) {
-        let multiples = sample.windows(2).map(|pair| (scale.multiple(pair[0]), scale.multiple(pair[1])));
+        let multiples = sample
+            .windows(2)
+            .map(|pair| (scale.multiple(pair[0]), scale.multiple(pair[1])));
         return multiples.map(|(a, b)| size(b.wrapping_sub(a) as u32)).sum();
     }
     let above = match shape {
@@ -245,7 +269,9 @@ fn plain_cost(bits: &[u32], shape: Shape) -> u64 {
         if index <= above {
             return west;
         }
-        let plane = order(index - 1).wrapping_add(order(index - above)).wrapping_sub(order(index - above - 1));
+        let plane = order(index - 1)
+            .wrapping_add(order(index - above))
+            .wrapping_sub(order(index - above - 1));
         west.min(size(order(index).wrapping_sub(plane)))
     };
     (1..sample.len()).map(cost).sum()

@@ -19,7 +19,11 @@ const SLOW: u32 = 7;
 
 impl Default for Bit {
     fn default() -> Self {
-        Self { fast: 1 << 15, slow: 1 << 15, seen: 0 }
+        Self {
+            fast: 1 << 15,
+            slow: 1 << 15,
+            seen: 0,
+        }
     }
 }
 
@@ -54,7 +58,11 @@ pub(crate) struct BinaryEncoder {
 
 impl BinaryEncoder {
     pub(crate) fn new() -> Self {
-        Self { low: 0, range: u32::MAX, out: Vec::new() }
+        Self {
+            low: 0,
+            range: u32::MAX,
+            out: Vec::new(),
+        }
     }
 
     #[inline]
@@ -62,12 +70,6 @@ impl BinaryEncoder {
         let split = ((u64::from(self.range) * u64::from(bit.zero())) >> 16) as u32;
         bit.learn(one);
         self.narrow(split, one);
-    }
-
-    /// A decision without a model: one whole bit.
-    #[inline]
-    pub(crate) fn put_flat(&mut self, one: bool) {
-        self.narrow(self.range >> 1, one);
     }
 
     #[inline]
@@ -123,7 +125,12 @@ pub(crate) struct BinaryDecoder<'a> {
 
 impl<'a> BinaryDecoder<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        let mut this = Self { code: 0, range: u32::MAX, bytes, missing: 0 };
+        let mut this = Self {
+            code: 0,
+            range: u32::MAX,
+            bytes,
+            missing: 0,
+        };
         for _ in 0..4 {
             this.code = this.code << 8 | this.next();
         }
@@ -152,12 +159,6 @@ impl<'a> BinaryDecoder<'a> {
         one
     }
 
-    /// The counterpart of [`BinaryEncoder::put_flat`].
-    #[inline]
-    pub(crate) fn get_flat(&mut self) -> bool {
-        self.narrow(self.range >> 1)
-    }
-
     #[inline]
     fn narrow(&mut self, split: u32) -> bool {
         let one = self.code >= split;
@@ -175,7 +176,11 @@ impl<'a> BinaryDecoder<'a> {
     }
 
     pub(crate) fn finish(self) -> Result<(), Error> {
-        if self.bytes.is_empty() { Ok(()) } else { Err(Error::Corrupt("bytes after the last decision")) }
+        if self.bytes.is_empty() {
+            Ok(())
+        } else {
+            Err(Error::Corrupt("bytes after the last decision"))
+        }
     }
 }
 
@@ -191,19 +196,17 @@ mod tests {
         for index in 0..100_000 {
             encoder.put(&mut bit, decision(index));
             if index % 100 == 0 {
-                encoder.put_flat(index % 300 == 0);
                 encoder.put(&mut other, true);
             }
         }
         let bytes = encoder.finish();
-        // One in 128: 0.066 bits each by Shannon, and a thousand whole bits.
-        assert!(bytes.len() < 100_000 * 75 / 8000 + 1000 / 8 + 20, "{}", bytes.len());
+        // One in 128: 0.066 bits each by Shannon.
+        assert!(bytes.len() < 100_000 * 75 / 8000 + 20, "{}", bytes.len());
         let mut decoder = BinaryDecoder::new(&bytes);
         let (mut bit, mut other) = (Bit::default(), Bit::default());
         for index in 0..100_000 {
             assert_eq!(decoder.get(&mut bit), decision(index), "{index}");
             if index % 100 == 0 {
-                assert_eq!(decoder.get_flat(), index % 300 == 0);
                 assert!(decoder.get(&mut other));
             }
         }

@@ -16,7 +16,8 @@ impl BitWriter {
         self.pending |= u64::from(value) << self.count;
         self.count += count;
         if self.count >= 32 {
-            self.bytes.extend_from_slice(&(self.pending as u32).to_le_bytes());
+            self.bytes
+                .extend_from_slice(&(self.pending as u32).to_le_bytes());
             self.pending >>= 32;
             self.count -= 32;
         }
@@ -41,7 +42,8 @@ impl BitWriter {
 
     pub(crate) fn finish(mut self) -> Vec<u8> {
         let left = self.count.div_ceil(8) as usize;
-        self.bytes.extend_from_slice(&self.pending.to_le_bytes()[..left]);
+        self.bytes
+            .extend_from_slice(&self.pending.to_le_bytes()[..left]);
         self.bytes
     }
 }
@@ -58,7 +60,10 @@ pub(crate) struct BitReader<'a> {
 
 impl<'a> BitReader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self { bytes, ..Self::default() }
+        Self {
+            bytes,
+            ..Self::default()
+        }
     }
 
     #[inline]

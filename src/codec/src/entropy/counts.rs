@@ -51,7 +51,11 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
     let size = 1i32 << log;
     let mut left = size;
     let mut largest = 0;
-    for (symbol, &count) in histogram.iter().enumerate().filter(|&(_, &count)| count > 0) {
+    for (symbol, &count) in histogram
+        .iter()
+        .enumerate()
+        .filter(|&(_, &count)| count > 0)
+    {
         let scaled = ((u64::from(count) << log) + total / 2) / total;
         counts[symbol] = scaled.max(1) as u16;
         left -= i32::from(counts[symbol]);
@@ -64,7 +68,9 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
     }
     // Rounding up rare symbols took too much: give it back where a single state matters least.
     while left < 0 {
-        let richest = (0..SYMBOLS).max_by_key(|&symbol| counts[symbol]).unwrap_or(0);
+        let richest = (0..SYMBOLS)
+            .max_by_key(|&symbol| counts[symbol])
+            .unwrap_or(0);
         let step = (counts[richest] / 16).clamp(1, (-left) as u16);
         counts[richest] -= step;
         left += i32::from(step);
@@ -89,7 +95,9 @@ pub(crate) fn write(counts: &Counts, order: Order, log: u32, out: &mut BitWriter
         left -= count;
         rank += 1;
         if count == 0 {
-            let zeros = (rank..SYMBOLS).take_while(|&rank| counts[order.symbol(rank)] == 0).count();
+            let zeros = (rank..SYMBOLS)
+                .take_while(|&rank| counts[order.symbol(rank)] == 0)
+                .count();
             out.put_gamma(zeros as u32 + 1);
             rank += zeros;
         }
@@ -110,7 +118,10 @@ pub(crate) fn read(order: Order, log: u32, input: &mut BitReader<'_>) -> Result<
         if rank >= SYMBOLS || input.overran() {
             return Err(BAD);
         }
-        let count = input.take_rice(rice_parameter(average), left).filter(|&count| count <= left).ok_or(BAD)?;
+        let count = input
+            .take_rice(rice_parameter(average), left)
+            .filter(|&count| count <= left)
+            .ok_or(BAD)?;
         counts[order.symbol(rank)] = count as u16;
         average = (average + count).div_ceil(2);
         left -= count;
@@ -128,7 +139,11 @@ pub(crate) fn read(order: Order, log: u32, input: &mut BitReader<'_>) -> Result<
 
 fn rice_parameter(average: u32) -> u32 {
     let half = average / 2;
-    if half == 0 { 0 } else { 32 - half.leading_zeros() - 1 }
+    if half == 0 {
+        0
+    } else {
+        32 - half.leading_zeros() - 1
+    }
 }
 
 #[cfg(test)]
@@ -152,7 +167,10 @@ mod tests {
         for log in [8, 9, 11] {
             let counts = round_trip(&histogram, log, Order::Natural);
             assert!(counts.iter().all(|&count| count > 0));
-            assert_eq!(counts.iter().map(|&count| u32::from(count)).sum::<u32>(), 1 << log);
+            assert_eq!(
+                counts.iter().map(|&count| u32::from(count)).sum::<u32>(),
+                1 << log
+            );
         }
     }
 
@@ -171,6 +189,9 @@ mod tests {
             seen[Order::Signed.symbol(rank)] = true;
         }
         assert!(seen.iter().all(|&seen| seen));
-        assert_eq!([0, 1, 2].map(|rank| Order::Signed.symbol(rank)), [0, 255, 1]);
+        assert_eq!(
+            [0, 1, 2].map(|rank| Order::Signed.symbol(rank)),
+            [0, 255, 1]
+        );
     }
 }

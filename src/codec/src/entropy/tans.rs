@@ -66,12 +66,21 @@ pub(crate) struct Encoder {
 
 impl Encoder {
     /// Builds the tables and writes their description to `out`.
-    pub(crate) fn new(histogram: &Histogram, contexts: usize, order: Order, out: &mut Vec<u8>) -> Self {
+    pub(crate) fn new(
+        histogram: &Histogram,
+        contexts: usize,
+        order: Order,
+        out: &mut Vec<u8>,
+    ) -> Self {
         let total: usize = histogram.0.iter().map(|&count| count as usize).sum();
         let log = counts::log_for(total);
         let mut description = BitWriter::default();
         description.put(log - 8, 2);
-        let mut this = Self { log, shed: boxed(), next: boxed() };
+        let mut this = Self {
+            log,
+            shed: boxed(),
+            next: boxed(),
+        };
         for context in 0..contexts {
             let keys = context * SYMBOLS..(context + 1) * SYMBOLS;
             let counts = counts::normalise(&histogram.0[keys], log);
@@ -89,7 +98,11 @@ impl Encoder {
         let mut start = base;
         for (symbol, &count) in counts.iter().enumerate().filter(|&(_, &count)| count > 0) {
             // A state sheds `most` or `most - 1` bits to land in count..2·count.
-            let most = if count == 1 { self.log } else { self.log - (count - 1).ilog2() };
+            let most = if count == 1 {
+                self.log
+            } else {
+                self.log - (count - 1).ilog2()
+            };
             let adder = (most << 16).wrapping_sub(u32::from(count) << most);
             self.shed[context * SYMBOLS + symbol] = (adder, start as i32 - i32::from(count));
             starts[symbol] = start;
@@ -132,7 +145,8 @@ impl Encoder {
                 if written[lane] + 8 > out[lane].len() {
                     grow(&mut out[lane]);
                 }
-                out[lane][written[lane]..written[lane] + 8].copy_from_slice(&pending[lane].to_le_bytes());
+                out[lane][written[lane]..written[lane] + 8]
+                    .copy_from_slice(&pending[lane].to_le_bytes());
                 written[lane] += (count[lane] >> 3) as usize;
                 pending[lane] >>= count[lane] & !7;
                 count[lane] &= 7;
@@ -164,10 +178,18 @@ pub(crate) struct Decoder {
 
 impl Decoder {
     /// Reads the description of a model of `contexts` contexts; returns how many bytes it took.
-    pub(crate) fn read(bytes: &[u8], contexts: usize, order: Order) -> Result<(Self, usize), Error> {
+    pub(crate) fn read(
+        bytes: &[u8],
+        contexts: usize,
+        order: Order,
+    ) -> Result<(Self, usize), Error> {
         let mut input = BitReader::new(bytes);
         let log = input.take(2) + 8;
-        let mut this = Self { log, contexts, entries: boxed() };
+        let mut this = Self {
+            log,
+            contexts,
+            entries: boxed(),
+        };
         for context in 0..contexts {
             let counts = counts::read(order, log, &mut input)?;
             this.fill(context, &counts);
@@ -229,7 +251,13 @@ impl<'a> Lane<'a> {
             return Err(Error::Corrupt("a lane without its end mark"));
         }
         let below = ((bytes.len() - 1) * 8 + last.ilog2() as usize) as isize;
-        let mut lane = Self { bytes, state: 0, window: 0, filled: 0, below };
+        let mut lane = Self {
+            bytes,
+            state: 0,
+            window: 0,
+            filled: 0,
+            below,
+        };
         lane.state = lane.take(log);
         Ok(lane)
     }
@@ -288,7 +316,10 @@ mod tests {
         for (symbols, stream) in lanes.iter().zip(&streams) {
             let mut lane = Lane::new(stream, decoder.log).unwrap();
             for &key in *symbols {
-                assert_eq!(u16::from(decoder.symbol(decoder.base(usize::from(key >> 8)), &mut lane)), key & 0xff);
+                assert_eq!(
+                    u16::from(decoder.symbol(decoder.base(usize::from(key >> 8)), &mut lane)),
+                    key & 0xff
+                );
             }
             lane.finish().unwrap();
         }
@@ -300,7 +331,9 @@ mod tests {
         let mut state = seed;
         (0..count)
             .map(|index| {
-                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
                 let context = (index % 5) as u16;
                 context << 8 | ((state >> 33).trailing_zeros() as u16)
             })
@@ -313,7 +346,10 @@ mod tests {
             let lanes = [skewed(count, 1), skewed(count, 2), skewed(count, 3)];
             let size = round_trip([&lanes[0], &lanes[1], &lanes[2]], 5, Order::Natural);
             // The numbers hold two bits each.
-            assert!(size < 3 * count / 4 + count / 50 + 300, "{count} symbols took {size} bytes");
+            assert!(
+                size < 3 * count / 4 + count / 50 + 300,
+                "{count} symbols took {size} bytes"
+            );
         }
     }
 

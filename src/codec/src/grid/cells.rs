@@ -138,13 +138,24 @@ impl Side for Decoding<'_> {
 
 /// Appends `cells` as they differ from `base`.
 pub(super) fn encode(cells: &[u8], layout: &Grid, base: Base<'_>, out: &mut Vec<u8>) {
-    let side = Encoding { coder: BinaryEncoder::new(), cells };
+    let side = Encoding {
+        coder: BinaryEncoder::new(),
+        cells,
+    };
     out.extend_from_slice(&walk(side, layout, base).coder.finish());
 }
 
 /// Turns `cells`, which are as `base` says, into what was encoded.
-pub(super) fn decode(bytes: &[u8], layout: &Grid, base: Base<'_>, cells: &mut [u8]) -> Result<(), Error> {
-    let side = Decoding { coder: BinaryDecoder::new(bytes), cells };
+pub(super) fn decode(
+    bytes: &[u8],
+    layout: &Grid,
+    base: Base<'_>,
+    cells: &mut [u8],
+) -> Result<(), Error> {
+    let side = Decoding {
+        coder: BinaryDecoder::new(bytes),
+        cells,
+    };
     walk(side, layout, base).coder.finish()
 }
 
@@ -222,7 +233,10 @@ impl<S: Side> Walk<'_, S> {
             for y in rows {
                 let (new, old) = (self.row_of(y), self.base_row(y));
                 if new != old {
-                    for (tile, (new, old)) in changed.iter_mut().zip(new.chunks(TILE).zip(old.chunks(TILE))) {
+                    for (tile, (new, old)) in changed
+                        .iter_mut()
+                        .zip(new.chunks(TILE).zip(old.chunks(TILE)))
+                    {
                         *tile = *tile || new != old;
                     }
                 }
@@ -251,7 +265,13 @@ impl<S: Side> Walk<'_, S> {
         }
     }
 
-    fn block(&mut self, columns: Range<usize>, rows: Range<usize>, left: State, above: State) -> State {
+    fn block(
+        &mut self,
+        columns: Range<usize>,
+        rows: Range<usize>,
+        left: State,
+        above: State,
+    ) -> State {
         let at = rows.start * self.width + columns.start;
         let (mut differs, mut uniform) = (false, true);
         if S::ENCODES {
@@ -263,10 +283,16 @@ impl<S: Side> Walk<'_, S> {
             }
         }
         let context = |state: State| usize::from(left == state) + 2 * usize::from(above == state);
-        if !self.side.bit(&mut self.model.blocks[context(State::Same)], differs) {
+        if !self
+            .side
+            .bit(&mut self.model.blocks[context(State::Same)], differs)
+        {
             return State::Same;
         }
-        if !self.side.bit(&mut self.model.uniform[context(State::Uniform)], uniform) {
+        if !self
+            .side
+            .bit(&mut self.model.uniform[context(State::Uniform)], uniform)
+        {
             return State::Mixed;
         }
         // The cells of a mixed block to the left are told only later.
@@ -276,9 +302,18 @@ impl<S: Side> Walk<'_, S> {
             _ => KNOWN[0],
         };
         let known = self.side.cells()[at];
-        let value = value(&mut self.side, &mut self.model.uniform_value, &mut self.model.values, guess, known);
+        let value = value(
+            &mut self.side,
+            &mut self.model.uniform_value,
+            &mut self.model.values,
+            guess,
+            known,
+        );
         for y in rows {
-            self.side.set(y * self.width + columns.start..y * self.width + columns.end, value);
+            self.side.set(
+                y * self.width + columns.start..y * self.width + columns.end,
+                value,
+            );
         }
         State::Uniform
     }
@@ -300,7 +335,11 @@ impl<S: Side> Walk<'_, S> {
     #[inline(always)]
     fn near(&self, x: usize, y: usize, left: isize, up: usize, outside: u8) -> u8 {
         let column = x.wrapping_add_signed(-left);
-        if column < self.width && up <= y { self.side.cells()[(y - up) * self.width + column] } else { outside }
+        if column < self.width && up <= y {
+            self.side.cells()[(y - up) * self.width + column]
+        } else {
+            outside
+        }
     }
 
     #[inline(always)]
@@ -322,12 +361,24 @@ impl<S: Side> Walk<'_, S> {
         let at = y * self.width + x;
         let old = base[at];
         let (west, north) = (self.near(x, y, 1, 0, old), self.near(x, y, 0, 1, old));
-        let east = if x + 1 < self.width { base[at + 1] } else { old };
-        let south = if y + 1 < self.height { base[at + self.width] } else { old };
+        let east = if x + 1 < self.width {
+            base[at + 1]
+        } else {
+            old
+        };
+        let south = if y + 1 < self.height {
+            base[at + self.width]
+        } else {
+            old
+        };
         let west_changed = x > 0 && west != base[at - 1];
         let north_changed = y > 0 && north != base[at - self.width];
         let context = context([old, west, north, east, south]) << 2;
-        self.cell(at, old, context | usize::from(west_changed) | usize::from(north_changed) << 1);
+        self.cell(
+            at,
+            old,
+            context | usize::from(west_changed) | usize::from(north_changed) << 1,
+        );
     }
 
     #[inline(always)]
@@ -341,12 +392,20 @@ impl<S: Side> Walk<'_, S> {
 
 #[inline(always)]
 fn context<const N: usize>(neighbours: [u8; N]) -> usize {
-    neighbours.into_iter().fold(0, |context, cell| context << 2 | usize::from(CLASSES[usize::from(cell)]))
+    neighbours.into_iter().fold(0, |context, cell| {
+        context << 2 | usize::from(CLASSES[usize::from(cell)])
+    })
 }
 
 /// Codes a cell: as guessed, one of the known values, or any other.
 #[inline(always)]
-fn value<S: Side>(side: &mut S, bits: &mut [Bit; 4], values: &mut [Bit], guess: u8, known: u8) -> u8 {
+fn value<S: Side>(
+    side: &mut S,
+    bits: &mut [Bit; 4],
+    values: &mut [Bit],
+    guess: u8,
+    known: u8,
+) -> u8 {
     if !side.bit(&mut bits[0], known != guess) {
         return guess;
     }
@@ -354,7 +413,10 @@ fn value<S: Side>(side: &mut S, bits: &mut [Bit; 4], values: &mut [Bit], guess: 
         return full(side, values, known);
     }
     let mut candidates = KNOWN.into_iter().filter(|&value| value != guess);
-    let (first, second) = (candidates.next().unwrap_or(0), candidates.next().unwrap_or(0));
+    let (first, second) = (
+        candidates.next().unwrap_or(0),
+        candidates.next().unwrap_or(0),
+    );
     if !side.bit(&mut bits[2], known != first) {
         return first;
     }

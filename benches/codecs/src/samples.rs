@@ -1,0 +1,208 @@
+//! What is measured: the recordings beside the repository when they are there, packaged pictures otherwise, and
+//! synthetic corner cases.
+
+use anyhow::{Context, Result, bail};
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// A picture as decoded.
+pub struct Picture {
+    pub name: String,
+    pub width: usize,
+    pub height: usize,
+    /// Bytes per pixel: 1 grey, 2 depth (little endian), 3 red, green, blue.
+    pub depth: usize,
+    pub data: Vec<u8>,
+}
+
+/// Where the recordings are, if they are.
+pub fn recordings() -> Option<PathBuf> {
+    let path = bench_report::root().join("../shared/data");
+    path.is_dir().then_some(path)
+}
+
+/// Debian's `opencv-doc`.
+pub fn packaged() -> PathBuf {
+    PathBuf::from("/usr/share/doc/opencv-doc/examples/data")
+}
+
+fn picture(path: &Path) -> Result<Picture> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let decoder = png::Decoder::new(BufReader::new(File::open(path).with_context(|| path.display().to_string())?));
+    let mut reader = decoder.read_info()?;
+    let mut data = vec![0; reader.output_buffer_size().context("picture is too large")?];
+    let info = reader.next_frame(&mut data)?;
+    data.truncate(info.buffer_size());
+    let depth = match (info.color_type, info.bit_depth) {
+        (png::ColorType::Grayscale, png::BitDepth::Eight) => 1,
+        (png::ColorType::Grayscale, png::BitDepth::Sixteen) => {
+            // PNG is big endian.
+            data.chunks_exact_mut(2).for_each(|pair| pair.swap(0, 1));
+            2
+        }
+        (png::ColorType::Rgb, png::BitDepth::Eight) => 3,
+        (png::ColorType::Rgba, png::BitDepth::Eight) => {
+            data = data.chunks_exact(4).flat_map(|pixel| &pixel[..3]).copied().collect();
+            3
+        }
+        other => bail!("{name} holds {other:?}, which is not measured"),
+    };
+    Ok(Picture { name, width: info.width as usize, height: info.height as usize, depth, data })
+}
+
+fn pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
+    names.iter().map(|name| picture(&directory.join(name))).collect()
+}
+
+/// Colour frames of a camera.
+pub fn colours() -> Result<Vec<Picture>> {
+    match recordings() {
+        Some(path) => pictures(&path, &["color1.png", "color2.png", "color3.png"]),
+        None => packaged_colours(),
+    }
+}
+
+/// Photographs that are on any machine with `opencv-doc`.
+pub fn packaged_colours() -> Result<Vec<Picture>> {
+    pictures(&packaged(), &["rubberwhale1.png", "graf1.png", "basketball1.png"])
+}
+
+/// Depth frames; without recordings, the packaged disparity.
+pub fn depths() -> Result<Vec<Picture>> {
+    match recordings() {
+        Some(path) => pictures(&path, &["depth1.png", "depth2.png", "depth3.png"]),
+        None => Ok(motorcycle().iter().map(Disparity::depth).collect()),
+    }
+}
+
+/// A disparity measured by structured light, one float per pixel, infinite where there is none.
+pub struct Disparity {
+    pub width: usize,
+    pub height: usize,
+    pub values: Vec<f32>,
+}
+
+impl Disparity {
+    /// As depth in millimetres, zero where there is none: for Middlebury's 2014 rig, scaled as the picture is.
+    fn depth(&self) -> Picture {
+        let millimetre = |&disparity: &f32| {
+            let depth = 193.001 * 994.978 / (disparity + 32.778);
+            if depth.is_finite() && disparity.is_finite() { depth as u16 } else { 0 }
+        };
+        let data = self.values.iter().map(millimetre).flat_map(u16::to_le_bytes).collect();
+        Picture { name: "motorcycle".to_owned(), width: self.width, height: self.height, depth: 2, data }
+    }
+}
+
+/// scikit-image's motorcycle, if `samples.py` could fetch it: `height · width · floats`, little endian.
+pub fn motorcycle() -> Option<Disparity> {
+    let path = bench_report::root().join("target/bench/samples/motorcycle_disp.f32");
+    if !path.exists() {
+        let script = bench_report::root().join("benches/codecs/samples.py");
+        let fetched = Command::new("python3").arg(script).arg(path.parent()?).status();
+        if !fetched.is_ok_and(|status| status.success()) {
+            eprintln!("scikit-image's samples are not at hand: the float disparity is left out");
+            return None;
+        }
+    }
+    let bytes = std::fs::read(path).ok()?;
+    let size = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
+    let (height, width) = (size(0)?, size(4)?);
+    let values: Vec<f32> = bytes[8..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    (values.len() == width * height).then_some(Disparity { width, height, values })
+}
+
+/// An office floor of 566×608 cells as an occupancy grid: unknown, free, occupied.
+pub fn office() -> Result<Picture> {
+    let Some(path) = recordings() else { return Ok(rooms()) };
+    let mut pgm = Vec::new();
+    flate2::read::GzDecoder::new(File::open(path.join("willow.pgm.gz"))?).read_to_end(&mut pgm)?;
+    let mut numbers = Vec::new();
+    let mut at = 2;
+    while numbers.len() < 3 {
+        while pgm[at].is_ascii_whitespace() || pgm[at] == b'#' {
+            let line = pgm[at] == b'#';
+            while line && pgm[at] != b'\n' {
+                at += 1;
+            }
+            at += 1;
+        }
+        let end = at + pgm[at..].iter().position(u8::is_ascii_whitespace).context("a header without end")?;
+        numbers.push(std::str::from_utf8(&pgm[at..end])?.parse::<usize>()?);
+        at = end;
+    }
+    let (width, height) = (numbers[0], numbers[1]);
+    let pixels = &pgm[at + 1..at + 1 + width * height];
+    // As map_server does it, with its usual thresholds.
+    let cell = |&pixel: &u8| match (255.0 - f64::from(pixel)) / 255.0 {
+        occupied if occupied > 0.65 => 100u8,
+        occupied if occupied < 0.196 => 0,
+        _ => 255,
+    };
+    // A map begins at the bottom, a picture at the top.
+    let data = pixels.chunks_exact(width).rev().flatten().map(cell).collect();
+    Ok(Picture { name: "willow".to_owned(), width, height, depth: 1, data })
+}
+
+/// Rooms and corridors, where there is no recording.
+fn rooms() -> Picture {
+    let (width, height) = (566, 608);
+    let mut data = vec![255u8; width * height];
+    for y in 20..height - 20 {
+        for x in 20..width - 20 {
+            let wall = (x % 90 < 2 && y % 70 > 12) || (y % 110 < 2 && x % 80 > 10);
+            let noise = (x * 2_654_435_761 ^ y * 40_503) % 97 == 0;
+            data[y * width + x] = if wall || noise { 100 } else { 0 };
+        }
+    }
+    Picture { name: "rooms".to_owned(), width, height, depth: 1, data }
+}
+
+/// A grid of `size`×`size` cells with `map` in its middle, as gmapping publishes.
+pub fn in_the_middle(map: &Picture, size: usize) -> Vec<u8> {
+    let mut cells = vec![255u8; size * size];
+    let (left, top) = ((size - map.width) / 2, (size - map.height) / 2);
+    for (y, row) in map.data.chunks_exact(map.width).enumerate() {
+        let start = (top + y) * size + left;
+        cells[start..start + map.width].copy_from_slice(row);
+    }
+    cells
+}
+
+/// Frames of `vtest.avi` as blue, green, red.
+pub fn video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
+    let output = Command::new("ffmpeg")
+        .args(["-v", "error", "-i"])
+        .arg(packaged().join("vtest.avi"))
+        .args(["-frames:v", &frames.to_string(), "-f", "rawvideo", "-pix_fmt", "bgr24", "-"])
+        .output()
+        .context("ffmpeg decodes the video; install it")?;
+    if !output.status.success() {
+        bail!("ffmpeg: {}; install opencv-doc for vtest.avi", String::from_utf8_lossy(&output.stderr));
+    }
+    Ok((768, 576, output.stdout))
+}
+
+/// A small deterministic source of noise (xorshift).
+pub struct Noise(pub u64);
+
+impl Noise {
+    pub fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    /// Uniform in 0.0..1.0.
+    pub fn unit(&mut self) -> f64 {
+        (self.next() >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// Normal, by the sum of twelve.
+    pub fn normal(&mut self) -> f64 {
+        (0..12).map(|_| self.unit()).sum::<f64>() - 6.0
+    }
+}

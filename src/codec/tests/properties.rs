@@ -1,0 +1,404 @@
+//! What must hold for every message and every frame.
+
+use codec::{Codec, Decoder, Encoder, Error, Schema, VideoOptions};
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+const CODECS: [Codec; 9] = [
+    Codec::Raw,
+    Codec::Zlib(1),
+    Codec::Deflate(9),
+    Codec::Zstd(-3),
+    Codec::Image,
+    Codec::Grid,
+    Codec::Scan,
+    Codec::Cloud,
+    Codec::Zstd(9),
+];
+const SCHEMAS: [Schema; 5] = [
+    Schema::Image,
+    Schema::OccupancyGrid,
+    Schema::LaserScan,
+    Schema::PointCloud2,
+    Schema::Other,
+];
+const LIMIT: usize = 1 << 22;
+
+/// Fields of a ROS message, one after the other.
+#[derive(Default)]
+struct Message(Vec<u8>);
+
+impl Message {
+    fn new() -> Self {
+        Self::default().u32(1).u32(2).u32(3).bytes(b"frame")
+    }
+
+    fn raw(mut self, bytes: &[u8]) -> Self {
+        self.0.extend_from_slice(bytes);
+        self
+    }
+
+    fn u32(self, value: u32) -> Self {
+        self.raw(&value.to_le_bytes())
+    }
+
+    fn bytes(self, bytes: &[u8]) -> Self {
+        self.u32(bytes.len() as u32).raw(bytes)
+    }
+}
+
+/// Bytes that look like samples: smooth, with noise of some size.
+fn samples(count: usize, seed: u64, noise: u8) -> Vec<u8> {
+    let mut state = seed | 1;
+    (0..count)
+        .map(|index| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            ((index / 7) as u8).wrapping_add((state >> 24) as u8 & noise)
+        })
+        .collect()
+}
+
+fn image() -> impl Strategy<Value = Vec<u8>> {
+    let encodings = prop::sample::select(vec![
+        "rgb8",
+        "bgr8",
+        "rgba8",
+        "bgra8",
+        "mono8",
+        "8UC2",
+        "bayer_rggb8",
+        "bayer_gbrg8",
+        "mono16",
+        "16UC1",
+        "32FC1",
+        "32SC1",
+        "bayer_rggb16",
+        "yuv422",
+        "64FC1",
+        "rgb16",
+    ]);
+    let noise = prop::sample::select(vec![0u8, 1, 3, 0x7f, 0xff]);
+    (
+        encodings,
+        1usize..70,
+        1usize..70,
+        0usize..9,
+        any::<bool>(),
+        any::<u64>(),
+        noise,
+    )
+        .prop_map(
+            |(encoding, width, height, padding, big_endian, seed, noise)| {
+                let pixel = match encoding {
+                    "rgb8" | "bgr8" => 3,
+                    "rgba8" | "bgra8" | "32FC1" | "32SC1" => 4,
+                    "mono16" | "16UC1" | "bayer_rggb16" | "8UC2" | "yuv422" => 2,
+                    "64FC1" => 8,
+                    "rgb16" => 6,
+                    _ => 1,
+                };
+                let step = width * pixel + padding;
+                let message = Message::new()
+                    .u32(height as u32)
+                    .u32(width as u32)
+                    .bytes(encoding.as_bytes());
+                let message = message.raw(&[big_endian.into()]).u32(step as u32);
+                message.bytes(&samples(step * height, seed, noise)).0
+            },
+        )
+}
+
+fn grid() -> impl Strategy<Value = Vec<u8>> {
+    (1usize..150, 1usize..150, any::<u64>(), 0u32..5, 0u8..4).prop_map(
+        |(width, height, seed, shift, kind)| {
+            let cells: Vec<u8> = samples(width * height, seed, if kind == 3 { 0xff } else { 7 })
+                .iter()
+                .map(|&value| match kind {
+                    0 => [255, 0, 100][usize::from(value % 3)],
+                    1 => [255, 255, 255, 255, 255, 255, 0, 100][usize::from(value % 8)],
+                    _ => value,
+                })
+                .collect();
+            let origin = f64::from(shift) * 0.5;
+            let message = Message::new().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
+            let message = message
+                .u32(width as u32)
+                .u32(height as u32)
+                .raw(&origin.to_le_bytes())
+                .raw(&[0; 48]);
+            message.bytes(&cells).0
+        },
+    )
+}
+
+/// Floats of many kinds: measured in millimetres, rough, missing.
+fn float() -> impl Strategy<Value = f32> {
+    prop_oneof![
+        8 => (0u32..30_000).prop_map(|count| count as f32 * 0.001),
+        1 => any::<f32>(),
+        1 => prop::sample::select(vec![f32::NAN, f32::INFINITY, 0.0, -0.0, f32::from_bits(0x7fc0_0001)]),
+    ]
+}
+
+fn scan() -> impl Strategy<Value = Vec<u8>> {
+    (vec(float(), 0..1500), vec(any::<f32>(), 0..1500)).prop_map(|(ranges, intensities)| {
+        let floats = |message: Message, values: &[f32]| {
+            values
+                .iter()
+                .fold(message.u32(values.len() as u32), |message, value| {
+                    message.raw(&value.to_le_bytes())
+                })
+        };
+        floats(floats(Message::new().raw(&[1; 28]), &ranges), &intensities).0
+    })
+}
+
+fn cloud() -> impl Strategy<Value = Vec<u8>> {
+    let names = prop::sample::select(vec!["x", "y", "z", "rgb", "ring", "intensity", "normal"]);
+    let field = (names, 1u8..9, 0usize..4, 0u32..3);
+    (
+        vec(field, 0..7),
+        1usize..40,
+        1usize..40,
+        0usize..5,
+        0usize..5,
+        any::<u64>(),
+        vec(float(), 1..60),
+    )
+        .prop_map(|(fields, width, height, tail, padding, seed, floats)| {
+            let mut offset = 0;
+            let mut list = Message::default();
+            let count = fields.len() as u32;
+            let mut float_offsets = Vec::new();
+            for (name, number, gap, count) in fields {
+                offset += gap;
+                list = list
+                    .bytes(name.as_bytes())
+                    .u32(offset as u32)
+                    .raw(&[number])
+                    .u32(count);
+                if number == 7 && count == 1 {
+                    float_offsets.push(offset);
+                }
+                offset += [0, 1, 1, 2, 2, 4, 4, 4, 8][usize::from(number)] * count as usize;
+            }
+            let step = offset + tail + 1;
+            let row = step * width + padding;
+            let mut data = samples(row * height, seed, 0x0f);
+            for y in 0..height {
+                for x in 0..width {
+                    for (index, &offset) in float_offsets.iter().enumerate() {
+                        let value = floats[(x + y + index) % floats.len()] * (x + 1) as f32;
+                        data[y * row + x * step + offset..][..4]
+                            .copy_from_slice(&value.to_le_bytes());
+                    }
+                }
+            }
+            let message = Message::new()
+                .u32(height as u32)
+                .u32(width as u32)
+                .u32(count)
+                .raw(&list.0);
+            message
+                .raw(&[0])
+                .u32(step as u32)
+                .u32(row as u32)
+                .bytes(&data)
+                .raw(&[1])
+                .0
+        })
+}
+
+fn any_message() -> impl Strategy<Value = (Schema, Vec<u8>)> {
+    prop_oneof![
+        image().prop_map(|message| (Schema::Image, message)),
+        grid().prop_map(|message| (Schema::OccupancyGrid, message)),
+        scan().prop_map(|message| (Schema::LaserScan, message)),
+        cloud().prop_map(|message| (Schema::PointCloud2, message)),
+        (
+            prop::sample::select(SCHEMAS.to_vec()),
+            vec(any::<u8>(), 0..300)
+        ),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Whatever the message and the codec: it comes back bit by bit, and a frame is hardly larger than the message.
+    #[test]
+    fn every_message_comes_back_from_every_codec((schema, message) in any_message()) {
+        for codec in CODECS {
+            let mut frame = b"kept".to_vec();
+            let encoded = Encoder::new(schema).encode(codec, &message, &mut frame);
+            prop_assert_eq!(encoded.bytes, frame.len() - 4);
+            prop_assert!(encoded.bytes <= message.len() + 600);
+            let mut back = b"kept".to_vec();
+            let decoded = Decoder::new(message.len()).decode(&frame[4..], &mut back).unwrap();
+            prop_assert_eq!(&back[4..], &message[..]);
+            prop_assert_eq!(decoded.codec.name(), encoded.codec.name());
+            prop_assert_eq!(codec::peek(&frame[4..]).unwrap(), decoded);
+            if !message.is_empty() {
+                let too_large = Decoder::new(message.len() - 1).decode(&frame[4..], &mut Vec::new());
+                let refused = matches!(too_large, Err(Error::TooLarge { .. }));
+                prop_assert!(refused);
+            }
+        }
+    }
+
+    /// A message that is a byte off fits no codec of its own, or comes back all the same.
+    #[test]
+    fn a_damaged_message_comes_back((schema, mut message) in any_message(), at in any::<prop::sample::Index>(), bit in 0u8..8) {
+        if !message.is_empty() {
+            let at = at.index(message.len().min(200));
+            message[at] ^= 1 << bit;
+        }
+        let mut frame = Vec::new();
+        Encoder::new(schema).encode(Codec::made_for(schema), &message, &mut frame);
+        let mut back = Vec::new();
+        Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+        prop_assert_eq!(back, message);
+    }
+
+    /// A damaged frame is an error or a message of the declared size, never a panic.
+    #[test]
+    fn a_damaged_frame_does_no_harm((schema, message) in any_message(), damage in vec((any::<prop::sample::Index>(), any::<u8>()), 1..4)) {
+        let mut frame = Vec::new();
+        Encoder::new(schema).encode(Codec::made_for(schema), &message, &mut frame);
+        for (at, byte) in damage {
+            let at = at.index(frame.len());
+            frame[at] = byte;
+        }
+        let mut back = Vec::new();
+        match Decoder::new(LIMIT).decode(&frame, &mut back) {
+            Ok(decoded) => prop_assert_eq!(back.len(), decoded.bytes),
+            Err(_) => prop_assert!(back.is_empty()),
+        }
+    }
+
+    /// Grids in sequence, some lost, some acknowledged, some late, always come back.
+    #[test]
+    fn grids_survive_any_link(steps in vec((grid(), any::<bool>(), 0u64..6), 1..20)) {
+        let mut encoder = Encoder::new(Schema::OccupancyGrid);
+        let mut decoder = Decoder::new(LIMIT);
+        let mut received = Vec::new();
+        for (message, lost, delay) in steps {
+            let mut frame = Vec::new();
+            let encoded = encoder.encode(Codec::Grid, &message, &mut frame);
+            if !lost {
+                let mut back = Vec::new();
+                decoder.decode(&frame, &mut back).unwrap();
+                prop_assert_eq!(back, message);
+                received.push(encoded.sequence);
+            }
+            if let Some(&sequence) = received.iter().rev().nth(delay as usize) {
+                encoder.acknowledge(sequence);
+            }
+        }
+    }
+}
+
+/// A moving scene of 64×48 pixels.
+fn scene(encoding: &str, channels: usize, round: usize) -> Vec<u8> {
+    let (width, height, padding) = (64, 48, 5);
+    let mut data = Vec::new();
+    for y in 0..height {
+        for x in 0..width {
+            let colour = [
+                (x * 3 + round) as u8,
+                (y * 4) as u8,
+                (x + y) as u8,
+                (x ^ y) as u8,
+            ];
+            data.extend_from_slice(&colour[..channels]);
+        }
+        data.extend_from_slice(&[round as u8; 5]);
+    }
+    let message = Message::new()
+        .u32(height as u32)
+        .u32(width as u32)
+        .bytes(encoding.as_bytes());
+    message
+        .raw(&[0])
+        .u32((width * channels + padding) as u32)
+        .bytes(&data)
+        .0
+}
+
+#[test]
+fn video_is_never_used_unless_allowed() {
+    let message = scene("rgb8", 3, 0);
+    let mut frame = Vec::new();
+    let encoded = Encoder::new(Schema::Image).encode(Codec::Video, &message, &mut frame);
+    assert_eq!(encoded.codec, Codec::Zstd(3));
+    let mut back = Vec::new();
+    Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+    assert_eq!(back, message);
+}
+
+#[cfg(feature = "video")]
+#[test]
+fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
+    for (encoding, channels) in [("rgb8", 3), ("bgr8", 3), ("rgba8", 4), ("bgra8", 4)] {
+        let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
+        let mut decoder = Decoder::new(LIMIT);
+        for round in 0..12 {
+            let message = scene(encoding, channels, round);
+            let mut frame = Vec::new();
+            let encoded = encoder.encode(Codec::Video, &message, &mut frame);
+            assert_eq!(encoded.codec, Codec::Video);
+            let mut back = Vec::new();
+            if round == 5 {
+                continue;
+            }
+            let decoded = decoder.decode(&frame, &mut back);
+            if round == 6 {
+                assert!(decoded.as_ref().is_err_and(Error::wants_keyframe));
+                encoder.request_keyframe();
+                continue;
+            }
+            decoded.unwrap();
+            assert_eq!(back.len(), message.len());
+            let head = message.len() - 48 * (64 * channels + 5);
+            assert_eq!(back[..head], message[..head]);
+            let lines = |bytes: &[u8]| {
+                bytes[head..]
+                    .chunks(64 * channels + 5)
+                    .map(<[u8]>::to_vec)
+                    .collect::<Vec<_>>()
+            };
+            for (new, old) in lines(&back).iter().zip(lines(&message)) {
+                assert_eq!(new[64 * channels..], old[64 * channels..]);
+                for (new, old) in new[..64 * channels]
+                    .chunks(channels)
+                    .zip(old.chunks(channels))
+                {
+                    assert_eq!(new[3..], old[3..]);
+                    assert!(
+                        new[..3]
+                            .iter()
+                            .zip(&old[..3])
+                            .all(|(new, old)| new.abs_diff(*old) < 40),
+                        "{new:?} {old:?}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[cfg(not(feature = "video"))]
+#[test]
+fn a_build_without_video_falls_back() {
+    let message = scene("rgb8", 3, 0);
+    let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
+    assert!(!encoder.has_video());
+    assert_eq!(
+        encoder
+            .encode(Codec::Video, &message, &mut Vec::new())
+            .codec,
+        Codec::Zstd(3)
+    );
+}
