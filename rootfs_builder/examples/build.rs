@@ -16,13 +16,13 @@ use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rootfs_builder::probe::{ProbeOptions, Work, probe};
+use rootfs_builder::{BuildEvent, BuildOutcome, Builder, Config, PushRequest, Source, Sources};
 use ros::bus::ParamValue;
 use ros::net::{LoopbackSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
-use rootfs_builder::probe::{ProbeOptions, Work, probe};
-use rootfs_builder::{BuildEvent, BuildOutcome, Builder, Config, PushRequest, Source, Sources};
 use servant::engine::{Engine, Servant};
 use servant::local::{LocalEngine, LocalEngineConfig};
 use servant::shim::{Resident, ResidentContext, ResidentError};
@@ -58,12 +58,20 @@ impl Resident for WithMaster {
         context: &'a ResidentContext,
     ) -> Pin<Box<dyn Future<Output = Result<(), ResidentError>> + 'a>> {
         Box::pin(async move {
-            let parameters: Option<BTreeMap<String, ParamValue>> = serde_json::from_value(context.config.clone())?;
-            let Some(parameters) = parameters else { return Ok(()) };
+            let parameters: Option<BTreeMap<String, ParamValue>> =
+                serde_json::from_value(context.config.clone())?;
+            let Some(parameters) = parameters else {
+                return Ok(());
+            };
             let listener = tokio::net::TcpListener::bind(MASTER).await?;
-            let master = Master::new(MasterOptions { parameters, ..MasterOptions::default() });
+            let master = Master::new(MasterOptions {
+                parameters,
+                ..MasterOptions::default()
+            });
             self.0 = Some(master.clone());
-            tokio::task::spawn_local(async move { master.serve(listener, Arc::new(LoopbackSockets)).await });
+            tokio::task::spawn_local(async move {
+                master.serve(listener, Arc::new(LoopbackSockets)).await
+            });
             Ok(())
         })
     }
@@ -79,11 +87,17 @@ struct Inside(Arc<servant::netns::NetNs>);
 
 #[async_trait::async_trait]
 impl Sockets for Inside {
-    async fn connect(&self, address: std::net::SocketAddr) -> std::io::Result<tokio::net::TcpStream> {
+    async fn connect(
+        &self,
+        address: std::net::SocketAddr,
+    ) -> std::io::Result<tokio::net::TcpStream> {
         self.0.connect(address).await
     }
 
-    async fn listen(&self, address: std::net::SocketAddr) -> std::io::Result<tokio::net::TcpListener> {
+    async fn listen(
+        &self,
+        address: std::net::SocketAddr,
+    ) -> std::io::Result<tokio::net::TcpListener> {
         self.0.listen(address).await
     }
 }
@@ -103,7 +117,10 @@ fn parse() -> Result<Wish, Failure> {
         cache: scratch.join("cache"),
         probe: true,
         path: None,
-        request: PushRequest { id: format!("try-{}", std::process::id()), ..PushRequest::default() },
+        request: PushRequest {
+            id: format!("try-{}", std::process::id()),
+            ..PushRequest::default()
+        },
     };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
@@ -115,9 +132,13 @@ fn parse() -> Result<Wish, Failure> {
             wish.probe = false;
             continue;
         }
-        let value = words.next().ok_or_else(|| format!("{word} needs a value"))?;
+        let value = words
+            .next()
+            .ok_or_else(|| format!("{word} needs a value"))?;
         let pair = |separator: &str| -> Result<(String, String), Failure> {
-            let (key, value) = value.split_once(separator).ok_or_else(|| format!("{value}: no {separator}"))?;
+            let (key, value) = value
+                .split_once(separator)
+                .ok_or_else(|| format!("{value}: no {separator}"))?;
             Ok((key.to_owned(), value.to_owned()))
         };
         let request = &mut wish.request;
@@ -134,10 +155,15 @@ fn parse() -> Result<Wish, Failure> {
             "--remap" => request.remaps.extend([pair(":=")?]),
             "--param" => {
                 let (key, value) = pair("=")?;
-                let value = serde_json::from_str(&value).unwrap_or(serde_json::Value::String(value));
+                let value =
+                    serde_json::from_str(&value).unwrap_or(serde_json::Value::String(value));
                 request.params.insert(key, value);
             }
-            _ => return Err(format!("unknown option {word}: see the head of examples/build.rs").into()),
+            _ => {
+                return Err(
+                    format!("unknown option {word}: see the head of examples/build.rs").into(),
+                );
+            }
         }
     }
     Ok(wish)
@@ -149,15 +175,26 @@ async fn run() -> Result<(), Failure> {
     let own = std::env::current_exe()?;
     let init = match std::env::var_os("CLOUDROID_INIT") {
         Some(path) => path.into(),
-        None => own.ancestors().nth(3).ok_or("no target directory")?.join("x86_64-unknown-linux-gnu/init/cloudroid-init"),
+        None => own
+            .ancestors()
+            .nth(3)
+            .ok_or("no target directory")?
+            .join("x86_64-unknown-linux-gnu/init/cloudroid-init"),
     };
     for name in ["images", "layers", "servants", "build"] {
         std::fs::create_dir_all(wish.home.join(name))?;
     }
     let command = vec![own.into_os_string(), "shim".into()];
-    let engine = LocalEngine::new(LocalEngineConfig::new(wish.home.join("servants"), command, init))?;
+    let engine = LocalEngine::new(LocalEngineConfig::new(
+        wish.home.join("servants"),
+        command,
+        init,
+    ))?;
     let engine: Arc<dyn Engine> = Arc::new(engine);
-    let store = Arc::new(image::Store::open(&wish.home.join("images"), &wish.home.join("layers"))?);
+    let store = Arc::new(image::Store::open(
+        &wish.home.join("images"),
+        &wish.home.join("layers"),
+    )?);
     let builder = Builder::new(Config {
         cache_dir: wish.cache.clone(),
         bases_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"),
@@ -168,8 +205,15 @@ async fn run() -> Result<(), Failure> {
         engine: engine.clone(),
     })?;
     if let Some(path) = &wish.path {
-        let copy = wish.home.join("build").join(format!("{}-pushed", wish.request.id));
-        let status = Command::new("cp").arg("-rP").arg(path).arg(&copy).status()?;
+        let copy = wish
+            .home
+            .join("build")
+            .join(format!("{}-pushed", wish.request.id));
+        let status = Command::new("cp")
+            .arg("-rP")
+            .arg(path)
+            .arg(&copy)
+            .status()?;
         if !status.success() {
             return Err("copying failed".into());
         }
@@ -194,14 +238,27 @@ async fn run() -> Result<(), Failure> {
         let _ = std::fs::remove_dir_all(copy);
     }
     let outcome = result?;
-    println!("{:7.2} == built {} {}: {}", begun.elapsed().as_secs_f64(), outcome.package, outcome.version, outcome.image);
+    println!(
+        "{:7.2} == built {} {}: {}",
+        begun.elapsed().as_secs_f64(),
+        outcome.package,
+        outcome.version,
+        outcome.image
+    );
     for layer in &outcome.layers {
-        println!("  {:<13} {} {:>9} bytes, cached: {}", layer.name, layer.info.digest, layer.info.size, layer.cached);
+        println!(
+            "  {:<13} {} {:>9} bytes, cached: {}",
+            layer.name, layer.info.digest, layer.info.size, layer.cached
+        );
     }
     for node in &outcome.plan.nodes {
         println!("  node {} {:?}", node.name, node.argv);
     }
-    println!("  {} parameters, {} definitions", outcome.plan.parameters.len(), outcome.definitions.len());
+    println!(
+        "  {} parameters, {} definitions",
+        outcome.plan.parameters.len(),
+        outcome.definitions.len()
+    );
     if wish.probe {
         let begun = Instant::now();
         look(&wish, &outcome, &store, &*engine).await?;
@@ -225,7 +282,11 @@ async fn look(
     ] {
         environment.insert(name.into(), value.into());
     }
-    let layers = outcome.layers.iter().map(|layer| store.extracted(&layer.info.diff_id)).collect::<Result<_, _>>()?;
+    let layers = outcome
+        .layers
+        .iter()
+        .map(|layer| store.extracted(&layer.info.diff_id))
+        .collect::<Result<_, _>>()?;
     let servant = engine
         .start(Spec {
             id: format!("{}-probe", wish.request.id),
@@ -234,7 +295,12 @@ async fn look(
             profile: Profile::Servant,
             limits: Limits::default(),
             environment,
-            nodes: outcome.plan.nodes.iter().map(|node| node.spec("/root")).collect(),
+            nodes: outcome
+                .plan
+                .nodes
+                .iter()
+                .map(|node| node.spec("/root"))
+                .collect(),
             owned_directories: Vec::new(),
             mounts: Vec::new(),
             resident: serde_json::to_value(&outcome.plan.parameters)?,
@@ -256,8 +322,19 @@ async fn look(
     let interface = found.interface;
     for topic in &interface.topics {
         let marks = [(topic.lazy, "lazy"), (topic.latched, "latched")];
-        let marks: Vec<&str> = marks.into_iter().filter(|(set, _)| *set).map(|(_, mark)| mark).collect();
-        println!("  {:?} {} {} {} {}", topic.direction, topic.name, topic.type_name, topic.md5, marks.join(" "));
+        let marks: Vec<&str> = marks
+            .into_iter()
+            .filter(|(set, _)| *set)
+            .map(|(_, mark)| mark)
+            .collect();
+        println!(
+            "  {:?} {} {} {} {}",
+            topic.direction,
+            topic.name,
+            topic.type_name,
+            topic.md5,
+            marks.join(" ")
+        );
     }
     for service in &interface.services {
         println!("  Service {} {}", service.name, service.type_name);
@@ -266,16 +343,33 @@ async fn look(
         println!("  Action {} {}", action.name, action.type_name);
     }
     for parameter in &interface.parameters {
-        println!("  Parameter {} {:?}", parameter.name, parameter.value.as_ref().map(ToString::to_string));
+        println!(
+            "  Parameter {} {:?}",
+            parameter.name,
+            parameter.value.as_ref().map(ToString::to_string)
+        );
     }
     println!("  {} definitions", interface.definitions.len());
     Ok(())
 }
 
-async fn watch(outcome: &BuildOutcome, servant: &Arc<dyn Servant>) -> Result<rootfs_builder::probe::Found, Failure> {
-    let bus = Ros1Bus::connect(Arc::new(Inside(servant.endpoint().netns)), MASTER.parse()?, OWN_NAME).await?;
+async fn watch(
+    outcome: &BuildOutcome,
+    servant: &Arc<dyn Servant>,
+) -> Result<rootfs_builder::probe::Found, Failure> {
+    let bus = Ros1Bus::connect(
+        Arc::new(Inside(servant.endpoint().netns)),
+        MASTER.parse()?,
+        OWN_NAME,
+    )
+    .await?;
     let registry = Registry::from_definitions(&outcome.definitions)?;
-    let names = outcome.plan.nodes.iter().map(|node| node.name.clone()).collect();
+    let names = outcome
+        .plan
+        .nodes
+        .iter()
+        .map(|node| node.name.clone())
+        .collect();
     let exited = async {
         let ends = outcome.plan.nodes.iter().map(|node| {
             Box::pin(async { (node.name.clone(), servant.wait_node(&node.name).await) })
@@ -286,8 +380,17 @@ async fn watch(outcome: &BuildOutcome, servant: &Arc<dyn Servant>) -> Result<roo
     let asked = servant.clone();
     let work = Work::new(move || {
         let servant = asked.clone();
-        async move { servant.usage().await.ok().map(|usage| Duration::from_micros(usage.cpu_usec)) }
+        async move {
+            servant
+                .usage()
+                .await
+                .ok()
+                .map(|usage| Duration::from_micros(usage.cpu_usec))
+        }
     });
-    let options = ProbeOptions { work: Some(work), ..ProbeOptions::new(names, OWN_NAME) };
+    let options = ProbeOptions {
+        work: Some(work),
+        ..ProbeOptions::new(names, OWN_NAME)
+    };
     Ok(probe(&*bus, &registry, &outcome.definitions, &options, exited).await?)
 }

@@ -45,7 +45,12 @@ impl std::fmt::Display for Deb {
 impl Deb {
     /// The name apt gives the file: the epoch's colon is escaped.
     fn file_name(&self) -> String {
-        format!("{}_{}_{}.deb", self.name, self.version.replace(':', "%3a"), self.architecture)
+        format!(
+            "{}_{}_{}.deb",
+            self.name,
+            self.version.replace(':', "%3a"),
+            self.architecture
+        )
     }
 }
 
@@ -78,7 +83,9 @@ impl Apt {
         }
         let path = root.join("apt.conf");
         fs::write(&path, conf).at("writing", &path)?;
-        Ok(Self { root: root.to_owned() })
+        Ok(Self {
+            root: root.to_owned(),
+        })
     }
 
     fn command(&self, program: &str) -> Command {
@@ -109,9 +116,9 @@ impl Apt {
                 fs::write(&stamp, "").at("writing", &stamp)?;
                 Ok(None)
             }
-            Err(error) if age.is_some() => {
-                Ok(Some(format!("package lists could not be fetched, using those at hand: {error}")))
-            }
+            Err(error) if age.is_some() => Ok(Some(format!(
+                "package lists could not be fetched, using those at hand: {error}"
+            ))),
             Err(error) => Err(error),
         }
     }
@@ -119,9 +126,18 @@ impl Apt {
     /// The lists that tell which file is in which package.
     pub async fn contents_files(&self) -> Result<Vec<PathBuf>, Error> {
         let mut query = self.command("apt-get");
-        query.args(["indextargets", "--format", "$(FILENAME)", "Created-By: Contents-deb"]);
+        query.args([
+            "indextargets",
+            "--format",
+            "$(FILENAME)",
+            "Created-By: Contents-deb",
+        ]);
         let text = process::output(query, "apt").await?;
-        Ok(text.lines().map(PathBuf::from).filter(|path| path.is_file()).collect())
+        Ok(text
+            .lines()
+            .map(PathBuf::from)
+            .filter(|path| path.is_file())
+            .collect())
     }
 
     /// Names of all packages that can be installed.
@@ -134,19 +150,37 @@ impl Apt {
 
     /// What must be installed, in an order that dpkg accepts, so that all of `names` are, given what `status`
     /// (a dpkg status file; none for an empty system) says is there. Recommended packages are not.
-    pub async fn resolve(&self, status: Option<&Path>, names: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
+    pub async fn resolve(
+        &self,
+        status: Option<&Path>,
+        names: &BTreeSet<String>,
+    ) -> Result<Vec<Deb>, Error> {
         if names.is_empty() {
             return Ok(Vec::new());
         }
         let status = status.map_or_else(|| self.root.join("empty-status"), Path::to_owned);
         let mut simulate = self.command("apt-get");
-        simulate.arg("-o").arg(format!("Dir::State::status={}", status.display()));
-        simulate.args(["-q", "-s", "-y", "--no-install-recommends", "--no-remove", "install", "--"]);
+        simulate
+            .arg("-o")
+            .arg(format!("Dir::State::status={}", status.display()));
+        simulate.args([
+            "-q",
+            "-s",
+            "-y",
+            "--no-install-recommends",
+            "--no-remove",
+            "install",
+            "--",
+        ]);
         simulate.args(names);
         match process::output(simulate, "apt").await {
             Ok(text) => Ok(text.lines().filter_map(parse_inst).collect()),
             Err(Error::Program { last_lines, .. }) => Err(Error::Unsolvable {
-                wanted: names.iter().map(String::as_str).collect::<Vec<_>>().join(", "),
+                wanted: names
+                    .iter()
+                    .map(String::as_str)
+                    .collect::<Vec<_>>()
+                    .join(", "),
                 words: apts_words(&last_lines),
             }),
             Err(error) => Err(error),
@@ -170,18 +204,29 @@ impl Apt {
     /// Files of these packages, in the same order; those not in the cache are fetched and checked by apt.
     pub async fn download(&self, debs: &[Deb], progress: &Progress) -> Result<Vec<PathBuf>, Error> {
         let archives = self.root.join("archives");
-        let missing: Vec<&Deb> = debs.iter().filter(|deb| !archives.join(deb.file_name()).is_file()).collect();
+        let missing: Vec<&Deb> = debs
+            .iter()
+            .filter(|deb| !archives.join(deb.file_name()).is_file())
+            .collect();
         if !missing.is_empty() {
             let total = missing.len() as u64;
-            progress.step(&format!("downloading {total} packages")).await;
+            progress
+                .step(&format!("downloading {total} packages"))
+                .await;
             // Into a directory of its own, then renamed: what is in `archives` is whole.
             let partial = tempfile::Builder::new()
                 .prefix(".partial-")
                 .tempdir_in(&archives)
                 .at("making a directory in", &archives)?;
             let mut download = self.command("apt-get");
-            download.current_dir(partial.path()).args(["-q", "download", "--"]);
-            download.args(missing.iter().map(|deb| format!("{}={}", deb.name, deb.version)));
+            download
+                .current_dir(partial.path())
+                .args(["-q", "download", "--"]);
+            download.args(
+                missing
+                    .iter()
+                    .map(|deb| format!("{}={}", deb.name, deb.version)),
+            );
             let mut done = 0;
             process::run(download, "apt", |stream, line| {
                 if stream == Stream::Out && line.starts_with("Get:") {
@@ -195,7 +240,10 @@ impl Apt {
                 fs::rename(&from, archives.join(deb.file_name())).at("keeping", &from)?;
             }
         }
-        Ok(debs.iter().map(|deb| archives.join(deb.file_name())).collect())
+        Ok(debs
+            .iter()
+            .map(|deb| archives.join(deb.file_name()))
+            .collect())
     }
 
     /// Whether the lists need not be fetched again yet.
@@ -214,12 +262,16 @@ impl Apt {
         let lists = self.root.join("state/lists");
         for entry in fs::read_dir(&lists).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
-            if name.ends_with("Release") || name.ends_with("Packages") || name.contains("Packages.") {
+            if name.ends_with("Release") || name.ends_with("Packages") || name.contains("Packages.")
+            {
                 let about = entry.metadata().ok();
                 let changed = about.as_ref().and_then(|m| m.modified().ok());
                 let seconds = changed.and_then(|t| t.duration_since(SystemTime::UNIX_EPOCH).ok());
                 let size = about.map_or(0, |m| m.len());
-                parts.push(format!("{name} {size} {}", seconds.map_or(0, |s| s.as_secs())));
+                parts.push(format!(
+                    "{name} {size} {}",
+                    seconds.map_or(0, |s| s.as_secs())
+                ));
             }
         }
         parts.sort();
@@ -274,59 +326,44 @@ fn parse_inst(line: &str) -> Option<Deb> {
     let inside = rest.split_once('(')?.1.split_once(')')?.0;
     let version = inside.split(' ').next()?;
     let architecture = inside.rsplit_once('[')?.1.strip_suffix(']')?;
-    Some(Deb { name: name.to_owned(), version: version.to_owned(), architecture: architecture.to_owned() })
+    Some(Deb {
+        name: name.to_owned(),
+        version: version.to_owned(),
+        architecture: architecture.to_owned(),
+    })
 }
 
 /// A stanza of `apt-cache show`.
 fn parse_stanza(stanza: &str) -> Option<Deb> {
     let field = |name: &str| {
-        stanza.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": ").map(str::to_owned))
+        stanza.lines().find_map(|line| {
+            line.strip_prefix(name)?
+                .strip_prefix(": ")
+                .map(str::to_owned)
+        })
     };
-    Some(Deb { name: field("Package")?, version: field("Version")?, architecture: field("Architecture")? })
+    Some(Deb {
+        name: field("Package")?,
+        version: field("Version")?,
+        architecture: field("Architecture")?,
+    })
 }
 
 /// The part of apt's refusal that says why.
 fn apts_words(lines: &str) -> String {
     let words: Vec<&str> = lines
         .lines()
-        .skip_while(|line| !line.starts_with("E:") && !line.starts_with("The following packages have unmet"))
+        .skip_while(|line| {
+            !line.starts_with("E:") && !line.starts_with("The following packages have unmet")
+        })
         .map(str::trim)
         .collect();
-    if words.is_empty() { lines.to_owned() } else { words.join("; ") }
+    if words.is_empty() {
+        lines.to_owned()
+    } else {
+        words.join("; ")
+    }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn apts_simulation_is_understood() {
-        let deb = parse_inst("Inst libssl3 [3.0.1-1] (3.0.17-1~deb12u2 Debian:12.12/oldstable, Debian-Security:12 [amd64]) []");
-        let deb = deb.expect("an installation");
-        assert_eq!(deb.to_string(), "libssl3=3.0.17-1~deb12u2:amd64");
-        let plain = parse_inst("Inst ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])").expect("an installation");
-        assert_eq!(plain.architecture, "all");
-        assert_eq!(parse_inst("Conf ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])"), None);
-    }
-
-    #[test]
-    fn epochs_are_escaped_in_file_names() {
-        let deb = Deb { name: "login".into(), version: "1:4.13+dfsg1-1".into(), architecture: "amd64".into() };
-        assert_eq!(deb.file_name(), "login_1%3a4.13+dfsg1-1_amd64.deb");
-    }
-
-    #[test]
-    fn the_reason_is_taken_from_apts_refusal() {
-        let lines = "Reading package lists...\nBuilding dependency tree...\nE: Unable to locate package nonesuch";
-        assert_eq!(apts_words(lines), "E: Unable to locate package nonesuch");
-    }
-
-    #[test]
-    fn the_state_directory_is_its_own() {
-        let root = tempfile::tempdir().expect("a directory");
-        Apt::open(root.path(), Some("deb http://example.invalid/debian bookworm main")).expect("prepared");
-        let conf = fs::read_to_string(root.path().join("apt.conf")).expect("written");
-        assert!(conf.contains(&format!("Dir::State \"{}/state\"", root.path().display())), "{conf}");
-        assert!(conf.contains("sources.list"), "{conf}");
-    }
-}
+mod tests;

@@ -23,7 +23,12 @@ pub(crate) struct Archive {
 
 impl Archive {
     /// Opens it; fetches lists where they are missing or old (or `force`d).
-    pub(crate) async fn open(cache: &Path, sources: String, force: bool, progress: &Progress) -> Result<Self, Error> {
+    pub(crate) async fn open(
+        cache: &Path,
+        sources: String,
+        force: bool,
+        progress: &Progress,
+    ) -> Result<Self, Error> {
         let name = &crate::key::sha256(sources.as_bytes())[..12];
         let apt = Apt::open(&cache.join("apt").join(name), Some(&sources))?;
         if let Some(warning) = apt.refresh(force, progress).await? {
@@ -34,7 +39,13 @@ impl Archive {
         let contents = tokio::task::spawn_blocking(move || Contents::open(&root, &lists)).await??;
         let names = apt.names().await?;
         let stamp = apt.stamp();
-        Ok(Self { apt, contents: Arc::new(contents), names, stamp, sources })
+        Ok(Self {
+            apt,
+            contents: Arc::new(contents),
+            names,
+            stamp,
+            sources,
+        })
     }
 
     /// Whether its lists need not be fetched again yet.
@@ -45,11 +56,18 @@ impl Archive {
     /// Names that look like a key, the nearest first; at most three.
     pub(crate) fn similar(&self, key: &str) -> Vec<String> {
         let plain = key.replace('_', "-").to_lowercase();
-        let bare = plain.trim_start_matches("lib").trim_end_matches("-dev").to_owned();
+        let bare = plain
+            .trim_start_matches("lib")
+            .trim_end_matches("-dev")
+            .to_owned();
         if bare.len() < 3 {
             return Vec::new();
         }
-        let mut near: Vec<&String> = self.names.iter().filter(|name| name.contains(&bare)).collect();
+        let mut near: Vec<&String> = self
+            .names
+            .iter()
+            .filter(|name| name.contains(&bare))
+            .collect();
         near.sort_by_key(|name| (name.len(), name.as_str()));
         near.into_iter().take(3).cloned().collect()
     }
@@ -64,7 +82,12 @@ impl Archive {
                     parts.iter().any(|part| *part != Part::CMake) && (python || !only_python)
                 }
                 Depth::Needed => {
-                    let useful = [Part::Manifest, Part::Programs, Part::Definitions, Part::Share];
+                    let useful = [
+                        Part::Manifest,
+                        Part::Programs,
+                        Part::Definitions,
+                        Part::Share,
+                    ];
                     useful.iter().any(|part| parts.contains(part)) && !deb.starts_with("python3-")
                 }
                 Depth::Beyond => parts.contains(&Part::Definitions) && !deb.ends_with("-dev"),
@@ -83,11 +106,18 @@ impl Archive {
         let needed = [Part::Manifest, Part::CMake, Part::Definitions, Part::Python];
         let carriers: Carriers = self.contents.ros_package(ros_package);
         let wanted = |parts: &BTreeSet<Part>| needed.iter().any(|part| parts.contains(part));
-        carriers.into_iter().filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev")).map(|(deb, _)| deb).collect()
+        carriers
+            .into_iter()
+            .filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev"))
+            .map(|(deb, _)| deb)
+            .collect()
     }
 
     /// Debian packages with these libraries; second, those that nothing has.
-    pub(crate) fn libraries(&self, names: &BTreeSet<String>) -> (BTreeMap<String, String>, Vec<String>) {
+    pub(crate) fn libraries(
+        &self,
+        names: &BTreeSet<String>,
+    ) -> (BTreeMap<String, String>, Vec<String>) {
         let (mut found, mut missing) = (BTreeMap::new(), Vec::new());
         for name in names {
             match self.contents.library(name) {

@@ -125,19 +125,29 @@ pub struct RosPackages {
 
 /// Reads the definition `name` of a directory.
 pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
-    let plain = !name.is_empty() && name.bytes().all(|b| b.is_ascii_alphanumeric() || b"-_.".contains(&b));
+    let plain = !name.is_empty()
+        && name
+            .bytes()
+            .all(|b| b.is_ascii_alphanumeric() || b"-_.".contains(&b));
     let path = directory.join(format!("{name}.toml"));
     if !plain || !path.is_file() {
         let known = names(directory)?;
         return Err(Error::UnknownBase {
             name: name.to_owned(),
             directory: directory.to_owned(),
-            known: if known.is_empty() { "none".into() } else { known.join(", ") },
+            known: if known.is_empty() {
+                "none".into()
+            } else {
+                known.join(", ")
+            },
         });
     }
     let text = fs::read_to_string(&path).at("reading", &path)?;
     let definition = parse(&text).map_err(|problem| Error::BadBase { path, problem })?;
-    Ok(Base { name: name.to_owned(), definition })
+    Ok(Base {
+        name: name.to_owned(),
+        definition,
+    })
 }
 
 /// Names of all definitions in a directory, sorted.
@@ -158,7 +168,9 @@ pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
 /// Parses and validates; the error has no file name yet.
 fn parse(text: &str) -> Result<Definition, String> {
     let definition: Definition = toml::from_str(text).map_err(|error| {
-        let line = error.span().map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+        let line = error
+            .span()
+            .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
         match line {
             Some(line) => format!("line {line}: {}", error.message()),
             None => error.message().to_owned(),
@@ -169,13 +181,23 @@ fn parse(text: &str) -> Result<Definition, String> {
         None => String::new(),
     };
     let packages = [&definition.runtime.packages, &definition.build.packages];
-    for package in packages.into_iter().flatten().chain(definition.keys.values().flatten()) {
+    for package in packages
+        .into_iter()
+        .flatten()
+        .chain(definition.keys.values().flatten())
+    {
         if !is_debian_name(package) {
-            return Err(format!("{}{package:?} is not a Debian package name", line_of(&format!("{package:?}"))));
+            return Err(format!(
+                "{}{package:?} is not a Debian package name",
+                line_of(&format!("{package:?}"))
+            ));
         }
     }
     if definition.runtime.packages.is_empty() {
-        return Err(format!("{}runtime.packages is empty: name what a node needs", line_of("[runtime]")));
+        return Err(format!(
+            "{}runtime.packages is empty: name what a node needs",
+            line_of("[runtime]")
+        ));
     }
     for rule in &definition.strip.unpacked {
         if !rule.starts_with("path-exclude=/") && !rule.starts_with("path-include=/") {
@@ -185,12 +207,21 @@ fn parse(text: &str) -> Result<Definition, String> {
             ));
         }
     }
-    let absolute = definition.build.files.keys().chain([&definition.build.prefix]);
+    let absolute = definition
+        .build
+        .files
+        .keys()
+        .chain([&definition.build.prefix]);
     for path in absolute {
-        let climbs = path.components().any(|part| part == std::path::Component::ParentDir);
+        let climbs = path
+            .components()
+            .any(|part| part == std::path::Component::ParentDir);
         if !path.is_absolute() || climbs || path == Path::new("/") {
             let shown = path.display().to_string();
-            return Err(format!("{}{shown:?} is not an absolute path below /", line_of(&shown)));
+            return Err(format!(
+                "{}{shown:?} is not an absolute path below /",
+                line_of(&shown)
+            ));
         }
     }
     Ok(definition)
@@ -200,7 +231,9 @@ fn parse(text: &str) -> Result<Definition, String> {
 pub(crate) fn is_debian_name(name: &str) -> bool {
     name.len() >= 2
         && name.as_bytes()[0].is_ascii_alphanumeric()
-        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b"+-.".contains(&b))
+        && name
+            .bytes()
+            .all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b"+-.".contains(&b))
 }
 
 #[cfg(test)]
@@ -241,8 +274,14 @@ mod tests {
             (SMALLEST.replace("/opt/x", "/opt/../x"), "line 10"),
             (SMALLEST.replace("[\"libroscpp4d\"]", "[]"), "line 6"),
             (SMALLEST.replace("ros1", "ros7"), "line 4"),
-            (format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"), "line 12"),
-            (format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"), "line 12"),
+            (
+                format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"),
+                "line 12",
+            ),
+            (
+                format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"),
+                "line 12",
+            ),
         ];
         for (text, line) in cases {
             let problem = parse(&text).expect_err("a mistake");

@@ -31,7 +31,12 @@ const FILES: [(&str, &str); 4] = [
 /// How trees become layers here.
 pub(crate) fn tree_options(base: &Base) -> TreeOptions {
     TreeOptions {
-        exclude: base.strip.paths.iter().map(|path| path.trim_start_matches('/').to_owned()).collect(),
+        exclude: base
+            .strip
+            .paths
+            .iter()
+            .map(|path| path.trim_start_matches('/').to_owned())
+            .collect(),
         mtime: Mtime::Clamp(EPOCH),
         // Hundreds of megabytes: four times as fast as the default level, and a fifth larger.
         level: 1,
@@ -48,7 +53,10 @@ pub(crate) async fn resolve(
     let mut names: BTreeSet<String> = base.runtime.packages.iter().cloned().collect();
     // What mmdebstrap's minbase adds.
     names.extend(["?essential".to_owned(), "apt".to_owned()]);
-    let note = Key::new("base-resolved").with("archive", &archive.stamp).with_all("package", &names).finish();
+    let note = Key::new("base-resolved")
+        .with("archive", &archive.stamp)
+        .with_all("package", &names)
+        .finish();
     if let Some(debs) = shop.layers.note(&note) {
         return Ok(debs);
     }
@@ -61,12 +69,25 @@ pub(crate) async fn resolve(
 pub(crate) fn key(base: &Base, debs: &[Deb]) -> String {
     let mut names: Vec<String> = debs.iter().map(Deb::to_string).collect();
     names.sort();
-    Key::new("base").with("system", base.system_key()).with_all("deb", names).finish()
+    Key::new("base")
+        .with("system", base.system_key())
+        .with_all("deb", names)
+        .finish()
 }
 
 /// Makes the base layer.
-pub(crate) async fn make(shop: &Workshop, base: &Base, sources: &str, progress: &Progress) -> Result<Entry, Error> {
-    progress.step(&format!("bootstrapping base {} (once; about a minute)", base.name)).await;
+pub(crate) async fn make(
+    shop: &Workshop,
+    base: &Base,
+    sources: &str,
+    progress: &Progress,
+) -> Result<Entry, Error> {
+    progress
+        .step(&format!(
+            "bootstrapping base {} (once; about a minute)",
+            base.name
+        ))
+        .await;
     let root = shop.site.fresh("base")?;
     let list = root.join("sources.list");
     fs::write(&list, sources).at("writing", &list)?;
@@ -78,7 +99,12 @@ pub(crate) async fn make(shop: &Workshop, base: &Base, sources: &str, progress: 
         .env("TMPDIR", &root)
         .args(["--mode=root", "--variant=minbase", "--format=directory"])
         .arg(format!("--include={}", base.runtime.packages.join(",")))
-        .args(base.strip.unpacked.iter().map(|rule| format!("--dpkgopt={rule}")))
+        .args(
+            base.strip
+                .unpacked
+                .iter()
+                .map(|rule| format!("--dpkgopt={rule}")),
+        )
         .arg("--aptopt=APT::Install-Recommends \"false\"")
         .arg(&base.suite)
         .arg(&tree)
@@ -110,7 +136,10 @@ pub(crate) async fn make(shop: &Workshop, base: &Base, sources: &str, progress: 
         Ok(layer)
     })
     .await??;
-    Ok(Entry { layer: Some(layer), made_from: status })
+    Ok(Entry {
+        layer: Some(layer),
+        made_from: status,
+    })
 }
 
 /// The same content on every host.
@@ -139,7 +168,10 @@ pub(crate) fn installed(tree: &Path) -> Result<Vec<String>, Error> {
 }
 
 fn stanza(text: &str) -> Option<String> {
-    let field = |name: &str| text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": "));
+    let field = |name: &str| {
+        text.lines()
+            .find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
+    };
     (field("Status")? == "install ok installed").then_some(())?;
     let deb = Deb {
         name: field("Package")?.to_owned(),
@@ -163,9 +195,18 @@ mod tests {
         std::os::unix::fs::symlink(&outside, etc.join("resolv.conf")).expect("linked");
         fs::write(etc.join("hostname"), "build-host-7\n").expect("written");
         normalise(tree.path()).expect("done");
-        assert_eq!(fs::read_to_string(etc.join("hosts")).expect("there"), "127.0.0.1 localhost\n");
-        assert_eq!(fs::read_to_string(etc.join("hostname")).expect("there"), "localhost\n");
-        assert_eq!(fs::read_to_string(etc.join("resolv.conf")).expect("there"), "");
+        assert_eq!(
+            fs::read_to_string(etc.join("hosts")).expect("there"),
+            "127.0.0.1 localhost\n"
+        );
+        assert_eq!(
+            fs::read_to_string(etc.join("hostname")).expect("there"),
+            "localhost\n"
+        );
+        assert_eq!(
+            fs::read_to_string(etc.join("resolv.conf")).expect("there"),
+            ""
+        );
         assert_eq!(fs::read_to_string(outside).expect("there"), "the host's");
     }
 
@@ -181,6 +222,9 @@ mod tests {
              Package: a\nStatus: install ok installed\nArchitecture: amd64\nVersion: 1:1-1\n",
         )
         .expect("written");
-        assert_eq!(installed(tree.path()).expect("read"), ["a=1:1-1:amd64", "b=2:all"]);
+        assert_eq!(
+            installed(tree.path()).expect("read"),
+            ["a=1:1-1:amd64", "b=2:all"]
+        );
     }
 }

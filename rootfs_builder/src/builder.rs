@@ -1,12 +1,12 @@
 //! From a push to an image: which layers, in which order, from the cache or made now.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use image::Store;
 use package::workspace::Pushed;
-use image::{ImageSpec, LayerInfo, Store};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
 
@@ -14,19 +14,21 @@ use crate::apt::{Deb, Sources};
 use crate::archive::Archive;
 use crate::base::{self, Base};
 use crate::bootstrap;
+use crate::build::Build;
 use crate::cache::Layers;
 use crate::error::{Error, IoAt};
 use crate::event::{BuildEvent, Progress};
-use crate::install::{self, Addition, Made};
-use crate::key::Key;
-use crate::launch::{self, Ask, LaunchPlan};
-use crate::request::{BuildOutcome, BuiltLayer, PushRequest, Source};
+use crate::install::Made;
+use crate::request::{BuildOutcome, PushRequest, Source};
 use crate::sandbox::Site;
 use crate::workshop::{Turns, Workshop};
 use crate::{keys, packaged, prebuilt, pushed, source, sources};
 
 /// The base taken when none is named.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
+
+/// Logs of failed builds that are kept.
+const LOGS_KEPT: usize = 50;
 
 /// What a builder works with.
 #[derive(Clone)]
@@ -60,28 +62,6 @@ enum What<'a> {
     Packaged(&'a str),
 }
 
-/// What the three ways of pushing have in common while they work.
-pub(crate) struct Build<'a> {
-    pub(crate) shop: Workshop,
-    pub(crate) base: Base,
-    pub(crate) archive: Arc<Archive>,
-    pub(crate) base_layer: Made,
-    pub(crate) request: &'a PushRequest,
-    pub(crate) progress: &'a Progress,
-    pub(crate) log: PathBuf,
-}
-
-/// What one of them found and made.
-pub(crate) struct Parts {
-    /// ROS packages that the push is about, the one that gives its name first.
-    pub(crate) packages: Vec<String>,
-    pub(crate) version: String,
-    pub(crate) dependencies: Made,
-    pub(crate) package: Option<Made>,
-    /// Its install space; none for one below `/usr`.
-    pub(crate) prefix: Option<PathBuf>,
-}
-
 impl Builder {
     /// Prepares the cache.
     pub fn new(config: Config) -> Result<Self, Error> {
@@ -89,7 +69,12 @@ impl Builder {
             fs::create_dir_all(path).at("making", path)?;
         }
         let layers = Layers::new(&config.cache_dir, config.store.clone())?;
-        Ok(Self { config, layers, turns: Turns::default(), archives: Default::default() })
+        Ok(Self {
+            config,
+            layers,
+            turns: Turns::default(),
+            archives: Default::default(),
+        })
     }
 
     /// Makes the image of a push. To cancel, drop the future: containers are ended and the build's directory is
@@ -101,9 +86,20 @@ impl Builder {
     ) -> Result<BuildOutcome, Error> {
         let progress = &Progress::new(events);
         let hold = self.config.store.hold()?;
-        let base = base::load(&self.config.bases_dir, request.base.as_deref().unwrap_or(DEFAULT_BASE))?;
-        let site = Site::new(&self.config.build_dir, &request.id, self.config.engine.clone())?;
-        let shop = Workshop { site, layers: self.layers.clone(), turns: self.turns.clone() };
+        let base = base::load(
+            &self.config.bases_dir,
+            request.base.as_deref().unwrap_or(DEFAULT_BASE),
+        )?;
+        let site = Site::new(
+            &self.config.build_dir,
+            &request.id,
+            self.config.engine.clone(),
+        )?;
+        let shop = Workshop {
+            site,
+            layers: self.layers.clone(),
+            turns: self.turns.clone(),
+        };
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             Source::Tree(path) => What::Tree(pushed::inspect(path, &base)?),
@@ -121,7 +117,16 @@ impl Builder {
         }
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
-        let build = Build { shop, base, archive, base_layer, request, progress, log };
+        let build = Build {
+            shop,
+            base,
+            archive,
+            base_layer,
+            request,
+            progress,
+            log,
+        };
+        sweep_logs(&self.config.logs_dir);
         let made = match what {
             What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
             What::Tree(Pushed::Installed(space)) => prebuilt::build(&build, space).await?,
@@ -130,7 +135,12 @@ impl Builder {
         build.finish(made, hold).await
     }
 
-    async fn archive(&self, shop: &Workshop, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
+    async fn archive(
+        &self,
+        shop: &Workshop,
+        base: &Base,
+        progress: &Progress,
+    ) -> Result<Arc<Archive>, Error> {
         let mut archives = self.archives.lock().await;
         if let Some(archive) = archives.get(&base.name)
             && archive.is_fresh()
@@ -139,7 +149,8 @@ impl Builder {
         }
         let scratch = shop.site.directory("sources")?;
         let sources = sources::lines(&self.config.sources, base, &scratch).await?;
-        let archive = Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
+        let archive =
+            Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
         archives.insert(base.name.clone(), archive.clone());
         Ok(archive)
     }
@@ -155,154 +166,92 @@ impl Builder {
         let key = bootstrap::key(base, &resolved);
         let _turn = shop.turns.take(&key).await;
         if let Some(entry) = shop.cached(&key).await? {
-            return Ok((Made { layer: entry.layer, cached: true }, archive));
+            return Ok((
+                Made {
+                    layer: entry.layer,
+                    cached: true,
+                },
+                archive,
+            ));
         }
         let entry = bootstrap::make(shop, base, &archive.sources, progress).await?;
-        let made = Made { layer: entry.layer, cached: false };
+        let made = Made {
+            layer: entry.layer,
+            cached: false,
+        };
         let present: BTreeSet<&String> = entry.made_from.iter().collect();
-        let all_there = resolved.iter().all(|deb| present.contains(&deb.to_string()));
+        let all_there = resolved
+            .iter()
+            .all(|deb| present.contains(&deb.to_string()));
         shop.keep(&key, entry).await?;
         if all_there {
             return Ok((made, archive));
         }
         // The archive has moved on since the lists were fetched: fetch them, so that what is resolved from now on
         // fits, and know the layer by what is in it.
-        let archive =
-            Arc::new(Archive::open(&self.config.cache_dir, archive.sources.clone(), true, progress).await?);
-        self.archives.lock().await.insert(base.name.clone(), archive.clone());
+        let archive = Arc::new(
+            Archive::open(
+                &self.config.cache_dir,
+                archive.sources.clone(),
+                true,
+                progress,
+            )
+            .await?,
+        );
+        self.archives
+            .lock()
+            .await
+            .insert(base.name.clone(), archive.clone());
         let resolved = bootstrap::resolve(shop, &archive, base).await?;
         if let Some(layer) = made.layer {
             let made_from = resolved.iter().map(Deb::to_string).collect();
-            let entry = crate::cache::Entry { layer: Some(layer), made_from };
+            let entry = crate::cache::Entry {
+                layer: Some(layer),
+                made_from,
+            };
             shop.keep(&bootstrap::key(base, &resolved), entry).await?;
         }
         Ok((made, archive))
     }
 }
 
-impl Build<'_> {
-    /// The base layer alone, as what others are put on.
-    pub(crate) fn on_base(&self) -> Vec<LayerInfo> {
-        self.base_layer.layer.into_iter().collect()
-    }
-
-    /// A layer with these Debian packages, and what they need, on top of `below`.
-    pub(crate) async fn add(
-        &self,
-        name: &'static str,
-        below: &[LayerInfo],
-        packages: &BTreeSet<String>,
-        extras: Vec<crate::deb::Member>,
-    ) -> Result<Made, Error> {
-        let debs = self.resolve(below, packages).await?;
-        let addition = Addition { name, below, debs, extras };
-        install::layer(&self.shop, &self.archive, &self.base, addition, self.progress).await
-    }
-
-    /// What is to be installed on top of `below`. Remembered: apt takes seconds.
-    async fn resolve(&self, below: &[LayerInfo], packages: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
-        if packages.is_empty() {
-            return Ok(Vec::new());
-        }
-        let key = Key::new("resolved")
-            .with("archive", &self.archive.stamp)
-            .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
-            .with_all("package", packages)
-            .finish();
-        if let Some(debs) = self.shop.layers.note(&key) {
-            return Ok(debs);
-        }
-        let trees = self.shop.extracted(below).await?;
-        let status = trees.iter().rev().map(|tree| tree.join("var/lib/dpkg/status")).find(|path| path.is_file());
-        let debs = self.archive.apt.resolve(status.as_deref(), packages).await?;
-        self.shop.layers.keep_note(&key, &debs)?;
-        Ok(debs)
-    }
-
-    /// Names given with `--with`: ROS packages first, then Debian ones.
-    pub(crate) fn extra_packages(&self) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
-        let (mut ros, mut debs) = (BTreeSet::new(), BTreeSet::new());
-        let mut missing = Vec::new();
-        for name in &self.request.with {
-            if !self.archive.contents.ros_package(name).is_empty() {
-                ros.insert(name.clone());
-            } else if self.archive.names.contains(name) {
-                ros.extend(self.archive.contents.ros_packages_in(name).into_iter().map(str::to_owned));
-                debs.insert(name.clone());
-            } else {
-                missing.push(crate::error::Unresolved {
-                    key: name.clone(),
-                    wanted_by: vec!["--with".into()],
-                    similar: self.archive.similar(name),
-                });
-            }
-        }
-        if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }
-    }
-
-    /// Resolves what to run and writes the image.
-    async fn finish(self, made: Parts, hold: image::Hold) -> Result<BuildOutcome, Error> {
-        let mut layers = Vec::new();
-        let parts = [("base", Some(&self.base_layer)), ("dependencies", Some(&made.dependencies)), ("package", made.package.as_ref())];
-        for (name, part) in parts {
-            if let Some(Made { layer: Some(info), cached }) = part {
-                layers.push(BuiltLayer { name, info: *info, cached: *cached });
-            }
-        }
-        let infos: Vec<LayerInfo> = layers.iter().map(|layer| layer.info).collect();
-        let trees = self.shop.extracted(&infos).await?;
-        self.progress.step("resolving what to run").await;
-        let request = self.request;
-        let ask = Ask {
-            packages: made.packages.clone(),
-            prefix: made.prefix.as_deref().map_or_else(String::new, |prefix| prefix.display().to_string()),
-            launch: request.launch.clone().unwrap_or_default(),
-            nodes: request.nodes.clone(),
-            args: request.args.clone(),
-            remaps: request.remaps.clone(),
-            params: request.params.clone(),
-        };
-        let answer = launch::ask(&self.shop, trees.clone(), self.base.environment.clone(), &ask).await?;
-        for warning in &answer.warnings {
-            self.progress.warn(warning.as_str()).await;
-        }
-        let mut environment = self.base.environment.clone();
-        environment.extend(answer.environment);
-        // Where it works is made when it is run.
-        for name in ["HOME", "ROS_LOG_DIR", "ROS_HOME", "ROS_MASTER_URI", "ROS_HOSTNAME"] {
-            environment.remove(name);
-        }
-        let shares = pushed::shares(made.prefix.as_deref());
-        let definitions =
-            tokio::task::spawn_blocking(move || package::definitions::read(&trees, &shares)).await??;
-        let package = made.packages.first().cloned().unwrap_or_default();
-        let spec = ImageSpec {
-            layers: infos,
-            env: environment.clone(),
-            labels: BTreeMap::from([
-                ("org.cloudroid.package".to_owned(), package.clone()),
-                ("org.cloudroid.base".to_owned(), self.base.name.clone()),
-            ]),
-            annotations: BTreeMap::from([
-                ("org.opencontainers.image.title".to_owned(), package.clone()),
-                ("org.opencontainers.image.version".to_owned(), made.version.clone()),
-            ]),
-            ..ImageSpec::default()
-        };
-        let store = self.shop.layers.store().clone();
-        let image = tokio::task::spawn_blocking(move || store.put_image(&spec)).await??;
-        // A log that tells of no failure is of no use to anyone.
-        let _ = fs::remove_file(&self.log);
-        Ok(BuildOutcome {
-            package,
-            version: made.version,
-            base: self.base.name.clone(),
-            image,
-            layers,
-            environment,
-            plan: LaunchPlan { nodes: answer.nodes, parameters: answer.parameters },
-            definitions,
-            hold,
+/// Keeps the newest logs. Best effort: a log too many hurts nobody.
+fn sweep_logs(directory: &Path) {
+    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
+    let mut logs: Vec<_> = entries
+        .filter(|entry| {
+            entry
+                .path()
+                .extension()
+                .is_some_and(|extension| extension == "log")
         })
+        .filter_map(|entry| Some((entry.metadata().ok()?.modified().ok()?, entry.path())))
+        .collect();
+    logs.sort();
+    for (_, path) in logs.iter().rev().skip(LOGS_KEPT) {
+        let _ = fs::remove_file(path);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_newest_logs_are_kept() {
+        let directory = tempfile::tempdir().expect("a directory");
+        for number in 0..LOGS_KEPT + 3 {
+            let path = directory.path().join(format!("{number}.log"));
+            let file = fs::File::create(path).expect("made");
+            let time = std::time::UNIX_EPOCH + std::time::Duration::from_secs(number as u64);
+            file.set_modified(time).expect("set");
+        }
+        fs::write(directory.path().join("other.txt"), "").expect("written");
+        sweep_logs(directory.path());
+        let left = fs::read_dir(directory.path()).expect("listed").count();
+        assert_eq!(left, LOGS_KEPT + 1);
+        assert!(
+            !directory.path().join("2.log").exists() && directory.path().join("3.log").exists()
+        );
     }
 }

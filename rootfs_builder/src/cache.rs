@@ -35,7 +35,11 @@ impl Layers {
         for path in [&directory, &notes] {
             fs::create_dir_all(path).at("making", path)?;
         }
-        Ok(Self { directory, notes, store })
+        Ok(Self {
+            directory,
+            notes,
+            store,
+        })
     }
 
     pub(crate) fn store(&self) -> &Arc<Store> {
@@ -43,7 +47,10 @@ impl Layers {
     }
 
     fn paths(&self, key: &str) -> (PathBuf, PathBuf) {
-        (self.directory.join(format!("{key}.json")), self.directory.join(format!("{key}.tar.gz")))
+        (
+            self.directory.join(format!("{key}.json")),
+            self.directory.join(format!("{key}.tar.gz")),
+        )
     }
 
     /// The layer of this key, in the store now. Damaged or half-removed entries count as absent. Blocking.
@@ -65,7 +72,10 @@ impl Layers {
             return Ok(None);
         }
         match self.store.import_layer(&archive) {
-            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(Entry { layer: Some(found), ..entry })),
+            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(Entry {
+                layer: Some(found),
+                ..entry
+            })),
             Ok(_) | Err(image::Error::Archive { .. }) => {
                 tracing::warn!(path = %archive.display(), "a cached layer is damaged and will be made again");
                 Ok(None)
@@ -81,7 +91,10 @@ impl Layers {
 
     /// Keeps one.
     pub(crate) fn keep_note<T: Serialize>(&self, key: &str, value: &T) -> Result<(), Error> {
-        write_whole(&self.notes.join(key), &serde_json::to_vec(value).unwrap_or_default())
+        write_whole(
+            &self.notes.join(key),
+            &serde_json::to_vec(value).unwrap_or_default(),
+        )
     }
 
     /// Keeps a layer that is in the store. Blocking.
@@ -90,7 +103,10 @@ impl Layers {
         if let Some(layer) = &entry.layer {
             self.store.export_layer(&layer.diff_id, &archive)?;
         }
-        write_whole(&about, &serde_json::to_vec_pretty(entry).unwrap_or_default())
+        write_whole(
+            &about,
+            &serde_json::to_vec_pretty(entry).unwrap_or_default(),
+        )
     }
 }
 
@@ -100,5 +116,7 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     let mut file = tempfile::NamedTempFile::new_in(directory).at("making a file in", directory)?;
     file.write_all(bytes).at("writing", path)?;
     file.as_file().sync_data().at("writing", path)?;
-    file.persist(path).map(drop).map_err(|error| Error::io("writing", path, error.error))
+    file.persist(path)
+        .map(drop)
+        .map_err(|error| Error::io("writing", path, error.error))
 }

@@ -58,11 +58,22 @@ pub(crate) async fn compile(
         jobs: std::thread::available_parallelism().map_or(1, usize::from),
     };
     let mut files = BTreeMap::from([
-        (PathBuf::from("cloudroid/compile.py"), COMPILE.as_bytes().to_vec()),
-        (PathBuf::from("cloudroid/job.json"), serde_json::to_vec(&job).unwrap_or_default()),
+        (
+            PathBuf::from("cloudroid/compile.py"),
+            COMPILE.as_bytes().to_vec(),
+        ),
+        (
+            PathBuf::from("cloudroid/job.json"),
+            serde_json::to_vec(&job).unwrap_or_default(),
+        ),
         (PathBuf::from("cloudroid/source/.keep"), Vec::new()),
     ]);
-    files.extend(base.build.files.iter().map(|(path, text)| (path.clone(), text.clone().into_bytes())));
+    files.extend(
+        base.build
+            .files
+            .iter()
+            .map(|(path, text)| (path.clone(), text.clone().into_bytes())),
+    );
     lay_out(&tools, &files)?;
     open_up(source)?;
     let mut layers = shop.extracted(below).await?;
@@ -83,7 +94,9 @@ pub(crate) async fn compile(
 
     let mut file = fs::File::create(log).at("making", log)?;
     let mut writing = Ok(());
-    let mut package = units.first().map_or_else(String::new, |unit| unit.name.clone());
+    let mut package = units
+        .first()
+        .map_or_else(String::new, |unit| unit.name.clone());
     let mut tail = Tail::default();
     let (lines, mut told) = tokio::sync::mpsc::unbounded_channel::<String>();
     let forward = async {
@@ -104,9 +117,15 @@ pub(crate) async fn compile(
                     layers,
                     writable: Some(upper.clone()),
                     owned: vec!["/build".into(), base.build.prefix.clone()],
-                    mounts: vec![Mount { source: source.to_owned(), target: "/cloudroid/source".into(), writable: false }],
+                    mounts: vec![Mount {
+                        source: source.to_owned(),
+                        target: "/cloudroid/source".into(),
+                        writable: false,
+                    }],
                     environment,
-                    argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"].map(str::to_owned).into(),
+                    argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"]
+                        .map(str::to_owned)
+                        .into(),
                 },
                 |line| {
                     if writing.is_ok() {
@@ -133,9 +152,16 @@ pub(crate) async fn compile(
             last_lines = format!("{last_lines}\n{}", finished.last_words());
         }
         if last_lines.contains("No space left on device") {
-            return Err(Error::DiskFull { path: upper, what: format!("compiling {package}") });
+            return Err(Error::DiskFull {
+                path: upper,
+                what: format!("compiling {package}"),
+            });
         }
-        return Err(Error::BuildFailed { package, log: log.to_owned(), last_lines });
+        return Err(Error::BuildFailed {
+            package,
+            log: log.to_owned(),
+            last_lines,
+        });
     }
     let prefix = base.build.prefix.clone();
     let tree = room.join("tree");
@@ -154,8 +180,11 @@ fn title(line: &str, units: &[Unit]) -> Option<String> {
 
 /// make's and CMake's own chatter pushes what the compiler said out of the last lines.
 fn worth_showing(line: &str) -> bool {
-    let chatter = line.starts_with("make[") || line.starts_with("gmake[") || line.starts_with("-- ");
-    let progress = line.starts_with('[') && line.get(4..6).is_some_and(|rest| rest == "%]") && !line.contains("Error");
+    let chatter =
+        line.starts_with("make[") || line.starts_with("gmake[") || line.starts_with("-- ");
+    let progress = line.starts_with('[')
+        && line.get(4..6).is_some_and(|rest| rest == "%]")
+        && !line.contains("Error");
     !chatter && !progress && !line.trim().is_empty()
 }
 
@@ -167,9 +196,15 @@ pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
         if entry.file_type().is_symlink() {
             continue;
         }
-        let about = entry.metadata().map_err(|error| Error::io("reading", entry.path(), error.into()))?;
+        let about = entry
+            .metadata()
+            .map_err(|error| Error::io("reading", entry.path(), error.into()))?;
         let mode = about.permissions().mode() & 0o777;
-        let run = if about.is_dir() || mode & 0o100 != 0 { 0o111 } else { 0 };
+        let run = if about.is_dir() || mode & 0o100 != 0 {
+            0o111
+        } else {
+            0
+        };
         if mode != mode | 0o444 | run {
             set_mode(entry.path(), mode | 0o444 | run)?;
         }
@@ -183,14 +218,18 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
     let target = tree.join(inside);
     let parent = target.parent().unwrap_or(tree);
     fs::create_dir_all(parent).at("making", parent)?;
-    for directory in parent.ancestors().take_while(|directory| directory.starts_with(tree)) {
+    for directory in parent
+        .ancestors()
+        .take_while(|directory| directory.starts_with(tree))
+    {
         set_mode(directory, 0o755)?;
     }
     let from = upper.join(inside);
     fs::rename(&from, &target).at("moving", &from)?;
     for entry in walkdir::WalkDir::new(&target) {
         let entry = entry.map_err(|error| Error::io("reading", &target, error.into()))?;
-        std::os::unix::fs::lchown(entry.path(), Some(0), Some(0)).at("changing the owner of", entry.path())?;
+        std::os::unix::fs::lchown(entry.path(), Some(0), Some(0))
+            .at("changing the owner of", entry.path())?;
     }
     Ok(())
 }
@@ -198,7 +237,14 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
 /// Packs an install space.
 pub(crate) async fn pack(shop: &Workshop, base: &Base, tree: &Path) -> Result<LayerInfo, Error> {
     let store = shop.layers.store().clone();
-    let (tree, options) = (tree.to_owned(), TreeOptions { exclude: Vec::new(), level: 6, ..tree_options(base) });
+    let (tree, options) = (
+        tree.to_owned(),
+        TreeOptions {
+            exclude: Vec::new(),
+            level: 6,
+            ..tree_options(base)
+        },
+    );
     Ok(tokio::task::spawn_blocking(move || store.layer_from_tree(&tree, &options)).await??)
 }
 
@@ -209,10 +255,20 @@ mod tests {
 
     #[test]
     fn the_compilers_words_are_shown_and_makes_are_not() {
-        for line in ["x.cpp:3:5: error: 'y' was not declared", "CMake Error at CMakeLists.txt:3", "  3 | y();"] {
+        for line in [
+            "x.cpp:3:5: error: 'y' was not declared",
+            "CMake Error at CMakeLists.txt:3",
+            "  3 | y();",
+        ] {
             assert!(worth_showing(line), "{line}");
         }
-        for line in ["make[2]: *** [x.o] Error 1", "[ 50%] Building CXX object x.o", "-- Found x", "", "[100%] Built"] {
+        for line in [
+            "make[2]: *** [x.o] Error 1",
+            "[ 50%] Building CXX object x.o",
+            "-- Found x",
+            "",
+            "[100%] Built",
+        ] {
             assert!(!worth_showing(line), "{line}");
         }
     }
@@ -229,14 +285,24 @@ mod tests {
         set_mode(&root.path().join("d"), 0o700).expect("set");
         open_up(root.path()).expect("done");
         let mode = |path: &Path| path.metadata().expect("there").permissions().mode() & 0o777;
-        assert_eq!((mode(&script), mode(&text), mode(&root.path().join("d"))), (0o755, 0o644, 0o755));
+        assert_eq!(
+            (mode(&script), mode(&text), mode(&root.path().join("d"))),
+            (0o755, 0o644, 0o755)
+        );
     }
 
     #[test]
     fn steps_count_packages() {
-        let unit = |name: &str| Unit { name: name.into(), path: name.into(), build_type: "catkin".into() };
+        let unit = |name: &str| Unit {
+            name: name.into(),
+            path: name.into(),
+            build_type: "catkin".into(),
+        };
         let units = [unit("a"), unit("b")];
-        assert_eq!(title("::package b", &units).as_deref(), Some("compiling b (2 of 2)"));
+        assert_eq!(
+            title("::package b", &units).as_deref(),
+            Some("compiling b (2 of 2)")
+        );
         assert_eq!(title("anything", &units), None);
     }
 }

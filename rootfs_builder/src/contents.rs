@@ -48,7 +48,10 @@ impl Part {
     ];
 
     fn letter(self) -> char {
-        Self::ALL.into_iter().find(|(part, _)| *part == self).map_or('?', |(_, letter)| letter)
+        Self::ALL
+            .into_iter()
+            .find(|(part, _)| *part == self)
+            .map_or('?', |(_, letter)| letter)
     }
 }
 
@@ -66,26 +69,34 @@ impl Contents {
         if !path.is_file() {
             let lines = boil_down(lists)?;
             let mut file = tempfile::NamedTempFile::new_in(cache).at("making a file in", cache)?;
-            file.write_all(lines.join("\n").as_bytes()).at("writing", file.path())?;
+            file.write_all(lines.join("\n").as_bytes())
+                .at("writing", file.path())?;
             file.as_file().sync_data().at("writing", file.path())?;
-            file.persist(&path).map_err(|error| Error::io("writing", &path, error.error))?;
+            file.persist(&path)
+                .map_err(|error| Error::io("writing", &path, error.error))?;
             sweep(cache, &path);
         }
         let text = fs::read_to_string(&path).at("reading", &path)?;
-        Ok(Self { lines: text.lines().map(str::to_owned).collect() })
+        Ok(Self {
+            lines: text.lines().map(str::to_owned).collect(),
+        })
     }
 
     /// Lines that begin with `prefix`, without it.
     fn with_prefix<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = &'a str> {
         let start = self.lines.partition_point(|line| line.as_str() < prefix);
-        self.lines[start..].iter().map_while(move |line| line.strip_prefix(prefix))
+        self.lines[start..]
+            .iter()
+            .map_while(move |line| line.strip_prefix(prefix))
     }
 
     /// The Debian package with this shared library, by the name a program asks for (`libfoo.so.1`). Where several
     /// have it, the one whose name is nearest to the library's.
     pub fn library(&self, name: &str) -> Option<&str> {
         let prefix = format!("l{name}\t");
-        let start = self.lines.partition_point(|line| line.as_str() < prefix.as_str());
+        let start = self
+            .lines
+            .partition_point(|line| line.as_str() < prefix.as_str());
         self.lines[start..]
             .iter()
             .map_while(|line| line.strip_prefix(prefix.as_str()))
@@ -98,7 +109,10 @@ impl Contents {
         let mut carriers = Carriers::new();
         for rest in self.with_prefix(&prefix) {
             let (deb, letters) = rest.split_once('\t').unwrap_or((rest, ""));
-            let parts = Part::ALL.into_iter().filter(|(_, letter)| letters.contains(*letter)).map(|(part, _)| part);
+            let parts = Part::ALL
+                .into_iter()
+                .filter(|(_, letter)| letters.contains(*letter))
+                .map(|(part, _)| part);
             carriers.insert(deb.to_owned(), parts.collect());
         }
         carriers
@@ -106,10 +120,14 @@ impl Contents {
 
     /// ROS packages of which this Debian package holds something.
     pub fn ros_packages_in(&self, deb: &str) -> Vec<&str> {
-        let fields = self.with_prefix("r").filter_map(|rest| rest.split_once('\t'));
-        fields.filter(|(_, rest)| rest.split('\t').next() == Some(deb)).map(|(name, _)| name).collect()
+        let fields = self
+            .with_prefix("r")
+            .filter_map(|rest| rest.split_once('\t'));
+        fields
+            .filter(|(_, rest)| rest.split('\t').next() == Some(deb))
+            .map(|(name, _)| name)
+            .collect()
     }
-
 }
 
 /// Changes when the lists do.
@@ -117,7 +135,10 @@ fn stamp(lists: &[PathBuf]) -> Result<String, Error> {
     let mut key = crate::key::Key::new("contents").with("version", VERSION.to_string());
     for list in lists {
         let about = list.metadata().at("reading", list)?;
-        let changed = about.modified().ok().and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
+        let changed = about
+            .modified()
+            .ok()
+            .and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
         let text = format!("{} {} {:?}", list.display(), about.len(), changed);
         key = key.with("list", text);
     }
@@ -155,7 +176,10 @@ enum Kept {
 /// might be theirs is little once repetitions are left out.
 fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
     let found = std::thread::scope(|scope| {
-        let threads: Vec<_> = lists.iter().map(|list| scope.spawn(move || scan(list))).collect();
+        let threads: Vec<_> = lists
+            .iter()
+            .map(|list| scope.spawn(move || scan(list)))
+            .collect();
         let mut all = BTreeSet::new();
         for thread in threads {
             match thread.join() {
@@ -184,7 +208,10 @@ fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
                     lines.insert(format!("l{}\t{deb}", text(name)));
                 }
                 Kept::Ros(name, part) if ros.contains(name.as_slice()) => {
-                    parts.entry((text(name), deb.to_owned())).or_default().insert(*part);
+                    parts
+                        .entry((text(name), deb.to_owned()))
+                        .or_default()
+                        .insert(*part);
                 }
                 Kept::Ros(..) => {}
             }
@@ -229,13 +256,17 @@ fn scan(list: &Path) -> Result<Vec<(Kept, Vec<u8>)>, Error> {
 /// Keeps a line if it is of interest and says something that the one before did not.
 fn keep(line: &[u8], kept: &mut Vec<(Kept, Vec<u8>)>) {
     let Some(what) = classify(line) else { return };
-    let Some(space) = memchr::memrchr2(b' ', b'\t', line) else { return };
+    let Some(space) = memchr::memrchr2(b' ', b'\t', line) else {
+        return;
+    };
     let debs = &line[space + 1..];
     let same = kept.last().is_some_and(|(last, of)| {
         of == debs
             && match (last, what) {
                 (Kept::Library(name), What::Library(new)) => name == new,
-                (Kept::Ros(name, part), What::Ros(new, new_part)) => *part == new_part && name == new,
+                (Kept::Ros(name, part), What::Ros(new, new_part)) => {
+                    *part == new_part && name == new
+                }
                 _ => false,
             }
     });
@@ -262,7 +293,9 @@ fn classify(line: &[u8]) -> Option<What<'_>> {
             Some((b"msg" | b"srv" | b"action", _)) => Part::Definitions,
             Some((b"cmake", _)) => Part::CMake,
             // Below the directory, not in one below it. Behind it come spaces and a section with a slash.
-            _ if rest.starts_with(b"package.xml ") || rest.starts_with(b"package.xml\t") => Part::Manifest,
+            _ if rest.starts_with(b"package.xml ") || rest.starts_with(b"package.xml\t") => {
+                Part::Manifest
+            }
             _ => Part::Share,
         };
         return Some(What::Ros(name, part));
@@ -270,7 +303,9 @@ fn classify(line: &[u8]) -> Option<What<'_>> {
     if let Some(rest) = line.strip_prefix(b"usr/lib/python3/dist-packages/") {
         return Some(What::Ros(cut(rest)?.0, Part::Python));
     }
-    let rest = line.strip_prefix(b"usr/lib/").or_else(|| line.strip_prefix(b"lib/"))?;
+    let rest = line
+        .strip_prefix(b"usr/lib/")
+        .or_else(|| line.strip_prefix(b"lib/"))?;
     let end = memchr::memchr2(b' ', b'\t', rest)?;
     let path = &rest[..end];
     let own = triplet().as_bytes();
@@ -301,67 +336,4 @@ pub(crate) fn triplet() -> &'static str {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use flate2::Compression;
-    use flate2::write::GzEncoder;
-
-    fn list(directory: &Path, name: &str, text: &str) -> PathBuf {
-        let path = directory.join(name);
-        let mut gz = GzEncoder::new(File::create(&path).expect("made"), Compression::fast());
-        gz.write_all(text.as_bytes()).expect("written");
-        gz.finish().expect("written");
-        path
-    }
-
-    fn example(directory: &Path) -> Contents {
-        let t = triplet();
-        let native = format!(
-            "usr/lib/nodelet/nodelet   libs/nodelet-tools\n\
-             usr/lib/{t}/libfoo.so.1   libs/libfoo1\n\
-             usr/lib/{t}/libfoo.so   libdevel/libfoo-dev\n\
-             usr/lib/{t}/blas/libblas.so.3   libs/libblas3\n\
-             usr/lib/{t}/deep/libdeep.so.3   libs/libdeep3\n\
-             usr/lib/{t}/cmake/nodelet/nodeletConfig.cmake   libdevel/libnodelet-dev\n\
-             lib/{t}/libc.so.6   libs/libc6,libs/libc6-other\n\
-             usr/share/nodelet/package.xml   libs/nodelet-tools\n\
-             usr/share/nodelet/srv/NodeletLoad.srv   devel/ros-nodelet-srvs\n"
-        );
-        let all = "usr/lib/python3/dist-packages/nodelet/__init__.py python/python3-nodelet\n\
-                   usr/share/doc/with space/x doc/y\n";
-        Contents::open(directory, &[list(directory, "a.gz", &native), list(directory, "b.gz", all)]).expect("read")
-    }
-
-    #[test]
-    fn libraries_and_ros_packages_are_found() {
-        let directory = tempfile::tempdir().expect("a directory");
-        let contents = example(directory.path());
-        assert_eq!(contents.library("libfoo.so.1"), Some("libfoo1"));
-        assert_eq!(contents.library("libblas.so.3"), Some("libblas3"));
-        assert_eq!(contents.library("libc.so.6"), Some("libc6"));
-        assert_eq!(contents.library("libdeep.so.3"), None);
-        let nodelet = contents.ros_package("nodelet");
-        assert_eq!(nodelet["nodelet-tools"], [Part::Manifest, Part::Programs].into());
-        assert_eq!(nodelet["ros-nodelet-srvs"], [Part::Definitions].into());
-        assert_eq!(nodelet["python3-nodelet"], [Part::Python].into());
-        assert_eq!(nodelet["libnodelet-dev"], [Part::CMake].into());
-        assert!(contents.ros_package("nodele").is_empty());
-        assert_eq!(contents.ros_packages_in("python3-nodelet"), ["nodelet"]);
-    }
-
-    #[test]
-    fn it_is_made_once() {
-        let directory = tempfile::tempdir().expect("a directory");
-        example(directory.path());
-        let made = || {
-            let names = fs::read_dir(directory.path()).expect("listed").flatten().map(|entry| entry.file_name());
-            names.filter(|name| name.to_string_lossy().starts_with("contents-")).collect::<Vec<_>>()
-        };
-        let first = made();
-        assert_eq!(first.len(), 1);
-        let lists = [directory.path().join("a.gz"), directory.path().join("b.gz")];
-        fs::write(directory.path().join(&first[0]), "lx.so\tmarked").expect("written");
-        let again = Contents::open(directory.path(), &lists).expect("read");
-        assert_eq!(again.library("x.so"), Some("marked"), "read, not made again");
-    }
-}
+pub(crate) mod tests;

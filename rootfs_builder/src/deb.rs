@@ -34,9 +34,17 @@ pub(crate) enum Content {
 /// Members that `keep` accepts. Blocking.
 pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
     let mut unpack = Command::new("dpkg-deb");
-    unpack.arg("--fsys-tarfile").arg(deb).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    unpack
+        .arg("--fsys-tarfile")
+        .arg(deb)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null());
     let mut child = unpack.spawn().map_err(|error| match error.kind() {
-        std::io::ErrorKind::NotFound => Error::MissingProgram { program: "dpkg-deb", package: "dpkg" },
+        std::io::ErrorKind::NotFound => Error::MissingProgram {
+            program: "dpkg-deb",
+            package: "dpkg",
+        },
         _ => Error::io("reading", deb, error),
     })?;
     let mut found = Vec::new();
@@ -54,7 +62,10 @@ pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Me
                 continue;
             }
             let header = entry.header();
-            let (mode, mtime) = (header.mode().at("reading", deb)?, header.mtime().at("reading", deb)?);
+            let (mode, mtime) = (
+                header.mode().at("reading", deb)?,
+                header.mtime().at("reading", deb)?,
+            );
             let kind = header.entry_type();
             let content = if kind.is_symlink() {
                 match entry.link_name().at("reading", deb)? {
@@ -68,7 +79,12 @@ pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Me
             } else {
                 continue;
             };
-            found.push(Member { path, mode: mode & 0o777, mtime, content });
+            found.push(Member {
+                path,
+                mode: mode & 0o777,
+                mtime,
+                content,
+            });
         }
     }
     let status = child.wait().at("reading", deb)?;
@@ -88,7 +104,10 @@ pub(crate) fn wanted_of_development(path: &Path) -> bool {
     let parts: Vec<&str> = path.iter().filter_map(|part| part.to_str()).collect();
     match parts.as_slice() {
         ["usr", "share", directory, inner, ..] => {
-            !matches!(*directory, "doc" | "man" | "cmake" | "pkgconfig" | "lintian" | "bug") && *inner != "cmake"
+            !matches!(
+                *directory,
+                "doc" | "man" | "cmake" | "pkgconfig" | "lintian" | "bug"
+            ) && *inner != "cmake"
         }
         ["usr", "lib", name] | ["usr", "lib", _, name] => name.ends_with(".so"),
         _ => false,
@@ -113,16 +132,23 @@ pub(crate) fn write_tar(members: &[Member], to: &Path) -> Result<(), Error> {
             Content::File(bytes) => {
                 header.set_entry_type(tar::EntryType::Regular);
                 header.set_size(bytes.len() as u64);
-                archive.append_data(&mut header, &member.path, bytes.as_slice()).at("writing", to)?;
+                archive
+                    .append_data(&mut header, &member.path, bytes.as_slice())
+                    .at("writing", to)?;
             }
             Content::Link(target) => {
                 header.set_entry_type(tar::EntryType::Symlink);
                 header.set_size(0);
-                archive.append_link(&mut header, &member.path, target).at("writing", to)?;
+                archive
+                    .append_link(&mut header, &member.path, target)
+                    .at("writing", to)?;
             }
         }
     }
-    archive.into_inner().and_then(|mut file| file.flush()).at("writing", to)
+    archive
+        .into_inner()
+        .and_then(|mut file| file.flush())
+        .at("writing", to)
 }
 
 #[cfg(test)]
@@ -154,7 +180,12 @@ mod tests {
 
     #[test]
     fn members_become_the_same_archive_whatever_their_order() {
-        let member = |path: &str, content| Member { path: path.into(), mode: 0o644, mtime: 5, content };
+        let member = |path: &str, content| Member {
+            path: path.into(),
+            mode: 0o644,
+            mtime: 5,
+            content,
+        };
         let file = member("usr/share/x/a", Content::File(b"text".to_vec()));
         let link = member("usr/lib/t/libx.so", Content::Link("libx.so.1".into()));
         let directory = tempfile::tempdir().expect("a directory");
@@ -164,8 +195,14 @@ mod tests {
         let bytes = std::fs::read(&one).expect("there");
         assert_eq!(bytes, std::fs::read(&two).expect("there"));
         let mut archive = tar::Archive::new(bytes.as_slice());
-        let names: Vec<_> =
-            archive.entries().expect("an archive").map(|e| e.expect("one").path().expect("named").into_owned()).collect();
-        assert_eq!(names, [Path::new("usr/lib/t/libx.so"), Path::new("usr/share/x/a")]);
+        let names: Vec<_> = archive
+            .entries()
+            .expect("an archive")
+            .map(|e| e.expect("one").path().expect("named").into_owned())
+            .collect();
+        assert_eq!(
+            names,
+            [Path::new("usr/lib/t/libx.so"), Path::new("usr/share/x/a")]
+        );
     }
 }

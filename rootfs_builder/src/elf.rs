@@ -34,7 +34,10 @@ struct Segment {
 pub(crate) fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
     let mut file = File::open(path).at("reading", path)?;
     let mut magic = Vec::new();
-    (&mut file).take(64).read_to_end(&mut magic).at("reading", path)?;
+    (&mut file)
+        .take(64)
+        .read_to_end(&mut magic)
+        .at("reading", path)?;
     if magic.len() < 52 || !magic.starts_with(b"\x7fELF") || magic[5] != 1 {
         return Ok(None);
     }
@@ -45,13 +48,23 @@ pub(crate) fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
 fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     let wide = header[4] == 2;
     let (table, size, count) = if wide {
-        (u64_at(header, 32)?, u16_at(header, 54)?, u16_at(header, 56)?)
+        (
+            u64_at(header, 32)?,
+            u16_at(header, 54)?,
+            u16_at(header, 56)?,
+        )
     } else {
-        (u32_at(header, 28)?.into(), u16_at(header, 42)?, u16_at(header, 44)?)
+        (
+            u32_at(header, 28)?.into(),
+            u16_at(header, 42)?,
+            u16_at(header, 44)?,
+        )
     };
     let headers = part(file, table, u64::from(size) * u64::from(count))?;
-    let segments: Vec<Segment> =
-        headers.chunks_exact(usize::from(size).max(1)).filter_map(|raw| segment(raw, wide)).collect();
+    let segments: Vec<Segment> = headers
+        .chunks_exact(usize::from(size).max(1))
+        .filter_map(|raw| segment(raw, wide))
+        .collect();
     let place = segments.iter().find(|s| s.kind == PT_DYNAMIC)?;
     let entries = part(file, place.offset, place.size)?;
     let mut names = Vec::new();
@@ -72,23 +85,37 @@ fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     }
     // The table's address is where it is loaded; the segment that covers it tells where it is in the file.
     let address = strings?;
-    let home = segments.iter().find(|s| s.kind == PT_LOAD && (s.address..s.address + s.size).contains(&address))?;
+    let home = segments
+        .iter()
+        .find(|s| s.kind == PT_LOAD && (s.address..s.address + s.size).contains(&address))?;
     let table = part(file, home.offset + (address - home.address), length)?;
     let needed = names.into_iter().filter_map(|at| {
         let rest = table.get(usize::try_from(at).ok()?..)?;
         let end = rest.iter().position(|byte| *byte == 0)?;
         String::from_utf8(rest[..end].to_vec()).ok()
     });
-    Some(Dynamic { needed: needed.collect() })
+    Some(Dynamic {
+        needed: needed.collect(),
+    })
 }
 
 fn segment(raw: &[u8], wide: bool) -> Option<Segment> {
     let kind = u32_at(raw, 0)?;
     Some(if wide {
-        Segment { kind, offset: u64_at(raw, 8)?, address: u64_at(raw, 16)?, size: u64_at(raw, 32)? }
+        Segment {
+            kind,
+            offset: u64_at(raw, 8)?,
+            address: u64_at(raw, 16)?,
+            size: u64_at(raw, 32)?,
+        }
     } else {
         let field = |at| u32_at(raw, at).map(u64::from);
-        Segment { kind, offset: field(4)?, address: field(8)?, size: field(16)? }
+        Segment {
+            kind,
+            offset: field(4)?,
+            address: field(8)?,
+            size: field(16)?,
+        }
     })
 }
 
@@ -140,7 +167,13 @@ mod tests {
     fn a_program_tells_what_it_needs() {
         let own = std::env::current_exe().expect("known");
         let dynamic = read(&own).expect("read").expect("an ELF file");
-        assert!(dynamic.needed.iter().any(|name| name.starts_with("libc.so.")), "{dynamic:?}");
+        assert!(
+            dynamic
+                .needed
+                .iter()
+                .any(|name| name.starts_with("libc.so.")),
+            "{dynamic:?}"
+        );
     }
 
     #[test]
@@ -158,10 +191,22 @@ mod tests {
     #[test]
     fn what_is_beside_it_is_not_needed_from_elsewhere() {
         let directory = tempfile::tempdir().expect("a directory");
-        std::fs::copy(std::env::current_exe().expect("known"), directory.path().join("x")).expect("copied");
+        std::fs::copy(
+            std::env::current_exe().expect("known"),
+            directory.path().join("x"),
+        )
+        .expect("copied");
         let before = needed_below(directory.path()).expect("read");
-        let libc = before.iter().find(|name| name.starts_with("libc.so.")).expect("needed").clone();
+        let libc = before
+            .iter()
+            .find(|name| name.starts_with("libc.so."))
+            .expect("needed")
+            .clone();
         std::fs::write(directory.path().join(&libc), "").expect("written");
-        assert!(!needed_below(directory.path()).expect("read").contains(&libc));
+        assert!(
+            !needed_below(directory.path())
+                .expect("read")
+                .contains(&libc)
+        );
     }
 }

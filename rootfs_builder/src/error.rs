@@ -108,7 +108,9 @@ pub enum Error {
         known: String,
     },
     /// Nothing says what to run.
-    #[error("say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}")]
+    #[error(
+        "say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}"
+    )]
     NothingToRun {
         /// Executables of the package.
         executables: String,
@@ -116,7 +118,9 @@ pub enum Error {
         launch_files: String,
     },
     /// A package this base cannot compile.
-    #[error("package {package} has build type {build_type}, which base {base} cannot build: it builds catkin and cmake")]
+    #[error(
+        "package {package} has build type {build_type}, which base {base} cannot build: it builds catkin and cmake"
+    )]
     BuildType {
         /// The package.
         package: String,
@@ -185,7 +189,11 @@ pub struct Unresolved {
 fn unresolved_text(all: &[Unresolved]) -> String {
     let mut text = String::from("nothing provides:");
     for one in all {
-        text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
+        text.push_str(&format!(
+            "\n  {} (wanted by {})",
+            one.key,
+            one.wanted_by.join(", ")
+        ));
         if !one.similar.is_empty() {
             text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
         }
@@ -198,7 +206,9 @@ impl Error {
     /// An input/output error, told apart from a full disk.
     pub fn io(what: impl Into<String>, path: impl Into<PathBuf>, source: io::Error) -> Self {
         let (what, path) = (what.into(), path.into());
-        if source.kind() == io::ErrorKind::StorageFull || source.raw_os_error() == Some(nix::libc::ENOSPC) {
+        if source.kind() == io::ErrorKind::StorageFull
+            || source.raw_os_error() == Some(nix::libc::ENOSPC)
+        {
             Self::DiskFull { path, what }
         } else {
             Self::Io { what, path, source }
@@ -225,20 +235,39 @@ mod tests {
     #[test]
     fn all_that_is_missing_is_named_with_the_next_step() {
         let error = Error::Unresolved(vec![
-            Unresolved { key: "warp".into(), wanted_by: vec!["a".into(), "b".into()], similar: vec![] },
-            Unresolved { key: "eigne".into(), wanted_by: vec!["a".into()], similar: vec!["libeigen3-dev".into()] },
+            Unresolved {
+                key: "warp".into(),
+                wanted_by: vec!["a".into(), "b".into()],
+                similar: vec![],
+            },
+            Unresolved {
+                key: "eigne".into(),
+                wanted_by: vec!["a".into()],
+                similar: vec!["libeigen3-dev".into()],
+            },
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
-        assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
+        assert!(
+            text.contains("eigne (wanted by a); perhaps libeigen3-dev"),
+            "{text}"
+        );
         assert!(text.contains("--map KEY=DEB"), "{text}");
     }
 
     #[test]
     fn a_full_disk_is_told_apart() {
-        let full = io::Error::from_raw_os_error(nix::libc::ENOSPC);
-        let error = Error::io("writing", "/x/y", full);
+        let error = std::fs::write("/dev/full", "x")
+            .at("writing", "/dev/full")
+            .expect_err("full");
         assert!(matches!(error, Error::DiskFull { .. }), "{error}");
-        assert!(error.to_string().contains("/x/y"), "{error}");
+        assert!(
+            error.to_string().contains("the disk that holds /dev/full"),
+            "{error}"
+        );
+        let error = std::fs::write("/nonexistent/x", "x")
+            .at("writing", "/nonexistent/x")
+            .expect_err("absent");
+        assert!(matches!(error, Error::Io { .. }), "{error}");
     }
 }

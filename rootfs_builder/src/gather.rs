@@ -57,8 +57,9 @@ pub(crate) async fn gather(
             wanted.install.extend(carried.install);
             if depth != Depth::Beyond {
                 let tells = archive.contents.ros_package(&name).into_iter();
-                let tells = tells
-                    .filter(|(_, parts)| parts.contains(&Part::Manifest) || parts.contains(&Part::Share));
+                let tells = tells.filter(|(_, parts)| {
+                    parts.contains(&Part::Manifest) || parts.contains(&Part::Share)
+                });
                 round.extend(tells.map(|(deb, _)| deb));
                 round.extend(carried.unpack);
             }
@@ -67,8 +68,10 @@ pub(crate) async fn gather(
         let debs = archive.apt.candidates(&round).await?;
         let files = archive.apt.download(&debs, progress).await?;
         for (deb, file) in debs.iter().zip(files) {
-            let members =
-                tokio::task::spawn_blocking(move || deb::members(&file, deb::wanted_of_development)).await??;
+            let members = tokio::task::spawn_blocking(move || {
+                deb::members(&file, deb::wanted_of_development)
+            })
+            .await??;
             let told = tell(&members, base);
             next.extend(told.ros_packages);
             wanted.warnings.extend(told.warnings);
@@ -85,7 +88,9 @@ pub(crate) async fn gather(
         };
     }
     wanted.extras.sort_by(|a, b| a.path.cmp(&b.path));
-    wanted.extras.dedup_by(|later, first| later.path == first.path);
+    wanted
+        .extras
+        .dedup_by(|later, first| later.path == first.path);
     // Names of libraries that do not become present would be links to nothing.
     let plugin_targets = wanted.install.clone();
     wanted.extras.retain(|member| match &member.content {
@@ -117,8 +122,12 @@ fn tell(members: &[Member], base: &Base) -> Told {
         })
         .collect();
     for (path, bytes) in &texts {
-        let Ok(text) = std::str::from_utf8(bytes) else { continue };
-        if path.file_name().is_some_and(|name| name == "package.xml") && path.components().count() == 4 {
+        let Ok(text) = std::str::from_utf8(bytes) else {
+            continue;
+        };
+        if path.file_name().is_some_and(|name| name == "package.xml")
+            && path.components().count() == 4
+        {
             match manifest::run_dependencies(text, path, base) {
                 Ok(names) => told.ros_packages.extend(names),
                 Err(problem) => told.warnings.push(format!("in the archive: {problem}")),
@@ -134,17 +143,24 @@ fn tell(members: &[Member], base: &Base) -> Told {
 /// A plugin list names `libx`; the file with that name is a link in a development package to `libx.so.1`, which is
 /// in another one.
 fn want_plugin(archive: &Archive, library: &str, members: &[Member], wanted: &mut Wanted) {
-    let link = members.iter().find(|member| member.path.file_name().is_some_and(|name| name == library));
+    let link = members
+        .iter()
+        .find(|member| member.path.file_name().is_some_and(|name| name == library));
     let target: Option<PathBuf> = link.and_then(|member| match &member.content {
         Content::Link(target) => Some(target.clone()),
         Content::File(_) => None,
     });
-    let name = target.as_deref().and_then(Path::file_name).map_or(library.into(), |name| name.to_string_lossy());
+    let name = target
+        .as_deref()
+        .and_then(Path::file_name)
+        .map_or(library.into(), |name| name.to_string_lossy());
     match archive.contents.library(&name) {
         Some(deb) if !deb.ends_with("-dev") => {
             wanted.install.insert(deb.to_owned());
         }
-        _ => wanted.warnings.push(format!("no package holds the plugin library {name}")),
+        _ => wanted
+            .warnings
+            .push(format!("no package holds the plugin library {name}")),
     }
 }
 
@@ -153,7 +169,12 @@ mod tests {
     use super::*;
 
     fn file(path: &str, text: &str) -> Member {
-        Member { path: path.into(), mode: 0o644, mtime: 0, content: Content::File(text.into()) }
+        Member {
+            path: path.into(),
+            mode: 0o644,
+            mtime: 0,
+            content: Content::File(text.into()),
+        }
     }
 
     #[test]
@@ -167,11 +188,17 @@ mod tests {
                  <maintainer email=\"a@b.invalid\">m</maintainer><license>l</license>\
                  <run_depend>nodelet</run_depend><build_depend>rostest</build_depend></package>",
             ),
-            file("usr/share/x/nodelet_plugins.xml", "<library path=\"lib/libx_nodelets\"><class/></library>"),
+            file(
+                "usr/share/x/nodelet_plugins.xml",
+                "<library path=\"lib/libx_nodelets\"><class/></library>",
+            ),
             file("usr/share/x/launch/other.xml", "<launch/>"),
         ];
         let told = tell(&members, &base);
-        assert!(told.ros_packages.contains("nodelet") && !told.ros_packages.contains("rostest"), "{told:?}");
+        assert!(
+            told.ros_packages.contains("nodelet") && !told.ros_packages.contains("rostest"),
+            "{told:?}"
+        );
         assert_eq!(told.plugins, ["libx_nodelets.so".to_owned()].into());
     }
 }

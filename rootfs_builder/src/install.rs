@@ -44,7 +44,10 @@ impl Addition<'_> {
         names.sort();
         let mut key = Key::new("install")
             .with("system", base.system_key())
-            .with_all("below", self.below.iter().map(|layer| layer.diff_id.to_string()))
+            .with_all(
+                "below",
+                self.below.iter().map(|layer| layer.diff_id.to_string()),
+            )
             .with_all("deb", names);
         for member in &self.extras {
             key = key.with("extra", member.path.as_os_str().as_encoded_bytes());
@@ -66,18 +69,34 @@ pub(crate) async fn layer(
     progress: &Progress,
 ) -> Result<Made, Error> {
     if addition.debs.is_empty() && addition.extras.is_empty() {
-        return Ok(Made { layer: None, cached: true });
+        return Ok(Made {
+            layer: None,
+            cached: true,
+        });
     }
     addition.extras.sort_by(|a, b| a.path.cmp(&b.path));
     let key = addition.key(base);
     let _turn = shop.turns.take(&key).await;
     if let Some(entry) = shop.cached(&key).await? {
-        return Ok(Made { layer: entry.layer, cached: true });
+        return Ok(Made {
+            layer: entry.layer,
+            cached: true,
+        });
     }
     let layer = make(shop, archive, base, &addition, progress).await?;
     let made_from = addition.debs.iter().map(Deb::to_string).collect();
-    shop.keep(&key, Entry { layer: Some(layer), made_from }).await?;
-    Ok(Made { layer: Some(layer), cached: false })
+    shop.keep(
+        &key,
+        Entry {
+            layer: Some(layer),
+            made_from,
+        },
+    )
+    .await?;
+    Ok(Made {
+        layer: Some(layer),
+        cached: false,
+    })
 }
 
 async fn make(
@@ -106,14 +125,20 @@ async fn make(
         order.push_str(&format!("/cloudroid/debs/{name}\n"));
     }
     let mut given = BTreeMap::from([
-        (PathBuf::from("cloudroid/install.sh"), INSTALL.as_bytes().to_vec()),
+        (
+            PathBuf::from("cloudroid/install.sh"),
+            INSTALL.as_bytes().to_vec(),
+        ),
         (PathBuf::from("cloudroid/order"), order.into_bytes()),
         (PathBuf::from("cloudroid/debs/.keep"), Vec::new()),
     ]);
     if !addition.extras.is_empty() {
         let path = room.join("extras.tar");
         deb::write_tar(&addition.extras, &path)?;
-        given.insert("cloudroid/extras.tar".into(), fs::read(&path).at("reading", &path)?);
+        given.insert(
+            "cloudroid/extras.tar".into(),
+            fs::read(&path).at("reading", &path)?,
+        );
     }
     lay_out(&tools, &given)?;
     // Nothing may be started by a package's scripts; the refusal is in a layer that does not become part of it.
@@ -130,7 +155,11 @@ async fn make(
         ("LC_ALL".to_owned(), "C.UTF-8".to_owned()),
         ("HOME".to_owned(), "/root".to_owned()),
     ]);
-    environment.extend(base.environment.get_key_value("PATH").map(|(key, value)| (key.clone(), value.clone())));
+    environment.extend(
+        base.environment
+            .get_key_value("PATH")
+            .map(|(key, value)| (key.clone(), value.clone())),
+    );
     let total = addition.debs.len() as u64;
     let mut done = 0;
     let finished = shop
@@ -142,9 +171,15 @@ async fn make(
                 layers,
                 writable: Some(upper.clone()),
                 owned: Vec::new(),
-                mounts: vec![Mount { source: debs, target: "/cloudroid/debs".into(), writable: false }],
+                mounts: vec![Mount {
+                    source: debs,
+                    target: "/cloudroid/debs".into(),
+                    writable: false,
+                }],
                 environment,
-                argv: ["/bin/sh", "/cloudroid/install.sh"].map(str::to_owned).into(),
+                argv: ["/bin/sh", "/cloudroid/install.sh"]
+                    .map(str::to_owned)
+                    .into(),
             },
             |line| {
                 if line.starts_with("Setting up ") {
@@ -155,11 +190,19 @@ async fn make(
         )
         .await?;
     if !finished.success() {
-        return Err(Error::InstallFailed { last_lines: finished.last_words() });
+        return Err(Error::InstallFailed {
+            last_lines: finished.last_words(),
+        });
     }
-    progress.step(&format!("packing the {}", addition.name)).await;
+    progress
+        .step(&format!("packing the {}", addition.name))
+        .await;
     let store = shop.layers.store().clone();
-    let options = TreeOptions { uid_offset: finished.uid_offset, overlay_upper: true, ..tree_options(base) };
+    let options = TreeOptions {
+        uid_offset: finished.uid_offset,
+        overlay_upper: true,
+        ..tree_options(base)
+    };
     let layer = tokio::task::spawn_blocking(move || -> Result<_, Error> {
         let layer = store.layer_from_tree(&upper, &options)?;
         fs::remove_dir_all(&room).at("removing", &room)?;
@@ -176,7 +219,11 @@ pub(crate) fn lay_out(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Result
     fs::create_dir_all(root).at("making", root)?;
     set_mode(root, 0o755)?;
     for (path, bytes) in files {
-        write_file(&root.join(path.strip_prefix("/").unwrap_or(path)), bytes, 0o644)?;
+        write_file(
+            &root.join(path.strip_prefix("/").unwrap_or(path)),
+            bytes,
+            0o644,
+        )?;
     }
     Ok(())
 }
@@ -184,7 +231,10 @@ pub(crate) fn lay_out(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Result
 fn write_file(path: &Path, bytes: &[u8], mode: u32) -> Result<(), Error> {
     if let Some(parent) = path.parent() {
         let mut new = Vec::new();
-        for directory in parent.ancestors().take_while(|directory| !directory.exists()) {
+        for directory in parent
+            .ancestors()
+            .take_while(|directory| !directory.exists())
+        {
             new.push(directory.to_owned());
         }
         fs::create_dir_all(parent).at("making", parent)?;
@@ -216,8 +266,22 @@ mod tests {
     fn what_the_sandbox_is_given_can_be_read_by_all() {
         let root = tempfile::tempdir().expect("a directory");
         let tree = root.path().join("t");
-        lay_out(&tree, &BTreeMap::from([(PathBuf::from("/a/b/c"), b"x".to_vec())])).expect("made");
-        let mode = |path: &str| tree.join(path).metadata().expect("there").permissions().mode() & 0o777;
-        assert_eq!((mode(""), mode("a"), mode("a/b"), mode("a/b/c")), (0o755, 0o755, 0o755, 0o644));
+        lay_out(
+            &tree,
+            &BTreeMap::from([(PathBuf::from("/a/b/c"), b"x".to_vec())]),
+        )
+        .expect("made");
+        let mode = |path: &str| {
+            tree.join(path)
+                .metadata()
+                .expect("there")
+                .permissions()
+                .mode()
+                & 0o777
+        };
+        assert_eq!(
+            (mode(""), mode("a"), mode("a/b"), mode("a/b/c")),
+            (0o755, 0o755, 0o755, 0o644)
+        );
     }
 }

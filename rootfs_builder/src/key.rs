@@ -24,7 +24,9 @@ pub(crate) struct Key(Sha256);
 impl Key {
     /// Of one kind of result, such as `base`.
     pub(crate) fn new(kind: &str) -> Self {
-        Self(Sha256::new()).with("builder", BUILDER).with("kind", kind)
+        Self(Sha256::new())
+            .with("builder", BUILDER)
+            .with("kind", kind)
     }
 
     /// One more input.
@@ -37,7 +39,11 @@ impl Key {
     }
 
     /// Several inputs of one name.
-    pub(crate) fn with_all<T: AsRef<[u8]>>(mut self, name: &str, values: impl IntoIterator<Item = T>) -> Self {
+    pub(crate) fn with_all<T: AsRef<[u8]>>(
+        mut self,
+        name: &str,
+        values: impl IntoIterator<Item = T>,
+    ) -> Self {
         for value in values {
             self = self.with(name, value);
         }
@@ -66,11 +72,24 @@ pub(crate) fn tree(root: &Path) -> Result<String, Error> {
         let kind = entry.file_type();
         if kind.is_symlink() {
             add(&mut hash, b"link");
-            add(&mut hash, std::fs::read_link(path).at("reading", path)?.as_os_str().as_bytes());
+            add(
+                &mut hash,
+                std::fs::read_link(path)
+                    .at("reading", path)?
+                    .as_os_str()
+                    .as_bytes(),
+            );
         } else if kind.is_file() {
             let mut file = File::open(path).at("reading", path)?;
             let about = file.metadata().at("reading", path)?;
-            add(&mut hash, if about.permissions().mode() & 0o111 != 0 { b"executable" } else { b"file" });
+            add(
+                &mut hash,
+                if about.permissions().mode() & 0o111 != 0 {
+                    b"executable"
+                } else {
+                    b"file"
+                },
+            );
             hash.update(about.len().to_le_bytes());
             loop {
                 let read = file.read(&mut buffer).at("reading", path)?;

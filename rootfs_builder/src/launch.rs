@@ -54,7 +54,10 @@ impl LaunchNode {
             name: self.name.clone(),
             argv: self.argv.clone(),
             environment: self.environment.clone(),
-            directory: self.directory.clone().unwrap_or_else(|| ros_home.to_owned()),
+            directory: self
+                .directory
+                .clone()
+                .unwrap_or_else(|| ros_home.to_owned()),
             respawn: self.respawn,
             respawn_delay: self.respawn_delay,
             required: self.required,
@@ -93,10 +96,23 @@ pub(crate) struct Answer {
 #[derive(Debug, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 enum Refusal {
-    Launch { file: String, words: String },
-    NotFound { what: String, name: String, known: Vec<String> },
-    Nothing { executables: Vec<String>, launch_files: Vec<String> },
-    Setup { file: String, status: i32 },
+    Launch {
+        file: String,
+        words: String,
+    },
+    NotFound {
+        what: String,
+        name: String,
+        known: Vec<String>,
+    },
+    Nothing {
+        executables: Vec<String>,
+        launch_files: Vec<String>,
+    },
+    Setup {
+        file: String,
+        status: i32,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -121,7 +137,10 @@ pub(crate) async fn ask(
     lay_out(
         &tools,
         &BTreeMap::from([
-            (PathBuf::from("cloudroid/launch_plan.py"), SCRIPT.as_bytes().to_vec()),
+            (
+                PathBuf::from("cloudroid/launch_plan.py"),
+                SCRIPT.as_bytes().to_vec(),
+            ),
             (PathBuf::from("cloudroid/ask.json"), question),
             (PathBuf::from("cloudroid/out/.keep"), Vec::new()),
         ]),
@@ -130,7 +149,11 @@ pub(crate) async fn ask(
     // The container's root is nobody in particular out here; the directories above let nobody else in.
     set_mode(&out, 0o777)?;
     layers.push(tools);
-    for (name, value) in [("HOME", "/tmp"), ("ROS_LOG_DIR", "/tmp"), ("PYTHONDONTWRITEBYTECODE", "1")] {
+    for (name, value) in [
+        ("HOME", "/tmp"),
+        ("ROS_LOG_DIR", "/tmp"),
+        ("PYTHONDONTWRITEBYTECODE", "1"),
+    ] {
         environment.insert(name.to_owned(), value.to_owned());
     }
     let finished = shop
@@ -142,41 +165,67 @@ pub(crate) async fn ask(
                 layers,
                 writable: None,
                 owned: Vec::new(),
-                mounts: vec![Mount { source: out.clone(), target: "/cloudroid/out".into(), writable: true }],
+                mounts: vec![Mount {
+                    source: out.clone(),
+                    target: "/cloudroid/out".into(),
+                    writable: true,
+                }],
                 environment,
-                argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"].map(str::to_owned).into(),
+                argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"]
+                    .map(str::to_owned)
+                    .into(),
             },
             |_| {},
         )
         .await?;
     let path = out.join("plan.json");
     if !finished.success() || !path.is_file() {
-        return Err(Error::Inside { what: "resolving what to run", last_lines: finished.last_words() });
+        return Err(Error::Inside {
+            what: "resolving what to run",
+            last_lines: finished.last_words(),
+        });
     }
     let text = fs::read(&path).at("reading", &path)?;
     understand(&text)
 }
 
 fn understand(text: &[u8]) -> Result<Answer, Error> {
-    let list = |names: &[String]| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+    let list = |names: &[String]| {
+        if names.is_empty() {
+            "none".to_owned()
+        } else {
+            names.join(", ")
+        }
+    };
     match serde_json::from_slice::<Reply>(text) {
         Ok(Reply::Planned(answer)) => Ok(answer),
         Ok(Reply::Refused { error }) => Err(match error {
             Refusal::Launch { file, words } => Error::Launch { file, words },
             Refusal::NotFound { what, name, known } => Error::NotInPackage {
-                what: if what == "executable" { "executable" } else { "launch file" },
+                what: if what == "executable" {
+                    "executable"
+                } else {
+                    "launch file"
+                },
                 name,
                 known: list(&known),
             },
-            Refusal::Nothing { executables, launch_files } => {
-                Error::NothingToRun { executables: list(&executables), launch_files: list(&launch_files) }
-            }
+            Refusal::Nothing {
+                executables,
+                launch_files,
+            } => Error::NothingToRun {
+                executables: list(&executables),
+                launch_files: list(&launch_files),
+            },
             Refusal::Setup { file, status } => Error::Inside {
                 what: "sourcing the install space's setup.sh",
                 last_lines: format!("{file} ended with status {status}"),
             },
         }),
-        Err(error) => Err(Error::Inside { what: "resolving what to run", last_lines: error.to_string() }),
+        Err(error) => Err(Error::Inside {
+            what: "resolving what to run",
+            last_lines: error.to_string(),
+        }),
     }
 }
 
@@ -191,8 +240,13 @@ mod tests {
             "parameters":{"/a/k":[1,2.5,"x",true]},"environment":{},"warnings":[],"executables":[],"launch_files":[]}"#;
         let answer = understand(text).expect("a plan");
         let spec = answer.nodes[0].spec("/root/.ros");
-        assert_eq!((spec.directory.as_str(), spec.respawn, spec.respawn_delay), ("/root/.ros", true, 1.5));
-        let ParamValue::List(values) = &answer.parameters["/a/k"] else { panic!("a list") };
+        assert_eq!(
+            (spec.directory.as_str(), spec.respawn, spec.respawn_delay),
+            ("/root/.ros", true, 1.5)
+        );
+        let ParamValue::List(values) = &answer.parameters["/a/k"] else {
+            panic!("a list")
+        };
         assert_eq!(values[1], ParamValue::Double(2.5));
     }
 
@@ -200,12 +254,22 @@ mod tests {
     fn refusals_keep_roslaunchs_words_and_name_what_there_is() {
         let launch = br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
         let text = understand(launch).expect_err("refused").to_string();
-        assert_eq!(text, "roslaunch cannot load /x.launch: requires the 'manager' arg to be set");
-        let node = br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
+        assert_eq!(
+            text,
+            "roslaunch cannot load /x.launch: requires the 'manager' arg to be set"
+        );
+        let node =
+            br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
         let text = understand(node).expect_err("refused").to_string();
-        assert_eq!(text, "there is no executable \"y\" in the package; there are: a, b");
+        assert_eq!(
+            text,
+            "there is no executable \"y\" in the package; there are: a, b"
+        );
         let nothing = br#"{"error":{"kind":"nothing","executables":["a","b"],"launch_files":[]}}"#;
         let text = understand(nothing).expect_err("refused").to_string();
-        assert!(text.contains("executables: a, b; launch files: none"), "{text}");
+        assert!(
+            text.contains("executables: a, b; launch files: none"),
+            "{text}"
+        );
     }
 }

@@ -22,6 +22,7 @@ mod apt;
 mod archive;
 pub mod base;
 mod bootstrap;
+mod build;
 mod builder;
 mod cache;
 mod compile;

@@ -8,7 +8,6 @@ use package::manifest::{Kind, Manifest};
 
 use crate::base::Base;
 
-
 /// rosdep keys and ROS packages that running the package of this package.xml needs.
 pub(crate) fn run_dependencies(
     text: &str,
@@ -16,7 +15,11 @@ pub(crate) fn run_dependencies(
     base: &Base,
 ) -> Result<BTreeSet<String>, package::Error> {
     let manifest = Manifest::parse(text, path, &Variables::ros1(&base.ros_distribution))?;
-    Ok(manifest.needs(&[Kind::Exec]).into_iter().map(str::to_owned).collect())
+    Ok(manifest
+        .needs(&[Kind::Exec])
+        .into_iter()
+        .map(str::to_owned)
+        .collect())
 }
 
 /// File names (`libx.so`) of the libraries of a plugin list (pluginlib: one `library`, or several in
@@ -32,12 +35,22 @@ pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<String> {
         "class_libraries" => root.children().filter(is_library).collect(),
         _ => Vec::new(),
     };
-    let paths = libraries.iter().filter_map(|library| library.attribute("path"));
-    paths.filter_map(|path| path.rsplit('/').next()).filter(|name| !name.is_empty()).map(file_name).collect()
+    let paths = libraries
+        .iter()
+        .filter_map(|library| library.attribute("path"));
+    paths
+        .filter_map(|path| path.rsplit('/').next())
+        .filter(|name| !name.is_empty())
+        .map(file_name)
+        .collect()
 }
 
 fn file_name(name: &str) -> String {
-    if name.ends_with(".so") { name.to_owned() } else { format!("{name}.so") }
+    if name.ends_with(".so") {
+        name.to_owned()
+    } else {
+        format!("{name}.so")
+    }
 }
 
 #[cfg(test)]
@@ -47,9 +60,15 @@ mod tests {
     #[test]
     fn libraries_of_either_form_are_found() {
         let one = "<library path=\"lib/libimage_proc\"><class/></library>";
-        assert_eq!(plugin_libraries(one), ["libimage_proc.so".to_owned()].into());
+        assert_eq!(
+            plugin_libraries(one),
+            ["libimage_proc.so".to_owned()].into()
+        );
         let many = "<class_libraries><library path=\"liba\"/><library path=\"lib/libb.so\"/></class_libraries>";
-        assert_eq!(plugin_libraries(many), ["liba.so".to_owned(), "libb.so".to_owned()].into());
+        assert_eq!(
+            plugin_libraries(many),
+            ["liba.so".to_owned(), "libb.so".to_owned()].into()
+        );
         for other in ["<launch><library path=\"x\"/></launch>", "not xml", ""] {
             assert!(plugin_libraries(other).is_empty(), "{other}");
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use crate::builder::{Build, Parts};
+use crate::build::{Build, Parts};
 use crate::deb::Member;
 use crate::error::Error;
 use crate::gather::{self, Wanted};
@@ -18,24 +18,55 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
         vec![name.to_owned()]
     } else if archive.names.contains(name) {
         debs.insert(name.to_owned());
-        archive.contents.ros_packages_in(name).into_iter().map(str::to_owned).collect()
+        archive
+            .contents
+            .ros_packages_in(name)
+            .into_iter()
+            .map(str::to_owned)
+            .collect()
     } else {
         Vec::new()
     };
     if packages.is_empty() {
         let similar = archive.similar(name);
-        let hint = if similar.is_empty() { String::new() } else { format!(" (there is {})", similar.join(", ")) };
-        return Err(Error::UnknownPackage { name: name.to_owned(), suite: build.base.suite.clone(), hint });
+        let hint = if similar.is_empty() {
+            String::new()
+        } else {
+            format!(" (there is {})", similar.join(", "))
+        };
+        return Err(Error::UnknownPackage {
+            name: name.to_owned(),
+            suite: build.base.suite.clone(),
+            hint,
+        });
     }
     roots.extend(packages.iter().cloned());
-    build.progress.step(&format!("looking up what {name} needs")).await;
+    build
+        .progress
+        .step(&format!("looking up what {name} needs"))
+        .await;
     let wanted = wanted(build, &roots, true).await?;
     debs.extend(wanted.install);
-    debs.extend(build.request.map.values().flat_map(|debs| debs.split([',', ' '])).map(str::to_owned));
+    debs.extend(
+        build
+            .request
+            .map
+            .values()
+            .flat_map(|debs| debs.split([',', ' ']))
+            .map(str::to_owned),
+    );
     debs.remove("");
     let version = version(build, &packages[0]).await?;
-    let dependencies = build.add("dependencies", &build.on_base(), &debs, wanted.extras).await?;
-    Ok(Parts { packages, version, dependencies, package: None, prefix: None })
+    let dependencies = build
+        .add("dependencies", &build.on_base(), &debs, wanted.extras)
+        .await?;
+    Ok(Parts {
+        packages,
+        version,
+        dependencies,
+        package: None,
+        prefix: None,
+    })
 }
 
 /// Remembered: it downloads and looks into many packages.
@@ -64,8 +95,13 @@ pub(crate) async fn wanted(
     let note: Note = match build.shop.layers.note(&key) {
         Some(note) => note,
         None => {
-            let found = gather::gather(&build.archive, &build.base, roots, python, build.progress).await?;
-            let note = Note { install: found.install, extras: found.extras, warnings: found.warnings };
+            let found =
+                gather::gather(&build.archive, &build.base, roots, python, build.progress).await?;
+            let note = Note {
+                install: found.install,
+                extras: found.extras,
+                warnings: found.warnings,
+            };
             build.shop.layers.keep_note(&key, &note)?;
             note
         }
@@ -73,21 +109,38 @@ pub(crate) async fn wanted(
     for warning in &note.warnings {
         build.progress.warn(warning.as_str()).await;
     }
-    Ok(Wanted { install: note.install, extras: note.extras, warnings: note.warnings })
+    Ok(Wanted {
+        install: note.install,
+        extras: note.extras,
+        warnings: note.warnings,
+    })
 }
 
 /// The archive's version of the Debian package that holds a ROS package's programs, or its package.xml.
 async fn version(build: &Build<'_>, package: &str) -> Result<String, Error> {
     let carriers = build.archive.contents.ros_package(package);
-    let Some(deb) = carriers.keys().find(|deb| !deb.ends_with("-dev")).or(carriers.keys().next()) else {
+    let Some(deb) = carriers
+        .keys()
+        .find(|deb| !deb.ends_with("-dev"))
+        .or(carriers.keys().next())
+    else {
         return Ok(String::new());
     };
-    let key = Key::new("version").with("archive", &build.archive.stamp).with("deb", deb).finish();
+    let key = Key::new("version")
+        .with("archive", &build.archive.stamp)
+        .with("deb", deb)
+        .finish();
     if let Some(version) = build.shop.layers.note(&key) {
         return Ok(version);
     }
-    let found = build.archive.apt.candidates(&BTreeSet::from([deb.clone()])).await?;
-    let version = found.first().map_or_else(String::new, |deb| deb.version.clone());
+    let found = build
+        .archive
+        .apt
+        .candidates(&BTreeSet::from([deb.clone()]))
+        .await?;
+    let version = found
+        .first()
+        .map_or_else(String::new, |deb| deb.version.clone());
     build.shop.layers.keep_note(&key, &version)?;
     Ok(version)
 }

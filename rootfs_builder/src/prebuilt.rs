@@ -6,7 +6,7 @@ use std::path::Path;
 
 use package::workspace::InstallSpace;
 
-use crate::builder::{Build, Parts};
+use crate::build::{Build, Parts};
 use crate::cache::Entry;
 use crate::compile;
 use crate::error::{Error, IoAt};
@@ -21,16 +21,34 @@ const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/v
 /// Packs it and finds what it needs.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Parts, Error> {
     // Without a prefix nothing in it cares where it is.
-    let prefix = space.prefix.clone().unwrap_or_else(|| build.base.build.prefix.clone());
+    let prefix = space
+        .prefix
+        .clone()
+        .unwrap_or_else(|| build.base.build.prefix.clone());
     let packages = pushed::by_importance(&space.packages);
     let usable = prefix.is_absolute() && prefix != Path::new("/");
     if !usable || HIDDEN.iter().any(|hidden| prefix.starts_with(hidden)) {
-        return Err(Error::Prefix { prefix, package: packages.first().cloned().unwrap_or_default() });
+        return Err(Error::Prefix {
+            prefix,
+            package: packages.first().cloned().unwrap_or_default(),
+        });
     }
-    let (own, asked) = (pushed::names(&space.packages), pushed::asked(&space.packages));
+    let (own, asked) = (
+        pushed::names(&space.packages),
+        pushed::asked(&space.packages),
+    );
     // Compiled already: what it was compiled with is of no interest.
-    let asked = Asked { build: BTreeMap::new(), ..asked };
-    let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
+    let asked = Asked {
+        build: BTreeMap::new(),
+        ..asked
+    };
+    let resolved = keys::resolve(
+        &build.archive,
+        &build.base,
+        &build.request.map,
+        &own,
+        &asked,
+    )?;
     let python = pushed::has_python(&space.root);
     let package = packed(build, &space, &prefix).await?;
     let needed = source::needed_by(build, package.layer.as_ref()).await?;
@@ -55,14 +73,20 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
     let shop = &build.shop;
     let _turn = shop.turns.take(&key).await;
     if let Some(entry) = shop.cached(&key).await? {
-        return Ok(Made { layer: entry.layer, cached: true });
+        return Ok(Made {
+            layer: entry.layer,
+            cached: true,
+        });
     }
     build.progress.step("packing the install space").await;
     let tree = shop.site.fresh("prebuilt")?;
     let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
     fs::create_dir_all(&parent).at("making", &parent)?;
-    for directory in parent.ancestors().take_while(|directory| directory.starts_with(&tree)) {
+    for directory in parent
+        .ancestors()
+        .take_while(|directory| directory.starts_with(&tree))
+    {
         set_mode(directory, 0o755)?;
     }
     // The pushed tree is this build's own: moving it costs nothing.
@@ -71,6 +95,16 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
     tokio::task::spawn_blocking(move || compile::open_up(&opened)).await??;
     let layer = compile::pack(shop, &build.base, &tree).await?;
     let made_from = pushed::names(&space.packages).into_iter().collect();
-    shop.keep(&key, Entry { layer: Some(layer), made_from }).await?;
-    Ok(Made { layer: Some(layer), cached: false })
+    shop.keep(
+        &key,
+        Entry {
+            layer: Some(layer),
+            made_from,
+        },
+    )
+    .await?;
+    Ok(Made {
+        layer: Some(layer),
+        cached: false,
+    })
 }

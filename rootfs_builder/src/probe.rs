@@ -164,7 +164,10 @@ async fn look(
     registered(&mut watch, options).await?;
     let mut warnings = Vec::new();
     if !still(&mut watch, options).await? {
-        warnings.push(format!("topics kept changing for {:?}: some may be missing", options.restless));
+        warnings.push(format!(
+            "topics kept changing for {:?}: some may be missing",
+            options.restless
+        ));
     }
     let eager = inputs(&watch.borrow_and_update(), &options.own_name);
     // Subscribing may wake inputs, and those may make the node publish more.
@@ -179,7 +182,16 @@ async fn look(
         }
         let asked = Instant::now();
         for topic in &new {
-            match bus.subscribe(topic, SubscribeOptions { wire_type: None, queue: 1 }).await {
+            match bus
+                .subscribe(
+                    topic,
+                    SubscribeOptions {
+                        wire_type: None,
+                        queue: 1,
+                    },
+                )
+                .await
+            {
                 Ok(subscription) => {
                     subscriptions.insert(topic.clone(), subscription);
                 }
@@ -192,14 +204,28 @@ async fn look(
             let _ = bus.topic_type(topic).await;
         }
         let settle = (asked.elapsed() * 2).clamp(options.settle, options.restless);
-        still(&mut watch, &ProbeOptions { settle, ..options.clone() }).await?;
+        still(
+            &mut watch,
+            &ProbeOptions {
+                settle,
+                ..options.clone()
+            },
+        )
+        .await?;
     }
     let graph = watch.borrow_and_update().clone();
-    let latched = subscriptions.iter_mut().filter_map(|(topic, subscription)| {
-        let message = subscription.messages.try_recv()?;
-        message.latching.then(|| topic.clone())
-    });
-    let seen = describe::Seen { latched: latched.collect(), eager, graph, own_name: &options.own_name };
+    let latched = subscriptions
+        .iter_mut()
+        .filter_map(|(topic, subscription)| {
+            let message = subscription.messages.try_recv()?;
+            message.latching.then(|| topic.clone())
+        });
+    let seen = describe::Seen {
+        latched: latched.collect(),
+        eager,
+        graph,
+        own_name: &options.own_name,
+    };
     let mut found = describe::describe(bus, registry, definitions, &seen).await?;
     found.warnings.splice(..0, warnings);
     Ok(found)
@@ -210,19 +236,32 @@ async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeErr
 }
 
 /// Waits until all nodes that must register have.
-async fn registered(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOptions) -> Result<(), ProbeError> {
+async fn registered(
+    watch: &mut watch::Receiver<Arc<Graph>>,
+    options: &ProbeOptions,
+) -> Result<(), ProbeError> {
     let deadline = Instant::now() + options.patience;
     loop {
         let missing: Vec<String> = {
             let graph = watch.borrow_and_update();
-            options.nodes.iter().filter(|node| !graph.nodes.contains_key(*node)).cloned().collect()
+            options
+                .nodes
+                .iter()
+                .filter(|node| !graph.nodes.contains_key(*node))
+                .cloned()
+                .collect()
         };
         if missing.is_empty() {
             return Ok(());
         }
         match timeout_at(deadline, changed(watch)).await {
             Ok(result) => result?,
-            Err(_) => return Err(ProbeError::NeverRegistered { nodes: missing, after: options.patience }),
+            Err(_) => {
+                return Err(ProbeError::NeverRegistered {
+                    nodes: missing,
+                    after: options.patience,
+                });
+            }
         }
     }
 }
@@ -230,7 +269,10 @@ async fn registered(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOpti
 /// Waits until nothing changes any more; false when it did not come to rest in time.
 ///
 /// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to.
-async fn still(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOptions) -> Result<bool, ProbeError> {
+async fn still(
+    watch: &mut watch::Receiver<Arc<Graph>>,
+    options: &ProbeOptions,
+) -> Result<bool, ProbeError> {
     let begun = Instant::now();
     let limit = begun + options.restless;
     // Some nodes work all the time; that alone is not worth the whole wait.
@@ -272,23 +314,44 @@ async fn still(watch: &mut watch::Receiver<Arc<Graph>>, options: &ProbeOptions) 
 
 /// Whether some node that must be there has registered nothing but what every node has.
 fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
-    const SERVICES: [&str; 5] = ["get_loggers", "set_logger_level", "load_nodelet", "unload_nodelet", "list"];
+    const SERVICES: [&str; 5] = [
+        "get_loggers",
+        "set_logger_level",
+        "load_nodelet",
+        "unload_nodelet",
+        "list",
+    ];
     options.nodes.iter().any(|node| {
         let topics = graph.topics.iter().any(|(name, topic)| {
-            !is_plumbing(name) && (topic.publishers.contains(node) || topic.subscribers.contains(node))
+            !is_plumbing(name)
+                && (topic.publishers.contains(node) || topic.subscribers.contains(node))
         });
         let services = graph.services.iter().any(|(name, server)| {
-            server == node && !name.rsplit('/').next().is_some_and(|last| SERVICES.contains(&last))
+            server == node
+                && !name
+                    .rsplit('/')
+                    .next()
+                    .is_some_and(|last| SERVICES.contains(&last))
         });
         !topics && !services
     })
 }
 
-type Shape = (BTreeMap<String, ros::bus::TopicNodes>, BTreeMap<String, String>, BTreeSet<String>, usize);
+type Shape = (
+    BTreeMap<String, ros::bus::TopicNodes>,
+    BTreeMap<String, String>,
+    BTreeSet<String>,
+    usize,
+);
 
 fn shape(graph: &Graph) -> Shape {
     let nodes = graph.nodes.keys().cloned().collect();
-    (graph.topics.clone(), graph.services.clone(), nodes, graph.parameters.len())
+    (
+        graph.topics.clone(),
+        graph.services.clone(),
+        nodes,
+        graph.parameters.len(),
+    )
 }
 
 /// ROS's own plumbing, which every node has and no robot asks for.
@@ -298,16 +361,23 @@ fn is_plumbing(topic: &str) -> bool {
 
 /// Topics that the package publishes.
 fn outputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    ends(graph, |topic| topic.publishers.iter().any(|node| node != own))
+    ends(graph, |topic| {
+        topic.publishers.iter().any(|node| node != own)
+    })
 }
 
 /// Topics that the package subscribes to.
 fn inputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    ends(graph, |topic| topic.subscribers.iter().any(|node| node != own))
+    ends(graph, |topic| {
+        topic.subscribers.iter().any(|node| node != own)
+    })
 }
 
 fn ends(graph: &Graph, pick: impl Fn(&ros::bus::TopicNodes) -> bool) -> BTreeSet<String> {
-    let topics = graph.topics.iter().filter(|(name, topic)| !is_plumbing(name) && pick(topic));
+    let topics = graph
+        .topics
+        .iter()
+        .filter(|(name, topic)| !is_plumbing(name) && pick(topic));
     topics.map(|(name, _)| name.clone()).collect()
 }
 

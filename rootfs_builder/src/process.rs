@@ -28,14 +28,22 @@ impl Tail {
 
     /// All of them, one per line.
     pub(crate) fn text(&self) -> String {
-        self.0.iter().map(String::as_str).collect::<Vec<_>>().join("\n")
+        self.0
+            .iter()
+            .map(String::as_str)
+            .collect::<Vec<_>>()
+            .join("\n")
     }
 }
 
 /// A command in the C locale with nothing on its standard input.
 pub(crate) fn command(program: &str) -> Command {
     let mut command = Command::new(program);
-    command.env("LC_ALL", "C.UTF-8").env("DEBIAN_FRONTEND", "noninteractive").stdin(Stdio::null()).kill_on_drop(true);
+    command
+        .env("LC_ALL", "C.UTF-8")
+        .env("DEBIAN_FRONTEND", "noninteractive")
+        .stdin(Stdio::null())
+        .kill_on_drop(true);
     command
 }
 
@@ -48,7 +56,9 @@ pub(crate) async fn run(
 ) -> Result<(), Error> {
     let program = command.as_std().get_program().to_owned();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
-    let mut child = command.spawn().map_err(|error| spawn_error(&program, package, error))?;
+    let mut child = command
+        .spawn()
+        .map_err(|error| spawn_error(&program, package, error))?;
     let out = child.stdout.take().map(BufReader::new);
     let err = child.stderr.take().map(BufReader::new);
     let mut tail = Tail::default();
@@ -64,7 +74,10 @@ pub(crate) async fn run(
             on_line(stream, &line);
         }
     }
-    let status = child.wait().await.map_err(|error| spawn_error(&program, package, error))?;
+    let status = child
+        .wait()
+        .await
+        .map_err(|error| spawn_error(&program, package, error))?;
     if status.success() {
         return Ok(());
     }
@@ -95,9 +108,16 @@ pub(crate) enum Stream {
 
 fn failed(program: &OsStr, status: &str, last_lines: String) -> Error {
     if last_lines.contains("No space left on device") {
-        return Error::DiskFull { path: Path::new(program).to_owned(), what: format!("running {}", program.display()) };
+        return Error::DiskFull {
+            path: Path::new(program).to_owned(),
+            what: format!("running {}", program.display()),
+        };
     }
-    Error::Program { program: program.to_string_lossy().into_owned(), status: status.to_owned(), last_lines }
+    Error::Program {
+        program: program.to_string_lossy().into_owned(),
+        status: status.to_owned(),
+        last_lines,
+    }
 }
 
 fn spawn_error(program: &OsStr, package: &'static str, error: std::io::Error) -> Error {
@@ -121,7 +141,10 @@ struct Lines<R> {
 
 impl<R: AsyncRead + AsyncBufReadExt + Unpin> Lines<R> {
     fn new(reader: Option<R>) -> Self {
-        Self { reader, buffer: Vec::new() }
+        Self {
+            reader,
+            buffer: Vec::new(),
+        }
     }
 
     fn open(&self) -> bool {
@@ -138,7 +161,9 @@ impl<R: AsyncRead + AsyncBufReadExt + Unpin> Lines<R> {
         if self.buffer.is_empty() {
             return None;
         }
-        let line = String::from_utf8_lossy(&self.buffer).trim_end_matches(['\n', '\r']).to_owned();
+        let line = String::from_utf8_lossy(&self.buffer)
+            .trim_end_matches(['\n', '\r'])
+            .to_owned();
         self.buffer.clear();
         Some(line)
     }
@@ -157,13 +182,18 @@ mod tests {
     #[tokio::test]
     async fn lines_of_both_streams_come_and_the_last_are_kept() {
         let mut seen = Vec::new();
-        let error = run(shell("echo a; echo b >&2; exit 3"), "dash", |_, line| seen.push(line.to_owned()))
-            .await
-            .expect_err("status 3");
+        let error = run(shell("echo a; echo b >&2; exit 3"), "dash", |_, line| {
+            seen.push(line.to_owned())
+        })
+        .await
+        .expect_err("status 3");
         seen.sort();
         assert_eq!(seen, ["a", "b"]);
         let text = error.to_string();
-        assert!(text.contains("sh failed (exit status: 3)") && text.contains('b'), "{text}");
+        assert!(
+            text.contains("sh failed (exit status: 3)") && text.contains('b'),
+            "{text}"
+        );
     }
 
     #[tokio::test]
@@ -171,12 +201,20 @@ mod tests {
         let mut command = command("mmdebstrap");
         command.env("PATH", "/nonexistent");
         let error = output(command, "mmdebstrap").await.expect_err("not found");
-        assert_eq!(error.to_string(), "mmdebstrap is not installed: run `apt-get install mmdebstrap`");
+        assert_eq!(
+            error.to_string(),
+            "mmdebstrap is not installed: run `apt-get install mmdebstrap`"
+        );
     }
 
     #[tokio::test]
     async fn a_full_disk_is_seen_in_a_programs_words() {
-        let error = output(shell("echo 'x: No space left on device' >&2; exit 1"), "dash").await.expect_err("failed");
+        let error = output(
+            shell("echo 'x: No space left on device' >&2; exit 1"),
+            "dash",
+        )
+        .await
+        .expect_err("failed");
         assert!(matches!(error, Error::DiskFull { .. }), "{error}");
     }
 }

@@ -35,11 +35,20 @@ pub(crate) fn asked(packages: &[Package]) -> Asked {
     let mut asked = Asked::default();
     for external in workspace::external(packages) {
         let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
-        if needs(&[Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport]) {
-            asked.build.insert(external.name.clone(), external.needed_by.clone());
+        if needs(&[
+            Kind::Buildtool,
+            Kind::BuildtoolExport,
+            Kind::Build,
+            Kind::BuildExport,
+        ]) {
+            asked
+                .build
+                .insert(external.name.clone(), external.needed_by.clone());
         }
         if needs(&[Kind::Exec]) {
-            asked.run.insert(external.name.clone(), external.needed_by.clone());
+            asked
+                .run
+                .insert(external.name.clone(), external.needed_by.clone());
         }
     }
     asked
@@ -47,7 +56,10 @@ pub(crate) fn asked(packages: &[Package]) -> Asked {
 
 /// Names of packages.
 pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
-    packages.iter().map(|package| package.manifest.name.clone()).collect()
+    packages
+        .iter()
+        .map(|package| package.manifest.name.clone())
+        .collect()
 }
 
 /// The package that a push is about, and the others after it: the one that none of the others needs, the last in
@@ -57,13 +69,21 @@ pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
         .iter()
         .rev()
         .filter(|package| !package.manifest.metapackage)
-        .chain(packages.iter().filter(|package| package.manifest.metapackage))
+        .chain(
+            packages
+                .iter()
+                .filter(|package| package.manifest.metapackage),
+        )
         .map(|package| package.manifest.name.clone())
         .collect();
     let needed = |name: &String| {
-        packages
-            .iter()
-            .any(|package| package.manifest.dependencies.iter().any(|need| need.name == *name))
+        packages.iter().any(|package| {
+            package
+                .manifest
+                .dependencies
+                .iter()
+                .any(|need| need.name == *name)
+        })
     };
     // Stable: within either kind the order stays.
     names.sort_by_key(needed);
@@ -73,7 +93,9 @@ pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
 /// The version of that package.
 pub(crate) fn version(packages: &[Package]) -> String {
     let first = by_importance(packages).into_iter().next();
-    let package = packages.iter().find(|package| Some(&package.manifest.name) == first.as_ref());
+    let package = packages
+        .iter()
+        .find(|package| Some(&package.manifest.name) == first.as_ref());
     package.map_or_else(String::new, |package| package.manifest.version.clone())
 }
 
@@ -82,8 +104,13 @@ pub(crate) fn version(packages: &[Package]) -> String {
 pub(crate) fn has_python(root: &Path) -> bool {
     let generated = |path: &Path| {
         let parent = path.parent().and_then(Path::file_name).unwrap_or_default();
-        let setup = path.file_name().is_some_and(|name| name == "setup.py" || name == "_setup_util.py");
-        setup || ["msg", "srv", "cfg", "test", "tests"].iter().any(|name| parent == *name)
+        let setup = path
+            .file_name()
+            .is_some_and(|name| name == "setup.py" || name == "_setup_util.py");
+        setup
+            || ["msg", "srv", "cfg", "test", "tests"]
+                .iter()
+                .any(|name| parent == *name)
     };
     let runs = |path: &Path| {
         let extension = path.extension().unwrap_or_default();
@@ -91,9 +118,16 @@ pub(crate) fn has_python(root: &Path) -> bool {
             return std::fs::metadata(path).is_ok_and(|about| about.len() > 0);
         }
         let mut start = [0; 64];
-        let read = File::open(path).and_then(|mut file| file.read(&mut start)).unwrap_or(0);
-        let first = start[..read].split(|byte| *byte == b'\n').next().unwrap_or_default();
-        extension != "cfg" && first.starts_with(b"#!") && first.windows(6).any(|word| word == b"python")
+        let read = File::open(path)
+            .and_then(|mut file| file.read(&mut start))
+            .unwrap_or(0);
+        let first = start[..read]
+            .split(|byte| *byte == b'\n')
+            .next()
+            .unwrap_or_default();
+        extension != "cfg"
+            && first.starts_with(b"#!")
+            && first.windows(6).any(|word| word == b"python")
     };
     walkdir::WalkDir::new(root)
         .into_iter()
@@ -106,7 +140,8 @@ pub(crate) fn has_python(root: &Path) -> bool {
 pub(crate) fn shares(prefix: Option<&Path>) -> Vec<String> {
     let own = prefix.map(|prefix| prefix.join("share"));
     let all = own.into_iter().chain([PathBuf::from("/usr/share")]);
-    all.map(|share| share.to_string_lossy().trim_start_matches('/').to_owned()).collect()
+    all.map(|share| share.to_string_lossy().trim_start_matches('/').to_owned())
+        .collect()
 }
 
 #[cfg(test)]
@@ -133,7 +168,10 @@ mod tests {
     #[test]
     fn the_package_that_nobody_needs_is_the_one_meant() {
         let (_root, pushed) = workspace(&[
-            ("app", "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
+            (
+                "app",
+                "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>",
+            ),
             ("app_msgs", "<depend>std_msgs</depend>"),
         ]);
         assert_eq!(by_importance(pushed.packages()), ["app", "app_msgs"]);
@@ -143,12 +181,24 @@ mod tests {
     #[test]
     fn needs_are_sorted_by_when_they_matter() {
         let (_root, pushed) = workspace(&[
-            ("app", "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
-            ("app_msgs", "<build_depend>message_generation</build_depend><depend>std_msgs</depend>"),
+            (
+                "app",
+                "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>",
+            ),
+            (
+                "app_msgs",
+                "<build_depend>message_generation</build_depend><depend>std_msgs</depend>",
+            ),
         ]);
         let asked = asked(pushed.packages());
-        assert_eq!(asked.build.keys().collect::<Vec<_>>(), ["message_generation", "std_msgs"]);
-        assert_eq!(asked.run.keys().collect::<Vec<_>>(), ["python3-numpy", "std_msgs"]);
+        assert_eq!(
+            asked.build.keys().collect::<Vec<_>>(),
+            ["message_generation", "std_msgs"]
+        );
+        assert_eq!(
+            asked.run.keys().collect::<Vec<_>>(),
+            ["python3-numpy", "std_msgs"]
+        );
         assert!(asked.run["std_msgs"].contains("app_msgs"));
     }
 
@@ -188,7 +238,10 @@ mod tests {
 
     #[test]
     fn own_definitions_come_first() {
-        assert_eq!(shares(Some(Path::new("/opt/x"))), ["opt/x/share", "usr/share"]);
+        assert_eq!(
+            shares(Some(Path::new("/opt/x"))),
+            ["opt/x/share", "usr/share"]
+        );
         assert_eq!(shares(None), ["usr/share"]);
     }
 }

@@ -18,7 +18,8 @@ pub struct PushRequest {
     pub base: Option<String>,
     /// Launch file: relative to the package, or its bare name.
     pub launch: Option<String>,
-    /// Executables to run instead of, or beside, a launch file: `EXE` or `PACKAGE/EXE`.
+    /// Executables to run instead of, or beside, a launch file: `EXE` or `PACKAGE/EXE`, with arguments after it, as
+    /// a shell would split them.
     pub nodes: Vec<String>,
     /// Parameters: absolute ones begin with `/`, others are private to every node (`k`, `~k` or `_k`).
     pub params: BTreeMap<String, serde_json::Value>,

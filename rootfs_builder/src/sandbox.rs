@@ -70,7 +70,11 @@ impl Finished {
         } else {
             return text;
         };
-        if text.is_empty() { about } else { format!("{text}\n{about}") }
+        if text.is_empty() {
+            about
+        } else {
+            format!("{text}\n{about}")
+        }
     }
 }
 
@@ -82,7 +86,12 @@ impl Site {
         fs::create_dir_all(&directory).at("making", &directory)?;
         // What others may read in it is nobody's business out here.
         crate::install::set_mode(&directory, 0o700)?;
-        Ok(Self { id: id.to_owned(), directory, engine, running: Arc::default() })
+        Ok(Self {
+            id: id.to_owned(),
+            directory,
+            engine,
+            running: Arc::default(),
+        })
     }
 
     /// A new directory below the build's own.
@@ -102,7 +111,11 @@ impl Site {
     }
 
     /// Runs it to its end; each line it prints goes to `lines` as it comes.
-    pub(crate) async fn run(&self, run: Run, mut on_line: impl FnMut(&str)) -> Result<Finished, Error> {
+    pub(crate) async fn run(
+        &self,
+        run: Run,
+        mut on_line: impl FnMut(&str),
+    ) -> Result<Finished, Error> {
         let spec = Spec {
             id: format!("{}-{}", self.id, run.name),
             layers: run.layers,
@@ -127,17 +140,34 @@ impl Site {
         let (result, finished) = oneshot::channel();
         // Held by this future alone: when it is dropped, the task below sees it and ends the container.
         let (_alive, cancelled) = oneshot::channel::<()>();
-        let task = tokio::spawn(to_its_end(self.engine.clone(), spec, run.name, line, cancelled, result));
-        self.running.lock().unwrap_or_else(PoisonError::into_inner).push(task);
+        let task = tokio::spawn(to_its_end(
+            self.engine.clone(),
+            spec,
+            run.name,
+            line,
+            cancelled,
+            result,
+        ));
+        self.running
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(task);
         let mut tail = Tail::default();
         while let Some(line) = lines.recv().await {
             tail.push(&line);
             on_line(&line);
         }
         match finished.await {
-            Ok(Ok((exit, uid_offset))) => Ok(Finished { exit, uid_offset, tail }),
+            Ok(Ok((exit, uid_offset))) => Ok(Finished {
+                exit,
+                uid_offset,
+                tail,
+            }),
             Ok(Err(error)) => Err(error.into()),
-            Err(_) => Err(Error::Inside { what: "the sandbox", last_lines: tail.text() }),
+            Err(_) => Err(Error::Inside {
+                what: "the sandbox",
+                last_lines: tail.text(),
+            }),
         }
     }
 }
@@ -183,15 +213,23 @@ async fn to_its_end(
 /// A build may use the machine, but not all of its memory.
 fn limits() -> Limits {
     let memory = fs::read_to_string("/proc/meminfo").ok().and_then(|text| {
-        let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+        let line = text
+            .lines()
+            .find_map(|line| line.strip_prefix("MemTotal:"))?;
         line.trim().split(' ').next()?.parse::<u64>().ok()
     });
-    Limits { cpus: None, cpu_weight: None, memory: memory.map(|kib| kib * 1024 / 4 * 3), pids: Some(4096) }
+    Limits {
+        cpus: None,
+        cpu_weight: None,
+        memory: memory.map(|kib| kib * 1024 / 4 * 3),
+        pids: Some(4096),
+    }
 }
 
 impl Drop for Site {
     fn drop(&mut self) {
-        let running = std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));
+        let running =
+            std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));
         let directory = std::mem::take(&mut self.directory);
         let remove = move || {
             if let Err(error) = fs::remove_dir_all(&directory)
@@ -214,3 +252,6 @@ impl Drop for Site {
         });
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use package::workspace::Workspace;
 
-use crate::builder::{Build, Parts};
+use crate::build::{Build, Parts};
 use crate::cache::Entry;
 use crate::compile::{self, Unit};
 use crate::error::Error;
@@ -24,8 +24,17 @@ use crate::{elf, packaged, pushed};
 
 /// Compiles and packs.
 pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Parts, Error> {
-    let (own, asked) = (pushed::names(&workspace.packages), pushed::asked(&workspace.packages));
-    let resolved = keys::resolve(&build.archive, &build.base, &build.request.map, &own, &asked)?;
+    let (own, asked) = (
+        pushed::names(&workspace.packages),
+        pushed::asked(&workspace.packages),
+    );
+    let resolved = keys::resolve(
+        &build.archive,
+        &build.base,
+        &build.request.map,
+        &own,
+        &asked,
+    )?;
     let units: Vec<Unit> = workspace
         .packages
         .iter()
@@ -37,7 +46,13 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
         .collect();
     let package = compiled(build, &workspace.root, &units, &resolved).await?;
     let needed = needed_by(build, package.layer.as_ref()).await?;
-    let dependencies = dependencies(build, &resolved, &needed, pushed::has_python(&workspace.root)).await?;
+    let dependencies = dependencies(
+        build,
+        &resolved,
+        &needed,
+        pushed::has_python(&workspace.root),
+    )
+    .await?;
     Ok(Parts {
         packages: pushed::by_importance(&workspace.packages),
         version: pushed::version(&workspace.packages),
@@ -48,12 +63,21 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
 }
 
 /// The package layer: from the cache when the same sources were compiled with the same packages before.
-async fn compiled(build: &Build<'_>, root: &Path, units: &[Unit], resolved: &Resolved) -> Result<Made, Error> {
+async fn compiled(
+    build: &Build<'_>,
+    root: &Path,
+    units: &[Unit],
+    resolved: &Resolved,
+) -> Result<Made, Error> {
     let on_base = build.on_base();
     let toolchain = build.base.build.packages.iter().cloned().collect();
-    let toolchain = build.add("toolchain", &on_base, &toolchain, Vec::new()).await?;
+    let toolchain = build
+        .add("toolchain", &on_base, &toolchain, Vec::new())
+        .await?;
     let below: Vec<_> = on_base.into_iter().chain(toolchain.layer).collect();
-    let more = build.add("build-dependencies", &below, &resolved.build, Vec::new()).await?;
+    let more = build
+        .add("build-dependencies", &below, &resolved.build, Vec::new())
+        .await?;
     let below: Vec<_> = below.into_iter().chain(more.layer).collect();
     let hashed = root.to_owned();
     let sources = tokio::task::spawn_blocking(move || key::tree(&hashed)).await??;
@@ -61,19 +85,46 @@ async fn compiled(build: &Build<'_>, root: &Path, units: &[Unit], resolved: &Res
         .with("build", build.base.build_key())
         .with("sources", sources)
         .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
-        .with_all("unit", units.iter().map(|unit| format!("{} {} {}", unit.name, unit.path.display(), unit.build_type)))
+        .with_all(
+            "unit",
+            units
+                .iter()
+                .map(|unit| format!("{} {} {}", unit.name, unit.path.display(), unit.build_type)),
+        )
         .finish();
     let shop = &build.shop;
     let _turn = shop.turns.take(&key).await;
     if let Some(entry) = shop.cached(&key).await? {
-        return Ok(Made { layer: entry.layer, cached: true });
+        return Ok(Made {
+            layer: entry.layer,
+            cached: true,
+        });
     }
-    let tree = compile::compile(shop, &build.base, &below, root, units, &build.log, build.progress).await?;
+    let tree = compile::compile(
+        shop,
+        &build.base,
+        &below,
+        root,
+        units,
+        &build.log,
+        build.progress,
+    )
+    .await?;
     build.progress.step("packing the package").await;
     let layer = compile::pack(shop, &build.base, &tree).await?;
     let made_from = units.iter().map(|unit| unit.name.clone()).collect();
-    shop.keep(&key, Entry { layer: Some(layer), made_from }).await?;
-    Ok(Made { layer: Some(layer), cached: false })
+    shop.keep(
+        &key,
+        Entry {
+            layer: Some(layer),
+            made_from,
+        },
+    )
+    .await?;
+    Ok(Made {
+        layer: Some(layer),
+        cached: false,
+    })
 }
 
 /// Libraries that a package layer needs from elsewhere.
@@ -81,7 +132,10 @@ pub(crate) async fn needed_by(
     build: &Build<'_>,
     layer: Option<&image::LayerInfo>,
 ) -> Result<BTreeSet<String>, Error> {
-    let trees = build.shop.extracted(layer.map_or(&[], std::slice::from_ref)).await?;
+    let trees = build
+        .shop
+        .extracted(layer.map_or(&[], std::slice::from_ref))
+        .await?;
     tokio::task::spawn_blocking(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {
@@ -111,15 +165,29 @@ pub(crate) async fn dependencies(
     for name in missing {
         // Not in the index, perhaps in an image all the same: a link that a package's script made.
         if !library_in(&trees, &name) {
-            let text = format!("no package holds the library {name}, which the package needs; a node may fail to start");
+            let text = format!(
+                "no package holds the library {name}, which the package needs; a node may fail to start"
+            );
             build.progress.warn(text).await;
         }
     }
-    build.add("dependencies", &below, &debs, wanted.extras).await
+    build
+        .add("dependencies", &below, &debs, wanted.extras)
+        .await
 }
 
 fn library_in(trees: &[PathBuf], name: &str) -> bool {
     let triplet = crate::contents::triplet();
-    let places = [format!("usr/lib/{triplet}"), "usr/lib".into(), format!("lib/{triplet}"), "lib64".into(), "lib".into()];
-    trees.iter().any(|tree| places.iter().any(|place| tree.join(place).join(name).symlink_metadata().is_ok()))
+    let places = [
+        format!("usr/lib/{triplet}"),
+        "usr/lib".into(),
+        format!("lib/{triplet}"),
+        "lib64".into(),
+        "lib".into(),
+    ];
+    trees.iter().any(|tree| {
+        places
+            .iter()
+            .any(|place| tree.join(place).join(name).symlink_metadata().is_ok())
+    })
 }

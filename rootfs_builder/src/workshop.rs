@@ -34,7 +34,10 @@ impl Workshop {
     pub(crate) async fn extracted(&self, layers: &[LayerInfo]) -> Result<Vec<PathBuf>, Error> {
         let (store, layers) = (self.layers.store().clone(), layers.to_vec());
         tokio::task::spawn_blocking(move || {
-            layers.iter().map(|layer| Ok(store.extracted(&layer.diff_id)?)).collect()
+            layers
+                .iter()
+                .map(|layer| Ok(store.extracted(&layer.diff_id)?))
+                .collect()
         })
         .await?
     }

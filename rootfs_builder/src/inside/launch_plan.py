@@ -194,7 +194,8 @@ def from_executables(ask, rospack, plan, names):
     import roslib.packages
 
     taken = set()
-    for asked in names:
+    for words in names:
+        asked, *arguments = shlex.split(words) or [words]
         found = None
         for package in ask["packages"]:
             wanted = asked[len(package) + 1 :] if asked.startswith(package + "/") else asked
@@ -219,7 +220,7 @@ def from_executables(ask, rospack, plan, names):
                 "name": "/" + name,
                 "package": package,
                 "executable": wanted,
-                "argv": [path, "__name:=" + name],
+                "argv": [path] + arguments + ["__name:=" + name],
                 "remaps": {},
                 "environment": {},
                 "directory": None,

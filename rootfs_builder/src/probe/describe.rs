@@ -34,12 +34,16 @@ pub(super) async fn describe(
     seen: &Seen<'_>,
 ) -> Result<Found, ProbeError> {
     let mut found = Found::default();
-    let mut texts = Texts { definitions, used: BTreeMap::new() };
+    let mut texts = Texts {
+        definitions,
+        used: BTreeMap::new(),
+    };
     let graph = &*seen.graph;
     let mut topics = Vec::new();
-    for (direction, names) in
-        [(Direction::Input, inputs(graph, seen.own_name)), (Direction::Output, outputs(graph, seen.own_name))]
-    {
+    for (direction, names) in [
+        (Direction::Input, inputs(graph, seen.own_name)),
+        (Direction::Output, outputs(graph, seen.own_name)),
+    ] {
         for name in names {
             match ask(&name, bus.topic_type(&name)).await {
                 Ok(wire) => topics.push(topic(registry, seen, name, direction, wire, &mut texts)?),
@@ -48,30 +52,60 @@ pub(super) async fn describe(
         }
     }
     let actions = take_actions(&mut topics, registry, &mut texts)?;
-    topics.sort_by(|a, b| (&a.name, a.direction == Direction::Output).cmp(&(&b.name, b.direction == Direction::Output)));
+    topics.sort_by(|a, b| {
+        (&a.name, a.direction == Direction::Output)
+            .cmp(&(&b.name, b.direction == Direction::Output))
+    });
     let mut services = Vec::new();
-    for (name, node) in graph.services.iter().filter(|(_, node)| *node != seen.own_name) {
+    for (name, node) in graph
+        .services
+        .iter()
+        .filter(|(_, node)| *node != seen.own_name)
+    {
         if name.ends_with("/get_loggers") || name.ends_with("/set_logger_level") {
             continue;
         }
         match ask(name, bus.service_type(name)).await {
             Ok(wire) => {
-                let service = registry
-                    .service(&wire.name)
-                    .map_err(|problem| ProbeError::NoDefinition { what: format!("service {name}"), problem })?;
-                compare(&format!("service {name}"), &wire.name, &wire.md5, &service.md5)?;
+                let service =
+                    registry
+                        .service(&wire.name)
+                        .map_err(|problem| ProbeError::NoDefinition {
+                            what: format!("service {name}"),
+                            problem,
+                        })?;
+                compare(
+                    &format!("service {name}"),
+                    &wire.name,
+                    &wire.md5,
+                    &service.md5,
+                )?;
                 texts.service(&wire.name, [&service.request, &service.response]);
-                services.push(Service { name: name.clone(), type_name: wire.name, md5: wire.md5, node: node.clone() });
+                services.push(Service {
+                    name: name.clone(),
+                    type_name: wire.name,
+                    md5: wire.md5,
+                    node: node.clone(),
+                });
             }
             Err(problem) => found.warnings.push(problem),
         }
     }
     let parameters = parameters(bus, graph, seen.own_name).await;
-    found.interface = Interface { topics, services, actions, parameters, definitions: texts.used };
+    found.interface = Interface {
+        topics,
+        services,
+        actions,
+        parameters,
+        definitions: texts.used,
+    };
     Ok(found)
 }
 
-async fn ask<T>(name: &str, answer: impl Future<Output = Result<T, BusError>>) -> Result<T, String> {
+async fn ask<T>(
+    name: &str,
+    answer: impl Future<Output = Result<T, BusError>>,
+) -> Result<T, String> {
     match timeout(ANSWER, answer).await {
         Ok(Ok(value)) => Ok(value),
         Ok(Err(error)) => Err(format!("{name} does not tell its type: {error}")),
@@ -97,11 +131,24 @@ fn topic(
                 let added = registry.insert_full_text(&wire.name, &wire.definition);
                 added
                     .and_then(|()| registry.message(&wire.name))
-                    .map_err(|problem| ProbeError::NoDefinition { what: format!("topic {name}"), problem })?
+                    .map_err(|problem| ProbeError::NoDefinition {
+                        what: format!("topic {name}"),
+                        problem,
+                    })?
             }
-            Err(problem) => return Err(ProbeError::NoDefinition { what: format!("topic {name}"), problem }),
+            Err(problem) => {
+                return Err(ProbeError::NoDefinition {
+                    what: format!("topic {name}"),
+                    problem,
+                });
+            }
         };
-        compare(&format!("topic {name}"), &wire.name, &wire.md5, message.md5())?;
+        compare(
+            &format!("topic {name}"),
+            &wire.name,
+            &wire.md5,
+            message.md5(),
+        )?;
         texts.message(&message);
     }
     let ends = seen.graph.topics.get(&name);
@@ -109,7 +156,12 @@ fn topic(
         Direction::Input => ends.map(|topic| &topic.subscribers),
         Direction::Output => ends.map(|topic| &topic.publishers),
     };
-    let nodes = nodes.into_iter().flatten().filter(|node| *node != seen.own_name).cloned().collect();
+    let nodes = nodes
+        .into_iter()
+        .flatten()
+        .filter(|node| *node != seen.own_name)
+        .cloned()
+        .collect();
     Ok(Topic {
         latched: direction == Direction::Output && seen.latched.contains(&name),
         lazy: direction == Direction::Input && !seen.eager.contains(&name),
@@ -140,22 +192,42 @@ fn take_actions(
     texts: &mut Texts<'_>,
 ) -> Result<Vec<Action>, ProbeError> {
     use Direction::{Input, Output};
-    const ENDS: [(&str, Direction); 5] =
-        [("goal", Input), ("cancel", Input), ("status", Output), ("feedback", Output), ("result", Output)];
+    const ENDS: [(&str, Direction); 5] = [
+        ("goal", Input),
+        ("cancel", Input),
+        ("status", Output),
+        ("feedback", Output),
+        ("result", Output),
+    ];
     let has = |topics: &[Topic], name: &str, direction| {
-        topics.iter().any(|topic| topic.name == name && topic.direction == direction)
+        topics
+            .iter()
+            .any(|topic| topic.name == name && topic.direction == direction)
     };
     let mut actions = Vec::new();
-    let goals: Vec<Topic> =
-        topics.iter().filter(|topic| topic.direction == Input && topic.name.ends_with("/goal")).cloned().collect();
+    let goals: Vec<Topic> = topics
+        .iter()
+        .filter(|topic| topic.direction == Input && topic.name.ends_with("/goal"))
+        .cloned()
+        .collect();
     for goal in goals {
         let name = goal.name.trim_end_matches("/goal");
-        let Some(type_name) = goal.type_name.strip_suffix("ActionGoal") else { continue };
-        if !ENDS.iter().all(|(end, direction)| has(topics, &format!("{name}/{end}"), *direction)) {
+        let Some(type_name) = goal.type_name.strip_suffix("ActionGoal") else {
+            continue;
+        };
+        if !ENDS
+            .iter()
+            .all(|(end, direction)| has(topics, &format!("{name}/{end}"), *direction))
+        {
             continue;
         }
         if let Ok(action) = registry.action(type_name) {
-            compare(&format!("action {name}"), &goal.type_name, &goal.md5, action.action_goal.md5())?;
+            compare(
+                &format!("action {name}"),
+                &goal.type_name,
+                &goal.md5,
+                action.action_goal.md5(),
+            )?;
             texts.action(type_name);
         }
         actions.push(Action {
@@ -166,7 +238,10 @@ fn take_actions(
     }
     topics.retain(|topic| {
         !actions.iter().any(|action| {
-            let end = topic.name.strip_prefix(action.name.as_str()).and_then(|rest| rest.strip_prefix('/'));
+            let end = topic
+                .name
+                .strip_prefix(action.name.as_str())
+                .and_then(|rest| rest.strip_prefix('/'));
             end.is_some_and(|end| ENDS.contains(&(end, topic.direction)))
         })
     });
@@ -176,14 +251,21 @@ fn take_actions(
 async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
     let mut parameters = Vec::new();
     for (name, uses) in &graph.parameters {
-        let others = |nodes: &[String]| -> Vec<String> { nodes.iter().filter(|node| *node != own).cloned().collect() };
+        let others = |nodes: &[String]| -> Vec<String> {
+            nodes.iter().filter(|node| *node != own).cloned().collect()
+        };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
         let plumbing = is_plumbing(name);
         if plumbing || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
         let value = bus.get_param(name).await.ok().map(|value| json(&value));
-        parameters.push(Parameter { name: name.clone(), value, read_by, written_by });
+        parameters.push(Parameter {
+            name: name.clone(),
+            value,
+            read_by,
+            written_by,
+        });
     }
     parameters
 }
@@ -199,7 +281,10 @@ fn is_plumbing(name: &str) -> bool {
         "/enable_statistics",
         "/rosout_disable_topics_generation",
     ];
-    NAMES.contains(&name) || ["/roslaunch/", "/statistics_window_"].iter().any(|start| name.starts_with(start))
+    NAMES.contains(&name)
+        || ["/roslaunch/", "/statistics_window_"]
+            .iter()
+            .any(|start| name.starts_with(start))
 }
 
 fn json(value: &ParamValue) -> serde_json::Value {
@@ -216,7 +301,11 @@ impl Texts<'_> {
     fn message(&mut self, message: &Arc<MessageType>) {
         let key = message.name().replacen('/', "/msg/", 1);
         // Requests, goals and the like have no text of their own: the service's or the action's is theirs.
-        let text = self.definitions.get(&key).cloned().unwrap_or_else(|| message.text().to_owned());
+        let text = self
+            .definitions
+            .get(&key)
+            .cloned()
+            .unwrap_or_else(|| message.text().to_owned());
         if self.used.insert(key, text).is_none() {
             self.fields(message);
         }

@@ -2,18 +2,21 @@
 
 use std::net::SocketAddr;
 
+use package::interface::Direction;
 use ros::bus::{AdvertiseOptions, Publisher, ServiceHandler, ServiceType, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
-use package::interface::Direction;
 use tokio::net::TcpListener;
 
 use super::*;
 
 const STRING: (&str, &str) = ("std_msgs/msg/String", "string data\n");
 const ADD: (&str, &str) = ("lab/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n");
-const TURN: (&str, &str) = ("lab/action/Turn", "float64 angle\n---\nbool done\n---\nfloat64 left\n");
+const TURN: (&str, &str) = (
+    "lab/action/Turn",
+    "float64 angle\n---\nbool done\n---\nfloat64 left\n",
+);
 
 /// A Master on loopback, the definitions of an image, and a node of its package.
 struct Lab {
@@ -29,12 +32,22 @@ impl Lab {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
         let master = Master::new(MasterOptions::default());
-        let serving = tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
-        let definitions: BTreeMap<String, String> =
-            [STRING, ADD, TURN].map(|(key, text)| (key.to_owned(), text.to_owned())).into();
+        let serving =
+            tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        let definitions: BTreeMap<String, String> = [STRING, ADD, TURN]
+            .map(|(key, text)| (key.to_owned(), text.to_owned()))
+            .into();
         let registry = Arc::new(Registry::from_definitions(&definitions).expect("valid"));
-        let node = Ros1Bus::connect(Arc::new(HostSockets), address, "/package").await.expect("joined");
-        Self { address, definitions, registry, node, serving }
+        let node = Ros1Bus::connect(Arc::new(HostSockets), address, "/package")
+            .await
+            .expect("joined");
+        Self {
+            address,
+            definitions,
+            registry,
+            node,
+            serving,
+        }
     }
 
     fn wire(&self, name: &str) -> WireType {
@@ -46,22 +59,49 @@ impl Lab {
         }
     }
 
-    async fn advertises(&self, topic: &str, wire_type: WireType, latch: bool) -> Box<dyn Publisher> {
-        let options = AdvertiseOptions { wire_type, latch, queue: 1 };
-        self.node.advertise(topic, options).await.expect("advertised")
+    async fn advertises(
+        &self,
+        topic: &str,
+        wire_type: WireType,
+        latch: bool,
+    ) -> Box<dyn Publisher> {
+        let options = AdvertiseOptions {
+            wire_type,
+            latch,
+            queue: 1,
+        };
+        self.node
+            .advertise(topic, options)
+            .await
+            .expect("advertised")
     }
 
     async fn subscribes(&self, topic: &str, wire_type: WireType) -> Subscription {
-        let options = SubscribeOptions { wire_type: Some(wire_type), queue: 1 };
-        self.node.subscribe(topic, options).await.expect("subscribed")
+        let options = SubscribeOptions {
+            wire_type: Some(wire_type),
+            queue: 1,
+        };
+        self.node
+            .subscribe(topic, options)
+            .await
+            .expect("subscribed")
     }
 
-    async fn probed(&self, nodes: &[&str], exited: impl Future<Output = String> + Send) -> Result<Found, ProbeError> {
-        let bus = Ros1Bus::connect(Arc::new(HostSockets), self.address, "/looker").await.expect("joined");
+    async fn probed(
+        &self,
+        nodes: &[&str],
+        exited: impl Future<Output = String> + Send,
+    ) -> Result<Found, ProbeError> {
+        let bus = Ros1Bus::connect(Arc::new(HostSockets), self.address, "/looker")
+            .await
+            .expect("joined");
         let options = ProbeOptions {
             patience: Duration::from_millis(500),
             settle: Duration::from_millis(150),
-            ..ProbeOptions::new(nodes.iter().map(|&node| node.to_owned()).collect(), "/looker")
+            ..ProbeOptions::new(
+                nodes.iter().map(|&node| node.to_owned()).collect(),
+                "/looker",
+            )
         };
         let found = probe(&*bus, &self.registry, &self.definitions, &options, exited).await;
         bus.close().await;
@@ -92,33 +132,73 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
     latched.publish(bytes::Bytes::from_static(b"\x02\0\0\0hi"));
     let output = lab.advertises("/out", string.clone(), false).await;
     let add = lab.registry.service("lab/Add").expect("defined");
-    let add = ServiceType { name: "lab/Add".into(), md5: add.md5.clone() };
-    let _served = lab.node.serve("/add", add, Arc::new(Sum)).await.expect("served");
-    lab.node.set_param("/package/gain", ros::bus::ParamValue::Double(0.5)).await.expect("set");
+    let add = ServiceType {
+        name: "lab/Add".into(),
+        md5: add.md5.clone(),
+    };
+    let _served = lab
+        .node
+        .serve("/add", add, Arc::new(Sum))
+        .await
+        .expect("served");
+    lab.node
+        .set_param("/package/gain", ros::bus::ParamValue::Double(0.5))
+        .await
+        .expect("set");
     // Wakes as real nodes do: with the first subscriber of its output.
     let mut listeners = output.subscribers();
     let node = lab.node.clone();
     let waking = tokio::spawn(async move {
         listeners.wait_for(|count| *count > 0).await.expect("alive");
-        let options = SubscribeOptions { wire_type: Some(string), queue: 1 };
-        node.subscribe("/sleepy", options).await.expect("subscribed")
+        let options = SubscribeOptions {
+            wire_type: Some(string),
+            queue: 1,
+        };
+        node.subscribe("/sleepy", options)
+            .await
+            .expect("subscribed")
     });
 
-    let found = lab.probed(&["/package"], std::future::pending()).await.expect("found");
+    let found = lab
+        .probed(&["/package"], std::future::pending())
+        .await
+        .expect("found");
     let interface = found.interface;
-    let topic = |name: &str| interface.topics.iter().find(|topic| topic.name == name).expect(name);
-    assert_eq!((topic("/eager").direction, topic("/eager").lazy), (Direction::Input, false));
-    assert_eq!((topic("/sleepy").direction, topic("/sleepy").lazy), (Direction::Input, true));
-    assert_eq!((topic("/out").direction, topic("/out").latched), (Direction::Output, false));
+    let topic = |name: &str| {
+        interface
+            .topics
+            .iter()
+            .find(|topic| topic.name == name)
+            .expect(name)
+    };
+    assert_eq!(
+        (topic("/eager").direction, topic("/eager").lazy),
+        (Direction::Input, false)
+    );
+    assert_eq!(
+        (topic("/sleepy").direction, topic("/sleepy").lazy),
+        (Direction::Input, true)
+    );
+    assert_eq!(
+        (topic("/out").direction, topic("/out").latched),
+        (Direction::Output, false)
+    );
     assert!(topic("/latched").latched);
     assert_eq!(topic("/out").type_name, "std_msgs/String");
     assert_eq!(topic("/out").nodes, ["/package"]);
     assert_eq!(interface.topics.len(), 4, "{:?}", interface.topics);
     assert_eq!(interface.services[0].type_name, "lab/Add");
-    let gain = interface.parameters.iter().find(|parameter| parameter.name == "/package/gain").expect("written");
+    let gain = interface
+        .parameters
+        .iter()
+        .find(|parameter| parameter.name == "/package/gain")
+        .expect("written");
     assert_eq!(gain.value, Some(serde_json::json!(0.5)));
     assert_eq!(gain.written_by, ["/package"]);
-    assert_eq!(interface.definitions.keys().collect::<Vec<_>>(), ["lab/srv/Add", "std_msgs/msg/String"]);
+    assert_eq!(
+        interface.definitions.keys().collect::<Vec<_>>(),
+        ["lab/srv/Add", "std_msgs/msg/String"]
+    );
     drop(waking.await);
     lab.ends().await;
 }
@@ -126,8 +206,12 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
 #[tokio::test]
 async fn a_node_that_still_works_is_waited_for() {
     let lab = Lab::new().await;
-    let _first = lab.advertises("/first", lab.wire("std_msgs/String"), false).await;
-    let bus = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker").await.expect("joined");
+    let _first = lab
+        .advertises("/first", lab.wire("std_msgs/String"), false)
+        .await;
+    let bus = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker")
+        .await
+        .expect("joined");
     // Asked a third time it is done, and only then shows its last topic.
     let (node, wire) = (lab.node.clone(), lab.wire("std_msgs/String"));
     let asked = Arc::new(std::sync::atomic::AtomicU32::new(0));
@@ -138,8 +222,13 @@ async fn a_node_that_still_works_is_waited_for() {
         let times = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         async move {
             if times == 2 {
-                let options = AdvertiseOptions { wire_type, latch: false, queue: 1 };
-                *late.lock().await = Some(node.advertise("/last", options).await.expect("advertised"));
+                let options = AdvertiseOptions {
+                    wire_type,
+                    latch: false,
+                    queue: 1,
+                };
+                *late.lock().await =
+                    Some(node.advertise("/last", options).await.expect("advertised"));
             }
             Some(Duration::from_secs(times.min(2).into()))
         }
@@ -149,8 +238,21 @@ async fn a_node_that_still_works_is_waited_for() {
         work: Some(work),
         ..ProbeOptions::new(vec!["/package".into()], "/looker")
     };
-    let found = probe(&*bus, &lab.registry, &lab.definitions, &options, std::future::pending()).await.expect("found");
-    let names: Vec<_> = found.interface.topics.iter().map(|topic| topic.name.as_str()).collect();
+    let found = probe(
+        &*bus,
+        &lab.registry,
+        &lab.definitions,
+        &options,
+        std::future::pending(),
+    )
+    .await
+    .expect("found");
+    let names: Vec<_> = found
+        .interface
+        .topics
+        .iter()
+        .map(|topic| topic.name.as_str())
+        .collect();
     assert_eq!(names, ["/first", "/last"]);
     bus.close().await;
     drop(kept);
@@ -165,10 +267,26 @@ async fn a_node_that_shows_nothing_yet_is_waited_for() {
     let mut listeners = rosout.subscribers();
     let showing = tokio::spawn(async move {
         // Long after the graph was still for a while.
-        let _ = tokio::time::timeout(Duration::from_millis(600), listeners.wait_for(|count| *count > 0)).await;
-        node.advertise("/late", AdvertiseOptions { wire_type, latch: false, queue: 1 }).await.expect("advertised")
+        let _ = tokio::time::timeout(
+            Duration::from_millis(600),
+            listeners.wait_for(|count| *count > 0),
+        )
+        .await;
+        node.advertise(
+            "/late",
+            AdvertiseOptions {
+                wire_type,
+                latch: false,
+                queue: 1,
+            },
+        )
+        .await
+        .expect("advertised")
     });
-    let found = lab.probed(&["/package"], std::future::pending()).await.expect("found");
+    let found = lab
+        .probed(&["/package"], std::future::pending())
+        .await
+        .expect("found");
     assert_eq!(found.interface.topics[0].name, "/late");
     drop(showing.await);
     lab.ends().await;
@@ -184,32 +302,69 @@ async fn five_topics_are_an_action() {
         definition: message.full_text().to_owned(),
     };
     let _goal = lab.subscribes("/turn/goal", wire(&turn.action_goal)).await;
-    let _cancel = lab.subscribes("/turn/cancel", lab.wire("actionlib_msgs/GoalID")).await;
-    let _status = lab.advertises("/turn/status", lab.wire("actionlib_msgs/GoalStatusArray"), false).await;
-    let _feedback = lab.advertises("/turn/feedback", wire(&turn.action_feedback), false).await;
-    let _result = lab.advertises("/turn/result", wire(&turn.action_result), false).await;
-    let found = lab.probed(&["/package"], std::future::pending()).await.expect("found");
+    let _cancel = lab
+        .subscribes("/turn/cancel", lab.wire("actionlib_msgs/GoalID"))
+        .await;
+    let _status = lab
+        .advertises(
+            "/turn/status",
+            lab.wire("actionlib_msgs/GoalStatusArray"),
+            false,
+        )
+        .await;
+    let _feedback = lab
+        .advertises("/turn/feedback", wire(&turn.action_feedback), false)
+        .await;
+    let _result = lab
+        .advertises("/turn/result", wire(&turn.action_result), false)
+        .await;
+    let found = lab
+        .probed(&["/package"], std::future::pending())
+        .await
+        .expect("found");
     assert_eq!(found.interface.topics, []);
     assert_eq!(found.interface.actions[0].type_name, "lab/Turn");
-    assert_eq!((found.interface.actions[0].name.as_str(), found.interface.actions[0].node.as_str()), ("/turn", "/package"));
+    assert_eq!(
+        (
+            found.interface.actions[0].name.as_str(),
+            found.interface.actions[0].node.as_str()
+        ),
+        ("/turn", "/package")
+    );
     lab.ends().await;
 }
 
 #[tokio::test]
 async fn a_node_compiled_with_another_definition_is_refused() {
     let lab = Lab::new().await;
-    let other = WireType { md5: "0".repeat(32), ..lab.wire("std_msgs/String") };
+    let other = WireType {
+        md5: "0".repeat(32),
+        ..lab.wire("std_msgs/String")
+    };
     let _input = lab.subscribes("/in", other).await;
-    let error = lab.probed(&["/package"], std::future::pending()).await.expect_err("refused").to_string();
-    assert!(error.contains("topic /in") && error.contains("std_msgs/String"), "{error}");
+    let error = lab
+        .probed(&["/package"], std::future::pending())
+        .await
+        .expect_err("refused")
+        .to_string();
+    assert!(
+        error.contains("topic /in") && error.contains("std_msgs/String"),
+        "{error}"
+    );
     lab.ends().await;
 }
 
 #[tokio::test]
 async fn a_node_that_never_registers_is_named() {
     let lab = Lab::new().await;
-    let _output = lab.advertises("/out", lab.wire("std_msgs/String"), false).await;
-    let error = lab.probed(&["/package", "/absent"], std::future::pending()).await.expect_err("absent").to_string();
+    let _output = lab
+        .advertises("/out", lab.wire("std_msgs/String"), false)
+        .await;
+    let error = lab
+        .probed(&["/package", "/absent"], std::future::pending())
+        .await
+        .expect_err("absent")
+        .to_string();
     assert!(error.starts_with("/absent did not register"), "{error}");
     lab.ends().await;
 }
@@ -218,7 +373,11 @@ async fn a_node_that_never_registers_is_named() {
 async fn a_node_that_ends_is_told_before_anything_else() {
     let lab = Lab::new().await;
     let exited = async { "/package exited with 3".to_owned() };
-    let error = lab.probed(&["/absent"], exited).await.expect_err("ended").to_string();
+    let error = lab
+        .probed(&["/absent"], exited)
+        .await
+        .expect_err("ended")
+        .to_string();
     assert_eq!(error, "/package exited with 3");
     lab.ends().await;
 }

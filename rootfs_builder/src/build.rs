@@ -1,0 +1,241 @@
+//! What the three ways of pushing have in common: layers on layers, and the image at the end.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use image::{ImageSpec, LayerInfo};
+
+use crate::apt::Deb;
+use crate::archive::Archive;
+use crate::base::Base;
+use crate::error::Error;
+use crate::event::Progress;
+use crate::install::{self, Addition, Made};
+use crate::key::Key;
+use crate::launch::{self, Ask, LaunchPlan};
+use crate::pushed;
+use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
+use crate::workshop::Workshop;
+
+/// A push that is being built, its base layer made.
+pub(crate) struct Build<'a> {
+    pub(crate) shop: Workshop,
+    pub(crate) base: Base,
+    pub(crate) archive: Arc<Archive>,
+    pub(crate) base_layer: Made,
+    pub(crate) request: &'a PushRequest,
+    pub(crate) progress: &'a Progress,
+    pub(crate) log: PathBuf,
+}
+
+/// What one of them found and made.
+pub(crate) struct Parts {
+    /// ROS packages that the push is about, the one that gives its name first.
+    pub(crate) packages: Vec<String>,
+    pub(crate) version: String,
+    pub(crate) dependencies: Made,
+    pub(crate) package: Option<Made>,
+    /// Its install space; none for one below `/usr`.
+    pub(crate) prefix: Option<PathBuf>,
+}
+
+impl Build<'_> {
+    /// The base layer alone, as what others are put on.
+    pub(crate) fn on_base(&self) -> Vec<LayerInfo> {
+        self.base_layer.layer.into_iter().collect()
+    }
+
+    /// A layer with these Debian packages, and what they need, on top of `below`.
+    pub(crate) async fn add(
+        &self,
+        name: &'static str,
+        below: &[LayerInfo],
+        packages: &BTreeSet<String>,
+        extras: Vec<crate::deb::Member>,
+    ) -> Result<Made, Error> {
+        let debs = self.resolve(below, packages).await?;
+        let addition = Addition {
+            name,
+            below,
+            debs,
+            extras,
+        };
+        install::layer(
+            &self.shop,
+            &self.archive,
+            &self.base,
+            addition,
+            self.progress,
+        )
+        .await
+    }
+
+    /// What is to be installed on top of `below`. Remembered: apt takes seconds.
+    async fn resolve(
+        &self,
+        below: &[LayerInfo],
+        packages: &BTreeSet<String>,
+    ) -> Result<Vec<Deb>, Error> {
+        if packages.is_empty() {
+            return Ok(Vec::new());
+        }
+        let key = Key::new("resolved")
+            .with("archive", &self.archive.stamp)
+            .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
+            .with_all("package", packages)
+            .finish();
+        if let Some(debs) = self.shop.layers.note(&key) {
+            return Ok(debs);
+        }
+        let trees = self.shop.extracted(below).await?;
+        let status = trees
+            .iter()
+            .rev()
+            .map(|tree| tree.join("var/lib/dpkg/status"))
+            .find(|path| path.is_file());
+        let debs = self
+            .archive
+            .apt
+            .resolve(status.as_deref(), packages)
+            .await?;
+        self.shop.layers.keep_note(&key, &debs)?;
+        Ok(debs)
+    }
+
+    /// Names given with `--with`: ROS packages first, then Debian ones.
+    pub(crate) fn extra_packages(&self) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
+        let (mut ros, mut debs) = (BTreeSet::new(), BTreeSet::new());
+        let mut missing = Vec::new();
+        for name in &self.request.with {
+            if !self.archive.contents.ros_package(name).is_empty() {
+                ros.insert(name.clone());
+            } else if self.archive.names.contains(name) {
+                ros.extend(
+                    self.archive
+                        .contents
+                        .ros_packages_in(name)
+                        .into_iter()
+                        .map(str::to_owned),
+                );
+                debs.insert(name.clone());
+            } else {
+                missing.push(crate::error::Unresolved {
+                    key: name.clone(),
+                    wanted_by: vec!["--with".into()],
+                    similar: self.archive.similar(name),
+                });
+            }
+        }
+        if missing.is_empty() {
+            Ok((ros, debs))
+        } else {
+            Err(Error::Unresolved(missing))
+        }
+    }
+
+    /// Resolves what to run and writes the image.
+    pub(crate) async fn finish(
+        self,
+        made: Parts,
+        hold: image::Hold,
+    ) -> Result<BuildOutcome, Error> {
+        let mut layers = Vec::new();
+        let parts = [
+            ("base", Some(&self.base_layer)),
+            ("dependencies", Some(&made.dependencies)),
+            ("package", made.package.as_ref()),
+        ];
+        for (name, part) in parts {
+            if let Some(Made {
+                layer: Some(info),
+                cached,
+            }) = part
+            {
+                layers.push(BuiltLayer {
+                    name,
+                    info: *info,
+                    cached: *cached,
+                });
+            }
+        }
+        let infos: Vec<LayerInfo> = layers.iter().map(|layer| layer.info).collect();
+        let trees = self.shop.extracted(&infos).await?;
+        self.progress.step("resolving what to run").await;
+        let request = self.request;
+        let ask = Ask {
+            packages: made.packages.clone(),
+            prefix: made
+                .prefix
+                .as_deref()
+                .map_or_else(String::new, |prefix| prefix.display().to_string()),
+            launch: request.launch.clone().unwrap_or_default(),
+            nodes: request.nodes.clone(),
+            args: request.args.clone(),
+            remaps: request.remaps.clone(),
+            params: request.params.clone(),
+        };
+        let answer = launch::ask(
+            &self.shop,
+            trees.clone(),
+            self.base.environment.clone(),
+            &ask,
+        )
+        .await?;
+        for warning in &answer.warnings {
+            self.progress.warn(warning.as_str()).await;
+        }
+        let mut environment = self.base.environment.clone();
+        environment.extend(answer.environment);
+        // Where it works is made when it is run.
+        for name in [
+            "HOME",
+            "ROS_LOG_DIR",
+            "ROS_HOME",
+            "ROS_MASTER_URI",
+            "ROS_HOSTNAME",
+        ] {
+            environment.remove(name);
+        }
+        let shares = pushed::shares(made.prefix.as_deref());
+        let definitions =
+            tokio::task::spawn_blocking(move || package::definitions::read(&trees, &shares))
+                .await??;
+        let package = made.packages.first().cloned().unwrap_or_default();
+        let spec = ImageSpec {
+            layers: infos,
+            env: environment.clone(),
+            labels: BTreeMap::from([
+                ("org.cloudroid.package".to_owned(), package.clone()),
+                ("org.cloudroid.base".to_owned(), self.base.name.clone()),
+            ]),
+            annotations: BTreeMap::from([
+                ("org.opencontainers.image.title".to_owned(), package.clone()),
+                (
+                    "org.opencontainers.image.version".to_owned(),
+                    made.version.clone(),
+                ),
+            ]),
+            ..ImageSpec::default()
+        };
+        let store = self.shop.layers.store().clone();
+        let image = tokio::task::spawn_blocking(move || store.put_image(&spec)).await??;
+        // A log that tells of no failure is of no use to anyone.
+        let _ = fs::remove_file(&self.log);
+        Ok(BuildOutcome {
+            package,
+            version: made.version,
+            base: self.base.name.clone(),
+            image,
+            layers,
+            environment,
+            plan: LaunchPlan {
+                nodes: answer.nodes,
+                parameters: answer.parameters,
+            },
+            definitions,
+            hold,
+        })
+    }
+}
