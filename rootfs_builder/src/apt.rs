@@ -8,9 +8,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use nix::fcntl::{Flock, FlockArg};
 use serde::{Deserialize, Serialize};
 use tokio::process::Command;
 
+use crate::cache::write_whole;
 use crate::error::{Error, IoAt};
 use crate::event::Progress;
 use crate::process::{self, Stream};
@@ -64,25 +66,24 @@ pub struct Apt {
 const FRESH: Duration = Duration::from_secs(24 * 3600);
 
 impl Apt {
-    /// Prepares the directory; asks the network nothing yet. `sources`: none for the host's own.
-    pub fn open(root: &Path, sources: Option<&str>) -> Result<Self, Error> {
+    /// Prepares the directory; asks the network nothing yet. `sources`: lines of a sources.list.
+    pub fn open(root: &Path, sources: &str) -> Result<Self, Error> {
         for directory in ["state/lists/partial", "cache", "archives", "parts"] {
             let path = root.join(directory);
             fs::create_dir_all(&path).at("making", &path)?;
         }
-        let status = root.join("empty-status");
-        fs::write(&status, "").at("writing", &status)?;
-        let mut conf = CONFIGURATION.replace("@ROOT@", &root.display().to_string());
-        if let Some(sources) = sources {
-            let path = root.join("sources.list");
-            fs::write(&path, sources).at("writing", &path)?;
-            conf.push_str(&format!(
-                "Dir::Etc::sourcelist \"{0}/sources.list\";\nDir::Etc::sourceparts \"{0}/parts\";\n",
-                root.display()
-            ));
+        let conf = CONFIGURATION.replace("@ROOT@", &root.display().to_string());
+        for (name, text) in [
+            ("empty-status", ""),
+            ("sources.list", sources),
+            ("apt.conf", &conf),
+        ] {
+            // Another daemon may be reading it: it is not touched when it is as it should be.
+            let path = root.join(name);
+            if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
+                write_whole(&path, text.as_bytes())?;
+            }
         }
-        let path = root.join("apt.conf");
-        fs::write(&path, conf).at("writing", &path)?;
         Ok(Self {
             root: root.to_owned(),
         })
@@ -99,8 +100,17 @@ impl Apt {
     /// `force`d. With old lists at hand a failure is only a warning, which is returned.
     pub async fn refresh(&self, force: bool, progress: &Progress) -> Result<Option<String>, Error> {
         let stamp = self.root.join("updated");
+        if !force && self.is_fresh() {
+            return Ok(None);
+        }
+        // One daemon at a time; the others then find the lists fresh.
+        let path = self.root.join("lock");
+        let file = fs::File::create(&path).at("opening", &path)?;
+        let locked =
+            tokio::task::spawn_blocking(move || Flock::lock(file, FlockArg::LockExclusive)).await?;
+        let _lock = locked.map_err(|(_, error)| Error::io("locking", &path, error.into()))?;
         let age = age(&stamp);
-        if !force && age.is_some_and(|age| age < FRESH) {
+        if !force && self.is_fresh() {
             return Ok(None);
         }
         progress.step("fetching package lists").await;
@@ -124,27 +134,34 @@ impl Apt {
     }
 
     /// The lists that tell which file is in which package.
-    pub async fn contents_files(&self) -> Result<Vec<PathBuf>, Error> {
-        let mut query = self.command("apt-get");
-        query.args([
-            "indextargets",
-            "--format",
-            "$(FILENAME)",
-            "Created-By: Contents-deb",
-        ]);
-        let text = process::output(query, "apt").await?;
-        Ok(text
-            .lines()
-            .map(PathBuf::from)
-            .filter(|path| path.is_file())
-            .collect())
+    pub fn contents_files(&self) -> Result<Vec<PathBuf>, Error> {
+        let lists = self.root.join("state/lists");
+        let mut files = Vec::new();
+        for entry in fs::read_dir(&lists).at("reading", &lists)? {
+            let path = entry.at("reading", &lists)?.path();
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            if name.contains("_Contents-") && name.ends_with(".gz") {
+                files.push(path);
+            }
+        }
+        files.sort();
+        Ok(files)
     }
 
-    /// Names of all packages that can be installed.
+    /// Names of all packages that can be installed. Kept beside the lists.
     pub async fn names(&self) -> Result<BTreeSet<String>, Error> {
+        let path = self.root.join("names");
+        let stamp = self.stamp();
+        let kept = fs::read_to_string(&path).unwrap_or_default();
+        if let Some((of, names)) = kept.split_once('\n')
+            && of == stamp
+        {
+            return Ok(names.lines().map(str::to_owned).collect());
+        }
         let mut query = self.command("apt-cache");
         query.arg("pkgnames");
         let text = process::output(query, "apt").await?;
+        write_whole(&path, format!("{stamp}\n{text}").as_bytes())?;
         Ok(text.lines().map(str::to_owned).collect())
     }
 
@@ -292,6 +309,8 @@ Dir::State::status "@ROOT@/empty-status";
 Dir::Cache "@ROOT@/cache";
 Dir::Cache::srcpkgcache "srcpkgcache.bin";
 Dir::Cache::pkgcache "";
+Dir::Etc::sourcelist "@ROOT@/sources.list";
+Dir::Etc::sourceparts "@ROOT@/parts";
 Dir::Etc::preferences "/dev/null";
 Dir::Etc::preferencesparts "@ROOT@/parts";
 APT::Sandbox::User "root";

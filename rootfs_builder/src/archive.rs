@@ -30,11 +30,14 @@ impl Archive {
         progress: &Progress,
     ) -> Result<Self, Error> {
         let name = &crate::key::sha256(sources.as_bytes())[..12];
-        let apt = Apt::open(&cache.join("apt").join(name), Some(&sources))?;
+        let apt = Apt::open(&cache.join("apt").join(name), &sources)?;
         if let Some(warning) = apt.refresh(force, progress).await? {
             progress.warn(warning).await;
         }
-        let lists = apt.contents_files().await?;
+        let lists = apt.contents_files()?;
+        if lists.is_empty() {
+            return Err(Error::NoContents { sources });
+        }
         let root = apt.root().to_owned();
         let contents = tokio::task::spawn_blocking(move || Contents::open(&root, &lists)).await??;
         let names = apt.names().await?;

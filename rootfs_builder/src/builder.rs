@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use image::Store;
+use image::{Digest, Store};
 use package::workspace::Pushed;
 use servant::engine::Engine;
 use tokio::sync::mpsc;
@@ -55,6 +55,11 @@ pub struct Builder {
     layers: Layers,
     turns: Turns,
     archives: tokio::sync::Mutex<HashMap<String, Arc<Archive>>>,
+}
+
+/// Where the layers to keep for a base are noted.
+pub(crate) fn kept(base: &str) -> String {
+    format!("keep-{base}")
 }
 
 enum What<'a> {
@@ -133,6 +138,16 @@ impl Builder {
             What::Packaged(name) => packaged::build(&build, name).await?,
         };
         build.finish(made, hold).await
+    }
+
+    /// Layers that no image needs and the next build will: bases and toolchains, by diff-id. For the store's garbage
+    /// collector to keep; without them they are imported from the cache again.
+    pub fn keep(&self) -> BTreeSet<Digest> {
+        let names = base::names(&self.config.bases_dir).unwrap_or_default();
+        let notes = names
+            .iter()
+            .filter_map(|name| self.layers.note::<Vec<Digest>>(&kept(name)));
+        notes.flatten().collect()
     }
 
     async fn archive(

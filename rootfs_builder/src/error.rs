@@ -65,6 +65,15 @@ pub enum Error {
         /// Names that look alike, or nothing.
         hint: String,
     },
+    /// The archive has no index of files.
+    #[error(
+        "the package archive has no Contents index, by which ROS packages are found; use a mirror that has one. Asked: {}",
+        sources.trim().replace('\n', "; ")
+    )]
+    NoContents {
+        /// Lines of the sources.list.
+        sources: String,
+    },
     /// The package's build failed.
     #[error("the build of {package} failed; the complete log is {log}\n{last_lines}", log = log.display())]
     BuildFailed {

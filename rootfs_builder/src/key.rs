@@ -1,5 +1,6 @@
 //! Keys: names of results by what they were made from.
 
+use std::ffi::OsStr;
 use std::fs::File;
 use std::io::Read;
 use std::os::unix::ffi::OsStrExt;
@@ -58,13 +59,25 @@ impl Key {
 
 /// A file tree's names, kinds, execute bits and contents. Owners and times do not matter.
 pub(crate) fn tree(root: &Path) -> Result<String, Error> {
+    hash(root, |_| true)
+}
+
+/// The same without what version control keeps beside the sources.
+pub(crate) fn sources(root: &Path) -> Result<String, Error> {
+    hash(root, |name| {
+        ![".git", ".hg", ".svn"].iter().any(|kept| name == *kept)
+    })
+}
+
+fn hash(root: &Path, wanted: impl Fn(&OsStr) -> bool) -> Result<String, Error> {
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 64 * 1024];
     let add = |hash: &mut Sha256, part: &[u8]| {
         hash.update((part.len() as u64).to_le_bytes());
         hash.update(part);
     };
-    for entry in walkdir::WalkDir::new(root).sort_by_file_name() {
+    let entries = walkdir::WalkDir::new(root).sort_by_file_name().into_iter();
+    for entry in entries.filter_entry(|entry| entry.depth() == 0 || wanted(entry.file_name())) {
         let entry = entry.map_err(|error| Error::io("reading", root, error.into()))?;
         let path = entry.path();
         let relative = path.strip_prefix(root).unwrap_or(path);
@@ -131,5 +144,19 @@ mod tests {
         assert_eq!(first, make("x", 0o600));
         assert_ne!(first, make("y", 0o644));
         assert_ne!(first, make("x", 0o755));
+    }
+
+    #[test]
+    fn a_commit_changes_no_sources() {
+        let root = tempfile::tempdir().expect("a directory");
+        std::fs::create_dir(root.path().join(".git")).expect("made");
+        std::fs::write(root.path().join("CMakeLists.txt"), "project(x)").expect("written");
+        let before = (
+            sources(root.path()).expect("hashed"),
+            tree(root.path()).expect("hashed"),
+        );
+        std::fs::write(root.path().join(".git/HEAD"), "x").expect("written");
+        assert_eq!(sources(root.path()).expect("hashed"), before.0);
+        assert_ne!(tree(root.path()).expect("hashed"), before.1);
     }
 }

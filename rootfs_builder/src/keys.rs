@@ -148,7 +148,7 @@ mod tests {
             "python3-six",
         ];
         let archive = Archive {
-            apt: crate::apt::Apt::open(directory.path(), Some("")).expect("prepared"),
+            apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
             contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
             names: names.map(str::to_owned).into(),
             stamp: String::new(),

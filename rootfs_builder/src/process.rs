@@ -110,7 +110,7 @@ fn failed(program: &OsStr, status: &str, last_lines: String) -> Error {
     if last_lines.contains("No space left on device") {
         return Error::DiskFull {
             path: Path::new(program).to_owned(),
-            what: format!("running {}", program.display()),
+            what: format!("running {}", program.to_string_lossy()),
         };
     }
     Error::Program {

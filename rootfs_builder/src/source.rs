@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use package::workspace::Workspace;
 
 use crate::build::{Build, Parts};
+use crate::builder::kept;
 use crate::cache::Entry;
 use crate::compile::{self, Unit};
 use crate::error::Error;
@@ -75,12 +76,17 @@ async fn compiled(
         .add("toolchain", &on_base, &toolchain, Vec::new())
         .await?;
     let below: Vec<_> = on_base.into_iter().chain(toolchain.layer).collect();
+    let keep: Vec<_> = below.iter().map(|layer| layer.diff_id).collect();
+    build
+        .shop
+        .layers
+        .keep_note(&kept(&build.base.name), &keep)?;
     let more = build
         .add("build-dependencies", &below, &resolved.build, Vec::new())
         .await?;
     let below: Vec<_> = below.into_iter().chain(more.layer).collect();
     let hashed = root.to_owned();
-    let sources = tokio::task::spawn_blocking(move || key::tree(&hashed)).await??;
+    let sources = tokio::task::spawn_blocking(move || key::sources(&hashed)).await??;
     let key = Key::new("compiled")
         .with("build", build.base.build_key())
         .with("sources", sources)

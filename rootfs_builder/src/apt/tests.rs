@@ -37,7 +37,7 @@ fn the_state_directory_is_its_own() {
     let root = tempfile::tempdir().expect("a directory");
     Apt::open(
         root.path(),
-        Some("deb http://example.invalid/debian bookworm main"),
+        "deb http://example.invalid/debian bookworm main",
     )
     .expect("prepared");
     let conf = fs::read_to_string(root.path().join("apt.conf")).expect("written");
