@@ -17,6 +17,7 @@
 
 mod driver;
 mod handle;
+mod nodes;
 mod readiness;
 mod restart;
 mod tail;
@@ -37,8 +38,8 @@ use crate::journal::Journal;
 use crate::names;
 use crate::state::{self, NewEvent, RevisionRecord, ServantRecord, State};
 
-pub(crate) use driver::how_it_ended;
 pub use handle::{Handle, Lease};
+pub(crate) use nodes::how_it_ended;
 pub use tail::{read as read_log, record as log_record};
 
 use driver::Beginning;
@@ -113,19 +114,20 @@ impl Choreographer {
                 return Err(Error::Ending);
             }
             if let Some(handle) = servants.given.get(&key) {
-                let outdated =
-                    handle.revision.number != revision.number && handle.connections() == 0;
-                if !outdated {
+                if handle.revision.number != revision.number && handle.connections() == 0 {
+                    handle.end("another revision takes its place");
+                }
+                // Someone may have asked for its end before its task has seen that.
+                if !handle.is_ending() {
                     return Ok(Lease::new(Arc::clone(handle)));
                 }
-                handle.end("a newer revision takes its place");
             }
             let handle = Arc::new(Handle::new(
                 names::servant_id(service),
                 robot.to_owned(),
                 anonymous,
                 revision.plan.limits.or(inner.config.limits),
-                Arc::new(revision),
+                revision,
                 state::now(),
             ));
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
@@ -197,7 +199,7 @@ impl Choreographer {
     fn adopt_one(
         &self,
         record: ServantRecord,
-        revision: RevisionRecord,
+        revision: Arc<RevisionRecord>,
         servant: Arc<dyn servant::engine::Servant>,
     ) {
         let inner = &self.inner;
@@ -208,7 +210,7 @@ impl Choreographer {
             record.robot,
             record.anonymous,
             limits,
-            Arc::new(revision),
+            revision,
             record.created,
         ));
         {

@@ -287,7 +287,7 @@ impl Config {
     /// Whether servants outlive this daemon when it is ended.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
-            .unwrap_or_else(|| std::env::var_os("INVOCATION_ID").is_some())
+            .unwrap_or_else(|| std::env::var_os("NOTIFY_SOCKET").is_some())
     }
 }
 

@@ -130,11 +130,6 @@ impl Home {
         self.path.join("run/daemon.sock")
     }
 
-    /// Half-made things of the push `id`.
-    pub fn build(&self, id: &str) -> PathBuf {
-        self.path.join("build").join(id)
-    }
-
     fn sweep_builds(&self) -> Result<(), HomeError> {
         let builds = self.path.join("build");
         for entry in std::fs::read_dir(&builds).map_err(io("read", &builds))? {
@@ -268,10 +263,10 @@ mod tests {
     fn half_made_builds_are_swept() {
         let parent = tempfile::tempdir().expect("a directory");
         let home = Home::open(parent.path()).expect("free");
-        std::fs::create_dir_all(home.build("p1").join("deep")).expect("a build");
+        std::fs::create_dir_all(home.path().join("build/p1/deep")).expect("a build");
         drop(home);
         let home = Home::open(parent.path()).expect("free");
-        assert!(!home.build("p1").exists());
+        assert!(!home.path().join("build/p1").exists());
     }
 
     #[test]

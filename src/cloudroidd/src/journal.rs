@@ -20,19 +20,19 @@ impl Journal {
 
     /// As it should be.
     pub fn info(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
-        tracing::info!(kind, "{message}");
+        tracing::info!("{message}");
         self.write(Level::Info, kind, message, about);
     }
 
     /// Worth a look.
     pub fn warning(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
-        tracing::warn!(kind, "{message}");
+        tracing::warn!("{message}");
         self.write(Level::Warning, kind, message, about);
     }
 
     /// Something failed.
     pub fn error(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
-        tracing::error!(kind, "{message}");
+        tracing::error!("{message}");
         self.write(Level::Error, kind, message, about);
     }
 

@@ -30,6 +30,7 @@ mod views;
 mod works;
 
 use std::ffi::OsString;
+use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -93,6 +94,7 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .init();
     let outcome = match &arguments.verb {
@@ -127,7 +129,12 @@ fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
         return Ok(());
     }
     for check in &doctor.checks {
-        println!("{:?} {}: {}", check.status, check.name, check.found);
+        let mark = match check.status {
+            api::CheckStatus::Ok => "ok     ",
+            api::CheckStatus::Warning => "warning",
+            api::CheckStatus::Missing => "MISSING",
+        };
+        println!("{mark} {}: {}", check.name, check.found);
         if let Some(mend) = &check.mend {
             println!("    {mend}");
         }

@@ -10,10 +10,11 @@
 //! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
 
 mod probe;
+mod publish;
 mod receive;
 mod supplement;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -46,6 +47,8 @@ use crate::views;
 
 /// Events that may wait for a slow client before the build waits for it.
 const EVENTS_AHEAD: usize = 256;
+/// The unpacked archive, in the directory of its build.
+const PUSHED: &str = "pushed";
 /// Where nodes run, and keep what they write: a tmpfs.
 const HOME_INSIDE: &str = "/root";
 
@@ -221,8 +224,13 @@ impl Pusher {
             outcome = self.push(&id, &options, body, &tell) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
         };
-        let half_made = self.home.join("build").join(&id);
-        let _ = tokio::task::spawn_blocking(move || std::fs::remove_dir_all(half_made)).await;
+        let build = self.home.join("build").join(&id);
+        let _ = tokio::task::spawn_blocking(move || {
+            std::fs::remove_dir_all(build.join(PUSHED))?;
+            // What the builder still has in there goes when its containers have ended.
+            std::fs::remove_dir(build)
+        })
+        .await;
         let finished = outcome
             .and_then(|published| Ok((views::service(app, &published.service)?, published.layers)));
         match finished {
@@ -275,10 +283,16 @@ impl Pusher {
             None => None,
         };
         let source = match &options.apt {
-            Some(package) => Source::Packaged(package.clone()),
+            Some(package) => {
+                // Names of Debian packages have hyphens, those of ROS packages do not.
+                if let (Some(name), false) = (&options.name, package.contains('-')) {
+                    self.check_owner(name, std::slice::from_ref(package))?;
+                }
+                Source::Packaged(package.clone())
+            }
             None => {
                 tell.step("receiving the package").await;
-                let tree = self.home.join("build").join(id).join("pushed");
+                let tree = self.home.join("build").join(id).join(PUSHED);
                 receive::unpack(body, &tree, &self.config.push, tell).await?;
                 if let Some(name) = &options.name {
                     self.check_owner(name, &receive::packages_of(&tree))?;
@@ -382,147 +396,6 @@ impl Pusher {
         built.map_err(|error| push_error(&error))
     }
 
-    /// Writes the revision; from here on it is what new servants are started from.
-    async fn publish(&self, record: RevisionRecord) -> Result<u64, Error> {
-        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
-        blocking("publishing", move || {
-            let number = state.publish(&record)?;
-            // A crash before these is mended at the next start.
-            tag(&store, &record.service, number, &record.image)?;
-            tag_current(&store, &record.service, &record.image)?;
-            Ok(number)
-        })
-        .await
-    }
-
-    /// Makes an earlier revision the current one.
-    pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<u64, Error> {
-        let _turn = self.turn(name).await;
-        let current = views::current(&self.state, name)?;
-        let revisions = self.state.revisions(name)?;
-        let target = match wanted {
-            Some(number) => revisions.iter().find(|revision| revision.number == number),
-            None => revisions
-                .iter()
-                .find(|revision| revision.number < current.number),
-        };
-        let Some(target) = target.cloned() else {
-            return Err(Error::UnknownRevision {
-                service: name.to_owned(),
-                revision: wanted.map_or_else(
-                    || format!("before {}", current.number),
-                    |number| number.to_string(),
-                ),
-                exists: revisions
-                    .iter()
-                    .map(|revision| revision.number.to_string())
-                    .collect(),
-            });
-        };
-        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
-        let number = target.number;
-        blocking("rolling back", move || {
-            state.set_current(&target.service, target.number)?;
-            tag_current(&store, &target.service, &target.image)
-        })
-        .await?;
-        let about = NewEvent {
-            service: Some(name),
-            ..NewEvent::default()
-        };
-        let message = format!(
-            "{name} was set from revision {} to revision {number}",
-            current.number
-        );
-        self.journal.info("rolled-back", &message, &about);
-        Ok(number)
-    }
-
-    /// Removes a service, its servants and its images; gives the servants' ids.
-    pub async fn remove(&self, name: &str) -> Result<Vec<String>, Error> {
-        let _turn = self.turn(name).await;
-        let revisions = self.state.revisions(name)?;
-        self.state.remove_service(name)?;
-        let stopped = self
-            .choreographer
-            .stop("its service was removed", |handle| handle.service() == name)
-            .await;
-        let (store, service) = (Arc::clone(&self.store), name.to_owned());
-        blocking("removing a service", move || {
-            store.untag(&service)?;
-            for revision in revisions {
-                store.untag(&format!("{service}:{}", revision.number))?;
-            }
-            Ok(())
-        })
-        .await?;
-        self.collect_garbage().await;
-        let about = NewEvent {
-            service: Some(name),
-            ..NewEvent::default()
-        };
-        self.journal
-            .info("removed", &format!("{name} was removed"), &about);
-        Ok(stopped)
-    }
-
-    /// Makes the tags say what the database says (a crash may have come between), then removes what nothing needs.
-    pub async fn mend(&self) -> Result<(), Error> {
-        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
-        blocking("mending the image store", move || {
-            let mut wanted = BTreeSet::new();
-            for revision in state.all_revisions()? {
-                tag(&store, &revision.service, revision.number, &revision.image)?;
-                wanted.insert(format!("{}:{}", revision.service, revision.number));
-            }
-            for service in state.service_names()? {
-                if let Some(current) = state.current(&service)? {
-                    tag_current(&store, &service, &current.image)?;
-                }
-                wanted.insert(service);
-            }
-            for tag in store
-                .tags()?
-                .into_keys()
-                .filter(|tag| !wanted.contains(tag))
-            {
-                store.untag(&tag)?;
-            }
-            Ok(())
-        })
-        .await?;
-        self.collect_garbage().await;
-        Ok(())
-    }
-
-    async fn collect_garbage(&self) {
-        let keep: BTreeSet<image::Digest> = self
-            .choreographer
-            .images_in_use()
-            .iter()
-            .filter_map(|image| image.parse().ok())
-            .collect();
-        let store = Arc::clone(&self.store);
-        match blocking("collecting garbage", move || Ok(store.gc(&keep)?)).await {
-            Ok(swept) if swept.blobs + swept.trees + swept.leftovers > 0 => {
-                tracing::info!(
-                    "removed {} blobs and {} trees that nothing needs",
-                    swept.blobs,
-                    swept.trees
-                );
-            }
-            Ok(_) => {}
-            Err(error) => tracing::warn!("garbage could not be collected: {error}"),
-        }
-        if let Ok(revisions) = self.state.all_revisions() {
-            let images = revisions
-                .into_iter()
-                .map(|revision| revision.image)
-                .collect();
-            self.choreographer.keep_definitions(&images);
-        }
-    }
-
     async fn turn(&self, service: &str) -> OwnedMutexGuard<()> {
         let turn = {
             let mut turns = self.turns.lock();
@@ -530,28 +403,6 @@ impl Pusher {
             Arc::clone(turns.entry(service.to_owned()).or_default())
         };
         turn.lock_owned().await
-    }
-}
-
-/// A tag that cannot be set because its image is gone is told, and is no reason not to start.
-fn tag(store: &Store, service: &str, number: u64, image: &str) -> Result<(), Error> {
-    set_tag(store, &format!("{service}:{number}"), image)
-}
-
-fn tag_current(store: &Store, service: &str, image: &str) -> Result<(), Error> {
-    set_tag(store, service, image)
-}
-
-fn set_tag(store: &Store, name: &str, image: &str) -> Result<(), Error> {
-    let digest = image.parse().map_err(|_| Error::UnknownImage {
-        what: image.to_owned(),
-    })?;
-    match store.tag(name, &digest) {
-        Err(error @ image::Error::UnknownImage { .. }) => {
-            tracing::error!("{name} cannot be served: {error}");
-            Ok(())
-        }
-        outcome => Ok(outcome?),
     }
 }
 

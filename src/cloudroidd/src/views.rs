@@ -1,5 +1,7 @@
 //! The daemon's records as the API shows them.
 
+use std::sync::Arc;
+
 use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
 use package::interface as recorded;
 
@@ -8,7 +10,7 @@ use crate::portal::App;
 use crate::state::{RevisionRecord, State};
 
 /// The current revision of a service that exists.
-pub fn current(state: &State, name: &str) -> Result<RevisionRecord, Error> {
+pub fn current(state: &State, name: &str) -> Result<Arc<RevisionRecord>, Error> {
     match state.current(name)? {
         Some(revision) => Ok(revision),
         None => Err(Error::UnknownService {

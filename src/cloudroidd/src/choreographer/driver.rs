@@ -1,22 +1,17 @@
 //! The task of one servant: from asked for to gone. It alone changes the servant's state.
 
-use std::collections::HashMap;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
 use api::Phase;
-use futures_util::StreamExt;
-use futures_util::future::BoxFuture;
-use futures_util::stream::FuturesUnordered;
 use package::interface::Interface;
-use servant::engine::{ContainerState, NodeEvent, NodeExit, Servant};
-use servant::spec::{NodeSpec, Profile, Spec};
-use tokio::sync::broadcast::error::RecvError;
+use servant::engine::{ContainerState, Servant};
+use servant::spec::{Profile, Spec};
 use tokio::time::{Instant, timeout_at};
 
 use super::handle::{Failure, Handle};
-use super::restart::Backoff;
+use super::nodes::Nodes;
 use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
 use crate::definitions;
@@ -77,7 +72,7 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, beginning: Beg
             (Phase::Failed, format!("the servant {reason}"))
         }
     };
-    if let Some(works) = handle.works() {
+    if let Some(works) = handle.take_works() {
         works.bridge.close(&ended);
     }
     if let Some(container) = handle.container()
@@ -357,236 +352,5 @@ fn with_log(failure: Failure, handle: &Handle) -> Failure {
             Failure::Broken { reason, log }
         }
         (failure, _) => failure,
-    }
-}
-
-type Ended<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
-
-/// The servant's nodes: who ended, and who is started again. A node that asked for `respawn` is the engine's.
-struct Nodes<'a> {
-    inner: &'a Inner,
-    handle: &'a Handle,
-    container: &'a Arc<dyn Servant>,
-    running: FuturesUnordered<Ended<'a>>,
-    pausing: FuturesUnordered<BoxFuture<'a, NodeSpec>>,
-    backoffs: HashMap<String, Backoff>,
-    events: tokio::sync::broadcast::Receiver<NodeEvent>,
-    /// Nodes that still run or will run again.
-    alive: usize,
-}
-
-impl<'a> Nodes<'a> {
-    fn new(inner: &'a Inner, handle: &'a Handle, container: &'a Arc<dyn Servant>) -> Nodes<'a> {
-        let nodes = Nodes {
-            inner,
-            handle,
-            container,
-            running: FuturesUnordered::new(),
-            pausing: FuturesUnordered::new(),
-            backoffs: HashMap::new(),
-            events: container.events(),
-            alive: handle.revision.plan.nodes.len(),
-        };
-        for node in handle
-            .revision
-            .plan
-            .nodes
-            .iter()
-            .filter(|node| !node.respawn)
-        {
-            nodes.watch(node.clone());
-        }
-        nodes
-    }
-
-    fn watch(&self, node: NodeSpec) {
-        let container = self.container;
-        let began = Instant::now();
-        self.running.push(Box::pin(async move {
-            let exit = container.wait_node(&node.name).await;
-            (node, began, exit)
-        }));
-    }
-
-    /// Comes back when the servant has lost a node that it cannot do without.
-    async fn supervise(&mut self) -> Failure {
-        loop {
-            tokio::select! {
-                Some((node, began, exit)) = self.running.next() => {
-                    if let Err(failure) = self.ended(node, began, exit) {
-                        return failure;
-                    }
-                }
-                Some(node) = self.pausing.next() => {
-                    if let Err(failure) = self.restart(node).await {
-                        return failure;
-                    }
-                }
-                event = self.events.recv() => match event {
-                    Ok(NodeEvent::Respawning { node }) => self.tell("node-respawned", &format!("{node} is started again")),
-                    Ok(_) | Err(RecvError::Lagged(_)) => {}
-                    Err(RecvError::Closed) => std::future::pending().await,
-                },
-            }
-        }
-    }
-
-    fn ended(
-        &mut self,
-        node: NodeSpec,
-        began: Instant,
-        exit: Result<NodeExit, servant::Error>,
-    ) -> Result<(), Failure> {
-        // The engine lost it: the container's own state says why.
-        let Ok(exit) = exit else { return Ok(()) };
-        let how = how_it_ended(&exit, &self.handle.limits);
-        if exit.out_of_memory {
-            // What it knew is lost, and it would do the same again: its robot is told and begins anew.
-            return Err(self.failure(&node, format!("lost {}: it {how}", node.name)));
-        }
-        let failed = exit.code != Some(0);
-        if failed && self.handle.life().phase < Phase::Ready {
-            return Err(self.failure(&node, format!("did not become ready: {} {how}", node.name)));
-        }
-        if failed && self.handle.revision.plan.restart {
-            let backoff = self.backoffs.entry(node.name.clone()).or_default();
-            let Some(pause) = backoff.failed(began.elapsed()) else {
-                return Err(self.failure(
-                    &node,
-                    format!("gave {} up: it {how}, again and again", node.name),
-                ));
-            };
-            self.tell(
-                "node-failed",
-                &format!(
-                    "{} {how}; it is started again in {} ms",
-                    node.name,
-                    pause.as_millis()
-                ),
-            );
-            self.pausing.push(Box::pin(async move {
-                tokio::time::sleep(pause).await;
-                node
-            }));
-            return Ok(());
-        }
-        self.alive -= 1;
-        if self.alive == 0 {
-            return Err(self.failure(&node, format!("has no node left: {} {how}", node.name)));
-        }
-        self.tell("node-ended", &format!("{} {how}", node.name));
-        Ok(())
-    }
-
-    async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
-        match self.container.start_node(node.clone()).await {
-            Ok(()) => {
-                self.watch(node);
-                Ok(())
-            }
-            Err(error) => Err(self.failure(
-                &node,
-                format!("could not start {} again: {error}", node.name),
-            )),
-        }
-    }
-
-    fn failure(&self, node: &NodeSpec, reason: String) -> Failure {
-        let lines = tail::read(&self.container.log_path(), LOG_LINES, Some(&node.name));
-        Failure::Broken {
-            reason,
-            log: lines.into_iter().map(|line| line.line).collect(),
-        }
-    }
-
-    fn tell(&self, kind: &str, message: &str) {
-        let about = NewEvent {
-            service: Some(self.handle.service()),
-            servant: Some(&self.handle.id),
-            robot: Some(&self.handle.robot),
-        };
-        self.inner.journal.warning(
-            kind,
-            &format!("servant {}: {message}", self.handle.id),
-            &about,
-        );
-    }
-}
-
-pub(crate) fn how_it_ended(exit: &NodeExit, limits: &api::Limits) -> String {
-    if let Some(error) = &exit.exec_error {
-        return format!("could not be executed: {error}");
-    }
-    if exit.out_of_memory {
-        let limit = limits
-            .memory
-            .map_or_else(|| "the limit".to_owned(), |memory| memory.to_string());
-        return format!(
-            "was killed because the servant needed more memory than its limit of {limit}"
-        );
-    }
-    match (exit.code, exit.signal) {
-        (Some(code), _) => format!("exited with status {code}"),
-        (None, Some(signal)) => match nix::sys::signal::Signal::try_from(signal) {
-            Ok(name) => format!("was killed by {name}"),
-            Err(_) => format!("was killed by signal {signal}"),
-        },
-        (None, None) => "ended".to_owned(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn exit() -> NodeExit {
-        NodeExit {
-            code: None,
-            signal: None,
-            out_of_memory: false,
-            exec_error: None,
-        }
-    }
-
-    #[test]
-    fn ends_are_told_in_words() {
-        let limits = api::Limits {
-            memory: Some(api::Size(128 << 20)),
-            ..api::Limits::default()
-        };
-        let cases = [
-            (
-                NodeExit {
-                    code: Some(3),
-                    ..exit()
-                },
-                "exited with status 3",
-            ),
-            (
-                NodeExit {
-                    signal: Some(11),
-                    ..exit()
-                },
-                "was killed by SIGSEGV",
-            ),
-            (
-                NodeExit {
-                    signal: Some(9),
-                    out_of_memory: true,
-                    ..exit()
-                },
-                "was killed because the servant needed more memory than its limit of 128M",
-            ),
-            (
-                NodeExit {
-                    exec_error: Some("no such file".into()),
-                    ..exit()
-                },
-                "could not be executed: no such file",
-            ),
-        ];
-        for (exit, words) in cases {
-            assert_eq!(how_it_ended(&exit, &limits), words);
-        }
     }
 }

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use api::{Limits, Millis, Phase};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -83,7 +84,7 @@ pub struct Handle {
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
-    works: OnceLock<Arc<Works>>,
+    works: Mutex<Option<Arc<Works>>>,
 }
 
 impl Handle {
@@ -113,7 +114,7 @@ impl Handle {
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
             container: OnceLock::new(),
-            works: OnceLock::new(),
+            works: Mutex::default(),
         }
     }
 
@@ -144,7 +145,7 @@ impl Handle {
 
     /// Its ROS and its bridge, once reached.
     pub fn works(&self) -> Option<Arc<Works>> {
-        self.works.get().cloned()
+        self.works.lock().clone()
     }
 
     /// When it is ended if nobody connects before.
@@ -196,7 +197,12 @@ impl Handle {
     }
 
     pub(super) fn set_works(&self, works: Arc<Works>) {
-        let _ = self.works.set(works);
+        *self.works.lock() = Some(works);
+    }
+
+    /// Nobody reaches its ROS from here on; gives what was there.
+    pub(super) fn take_works(&self) -> Option<Arc<Works>> {
+        self.works.lock().take()
     }
 
     pub(super) fn set_idle_until(&self, until: Option<Millis>) {

@@ -87,7 +87,7 @@ pub async fn interface(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> Answer<package::interface::Interface> {
-    Ok(Json(views::current(&app.state, &name)?.interface))
+    Ok(Json(views::current(&app.state, &name)?.interface.clone()))
 }
 
 /// Removes a service, its servants and its images.

@@ -56,7 +56,7 @@ pub async fn manifest(
     let revisions = app.state.revisions(&name)?;
     let current = app.state.current(&name)?;
     let image = match reference.as_str() {
-        "latest" => current.map(|revision| revision.image),
+        "latest" => current.map(|revision| revision.image.clone()),
         _ => revisions
             .into_iter()
             .find(|revision| {

@@ -18,7 +18,7 @@ use super::guard::{self, Caller, Peer};
 use super::{App, auth, page};
 use crate::choreographer::Lease;
 use crate::errors::Error;
-use crate::names;
+use crate::{names, tokens};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
@@ -124,7 +124,7 @@ async fn connect(
 ) -> Result<Response, Error> {
     let accept = handshake(&request)?;
     let asked = Asked::read(&app, service, request.uri())?;
-    if app.state.current(&asked.service)?.is_none() {
+    if app.state.service_package(&asked.service)?.is_none() {
         return Err(Error::UnknownService {
             exists: app.state.service_names()?,
             name: asked.service,
@@ -190,14 +190,22 @@ fn handshake(request: &Request) -> Result<HeaderValue, Error> {
 /// The right to the servant that is asked for, if the robot's name is the caller's.
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     let Some(robot) = &asked.robot else {
-        let robot = format!("anonymous-{}", names::random(6));
-        return app.choreographer.ensure(&asked.service, &robot, true);
+        let (robot, anonymous) = nameless(asked.resume.as_deref());
+        return app.choreographer.ensure(&asked.service, &robot, anonymous);
     };
     let owner = app.state.robot_owner(robot, caller.token.as_ref())?;
     if owner.is_some() && owner != caller.token {
         return Err(Error::RobotTaken(robot.clone()));
     }
     app.choreographer.ensure(&asked.service, robot, false)
+}
+
+/// A name for a robot that gave none (one that no robot can give, so nobody takes it over), and whether nobody can come back under it: who holds the resume token can.
+fn nameless(resume: Option<&str>) -> (String, bool) {
+    match resume {
+        Some(token) => (format!("~{}", &tokens::hash(token)[..12]), false),
+        None => (format!("~{}", names::random(6)), true),
+    }
 }
 
 async fn upgraded_to(
@@ -344,6 +352,17 @@ mod tests {
         assert_eq!(
             handshake(&request(&GOOD)).expect("good"),
             "s3pPLMBiTxaQ9kYGzzhZRbK+xOo="
+        );
+    }
+
+    #[test]
+    fn who_holds_the_resume_token_comes_back_to_the_same_servant() {
+        assert_eq!(nameless(Some("secret")), nameless(Some("secret")));
+        assert_ne!(nameless(Some("secret")), nameless(Some("other")));
+        assert_ne!(nameless(None).0, nameless(None).0);
+        assert!(
+            names::robot(&nameless(Some("secret")).0).is_err(),
+            "no robot can claim it"
         );
     }
 

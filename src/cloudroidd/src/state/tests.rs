@@ -1,3 +1,5 @@
+use api::Level;
+
 use super::*;
 
 fn revision(service: &str, image: &str) -> RevisionRecord {
@@ -49,7 +51,7 @@ fn a_published_revision_is_read_back_after_a_restart() {
         .expect("readable")
         .expect("there");
     assert_eq!(
-        current,
+        *current,
         RevisionRecord {
             number: 2,
             ..second

@@ -1,0 +1,97 @@
+//! Who is who while servants live: robots' names and their owners, servants and their robots.
+
+use api::Millis;
+use rusqlite::params;
+
+use super::{State, StateError, now};
+use crate::tokens::TokenHash;
+
+/// Whose a servant is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServantRecord {
+    /// Its id.
+    pub id: String,
+    /// Its service.
+    pub service: String,
+    /// The revision it was started from.
+    pub revision: u64,
+    /// Its robot.
+    pub robot: String,
+    /// The robot named no name.
+    pub anonymous: bool,
+    /// When it was asked for.
+    pub created: Millis,
+}
+
+impl State {
+    /// Binds `robot` to `owner` when it is new; then says to whom it is bound.
+    pub fn robot_owner(
+        &self,
+        robot: &str,
+        owner: Option<&TokenHash>,
+    ) -> Result<Option<TokenHash>, StateError> {
+        self.run(|connection| {
+            connection.query_row(
+                "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
+                 ON CONFLICT (name) DO UPDATE SET last_seen = ?3 RETURNING owner",
+                params![robot, owner, now() as i64],
+                |row| row.get(0),
+            )
+        })
+    }
+
+    /// Forgets robots bound to tokens that are not in `tokens` any more, so that their names can be used again.
+    pub fn release_robots(&self, tokens: &[TokenHash]) -> Result<usize, StateError> {
+        let kept = serde_json::Value::from(tokens).to_string();
+        self.run(|connection| {
+            connection.execute(
+                "DELETE FROM robots WHERE owner IS NOT NULL AND owner NOT IN (SELECT value FROM json_each(?1))",
+                [kept],
+            )
+        })
+    }
+
+    /// Remembers whose a servant is.
+    pub fn add_servant(&self, servant: &ServantRecord) -> Result<(), StateError> {
+        self.run(|connection| {
+            connection.execute(
+                "INSERT OR REPLACE INTO servants (id, service, revision, robot, anonymous, created)
+                 VALUES (?1, ?2, ?3, ?4, ?5, ?6)",
+                params![
+                    servant.id,
+                    servant.service,
+                    servant.revision,
+                    servant.robot,
+                    servant.anonymous,
+                    servant.created as i64
+                ],
+            )
+        })
+        .map(|_| ())
+    }
+
+    /// Forgets a servant that has ended.
+    pub fn remove_servant(&self, id: &str) -> Result<(), StateError> {
+        self.run(|connection| connection.execute("DELETE FROM servants WHERE id = ?1", [id]))
+            .map(|_| ())
+    }
+
+    /// All servants that an earlier daemon may have left.
+    pub fn servants(&self) -> Result<Vec<ServantRecord>, StateError> {
+        self.run(|connection| {
+            connection
+                .prepare_cached("SELECT id, service, revision, robot, anonymous, created FROM servants ORDER BY created")?
+                .query_map([], |row| {
+                    Ok(ServantRecord {
+                        id: row.get(0)?,
+                        service: row.get(1)?,
+                        revision: row.get(2)?,
+                        robot: row.get(3)?,
+                        anonymous: row.get(4)?,
+                        created: row.get::<_, i64>(5)? as Millis,
+                    })
+                })?
+                .collect()
+        })
+    }
+}
