@@ -245,13 +245,24 @@ impl Apt {
                     .map(|deb| format!("{}={}", deb.name, deb.version)),
             );
             let mut done = 0;
-            process::run(download, "apt", |stream, line| {
+            let result = process::run(download, "apt", |stream, line| {
                 if stream == Stream::Out && line.starts_with("Get:") {
                     done += 1;
                     progress.count("packages", done, Some(total));
                 }
             })
-            .await?;
+            .await;
+            match result {
+                Ok(()) => {}
+                Err(Error::Program { last_lines, .. }) => {
+                    // Most often the mirror has newer versions by now: the next push asks it.
+                    let _ = fs::remove_file(self.root.join("updated"));
+                    return Err(Error::Download {
+                        words: apts_words(&last_lines),
+                    });
+                }
+                Err(error) => return Err(error),
+            }
             for deb in missing {
                 let from = partial.path().join(deb.file_name());
                 fs::rename(&from, archives.join(deb.file_name())).at("keeping", &from)?;
@@ -368,15 +379,20 @@ fn parse_stanza(stanza: &str) -> Option<Deb> {
     })
 }
 
-/// The part of apt's refusal that says why.
+/// The part of apt's refusal that says why: its errors, and the table of what does not fit together.
 fn apts_words(lines: &str) -> String {
-    let words: Vec<&str> = lines
-        .lines()
-        .skip_while(|line| {
-            !line.starts_with("E:") && !line.starts_with("The following packages have unmet")
-        })
-        .map(str::trim)
-        .collect();
+    let mut table = false;
+    let mut words = Vec::new();
+    for line in lines.lines() {
+        if line.starts_with("The following packages have unmet") {
+            table = true;
+        } else if !line.starts_with(' ') {
+            table = false;
+        }
+        if table || line.starts_with("E:") {
+            words.push(line.trim());
+        }
+    }
     if words.is_empty() {
         lines.to_owned()
     } else {

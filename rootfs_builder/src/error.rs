@@ -50,6 +50,14 @@ pub enum Error {
         /// apt's own words.
         words: String,
     },
+    /// Packages that the mirror would not give.
+    #[error(
+        "packages could not be downloaded: {words}; push again: the package lists will be fetched anew first"
+    )]
+    Download {
+        /// apt's own words.
+        words: String,
+    },
     /// Names that nothing provides.
     #[error("{}", unresolved_text(.0))]
     Unresolved(Vec<Unresolved>),

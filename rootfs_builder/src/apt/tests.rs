@@ -28,8 +28,16 @@ fn epochs_are_escaped_in_file_names() {
 
 #[test]
 fn the_reason_is_taken_from_apts_refusal() {
-    let lines = "Reading package lists...\nBuilding dependency tree...\nE: Unable to locate package nonesuch";
+    let lines = "Reading package lists...\nE: Unable to locate package nonesuch\nBuilding dependency tree...";
     assert_eq!(apts_words(lines), "E: Unable to locate package nonesuch");
+    let lines = "Some packages could not be installed.\n\nThe following packages have unmet dependencies:\n \
+                 a : Depends: b but it is not installable\nE: Unable to correct problems";
+    assert_eq!(
+        apts_words(lines),
+        "The following packages have unmet dependencies:; a : Depends: b but it is not installable; \
+         E: Unable to correct problems"
+    );
+    assert_eq!(apts_words("something else"), "something else");
 }
 
 #[test]
@@ -46,4 +54,75 @@ fn the_state_directory_is_its_own() {
         "{conf}"
     );
     assert!(conf.contains("sources.list"), "{conf}");
+}
+
+fn progress() -> Progress {
+    // Nobody listens.
+    Progress::new(tokio::sync::mpsc::channel(1).0)
+}
+
+#[tokio::test]
+async fn what_the_archive_does_not_have_is_said_in_apts_words() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = Apt::open(root.path(), "").expect("prepared");
+    let names = BTreeSet::from(["nonesuch".to_owned()]);
+    let error = apt
+        .resolve(None, &names)
+        .await
+        .expect_err("an empty archive")
+        .to_string();
+    assert_eq!(
+        error,
+        "apt cannot install nonesuch: E: Unable to locate package nonesuch"
+    );
+    assert_eq!(
+        apt.resolve(None, &BTreeSet::new())
+            .await
+            .expect("nothing asked"),
+        []
+    );
+}
+
+#[tokio::test]
+async fn after_a_failed_download_the_lists_count_as_old() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = Apt::open(root.path(), "").expect("prepared");
+    fs::write(root.path().join("updated"), "").expect("written");
+    assert!(apt.is_fresh());
+    let deb = Deb {
+        name: "nonesuch".into(),
+        version: "1".into(),
+        architecture: "all".into(),
+    };
+    let error = apt
+        .download(&[deb], &progress())
+        .await
+        .expect_err("an empty archive")
+        .to_string();
+    assert!(
+        error.contains("Unable to locate package nonesuch") && error.contains("push again"),
+        "{error}"
+    );
+    assert!(!apt.is_fresh());
+    let left = fs::read_dir(root.path().join("archives"))
+        .expect("there")
+        .count();
+    assert_eq!(left, 0, "nothing half-made is left");
+}
+
+#[tokio::test]
+async fn packages_in_the_cache_are_not_fetched_again() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = Apt::open(root.path(), "").expect("prepared");
+    let file = root.path().join("archives/x_1_all.deb");
+    fs::write(&file, "").expect("written");
+    let deb = Deb {
+        name: "x".into(),
+        version: "1".into(),
+        architecture: "all".into(),
+    };
+    assert_eq!(
+        apt.download(&[deb], &progress()).await.expect("there"),
+        [file]
+    );
 }
