@@ -1,0 +1,53 @@
+//! A cache of this bench's own that begins with what the user's holds.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+
+/// Fills `place/cache` with the user's cached layers, notes and lists, and gives its path for `XDG_CACHE_HOME`.
+pub(crate) fn copy(place: &Path) -> Result<PathBuf> {
+    let variable = |name| {
+        std::env::var_os(name)
+            .filter(|value| !value.is_empty())
+            .map(PathBuf::from)
+    };
+    let users =
+        variable("XDG_CACHE_HOME").or_else(|| variable("HOME").map(|home| home.join(".cache")));
+    let users = users
+        .context("neither XDG_CACHE_HOME nor HOME is set")?
+        .join("cloudroid");
+    let cache = place.join("cache");
+    for part in ["layers", "notes", "apt"] {
+        fill(&users.join(part), &cache.join("cloudroid").join(part))?;
+    }
+    Ok(cache)
+}
+
+/// Copies what is below `from`, where there is anything; layers and packages, which are replaced and never written to, by
+/// a link.
+fn fill(from: &Path, to: &Path) -> Result<()> {
+    let Ok(entries) = fs::read_dir(from) else {
+        return Ok(());
+    };
+    fs::create_dir_all(to)?;
+    for entry in entries {
+        let entry = entry?;
+        let (source, target) = (entry.path(), to.join(entry.file_name()));
+        let kind = entry.file_type()?;
+        if kind.is_dir() {
+            fill(&source, &target)?;
+            continue;
+        }
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let whole = [".tar.gz", ".deb"]
+            .iter()
+            .any(|ending| name.ends_with(ending));
+        // A link fails on another filesystem; a copy may fail because another daemon has tidied up meanwhile.
+        let linked = whole && fs::hard_link(&source, &target).is_ok();
+        if kind.is_file() && !linked && source.exists() {
+            fs::copy(&source, &target).with_context(|| format!("copying {}", source.display()))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,94 @@
+//! A push as a deployer sees it: `cloudroidctl push`, its events, and when they came.
+
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use serde_json::Value;
+
+use crate::Daemon;
+
+/// What a push came to.
+#[derive(Debug)]
+pub struct Pushed {
+    /// Each event of the answer (`api::PushEvent`), and how long after the command was typed it came.
+    pub events: Vec<(Duration, Value)>,
+    /// From the command to its end.
+    pub total: Duration,
+}
+
+impl Daemon {
+    /// Types `cloudroidctl push ARGUMENTS` and waits for its end.
+    pub fn push(&self, arguments: &[&str]) -> Result<Pushed> {
+        let mut command = self.ctl()?;
+        command.args(["--format", "json", "push"]).args(arguments);
+        let begun = Instant::now();
+        let mut child = command
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()?;
+        let mut events = Vec::new();
+        for line in BufReader::new(child.stdout.take().context("piped")?).lines() {
+            let event: Value = serde_json::from_str(&line?)?;
+            if event["type"] == "error" {
+                let _ = child.wait();
+                bail!(
+                    "the push of {} failed: {}",
+                    arguments.join(" "),
+                    event["problem"]
+                );
+            }
+            events.push((begun.elapsed(), event));
+        }
+        let status = child.wait()?;
+        let total = begun.elapsed();
+        ensure!(
+            status.success(),
+            "the push of {} ended with {status}",
+            arguments.join(" ")
+        );
+        Ok(Pushed { events, total })
+    }
+}
+
+impl Pushed {
+    /// Its last event.
+    pub fn done(&self) -> Result<&Value> {
+        let done = self
+            .events
+            .iter()
+            .map(|(_, event)| event)
+            .find(|event| event["type"] == "done");
+        done.context("a push that succeeded ends with done")
+    }
+
+    /// Names of the layers that were made anew.
+    pub fn layers_made(&self) -> Result<Vec<String>> {
+        let layers = self.done()?["layers"]
+            .as_array()
+            .context("done names the layers")?;
+        ensure!(!layers.is_empty(), "an image has layers");
+        let made = layers.iter().filter(|layer| layer["cached"] != true);
+        Ok(made
+            .map(|layer| layer["name"].as_str().unwrap_or_default().to_owned())
+            .collect())
+    }
+
+    /// How long the steps took whose titles begin like this: each lasts until the next, or to the end.
+    pub fn step(&self, title: &str) -> Option<Duration> {
+        let ends = |event: &Value| event["type"] == "step" || event["type"] == "done";
+        let marks: Vec<_> = self
+            .events
+            .iter()
+            .filter(|(_, event)| ends(event))
+            .collect();
+        let spans = marks.windows(2).filter(|pair| {
+            pair[0].1["title"]
+                .as_str()
+                .is_some_and(|found| found.starts_with(title))
+        });
+        let spans: Vec<Duration> = spans.map(|pair| pair[1].0 - pair[0].0).collect();
+        (!spans.is_empty()).then(|| spans.iter().sum())
+    }
+}
