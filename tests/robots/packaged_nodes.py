@@ -81,7 +81,7 @@ def ask(address, service, inputs, output, output_type, messages):
                 continue
         sys.exit(f"{service}: no answer on {output} within {PATIENCE:.0f} s")
     finally:
-        client.terminate()
+        client.close()  # not terminate: the other services share the reactor
 
 
 def check(name, condition, seen):

@@ -76,19 +76,13 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Told {
         heard["text"] == "hello Ada",
         "the remapping arrived: {heard}"
     );
+    // What roslaunch refuses is refused in its own words.
     deployer
         .pushes(
             "greeter_cpp",
-            &[
-                "--name",
-                "launched",
-                "--launch",
-                "two.launch",
-                "--arg",
-                "no_such:=1",
-            ],
+            &["--name", "unlaunched", "--launch", "needy.launch"],
         )?
-        .failed_saying(&["no_such"])?;
+        .failed_saying(&["requires the 'who' arg to be set"])?;
     Ok(())
 }
 
@@ -213,18 +207,35 @@ pub fn an_unchanged_push_builds_no_layer() -> Told {
 }
 
 pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
-    let daemon = world().with(ADDER)?;
-    let deployer = daemon.deployer();
-    deployer
-        .pushes("adder_py", &["--name", "steady", "--node", "adder.py"])?
-        .succeeded()?;
-    deployer
-        .pushes("broken_cpp", &["--name", "steady", "--node", "broken"])?
-        .failed_saying(&["no_such_function", "broken.cpp:2"])?;
-    let answer = daemon
-        .robot("steady")?
-        .calls("/add_two", json!({"a": 1, "b": 1}))?;
-    ensure!(answer["values"]["sum"] == 2, "{answer}");
+    let daemon = world().with(GREETER)?;
+    let place = tempfile::tempdir()?;
+    run(Command::new("cp")
+        .arg("-r")
+        .arg(binaries::package("greeter_cpp"))
+        .arg(place.path()))?
+    .succeeded()?;
+    let package = place.path().join("greeter_cpp");
+    let push = [
+        "push",
+        path_str(&package),
+        "--name",
+        "steady",
+        "--node",
+        "greeter",
+    ];
+    daemon.deployer().types(&push)?.succeeded()?;
+    let source = package.join("src/greeter.cpp");
+    let text = std::fs::read_to_string(&source)?;
+    std::fs::write(
+        &source,
+        text.replace("ros::spin()", "ros::no_such_function()"),
+    )?;
+    daemon
+        .deployer()
+        .types(&push)?
+        .failed_saying(&["no_such_function", "greeter.cpp:4"])?;
+    let answer = daemon.robot("steady")?.calls("/greeter/count", json!({}))?;
+    ensure!(answer["result"] == true, "{answer}");
     ensure!(daemon.get_json("/api/v1/services/steady")?["revision"] == 1);
     Ok(())
 }

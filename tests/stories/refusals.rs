@@ -50,7 +50,7 @@ pub fn malformed_xml() -> Told {
     daemon
         .deployer()
         .types(&["push", path_str(&package)])?
-        .failed_saying(&["package.xml", "4:"])?;
+        .failed_saying(&["package.xml", "line 4"])?;
     nothing_half_made(&daemon, "torn")
 }
 
@@ -80,6 +80,9 @@ fn archive_with(entry: impl Fn(&mut tar::Builder<Vec<u8>>)) -> anyhow::Result<Ve
     let mut header = tar::Header::new_gnu();
     header.set_size(manifest.len() as u64);
     header.set_mode(0o644);
+    header.set_uid(0);
+    header.set_gid(0);
+    header.set_mtime(0);
     header.set_cksum();
     builder.append_data(&mut header, "package.xml", &manifest[..])?;
     entry(&mut builder);
@@ -93,6 +96,9 @@ fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, li
     bytes[157..157 + link.len()].copy_from_slice(link.as_bytes());
     header.set_entry_type(kind);
     header.set_mode(0o644);
+    header.set_uid(0);
+    header.set_gid(0);
+    header.set_mtime(0);
     header.set_size(0);
     header.set_cksum();
     builder

@@ -1,2 +1,0 @@
-#include <ros/ros.h>
-int main() { return ros::no_such_function(); }
