@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
-use ros::bus::{Bus, Graph, SubscribeOptions, Subscription};
+use ros::bus::{Bus, Graph, SubscribeOptions, Subscription, TopicNodes};
 use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
@@ -312,7 +312,8 @@ async fn still(
     }
 }
 
-/// Whether some node that must be there has registered nothing but what every node has.
+/// Whether nobody has registered anything yet but what every node has. (Of several nodes some may never show
+/// anything, such as those that load nodelets into others.)
 fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
     const SERVICES: [&str; 5] = [
         "get_loggers",
@@ -321,24 +322,23 @@ fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
         "unload_nodelet",
         "list",
     ];
-    options.nodes.iter().any(|node| {
-        let topics = graph.topics.iter().any(|(name, topic)| {
-            !is_plumbing(name)
-                && (topic.publishers.contains(node) || topic.subscribers.contains(node))
-        });
-        let services = graph.services.iter().any(|(name, server)| {
-            server == node
-                && !name
-                    .rsplit('/')
-                    .next()
-                    .is_some_and(|last| SERVICES.contains(&last))
-        });
-        !topics && !services
-    })
+    let own = |node: &String| *node == options.own_name;
+    let topics = graph.topics.iter().any(|(name, topic)| {
+        let mut ends = topic.publishers.iter().chain(&topic.subscribers);
+        !is_plumbing(name, topic) && ends.any(|node| !own(node))
+    });
+    let services = graph.services.iter().any(|(name, server)| {
+        !own(server)
+            && name
+                .rsplit('/')
+                .next()
+                .is_some_and(|last| !SERVICES.contains(&last))
+    });
+    !topics && !services
 }
 
 type Shape = (
-    BTreeMap<String, ros::bus::TopicNodes>,
+    BTreeMap<String, TopicNodes>,
     BTreeMap<String, String>,
     BTreeSet<String>,
     usize,
@@ -354,9 +354,10 @@ fn shape(graph: &Graph) -> Shape {
     )
 }
 
-/// ROS's own plumbing, which every node has and no robot asks for.
-fn is_plumbing(topic: &str) -> bool {
-    matches!(topic, "/rosout" | "/rosout_agg" | "/statistics" | "/clock")
+/// ROS's own plumbing, which no robot asks for: logs, statistics, simulated time, the life lines of nodelets.
+fn is_plumbing(name: &str, topic: &TopicNodes) -> bool {
+    matches!(name, "/rosout" | "/rosout_agg" | "/statistics" | "/clock")
+        || topic.type_name == "bond/Status"
 }
 
 /// Topics that the package publishes.
@@ -373,11 +374,11 @@ fn inputs(graph: &Graph, own: &str) -> BTreeSet<String> {
     })
 }
 
-fn ends(graph: &Graph, pick: impl Fn(&ros::bus::TopicNodes) -> bool) -> BTreeSet<String> {
+fn ends(graph: &Graph, pick: impl Fn(&TopicNodes) -> bool) -> BTreeSet<String> {
     let topics = graph
         .topics
         .iter()
-        .filter(|(name, topic)| !is_plumbing(name) && pick(topic));
+        .filter(|(name, topic)| !is_plumbing(name, topic) && pick(topic));
     topics.map(|(name, _)| name.clone()).collect()
 }
 
