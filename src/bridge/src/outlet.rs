@@ -34,11 +34,29 @@ pub(crate) struct Outlet {
 }
 
 enum State {
-    /// Not yet advertised, or no subscriber has connected yet: messages wait a moment, since clients publish
-    /// right behind their `advertise`.
-    Warming { waiting: VecDeque<Bytes>, bytes: usize },
-    Live(Box<dyn Publisher>),
+    /// Not yet advertised, or a node that the Master names as subscriber has not connected yet: messages wait a
+    /// moment, since clients publish right behind their `advertise`, or as soon as rosapi names a subscriber.
+    Warming {
+        waiting: VecDeque<Bytes>,
+        bytes: usize,
+        publisher: Option<Box<dyn Publisher>>,
+    },
+    Live {
+        publisher: Box<dyn Publisher>,
+        /// The graph in which waiting has ended: whoever had not connected by then is not waited for again.
+        settled: u64,
+    },
     Failed,
+}
+
+impl State {
+    fn warming(publisher: Option<Box<dyn Publisher>>) -> State {
+        State::Warming {
+            waiting: VecDeque::new(),
+            bytes: 0,
+            publisher,
+        }
+    }
 }
 
 impl Outlet {
@@ -65,16 +83,20 @@ impl Outlet {
             shared: shared.clone(),
             last: Mutex::default(),
             connected: watch::Sender::default(),
-            state: Mutex::new(State::Warming { waiting: VecDeque::new(), bytes: 0 }),
+            state: Mutex::new(State::warming(None)),
         });
         shared.add_outlet(&outlet);
-        let options = AdvertiseOptions { wire_type, latch, queue };
+        let options = AdvertiseOptions {
+            wire_type,
+            latch,
+            queue,
+        };
         // Holds the outlet until what was published at once has been sent, even if the client is gone by then.
         tokio::spawn(warm_up(outlet.clone(), options, failed));
         outlet
     }
 
-    pub(crate) fn publish(&self, bytes: Bytes) {
+    pub(crate) fn publish(self: &Arc<Self>, bytes: Bytes) {
         self.shared.metrics.published.add(1);
         if self.latch {
             *self.last.lock() = Some(bytes.clone());
@@ -82,14 +104,33 @@ impl Outlet {
         if let Some(hub) = self.shared.live_hub(&self.topic) {
             hub.deliver(self.message(bytes.clone()), true);
         }
-        match &mut *self.state.lock() {
-            State::Live(publisher) => publisher.publish(bytes),
+        let mut state = self.state.lock();
+        if let State::Live { publisher, settled } = &*state
+            && *publisher.subscribers().borrow() < self.expected(*settled)
+        {
+            let subscribers = publisher.subscribers();
+            if let State::Live { publisher, .. } =
+                std::mem::replace(&mut *state, State::warming(None))
+            {
+                *state = State::warming(Some(publisher));
+            }
+            let deadline = Instant::now() + self.shared.options.warm_up;
+            tokio::spawn(settle(self.clone(), subscribers, deadline));
+        }
+        match &mut *state {
+            State::Live { publisher, .. } => publisher.publish(bytes),
             State::Failed => {}
-            State::Warming { waiting, bytes: held } => {
+            State::Warming {
+                waiting,
+                bytes: held,
+                ..
+            } => {
                 *held += bytes.len();
                 waiting.push_back(bytes);
                 while waiting.len() > WARM_MESSAGES || (*held > WARM_BYTES && waiting.len() > 1) {
-                    let Some(lost) = waiting.pop_front() else { break };
+                    let Some(lost) = waiting.pop_front() else {
+                        break;
+                    };
                     *held -= lost.len();
                     self.shared.metrics.dropped.add(1);
                     self.shared.metrics.dropped_bytes.add(lost.len() as u64);
@@ -115,17 +156,46 @@ impl Outlet {
     }
 
     fn message(&self, bytes: Bytes) -> Message {
-        Message { bytes, wire_type: self.wire_type.clone(), publisher: self.name.clone(), latching: self.latch }
+        Message {
+            bytes,
+            wire_type: self.wire_type.clone(),
+            publisher: self.name.clone(),
+            latching: self.latch,
+        }
     }
 
-    fn go(&self, next: State) {
-        let mut state = self.state.lock();
-        if let (State::Warming { waiting, .. }, State::Live(publisher)) = (&mut *state, &next) {
-            for bytes in waiting.drain(..) {
-                publisher.publish(bytes);
-            }
+    /// How many nodes should be connected, or none if the graph is still the one of generation `settled`. The
+    /// bridge itself may be among those that the Master names, but never connects.
+    fn expected(&self, settled: u64) -> usize {
+        let graph = self.shared.bus.graph();
+        let graph = graph.borrow();
+        if graph.generation == settled {
+            return 0;
         }
-        *state = next;
+        let named = graph
+            .topics
+            .get(&self.topic)
+            .map_or(0, |nodes| nodes.subscribers.len());
+        named.saturating_sub(usize::from(self.shared.live_hub(&self.topic).is_some()))
+    }
+
+    /// Sends what waits, in order, and from now on at once.
+    fn go_live(&self) {
+        let settled = self.shared.bus.graph().borrow().generation;
+        let mut state = self.state.lock();
+        let State::Warming {
+            waiting, publisher, ..
+        } = &mut *state
+        else {
+            return;
+        };
+        let Some(publisher) = publisher.take() else {
+            return;
+        };
+        for bytes in waiting.drain(..) {
+            publisher.publish(bytes);
+        }
+        *state = State::Live { publisher, settled };
     }
 }
 
@@ -135,44 +205,56 @@ impl Drop for Outlet {
     }
 }
 
-async fn warm_up(outlet: Arc<Outlet>, options: AdvertiseOptions, failed: impl FnOnce(String) + Send) {
+async fn warm_up(
+    outlet: Arc<Outlet>,
+    options: AdvertiseOptions,
+    failed: impl FnOnce(String) + Send,
+) {
     let shared = outlet.shared.clone();
     let deadline = Instant::now() + shared.options.warm_up;
     let publisher = match shared.bus.advertise(&outlet.topic, options).await {
         Ok(publisher) => publisher,
         Err(error) => {
-            outlet.go(State::Failed);
+            *outlet.state.lock() = State::Failed;
             return failed(error.to_string());
         }
     };
-    let mut subscribers = publisher.subscribers();
-    // Nodes that the Master names as subscribers; the bridge itself may be among them, but never connects.
-    let expected = |shared: &Shared| {
-        let graph = shared.bus.graph();
-        let graph = graph.borrow();
-        let named = graph.topics.get(&outlet.topic).map_or(0, |nodes| nodes.subscribers.len());
-        named.saturating_sub(usize::from(shared.live_hub(&outlet.topic).is_some())).max(1)
-    };
+    let subscribers = publisher.subscribers();
+    if let State::Warming {
+        publisher: held, ..
+    } = &mut *outlet.state.lock()
+    {
+        *held = Some(publisher);
+    }
+    follow(Arc::downgrade(&outlet), subscribers.clone());
+    settle(outlet, subscribers, deadline).await;
+}
+
+/// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits.
+async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<usize>, deadline: Instant) {
     let connected = async {
-        while *subscribers.borrow_and_update() < expected(&shared) {
+        // No generation is that high: the graph as it is counts.
+        while *subscribers.borrow_and_update() < outlet.expected(u64::MAX).max(1) {
             if subscribers.changed().await.is_err() {
                 return;
             }
         }
     };
-    // Out of patience: whoever is connected gets what waits.
     let _ = timeout_at(deadline.into(), connected).await;
     outlet.connected.send_replace(*subscribers.borrow());
-    outlet.go(State::Live(publisher));
-    follow(Arc::downgrade(&outlet), subscribers);
+    outlet.go_live();
 }
 
 /// Tells those who wait for a first subscriber, for as long as the outlet lives.
 fn follow(outlet: Weak<Outlet>, mut subscribers: watch::Receiver<usize>) {
     tokio::spawn(async move {
         loop {
-            let Some(outlet) = outlet.upgrade() else { return };
-            outlet.connected.send_replace(*subscribers.borrow_and_update());
+            let Some(outlet) = outlet.upgrade() else {
+                return;
+            };
+            outlet
+                .connected
+                .send_replace(*subscribers.borrow_and_update());
             drop(outlet);
             // An error means that the publisher is gone, and the outlet with it.
             if subscribers.changed().await.is_err() {
