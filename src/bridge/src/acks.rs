@@ -32,7 +32,11 @@ impl Acks {
         if self.kept.len() >= MAX_KEPT {
             self.kept.pop_front();
         }
-        self.kept.push_back(Sent { control, at, ping: self.pings + 1 });
+        self.kept.push_back(Sent {
+            control,
+            at,
+            ping: self.pings + 1,
+        });
     }
 
     /// When a ping should follow what was sent.
@@ -57,7 +61,9 @@ impl Acks {
 
     /// What was never acknowledged.
     pub(crate) fn take(&mut self) -> impl DoubleEndedIterator<Item = Control> + use<> {
-        std::mem::take(&mut self.kept).into_iter().map(|sent| sent.control)
+        std::mem::take(&mut self.kept)
+            .into_iter()
+            .map(|sent| sent.control)
     }
 }
 
@@ -69,8 +75,15 @@ mod tests {
     use crate::sample::Frame;
 
     fn answer(name: &'static str) -> Control {
-        let frame = Frame { format: Format::Json, bytes: name.into() };
-        Control { frame, fragment_size: None, answer: true }
+        let frame = Frame {
+            format: Format::Json,
+            bytes: name.into(),
+        };
+        Control {
+            frame,
+            fragment_size: None,
+            answer: true,
+        }
     }
 
     #[test]

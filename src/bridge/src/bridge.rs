@@ -16,6 +16,7 @@ use crate::client::Client;
 use crate::hub::Hub;
 use crate::outbox::Goodbye;
 use crate::outlet::Outlet;
+use crate::presence::{self, Presence};
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
 use crate::session::Session;
@@ -65,6 +66,7 @@ pub(crate) struct Shared {
     pub(crate) metrics: Arc<Metrics>,
     pub(crate) service_types: ServiceTypes,
     pub(crate) registrations: Registrations,
+    presence: Presence,
     hubs: Mutex<HashMap<String, Weak<Hub>>>,
     /// What clients publish on, by topic.
     outlets: Mutex<HashMap<String, Vec<Weak<Outlet>>>>,
@@ -85,6 +87,7 @@ impl Bridge {
     /// A bridge between `bus` and the sockets that [`serve`](Self::serve) will be given. `registry` holds the
     /// definitions of the servant's types; types that publishers announce are added.
     pub fn new(bus: Arc<dyn Bus>, registry: Arc<Registry>, options: BridgeOptions) -> Arc<Self> {
+        presence::define(&registry);
         let shared = Shared {
             bus,
             registry,
@@ -92,13 +95,16 @@ impl Bridge {
             metrics: Arc::default(),
             service_types: ServiceTypes::default(),
             registrations: Registrations::default(),
+            presence: Presence::default(),
             hubs: Mutex::default(),
             outlets: Mutex::default(),
             clients: Mutex::default(),
             sessions: watch::Sender::default(),
             numbers: AtomicU64::new(1),
         };
-        Arc::new(Self { shared: Arc::new(shared) })
+        Arc::new(Self {
+            shared: Arc::new(shared),
+        })
     }
 
     /// Speaks rosbridge on `io`, a connection behind its WebSocket upgrade, until it ends.
@@ -116,13 +122,23 @@ impl Bridge {
         };
         shared.metrics.sessions.add(1);
         let limits = &shared.options;
-        let socket = WebSocket::new(io, &options.read_ahead, limits.max_frame, limits.max_message);
+        let socket = WebSocket::new(
+            io,
+            &options.read_ahead,
+            limits.max_frame,
+            limits.max_message,
+        );
         let number = client.outbox.attach();
         shared.sessions.send_modify(|count| count.connected += 1);
+        let present = shared.next_number();
+        shared.presence.enter(present, &client.name);
+        shared.tell_presence();
         tracing::debug!(client = %client.name, "session begins");
         let end = Session::new(socket, client.clone(), number).run().await;
         tracing::debug!(client = %client.name, ?end, "session ends");
         shared.sessions.send_modify(|count| count.connected -= 1);
+        shared.presence.leave(present);
+        shared.tell_presence();
         shared.leave(client, number, options.resume, &end);
         end
     }
@@ -134,11 +150,18 @@ impl Bridge {
             let mut clients = self.shared.clients.lock();
             clients.closed.get_or_insert_with(|| reason.to_owned());
             clients.resumable.clear();
-            clients.all.drain(..).filter_map(|client| client.upgrade()).collect()
+            clients
+                .all
+                .drain(..)
+                .filter_map(|client| client.upgrade())
+                .collect()
         };
         for client in clients {
             client.status(Level::Error, None, Format::Json, reason);
-            client.outbox.say_goodbye(Goodbye { code: 1012, reason: reason.to_owned() });
+            client.outbox.say_goodbye(Goodbye {
+                code: 1012,
+                reason: reason.to_owned(),
+            });
             client.end();
         }
     }
@@ -177,8 +200,16 @@ impl Shared {
     }
 
     /// A connection has ended: its client goes too, or waits for the next connection.
-    fn leave(self: &Arc<Self>, client: Arc<Client>, number: u64, token: Option<String>, end: &SessionEnd) {
-        let Some(token) = token else { return client.end() };
+    fn leave(
+        self: &Arc<Self>,
+        client: Arc<Client>,
+        number: u64,
+        token: Option<String>,
+        end: &SessionEnd,
+    ) {
+        let Some(token) = token else {
+            return client.end();
+        };
         if !client.outbox.is_attached(number) {
             // A newer connection has taken over.
             return;
@@ -204,7 +235,11 @@ impl Shared {
 
     fn forget_client(&self, client: &Arc<Client>, token: &str) {
         let mut clients = self.clients.lock();
-        if clients.resumable.get(token).is_some_and(|known| Arc::ptr_eq(known, client)) {
+        if clients
+            .resumable
+            .get(token)
+            .is_some_and(|known| Arc::ptr_eq(known, client))
+        {
             clients.resumable.remove(token);
         }
         drop(clients);
@@ -212,12 +247,26 @@ impl Shared {
     }
 
     /// The topic's hub; begun if it is not there.
-    pub(crate) fn hub(self: &Arc<Self>, topic: &str, message_type: Option<&MessageType>) -> Arc<Hub> {
+    pub(crate) fn hub(
+        self: &Arc<Self>,
+        topic: &str,
+        message_type: Option<&MessageType>,
+    ) -> Arc<Hub> {
         let mut hubs = self.hubs.lock();
         if let Some(hub) = hubs.get(topic).and_then(Weak::upgrade) {
             return hub;
         }
-        let hub = Hub::start(self, topic, message_type);
+        let own = presence::type_name(topic)
+            .filter(|_| !self.bus.graph().borrow().topics.contains_key(topic));
+        let own = own.and_then(|name| self.registry.message(name).ok());
+        let hub = match &own {
+            Some(own) => {
+                let hub = Hub::internal(self, topic);
+                hub.deliver(self.presence.message(topic, own), true);
+                hub
+            }
+            None => Hub::start(self, topic, message_type),
+        };
         let outlets = self.outlets_of(topic);
         for message in outlets.iter().filter_map(|outlet| outlet.latched()) {
             hub.deliver(message, true);
@@ -228,12 +277,33 @@ impl Shared {
         hub
     }
 
+    /// Tells who listens that somebody has come or gone.
+    fn tell_presence(&self) {
+        for topic in presence::TOPICS {
+            let hub = self.live_hub(topic).filter(|hub| hub.is_internal());
+            let own = presence::type_name(topic).and_then(|name| self.registry.message(name).ok());
+            if let (Some(hub), Some(own)) = (hub, own) {
+                hub.deliver(self.presence.message(topic, &own), true);
+            }
+        }
+    }
+
     fn outlets_of(&self, topic: &str) -> Vec<Arc<Outlet>> {
-        self.outlets.lock().get(topic).into_iter().flatten().filter_map(Weak::upgrade).collect()
+        self.outlets
+            .lock()
+            .get(topic)
+            .into_iter()
+            .flatten()
+            .filter_map(Weak::upgrade)
+            .collect()
     }
 
     pub(crate) fn add_outlet(&self, outlet: &Arc<Outlet>) {
-        self.outlets.lock().entry(outlet.topic.clone()).or_default().push(Arc::downgrade(outlet));
+        self.outlets
+            .lock()
+            .entry(outlet.topic.clone())
+            .or_default()
+            .push(Arc::downgrade(outlet));
     }
 
     /// Forgets an outlet that is being dropped, and what it latched.
@@ -255,7 +325,9 @@ impl Shared {
 
     /// What clients of this bridge publish on a topic, known before the graph shows it.
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
-        self.outlets_of(topic).first().map(|outlet| outlet.message_type.name().to_owned())
+        let outlets = self.outlets_of(topic);
+        let known = outlets.first().map(|outlet| outlet.message_type.name());
+        known.or(presence::type_name(topic)).map(str::to_owned)
     }
 
     /// The topic's hub, if anybody listens.
@@ -266,7 +338,10 @@ impl Shared {
     /// Forgets a hub that is gone, or that will never carry anything.
     pub(crate) fn forget_hub(&self, hub: &Hub) {
         let mut hubs = self.hubs.lock();
-        if hubs.get(&hub.topic).is_some_and(|known| std::ptr::eq(known.as_ptr(), hub)) {
+        if hubs
+            .get(&hub.topic)
+            .is_some_and(|known| std::ptr::eq(known.as_ptr(), hub))
+        {
             hubs.remove(&hub.topic);
         }
     }
@@ -284,7 +359,12 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let mut out = Vec::new();
-    Op::from(Status { id: None, level: Level::Error, msg: reason.into() }).print(&mut out, Format::Json);
+    Op::from(Status {
+        id: None,
+        level: Level::Error,
+        msg: reason.into(),
+    })
+    .print(&mut out, Format::Json);
     let mut socket = WebSocket::new(io, b"", 4096, 4096);
     socket.queue(frame::TEXT, Bytes::from(out));
     socket.queue_close(code, reason);

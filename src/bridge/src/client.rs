@@ -12,7 +12,9 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rosbridge::{Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Png, Status};
+use rosbridge::{
+    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Png, Status,
+};
 use tokio_util::sync::CancellationToken;
 
 use crate::SessionOptions;
@@ -56,7 +58,10 @@ pub(crate) struct Inbox {
 impl Inbox {
     pub(crate) fn new(shared: &Shared) -> Self {
         let limits = shared.options.fragments;
-        Self { fragments: Fragments::new(limits), pictures: Fragments::new(limits) }
+        Self {
+            fragments: Fragments::new(limits),
+            pictures: Fragments::new(limits),
+        }
     }
 }
 
@@ -108,7 +113,13 @@ impl Client {
         self.frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
     }
 
-    fn frame(self: &Arc<Self>, inbox: &mut Inbox, frame: Incoming<'_>, source: Option<&Bytes>, wrapping: usize) {
+    fn frame(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        frame: Incoming<'_>,
+        source: Option<&Bytes>,
+        wrapping: usize,
+    ) {
         let format = frame.format();
         let op = match Op::parse(frame) {
             Ok(op) => op,
@@ -116,12 +127,23 @@ impl Client {
         };
         if self.hears(Level::Warning) {
             for field in rosbridge::unknown_fields(frame) {
-                let text = format!("{}: field {field:?} is not known and was ignored", op.name());
-                self.status(Level::Warning, op.id().cloned().map(Id::into_owned), format, &text);
+                let text = format!(
+                    "{}: field {field:?} is not known and was ignored",
+                    op.name()
+                );
+                self.status(
+                    Level::Warning,
+                    op.id().cloned().map(Id::into_owned),
+                    format,
+                    &text,
+                );
             }
         }
         let name = op.name();
-        let reply = Reply { id: op.id().cloned().map(Id::into_owned), format };
+        let reply = Reply {
+            id: op.id().cloned().map(Id::into_owned),
+            format,
+        };
         if let Err(reason) = self.perform(inbox, op, &reply, source, wrapping) {
             self.status(Level::Error, reply.id, format, &format!("{name}: {reason}"));
         }
@@ -162,36 +184,62 @@ impl Client {
                 Ok(())
             }
             Op::Auth(_) => {
-                self.info(reply, "auth: ignored, this server knows its clients by the token of their connection");
+                self.info(
+                    reply,
+                    "auth: ignored, this server knows its clients by the token of their connection",
+                );
                 Ok(())
             }
         }
     }
 
-    fn fragment(self: &Arc<Self>, inbox: &mut Inbox, op: &Fragment<'_>, wrapping: usize) -> Result<(), String> {
-        let whole = inbox.fragments.add(op, Instant::now()).map_err(|error| error.to_string())?;
+    fn fragment(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        op: &Fragment<'_>,
+        wrapping: usize,
+    ) -> Result<(), String> {
+        let whole = inbox
+            .fragments
+            .add(op, Instant::now())
+            .map_err(|error| error.to_string())?;
         if let Some(text) = whole {
             self.unwrapped(inbox, &text, wrapping)?;
         }
         Ok(())
     }
 
-    fn png(self: &Arc<Self>, inbox: &mut Inbox, op: &Png<'_>, wrapping: usize) -> Result<(), String> {
+    fn png(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        op: &Png<'_>,
+        wrapping: usize,
+    ) -> Result<(), String> {
         let whole = match op.fragment() {
             None => Some(op.data.to_string()),
-            Some(part) => inbox.pictures.add(&part, Instant::now()).map_err(|error| error.to_string())?,
+            Some(part) => inbox
+                .pictures
+                .add(&part, Instant::now())
+                .map_err(|error| error.to_string())?,
         };
         if let Some(data) = whole {
-            let text =
-                rosbridge::decode_png(&data, self.shared.options.max_png).map_err(|error| error.to_string())?;
+            let text = rosbridge::decode_png(&data, self.shared.options.max_png)
+                .map_err(|error| error.to_string())?;
             self.unwrapped(inbox, &text, wrapping)?;
         }
         Ok(())
     }
 
-    fn unwrapped(self: &Arc<Self>, inbox: &mut Inbox, text: &str, wrapping: usize) -> Result<(), String> {
+    fn unwrapped(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        text: &str,
+        wrapping: usize,
+    ) -> Result<(), String> {
         if wrapping == MAX_WRAPPING {
-            return Err(format!("messages within messages go {MAX_WRAPPING} deep at most"));
+            return Err(format!(
+                "messages within messages go {MAX_WRAPPING} deep at most"
+            ));
         }
         self.frame(inbox, Incoming::Text(text), None, wrapping + 1);
         Ok(())
@@ -212,7 +260,15 @@ impl Client {
             tracing::debug!(client = %self.name, "{text}");
         }
         if self.hears(level) {
-            self.send(Status { id, level, msg: text.into() }.into(), format);
+            self.send(
+                Status {
+                    id,
+                    level,
+                    msg: text.into(),
+                }
+                .into(),
+                format,
+            );
         }
     }
 
@@ -232,15 +288,31 @@ impl Client {
     pub(crate) fn send(&self, op: Op<'_>, format: Format) {
         let mut out = Vec::with_capacity(128);
         op.print(&mut out, format);
-        self.send_frame(Frame { format, bytes: out.into() }, None, false);
+        self.send_frame(
+            Frame {
+                format,
+                bytes: out.into(),
+            },
+            None,
+            false,
+        );
     }
 
     pub(crate) fn send_frame(&self, frame: Frame, fragment_size: Option<usize>, answer: bool) {
-        self.outbox.control(Control { frame, fragment_size, answer });
+        self.outbox.control(Control {
+            frame,
+            fragment_size,
+            answer,
+        });
     }
 
     /// Sends a frame printed in JSON or CBOR as the client wants it.
-    pub(crate) fn send_as(&self, frame: Frame, compression: Compression, fragment_size: Option<usize>) {
+    pub(crate) fn send_as(
+        &self,
+        frame: Frame,
+        compression: Compression,
+        fragment_size: Option<usize>,
+    ) {
         let wrapped = match compression {
             Compression::Png if frame.format == Format::Json => frame.clone().into_png(),
             _ => Ok(frame),
@@ -257,7 +329,9 @@ impl Client {
         let before = self.under_way.fetch_add(1, Ordering::Relaxed);
         let guard = UnderWay(self.clone());
         if before >= limit {
-            return Err(format!("{limit} calls and goals of this client are under way already; wait for some to end"));
+            return Err(format!(
+                "{limit} calls and goals of this client are under way already; wait for some to end"
+            ));
         }
         Ok(guard)
     }

@@ -20,7 +20,10 @@ impl Listener for Ticks {
     fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
         // rosgraph_msgs/Clock is one time.
         if let [a, b, c, d, e, f, g, h] = sample.bytes[..] {
-            let time = Time { secs: u32::from_le_bytes([a, b, c, d]), nsecs: u32::from_le_bytes([e, f, g, h]) };
+            let time = Time {
+                secs: u32::from_le_bytes([a, b, c, d]),
+                nsecs: u32::from_le_bytes([e, f, g, h]),
+            };
             // Nobody waits any more.
             let _ = self.0.send(time);
         }

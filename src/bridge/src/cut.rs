@@ -32,14 +32,31 @@ struct Cut {
 
 impl Cuts {
     /// Takes a frame to be cut, where it is a text longer than `size`. Gives whether it was taken.
-    pub(crate) fn cut(&mut self, frame: &Frame, size: Option<usize>, key: Option<TopicKey>) -> bool {
-        let Some(size) = size.filter(|size| frame.format == Format::Json && frame.bytes.len() > *size) else {
+    pub(crate) fn cut(
+        &mut self,
+        frame: &Frame,
+        size: Option<usize>,
+        key: Option<TopicKey>,
+    ) -> bool {
+        let Some(size) =
+            size.filter(|size| frame.format == Format::Json && frame.bytes.len() > *size)
+        else {
             return false;
         };
-        let Ok(text) = String::from_utf8(frame.bytes.to_vec()) else { return false };
+        let Ok(text) = String::from_utf8(frame.bytes.to_vec()) else {
+            return false;
+        };
         let total = split_text(&text, size).count() as u64;
         self.ids += 1;
-        self.cuts.push_back(Cut { text, at: 0, size, id: self.ids, num: 0, total, key });
+        self.cuts.push_back(Cut {
+            text,
+            at: 0,
+            size,
+            id: self.ids,
+            num: 0,
+            total,
+            key,
+        });
         true
     }
 
@@ -63,7 +80,12 @@ impl Cuts {
         let mut cut = self.cuts.pop_front()?;
         let piece = split_text(&cut.text[cut.at..], cut.size).next()?;
         let mut out = Vec::with_capacity(piece.len() + piece.len() / 8 + 64);
-        let fragment = Fragment { id: Id::Integer(cut.id), data: piece.into(), num: cut.num, total: cut.total };
+        let fragment = Fragment {
+            id: Id::Integer(cut.id),
+            data: piece.into(),
+            num: cut.num,
+            total: cut.total,
+        };
         cut.at += piece.len();
         cut.num += 1;
         Op::from(fragment).print(&mut out, Format::Json);
@@ -88,18 +110,26 @@ mod tests {
         let texts = ["grüße ".repeat(100), "kurz ".repeat(50)];
         let mut cuts = Cuts::default();
         for (key, text) in texts.iter().enumerate() {
-            let frame = Frame { format: Format::Json, bytes: text.clone().into() };
+            let frame = Frame {
+                format: Format::Json,
+                bytes: text.clone().into(),
+            };
             assert!(cuts.cut(&frame, Some(99), Some(key as u64)));
             assert!(!cuts.cut(&frame, Some(10_000), None));
         }
-        let limits = FragmentLimits { age: Duration::from_secs(1), ..FragmentLimits::default() };
+        let limits = FragmentLimits {
+            age: Duration::from_secs(1),
+            ..FragmentLimits::default()
+        };
         let mut fragments = Fragments::new(limits);
         let mut whole = Vec::new();
         let mut ends = Vec::new();
         let mut ids = Vec::new();
         while let Some((bytes, end)) = cuts.next() {
             ends.extend(end);
-            let Ok(Op::Fragment(fragment)) = Op::parse(Incoming::Text(std::str::from_utf8(&bytes).unwrap())) else {
+            let Ok(Op::Fragment(fragment)) =
+                Op::parse(Incoming::Text(std::str::from_utf8(&bytes).unwrap()))
+            else {
                 panic!("not a fragment")
             };
             ids.push(fragment.id.to_string());

@@ -55,7 +55,10 @@ impl Drop for Listening {
     fn drop(&mut self) {
         let mut state = self.hub.state.lock();
         let earlier = state.listeners.clone();
-        let kept = earlier.iter().filter(|(number, _)| *number != self.number).cloned();
+        let kept = earlier
+            .iter()
+            .filter(|(number, _)| *number != self.number)
+            .cloned();
         state.listeners = Arc::new(kept.collect());
         drop(state);
         // Only now may the listener itself go.
@@ -65,7 +68,11 @@ impl Drop for Listening {
 
 impl Hub {
     /// Subscribes in the background. `message_type` is what the first listener expects, where it knows.
-    pub(crate) fn start(shared: &Arc<Shared>, topic: &str, message_type: Option<&MessageType>) -> Arc<Hub> {
+    pub(crate) fn start(
+        shared: &Arc<Shared>,
+        topic: &str,
+        message_type: Option<&MessageType>,
+    ) -> Arc<Hub> {
         let hub = Arc::new(Hub {
             topic: topic.to_owned(),
             shared: Arc::downgrade(shared),
@@ -81,7 +88,12 @@ impl Hub {
             }),
             queue: shared.options.bus_queue,
         };
-        let pump = tokio::spawn(pump(Arc::downgrade(&hub), shared.clone(), topic.to_owned(), options));
+        let pump = tokio::spawn(pump(
+            Arc::downgrade(&hub),
+            shared.clone(),
+            topic.to_owned(),
+            options,
+        ));
         // Set once, here.
         let _ = hub.pump.set(pump.abort_handle());
         hub
@@ -98,6 +110,10 @@ impl Hub {
         })
     }
 
+    pub(crate) fn is_internal(&self) -> bool {
+        self.pump.get().is_none()
+    }
+
     /// Adds a listener, which first hears what latching publishers last said.
     pub(crate) fn listen(self: &Arc<Self>, listener: Arc<dyn Listener>) -> Listening {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
@@ -110,7 +126,10 @@ impl Hub {
         let mut listeners = Listeners::clone(&state.listeners);
         listeners.push((number, listener));
         state.listeners = Arc::new(listeners);
-        Listening { hub: self.clone(), number }
+        Listening {
+            hub: self.clone(),
+            number,
+        }
     }
 
     /// Lets a listener hear once more what latching publishers last said.
@@ -125,8 +144,14 @@ impl Hub {
         // A publisher that is gone has taken its message with it.
         if let Some(shared) = self.shared.upgrade() {
             let graph = shared.bus.graph().borrow().clone();
-            let publishers = graph.topics.get(&self.topic).map(|nodes| nodes.publishers.as_slice()).unwrap_or_default();
-            state.latched.retain(|sample| sample.local || publishers.iter().any(|name| **name == *sample.publisher));
+            let publishers = graph
+                .topics
+                .get(&self.topic)
+                .map(|nodes| nodes.publishers.as_slice())
+                .unwrap_or_default();
+            state.latched.retain(|sample| {
+                sample.local || publishers.iter().any(|name| **name == *sample.publisher)
+            });
         }
         for sample in &state.latched {
             listener.sample(sample, true);
@@ -139,7 +164,9 @@ impl Hub {
         let listeners = {
             let mut state = self.state.lock();
             if sample.latching {
-                state.latched.retain(|other| other.publisher != sample.publisher);
+                state
+                    .latched
+                    .retain(|other| other.publisher != sample.publisher);
                 state.latched.push(sample.clone());
             }
             state.listeners.clone()
@@ -151,7 +178,10 @@ impl Hub {
 
     /// A client that latched a message here publishes no longer.
     pub(crate) fn forget(&self, publisher: &str) {
-        self.state.lock().latched.retain(|sample| *sample.publisher != *publisher);
+        self.state
+            .lock()
+            .latched
+            .retain(|sample| *sample.publisher != *publisher);
     }
 
     fn fail(&self, reason: String) {

@@ -37,6 +37,7 @@ mod names;
 mod options;
 mod outbox;
 mod outlet;
+mod presence;
 mod registrations;
 mod rosapi;
 mod sample;

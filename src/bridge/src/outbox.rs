@@ -31,7 +31,13 @@ pub(crate) struct Control {
 /// The next thing to send.
 pub(crate) enum Outgoing {
     Control(Control),
-    Sample { key: TopicKey, sample: Arc<Sample>, topic: Arc<str>, compression: Compression, fragment_size: Option<usize> },
+    Sample {
+        key: TopicKey,
+        sample: Arc<Sample>,
+        topic: Arc<str>,
+        compression: Compression,
+        fragment_size: Option<usize>,
+    },
 }
 
 /// Why a client is to be told goodbye.
@@ -79,9 +85,17 @@ impl Outbox {
             control_messages: options.control_messages,
             control_bytes: options.control_bytes,
             session_bytes: options.session_bytes,
-            topic: QueueLimits { messages: options.topic_messages.max(1), bytes: options.topic_bytes },
+            topic: QueueLimits {
+                messages: options.topic_messages.max(1),
+                bytes: options.topic_bytes,
+            },
         };
-        Self { queues: Mutex::default(), limits, metrics, attached: watch::Sender::default() }
+        Self {
+            queues: Mutex::default(),
+            limits,
+            metrics,
+            attached: watch::Sender::default(),
+        }
     }
 
     /// Makes the caller the one that sends; whoever did before is woken and finds out. Gives the caller's number.
@@ -111,7 +125,11 @@ impl Outbox {
         if queues.socket != socket {
             return false;
         }
-        if !queues.waker.as_ref().is_some_and(|known| known.will_wake(waker)) {
+        if !queues
+            .waker
+            .as_ref()
+            .is_some_and(|known| known.will_wake(waker))
+        {
             queues.waker = Some(waker.clone());
         }
         true
@@ -164,7 +182,9 @@ impl Outbox {
         let mut queues = self.queues.lock();
         queues.next_key += 1;
         let key = queues.next_key;
-        queues.topics.insert(key, TopicQueue::new(topic, wishes, self.limits.topic));
+        queues
+            .topics
+            .insert(key, TopicQueue::new(topic, wishes, self.limits.topic));
         key
     }
 
@@ -196,9 +216,15 @@ impl Outbox {
         let now = Instant::now();
         let mut queues = self.queues.lock();
         let queues = &mut *queues;
-        let Some(queue) = queues.topics.get_mut(&key) else { return };
+        let Some(queue) = queues.topics.get_mut(&key) else {
+            return;
+        };
         let size = sample.bytes.len();
-        let Pushed { throttled, mut dropped, mut dropped_bytes } = queue.push(sample, replay, now);
+        let Pushed {
+            throttled,
+            mut dropped,
+            mut dropped_bytes,
+        } = queue.push(sample, replay, now);
         if throttled {
             self.metrics.throttled.add(1);
             return;
@@ -243,8 +269,12 @@ impl Outbox {
     /// A topic's messages cannot be sent; gives whether it is time to say so again.
     pub(crate) fn may_complain(&self, key: TopicKey, now: Instant) -> bool {
         let mut queues = self.queues.lock();
-        let Some(queue) = queues.topics.get_mut(&key) else { return false };
-        let due = queue.complained.is_none_or(|at| now.saturating_duration_since(at).as_secs() >= 5);
+        let Some(queue) = queues.topics.get_mut(&key) else {
+            return false;
+        };
+        let due = queue
+            .complained
+            .is_none_or(|at| now.saturating_duration_since(at).as_secs() >= 5);
         if due {
             queue.complained = Some(now);
         }
@@ -261,15 +291,29 @@ impl Outbox {
         queues.wake_up_later(now);
         loop {
             let key = queues.ready.pop_front()?;
-            let Some(queue) = queues.topics.get_mut(&key) else { continue };
+            let Some(queue) = queues.topics.get_mut(&key) else {
+                continue;
+            };
             queue.scheduled = false;
             let before = queue.bytes;
-            let Some(sample) = queue.pop(now) else { continue };
+            let Some(sample) = queue.pop(now) else {
+                continue;
+            };
             queues.bytes -= before - queue.bytes;
-            let Wishes { compression, fragment_size, .. } = queue.wishes;
+            let Wishes {
+                compression,
+                fragment_size,
+                ..
+            } = queue.wishes;
             let topic = queue.topic.clone();
             queues.schedule(key, now);
-            return Some(Outgoing::Sample { key, sample, topic, compression, fragment_size });
+            return Some(Outgoing::Sample {
+                key,
+                sample,
+                topic,
+                compression,
+                fragment_size,
+            });
         }
     }
 
@@ -300,19 +344,29 @@ impl Queues {
         if self.bytes <= limit {
             return None;
         }
-        let spare_only = self.bytes <= limit.saturating_mul(4) || self.bytes == self.largest_bytes();
-        let candidates = self.topics.values_mut().filter(|queue| !(spare_only && queue.has_one()));
+        let spare_only =
+            self.bytes <= limit.saturating_mul(4) || self.bytes == self.largest_bytes();
+        let candidates = self
+            .topics
+            .values_mut()
+            .filter(|queue| !(spare_only && queue.has_one()));
         let lost = candidates.max_by_key(|queue| queue.bytes)?.drop_one()?;
         self.bytes -= lost;
         Some(lost)
     }
 
     fn largest_bytes(&self) -> usize {
-        self.topics.values().map(|queue| queue.bytes).max().unwrap_or(0)
+        self.topics
+            .values()
+            .map(|queue| queue.bytes)
+            .max()
+            .unwrap_or(0)
     }
 
     fn schedule(&mut self, key: TopicKey, now: Instant) {
-        let Some(queue) = self.topics.get_mut(&key) else { return };
+        let Some(queue) = self.topics.get_mut(&key) else {
+            return;
+        };
         if queue.scheduled {
             return;
         }
@@ -332,3 +386,7 @@ impl Queues {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "outbox_tests.rs"]
+mod tests;

@@ -46,12 +46,17 @@ impl Service {
     /// The service of that (absolute) name.
     pub(crate) fn find(name: &str) -> Option<Service> {
         let name = name.strip_prefix("/rosapi/")?;
-        definitions::SERVICES.iter().find(|(known, _)| *known == name).map(|(name, srv)| Service { name, srv })
+        definitions::SERVICES
+            .iter()
+            .find(|(known, _)| *known == name)
+            .map(|(name, srv)| Service { name, srv })
     }
 
     /// All of them.
     pub(crate) fn all() -> impl Iterator<Item = Service> {
-        definitions::SERVICES.iter().map(|(name, srv)| Service { name, srv })
+        definitions::SERVICES
+            .iter()
+            .map(|(name, srv)| Service { name, srv })
     }
 
     /// `/rosapi/…`.
@@ -66,7 +71,9 @@ impl Service {
 
     /// Its definition.
     pub(crate) fn definition(self) -> Result<Arc<ServiceDef>, String> {
-        definitions::registry().service(&self.type_name()).map_err(|error| error.to_string())
+        definitions::registry()
+            .service(&self.type_name())
+            .map_err(|error| error.to_string())
     }
 
     /// The response, as JSON, to a request in JSON.

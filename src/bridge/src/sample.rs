@@ -30,10 +30,19 @@ impl Frame {
 
     /// JSON text wrapped as the pixels of a picture.
     pub(crate) fn into_png(self) -> Result<Frame, String> {
-        let data = rosbridge::encode_png(&self.bytes).map_err(|error| format!("cannot be packed as png: {error}"))?;
+        let data = rosbridge::encode_png(&self.bytes)
+            .map_err(|error| format!("cannot be packed as png: {error}"))?;
         let mut out = Vec::with_capacity(data.len() + 64);
-        rosbridge::Op::from(rosbridge::Png { id: None, data: data.into(), part: None }).print(&mut out, Format::Json);
-        Ok(Frame { format: Format::Json, bytes: out.into() })
+        rosbridge::Op::from(rosbridge::Png {
+            id: None,
+            data: data.into(),
+            part: None,
+        })
+        .print(&mut out, Format::Json);
+        Ok(Frame {
+            format: Format::Json,
+            bytes: out.into(),
+        })
     }
 }
 
@@ -49,7 +58,11 @@ type FoundType = Result<Arc<MessageType>, Arc<str>>;
 
 impl TopicTypes {
     pub(crate) fn new(registry: Arc<Registry>) -> Self {
-        Self { registry, found: Mutex::default(), sizes: Default::default() }
+        Self {
+            registry,
+            found: Mutex::default(),
+            sizes: Default::default(),
+        }
     }
 
     /// The type that messages announced so have.
@@ -78,12 +91,19 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
     };
     if wire.definition.is_empty() {
         return Err(match ours {
-            Ok(found) => format!("its type {} has MD5 {}, ours has {}", wire.name, wire.md5, found.md5()),
+            Ok(found) => format!(
+                "its type {} has MD5 {}, ours has {}",
+                wire.name,
+                wire.md5,
+                found.md5()
+            ),
             Err(error) => error.to_string(),
         });
     }
     let theirs = if ours.is_err() {
-        registry.insert_full_text(&wire.name, &wire.definition).and_then(|()| registry.message(&wire.name))
+        registry
+            .insert_full_text(&wire.name, &wire.definition)
+            .and_then(|()| registry.message(&wire.name))
     } else {
         MessageType::from_full_text(&wire.name, &wire.definition)
     };
@@ -148,38 +168,74 @@ impl Sample {
         }
         metrics.encoded.add(1);
         let frame = self.encode(compression, topic, non_finite);
-        encoded.push(Encoded { compression, topic: topic.clone(), frame: frame.clone() });
+        encoded.push(Encoded {
+            compression,
+            topic: topic.clone(),
+            frame: frame.clone(),
+        });
         frame
     }
 
-    fn encode(&self, compression: Compression, topic: &str, non_finite: NonFinite) -> Result<Frame, Arc<str>> {
+    fn encode(
+        &self,
+        compression: Compression,
+        topic: &str,
+        non_finite: NonFinite,
+    ) -> Result<Frame, Arc<str>> {
         let slot = match compression {
             Compression::None | Compression::Png => 0,
             Compression::Cbor => 1,
             Compression::CborRaw => 2,
         };
-        let hint = self.types.sizes[slot].load(Ordering::Relaxed).max(self.bytes.len()) + 128;
+        let hint = self.types.sizes[slot]
+            .load(Ordering::Relaxed)
+            .max(self.bytes.len())
+            + 128;
         let mut out = Vec::with_capacity(hint);
-        let failed = |error: codec::CodecError| Arc::<str>::from(format!("{error} (from {})", self.publisher));
+        let failed = |error: codec::CodecError| {
+            Arc::<str>::from(format!("{error} (from {})", self.publisher))
+        };
         match compression {
             Compression::CborRaw => {
-                Publish::print_raw(&mut out, topic, (self.received.secs, self.received.nsecs), &self.bytes);
+                Publish::print_raw(
+                    &mut out,
+                    topic,
+                    (self.received.secs, self.received.nsecs),
+                    &self.bytes,
+                );
             }
             Compression::Cbor => {
                 let message_type = self.types.find(&self.wire_type)?;
-                let write = |out: &mut Vec<u8>| codec::to_cbor(&message_type, &self.bytes, out, &CborOptions::default());
+                let write = |out: &mut Vec<u8>| {
+                    codec::to_cbor(&message_type, &self.bytes, out, &CborOptions::default())
+                };
                 Publish::print_with(&mut out, Format::Cbor, topic, write).map_err(failed)?;
             }
             Compression::None | Compression::Png => {
                 let message_type = self.types.find(&self.wire_type)?;
-                let options = JsonOptions { non_finite, ..JsonOptions::default() };
-                let write = |out: &mut Vec<u8>| codec::to_json(&message_type, &self.bytes, out, &options);
+                let options = JsonOptions {
+                    non_finite,
+                    ..JsonOptions::default()
+                };
+                let write =
+                    |out: &mut Vec<u8>| codec::to_json(&message_type, &self.bytes, out, &options);
                 Publish::print_with(&mut out, Format::Json, topic, write).map_err(failed)?;
             }
         }
         self.types.sizes[slot].store(out.len(), Ordering::Relaxed);
-        let format = if slot == 0 { Format::Json } else { Format::Cbor };
-        let frame = Frame { format, bytes: out.into() };
-        if compression == Compression::Png { frame.into_png().map_err(Arc::from) } else { Ok(frame) }
+        let format = if slot == 0 {
+            Format::Json
+        } else {
+            Format::Cbor
+        };
+        let frame = Frame {
+            format,
+            bytes: out.into(),
+        };
+        if compression == Compression::Png {
+            frame.into_png().map_err(Arc::from)
+        } else {
+            Ok(frame)
+        }
     }
 }

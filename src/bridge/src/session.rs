@@ -51,7 +51,11 @@ enum Stop {
     /// The client sent a close frame.
     Client { code: u16, reason: String },
     /// It is to be closed; `readable` unless the client's bytes can no longer be told apart.
-    Close { code: u16, reason: String, readable: bool },
+    Close {
+        code: u16,
+        reason: String,
+        readable: bool,
+    },
     /// The socket is of no more use. `heard_all`: the client ended it in good order, having read what was sent.
     Lost { reason: String, heard_all: bool },
 }
@@ -79,7 +83,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<std::io::Result<()>> {
         loop {
             while self.socket.queued() < SOCKET_FULL {
-                let Some((opcode, bytes)) = self.next_frame(now) else { break };
+                let Some((opcode, bytes)) = self.next_frame(now) else {
+                    break;
+                };
                 let metrics = &self.client.shared.metrics;
                 metrics.frames_out.add(1);
                 metrics.bytes_out.add(bytes.len() as u64);
@@ -111,9 +117,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                     let cut = self.cuts.cut(&control.frame, control.fragment_size, None);
                     (!cut).then_some(control.frame)
                 }
-                Some(Outgoing::Sample { key, sample, topic, compression, fragment_size }) => {
+                Some(Outgoing::Sample {
+                    key,
+                    sample,
+                    topic,
+                    compression,
+                    fragment_size,
+                }) => {
                     let frame = self.encode(key, &sample, &topic, compression, now);
-                    let cut = frame.as_ref().is_some_and(|frame| self.cuts.cut(frame, fragment_size, Some(key)));
+                    let cut = frame
+                        .as_ref()
+                        .is_some_and(|frame| self.cuts.cut(frame, fragment_size, Some(key)));
                     if cut {
                         self.client.outbox.sending_fragments(key);
                     }
@@ -144,7 +158,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         now: Instant,
     ) -> Option<Frame> {
         let shared = &self.client.shared;
-        match sample.frame(compression, topic, shared.options.non_finite, &shared.metrics) {
+        match sample.frame(
+            compression,
+            topic,
+            shared.options.non_finite,
+            &shared.metrics,
+        ) {
             Ok(frame) => Some(frame),
             Err(reason) => {
                 if self.client.outbox.may_complain(key, now) {
@@ -165,7 +184,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
 
     fn ping(&mut self) {
         let payload = self.acks.ping();
-        self.socket.queue(frame::PING, Bytes::copy_from_slice(&payload));
+        self.socket
+            .queue(frame::PING, Bytes::copy_from_slice(&payload));
     }
 
     /// Takes frames from the client. Ready when a batch was taken, pending when none is there.
@@ -179,11 +199,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             let message = match ready!(self.socket.poll_next(cx)) {
                 Ok(message) => message,
                 Err(WsError::Refused { code, reason }) => {
-                    return Poll::Ready(Err(Stop::Close { code, reason, readable: false }));
+                    return Poll::Ready(Err(Stop::Close {
+                        code,
+                        reason,
+                        readable: false,
+                    }));
                 }
                 Err(error) => {
                     let heard_all = matches!(error, WsError::Eof);
-                    return Poll::Ready(Err(Stop::Lost { reason: error.to_string(), heard_all }));
+                    return Poll::Ready(Err(Stop::Lost {
+                        reason: error.to_string(),
+                        heard_all,
+                    }));
                 }
             };
             self.heard = now;
@@ -202,7 +229,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                     Ok(text) => self.client.text(&mut self.inbox, text),
                     Err(_) => {
                         let reason = "a text frame is not UTF-8".to_owned();
-                        return Err(Stop::Close { code: 1007, reason, readable: true });
+                        return Err(Stop::Close {
+                            code: 1007,
+                            reason,
+                            readable: true,
+                        });
                     }
                 }
             }
@@ -212,7 +243,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 self.client.binary(&mut self.inbox, &bytes);
             }
             // Pongs that a client does not read pile up no higher than this.
-            Message::Ping(payload) if self.socket.queued() < SOCKET_FULL => self.socket.queue(frame::PONG, payload),
+            Message::Ping(payload) if self.socket.queued() < SOCKET_FULL => {
+                self.socket.queue(frame::PONG, payload)
+            }
             Message::Ping(_) => {}
             Message::Pong(payload) => self.acks.pong(&payload),
             Message::Close(code, reason) => return Err(Stop::Client { code, reason }),
@@ -226,12 +259,21 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         let (idle, interval) = (options.idle_timeout, options.ping_interval);
         let silent = now.saturating_duration_since(self.heard);
         if !idle.is_zero() && silent >= idle {
-            let reason = format!("nothing was heard for {} s, not even a pong", silent.as_secs());
-            return Err(Stop::Close { code: 1001, reason, readable: true });
+            let reason = format!(
+                "nothing was heard for {} s, not even a pong",
+                silent.as_secs()
+            );
+            return Err(Stop::Close {
+                code: 1001,
+                reason,
+                readable: true,
+            });
         }
         let regular = self.ping_at.is_some_and(|at| at <= now);
         // Behind a blocked message a ping would only pile up.
-        if self.socket.queued() < SOCKET_FULL && (regular || self.acks.ping_due().is_some_and(|at| at <= now)) {
+        if self.socket.queued() < SOCKET_FULL
+            && (regular || self.acks.ping_due().is_some_and(|at| at <= now))
+        {
             self.ping();
         }
         if regular {
@@ -239,7 +281,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         }
         let idle_at = (!idle.is_zero()).then(|| self.heard + idle);
         let ack_at = self.acks.ping_due().filter(|at| *at > now);
-        Ok([self.ping_at, idle_at, ack_at, self.client.outbox.next_due()].into_iter().flatten().min())
+        Ok(
+            [self.ping_at, idle_at, ack_at, self.client.outbox.next_due()]
+                .into_iter()
+                .flatten()
+                .min(),
+        )
     }
 
     /// Ready when it is time.
@@ -258,11 +305,19 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     fn step(&mut self, cx: &mut Context<'_>) -> Poll<Stop> {
         if !self.client.outbox.register(self.number, cx.waker()) {
             let reason = "a newer connection has taken this session over".to_owned();
-            return Poll::Ready(Stop::Close { code: 4001, reason, readable: true });
+            return Poll::Ready(Stop::Close {
+                code: 4001,
+                reason,
+                readable: true,
+            });
         }
         for _ in 0..ROUNDS {
             if let Some(Goodbye { code, reason }) = self.client.outbox.goodbye() {
-                return Poll::Ready(Stop::Close { code, reason, readable: true });
+                return Poll::Ready(Stop::Close {
+                    code,
+                    reason,
+                    readable: true,
+                });
             }
             let now = Instant::now();
             let read = match self.read(cx, now) {
@@ -275,11 +330,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             };
             let written = match self.write(cx, now) {
                 Poll::Ready(Err(error)) => {
-                    return Poll::Ready(Stop::Lost { reason: error.to_string(), heard_all: false });
+                    return Poll::Ready(Stop::Lost {
+                        reason: error.to_string(),
+                        heard_all: false,
+                    });
                 }
                 written => written,
             };
-            let more = read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
+            let more =
+                read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
             if !more && self.arm(cx, at).is_pending() {
                 return Poll::Pending;
             }
@@ -303,11 +362,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 let _ = timeout(patience, answered).await;
                 (SessionEnd::Client { code, reason }, arrived)
             }
-            Stop::Close { code, reason, readable } => {
+            Stop::Close {
+                code,
+                reason,
+                readable,
+            } => {
                 self.last_words(code, &reason);
                 // A client that does not take its leave in time is left alone.
                 let left = timeout(patience, self.socket.leave(readable)).await;
-                (SessionEnd::Closed { code, reason }, matches!(left, Ok(Ok(()))))
+                (
+                    SessionEnd::Closed { code, reason },
+                    matches!(left, Ok(Ok(()))),
+                )
             }
         };
         if !heard_all {
@@ -325,7 +391,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         if code != 1008 && code != 4001 {
             while let Some(control) = self.client.outbox.next_control() {
                 self.remember(&control, Instant::now());
-                self.socket.queue(control.frame.opcode(), control.frame.bytes);
+                self.socket
+                    .queue(control.frame.opcode(), control.frame.bytes);
             }
         }
         self.socket.queue_close(code, reason);

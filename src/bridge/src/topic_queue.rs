@@ -108,13 +108,20 @@ impl TopicQueue {
         let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
         if throttles && !first {
             if self.next_at.is_some_and(|at| now < at) {
-                return Pushed { throttled: true, ..Pushed::default() };
+                return Pushed {
+                    throttled: true,
+                    ..Pushed::default()
+                };
             }
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
         self.bytes += sample.bytes.len();
         if first {
-            let at = self.samples.iter().take_while(|waiting| waiting.first).count();
+            let at = self
+                .samples
+                .iter()
+                .take_while(|waiting| waiting.first)
+                .count();
             self.samples.insert(at, Waiting { sample, first });
         } else {
             self.samples.push_back(Waiting { sample, first });
@@ -144,7 +151,11 @@ impl TopicQueue {
             return true;
         }
         // What latching publishers said first does not count: it may never come again.
-        let firsts = self.samples.iter().take_while(|waiting| waiting.first).count();
+        let firsts = self
+            .samples
+            .iter()
+            .take_while(|waiting| waiting.first)
+            .count();
         let asked = match self.wishes.queue_length {
             0 => self.limits.messages,
             length => length.min(self.limits.messages),
@@ -167,8 +178,13 @@ impl TopicQueue {
     /// When the next sample may be sent; `None` while there is none.
     pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
         let next = self.samples.front().filter(|_| !self.busy)?;
-        let held_back = !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
-        Some(self.next_at.filter(|at| held_back && *at > now).unwrap_or(now))
+        let held_back =
+            !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
+        Some(
+            self.next_at
+                .filter(|at| held_back && *at > now)
+                .unwrap_or(now),
+        )
     }
 
     /// The next sample to send.

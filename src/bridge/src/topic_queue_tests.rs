@@ -5,9 +5,22 @@ use super::*;
 use crate::sample::TopicTypes;
 
 fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
-    let wire_type = Arc::new(WireType { name: "a/B".into(), md5: "*".into(), definition: String::new() });
-    let message = Message { bytes: vec![0; size].into(), wire_type, publisher: publisher.into(), latching };
-    Arc::new(Sample::new(message, false, Arc::new(TopicTypes::new(Arc::new(Registry::new())))))
+    let wire_type = Arc::new(WireType {
+        name: "a/B".into(),
+        md5: "*".into(),
+        definition: String::new(),
+    });
+    let message = Message {
+        bytes: vec![0; size].into(),
+        wire_type,
+        publisher: publisher.into(),
+        latching,
+    };
+    Arc::new(Sample::new(
+        message,
+        false,
+        Arc::new(TopicTypes::new(Arc::new(Registry::new()))),
+    ))
 }
 
 fn wishes(throttle: u64, length: usize) -> Wishes {
@@ -20,11 +33,22 @@ fn wishes(throttle: u64, length: usize) -> Wishes {
 }
 
 fn queue(throttle: u64, length: usize) -> TopicQueue {
-    TopicQueue::new("/x".into(), wishes(throttle, length), QueueLimits { messages: 5, bytes: 1000 })
+    TopicQueue::new(
+        "/x".into(),
+        wishes(throttle, length),
+        QueueLimits {
+            messages: 5,
+            bytes: 1000,
+        },
+    )
 }
 
 fn sizes(queue: &TopicQueue) -> Vec<usize> {
-    queue.samples.iter().map(|waiting| waiting.sample.bytes.len()).collect()
+    queue
+        .samples
+        .iter()
+        .map(|waiting| waiting.sample.bytes.len())
+        .collect()
 }
 
 #[test]
@@ -39,7 +63,10 @@ fn the_newest_win_within_messages_and_bytes() {
     let mut bytes = queue(0, 0);
     bytes.push(sample("/p", false, 600), false, now);
     let pushed = bytes.push(sample("/p", false, 601), false, now);
-    assert_eq!((pushed.dropped, pushed.dropped_bytes, sizes(&bytes)), (1, 600, vec![601]));
+    assert_eq!(
+        (pushed.dropped, pushed.dropped_bytes, sizes(&bytes)),
+        (1, 600, vec![601])
+    );
     bytes.push(sample("/p", false, 5000), false, now);
     assert_eq!(sizes(&bytes), [5000], "one message is always kept");
     let mut asked = queue(0, 2);
@@ -54,9 +81,21 @@ fn without_a_queue_a_throttle_leaves_messages_out() {
     let (now, ms) = (Instant::now(), Duration::from_millis(1));
     let mut queue = queue(100, 0);
     assert!(!queue.push(sample("/p", false, 1), false, now).throttled);
-    assert!(queue.push(sample("/p", false, 2), false, now + 99 * ms).throttled);
-    assert!(!queue.push(sample("/p", false, 3), true, now + 99 * ms).throttled);
-    assert!(!queue.push(sample("/p", false, 4), false, now + 100 * ms).throttled);
+    assert!(
+        queue
+            .push(sample("/p", false, 2), false, now + 99 * ms)
+            .throttled
+    );
+    assert!(
+        !queue
+            .push(sample("/p", false, 3), true, now + 99 * ms)
+            .throttled
+    );
+    assert!(
+        !queue
+            .push(sample("/p", false, 4), false, now + 100 * ms)
+            .throttled
+    );
     assert_eq!(sizes(&queue), [3, 1, 4]);
     assert_eq!(queue.due(now), Some(now));
 }
@@ -80,11 +119,18 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
     let now = Instant::now();
     let mut queue = queue(60_000, 1);
     for publisher in ["/a", "/b", "/c"] {
-        assert_eq!(queue.push(sample(publisher, true, 1), false, now).dropped, 0);
+        assert_eq!(
+            queue.push(sample(publisher, true, 1), false, now).dropped,
+            0
+        );
     }
     assert_eq!(queue.push(sample("/b", true, 2), false, now).dropped, 0);
     assert_eq!(queue.push(sample("/b", true, 3), false, now).dropped, 2);
-    assert_eq!(sizes(&queue), [1, 1, 3], "of a publisher of whom a newer one is there the older give way");
+    assert_eq!(
+        sizes(&queue),
+        [1, 1, 3],
+        "of a publisher of whom a newer one is there the older give way"
+    );
     for _ in 0..3 {
         assert_eq!(queue.due(now), Some(now));
         queue.pop(now);
@@ -95,10 +141,20 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
 
 #[test]
 fn several_subscriptions_of_a_topic_merge() {
-    let one = Wishes { fragment_size: Some(500), ..wishes(100, 0) };
-    let two = Wishes { compression: Compression::CborRaw, ..wishes(50, 3) };
+    let one = Wishes {
+        fragment_size: Some(500),
+        ..wishes(100, 0)
+    };
+    let two = Wishes {
+        compression: Compression::CborRaw,
+        ..wishes(50, 3)
+    };
     let merged = Wishes::merged([one, two].iter()).unwrap();
-    let expected = Wishes { fragment_size: Some(500), compression: Compression::CborRaw, ..wishes(50, 3) };
+    let expected = Wishes {
+        fragment_size: Some(500),
+        compression: Compression::CborRaw,
+        ..wishes(50, 3)
+    };
     assert_eq!(merged, expected);
     assert_eq!(Wishes::merged([].iter()), None);
 }

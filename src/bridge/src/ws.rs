@@ -55,11 +55,17 @@ pub(crate) enum WsError {
 
 impl WsError {
     pub(crate) fn protocol(reason: &str) -> Self {
-        WsError::Refused { code: 1002, reason: reason.to_owned() }
+        WsError::Refused {
+            code: 1002,
+            reason: reason.to_owned(),
+        }
     }
 
     fn too_long(what: &str, length: u64, limit: usize) -> Self {
-        WsError::Refused { code: 1009, reason: format!("a {what} of {length} bytes is over the limit of {limit}") }
+        WsError::Refused {
+            code: 1009,
+            reason: format!("a {what} of {length} bytes is over the limit of {limit}"),
+        }
     }
 }
 
@@ -117,7 +123,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     fn next_header(&mut self) -> Result<Option<Header>, WsError> {
-        let Some((header, size)) = Header::parse(&self.read)? else { return Ok(None) };
+        let Some((header, size)) = Header::parse(&self.read)? else {
+            return Ok(None);
+        };
         if header.mask.is_none() {
             return Err(WsError::protocol("a client's frames must be masked"));
         }
@@ -130,7 +138,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
 
     fn make_room(&mut self) {
         let missing = match self.header {
-            Some(header) => (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len())),
+            Some(header) => {
+                (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len()))
+            }
             None => 0,
         };
         let room = missing.max(READ_SIZE / 2);
@@ -139,7 +149,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
-    fn accept(&mut self, header: Header, mut payload: BytesMut) -> Result<Option<Message>, WsError> {
+    fn accept(
+        &mut self,
+        header: Header,
+        mut payload: BytesMut,
+    ) -> Result<Option<Message>, WsError> {
         if let Some(mask) = header.mask {
             frame::unmask(&mut payload, mask);
         }
@@ -150,7 +164,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             _ => {}
         }
         let (opcode, whole) = match (self.partial.take(), header.opcode) {
-            (None, frame::CONTINUATION) => return Err(WsError::protocol("a message begins with a continuation frame")),
+            (None, frame::CONTINUATION) => {
+                return Err(WsError::protocol(
+                    "a message begins with a continuation frame",
+                ));
+            }
             (None, opcode) => (opcode, payload),
             (Some((opcode, mut begun)), frame::CONTINUATION) => {
                 let length = begun.len() as u64 + header.length;
@@ -160,17 +178,29 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 begun.unsplit(payload);
                 (opcode, begun)
             }
-            (Some(_), _) => return Err(WsError::protocol("a message begins before the last one has ended")),
+            (Some(_), _) => {
+                return Err(WsError::protocol(
+                    "a message begins before the last one has ended",
+                ));
+            }
         };
         if !header.last {
             self.partial = Some((opcode, whole));
             return Ok(None);
         }
         if whole.len() > self.max_message {
-            return Err(WsError::too_long("message", whole.len() as u64, self.max_message));
+            return Err(WsError::too_long(
+                "message",
+                whole.len() as u64,
+                self.max_message,
+            ));
         }
         let whole = whole.freeze();
-        Ok(Some(if opcode == frame::TEXT { Message::Text(whole) } else { Message::Binary(whole) }))
+        Ok(Some(if opcode == frame::TEXT {
+            Message::Text(whole)
+        } else {
+            Message::Binary(whole)
+        }))
     }
 
     /// Bytes queued and not yet taken by the socket.
@@ -218,7 +248,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 *slice = IoSlice::new(bytes);
                 count += 1;
             }
-            let mut written = ready!(Pin::new(&mut self.io).poll_write_vectored(cx, &slices[..count]))?;
+            let mut written =
+                ready!(Pin::new(&mut self.io).poll_write_vectored(cx, &slices[..count]))?;
             if written == 0 {
                 return Poll::Ready(Err(io::ErrorKind::WriteZero.into()));
             }
@@ -266,7 +297,9 @@ fn close_message(payload: &[u8]) -> Result<Message, WsError> {
             let code = u16::from_be_bytes([*high, *low]);
             match std::str::from_utf8(reason) {
                 Ok(reason) if is_sendable(code) => Ok(Message::Close(code, reason.to_owned())),
-                _ => Err(WsError::protocol("a close frame has no valid code and reason")),
+                _ => Err(WsError::protocol(
+                    "a close frame has no valid code and reason",
+                )),
             }
         }
         _ => Err(WsError::protocol("a close frame has half a code")),

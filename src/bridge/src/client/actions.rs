@@ -1,6 +1,8 @@
 //! The ops on actions, mapped onto actionlib's topics.
 
+mod answering;
 mod goals;
+mod sending;
 mod server;
 
 use std::collections::HashMap;
@@ -33,10 +35,12 @@ impl Client {
         let name = plain_type(type_name);
         let registry = &self.shared.registry;
         // ROS 1 clients write NameAction as well as Name.
-        let def = registry.action(&name).or_else(|error| match name.strip_suffix("Action") {
-            Some(short) => registry.action(short),
-            None => Err(error),
-        });
+        let def = registry
+            .action(&name)
+            .or_else(|error| match name.strip_suffix("Action") {
+                Some(short) => registry.action(short),
+                None => Err(error),
+            });
         def.map_err(|error| format!("action {action}: {error}"))
     }
 
@@ -51,16 +55,31 @@ impl Client {
         let failed = move |reason: String| {
             if let Some(client) = client.upgrade() {
                 let text = format!("topic {name}: {reason}");
-                client.status(rosbridge::Level::Error, None, rosbridge::Format::Json, &text);
+                client.status(
+                    rosbridge::Level::Error,
+                    None,
+                    rosbridge::Format::Json,
+                    &text,
+                );
             }
         };
-        Outlet::open(&self.shared, &topic, message_type.clone(), latch, 100, failed)
+        Outlet::open(
+            &self.shared,
+            &topic,
+            message_type.clone(),
+            latch,
+            100,
+            failed,
+        )
     }
 }
 
 /// The type that an action's topic has, for those that do not depend on the action.
 fn common_type(shared: &Shared, name: &str) -> Result<Arc<MessageType>, String> {
-    shared.registry.message(name).map_err(|error| error.to_string())
+    shared
+        .registry
+        .message(name)
+        .map_err(|error| error.to_string())
 }
 
 /// Whether what a node sends is what we take it for.

@@ -28,12 +28,19 @@ struct Call {
 
 impl Call {
     fn args(&self) -> Option<Payload<'_>> {
-        self.args.as_ref().map(|(format, bytes)| Payload { format: *format, bytes })
+        self.args.as_ref().map(|(format, bytes)| Payload {
+            format: *format,
+            bytes,
+        })
     }
 }
 
 impl Client {
-    pub(super) fn call_service(self: &Arc<Self>, op: CallService<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn call_service(
+        self: &Arc<Self>,
+        op: CallService<'_>,
+        reply: &Reply,
+    ) -> Result<(), String> {
         self.shared.metrics.calls.add(1);
         let compression = op.compression.unwrap_or(match reply.format {
             Format::Json => Compression::None,
@@ -43,19 +50,28 @@ impl Client {
             service: String::new(),
             written: op.service.clone().into_owned(),
             id: reply.id.clone(),
-            args: op.args.map(|args| (args.format, Bytes::copy_from_slice(args.bytes))),
-            timeout: op.timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(self.shared.options.call_timeout),
+            args: op
+                .args
+                .map(|args| (args.format, Bytes::copy_from_slice(args.bytes))),
+            timeout: op
+                .timeout
+                .filter(|timeout| !timeout.is_zero())
+                .unwrap_or(self.shared.options.call_timeout),
             compression,
             fragment_size: op.fragment_size,
         };
-        let (service, guard) = match resolve(&op.service).and_then(|service| Ok((service, self.begin()?))) {
-            Ok(found) => found,
-            Err(reason) => {
-                self.call_failed(&call, &reason);
-                return Ok(());
-            }
+        let (service, guard) =
+            match resolve(&op.service).and_then(|service| Ok((service, self.begin()?))) {
+                Ok(found) => found,
+                Err(reason) => {
+                    self.call_failed(&call, &reason);
+                    return Ok(());
+                }
+            };
+        let call = Call {
+            service: service.into_owned(),
+            ..call
         };
-        let call = Call { service: service.into_owned(), ..call };
         let client = self.clone();
         tokio::spawn(async move {
             let _guard = guard;
@@ -72,7 +88,13 @@ impl Client {
     }
 
     async fn answer(&self, call: &Call) -> Result<Frame, String> {
-        let served = self.shared.bus.graph().borrow().services.contains_key(&call.service);
+        let served = self
+            .shared
+            .bus
+            .graph()
+            .borrow()
+            .services
+            .contains_key(&call.service);
         if !served && let Some(api) = rosapi::Service::find(&call.service) {
             return self.answer_rosapi(call, api).await;
         }
@@ -82,20 +104,30 @@ impl Client {
             .find(self.shared.bus.as_ref(), &call.service)
             .await
             .map_err(|error| error.to_string())?;
-        let def = self.shared.registry.service(&service_type.name).map_err(|error| error.to_string());
-        let def = def.and_then(|def| match def.md5 == service_type.md5 || service_type.md5 == "*" {
-            true => Ok(def),
-            false => Err(format!(
-                "service {} has type {} with MD5 {} there and {} here",
-                call.service, def.name, service_type.md5, def.md5
-            )),
-        });
+        let def = self
+            .shared
+            .registry
+            .service(&service_type.name)
+            .map_err(|error| error.to_string());
+        let def =
+            def.and_then(
+                |def| match def.md5 == service_type.md5 || service_type.md5 == "*" {
+                    true => Ok(def),
+                    false => Err(format!(
+                        "service {} has type {} with MD5 {} there and {} here",
+                        call.service, def.name, service_type.md5, def.md5
+                    )),
+                },
+            );
         let request = match (&def, call.compression, call.args()) {
             (Ok(def), compression, args) => decode_args(&def.request, args, compression)?,
             // ROS bytes both ways need no definition.
-            (Err(_), Compression::CborRaw, Some(args)) => {
-                Bytes::from(args.raw().map_err(|error| error.to_string())?.bytes.into_owned())
-            }
+            (Err(_), Compression::CborRaw, Some(args)) => Bytes::from(
+                args.raw()
+                    .map_err(|error| error.to_string())?
+                    .bytes
+                    .into_owned(),
+            ),
             (Err(reason), ..) => return Err(reason.clone()),
         };
         let response = self
@@ -111,7 +143,11 @@ impl Client {
         let def = api.definition()?;
         let args = match call.args() {
             None => Bytes::from_static(b"{}"),
-            Some(args) if args.format == Format::Json && args.is_object() && call.compression != Compression::CborRaw => {
+            Some(args)
+                if args.format == Format::Json
+                    && args.is_object()
+                    && call.compression != Compression::CborRaw =>
+            {
                 Bytes::copy_from_slice(args.bytes)
             }
             args => {
@@ -128,12 +164,20 @@ impl Client {
                 Ok::<_, String>(())
             });
         }
-        let values = Payload { format: Format::Json, bytes: &values };
+        let values = Payload {
+            format: Format::Json,
+            bytes: &values,
+        };
         let response = decode_args(&def.response, Some(values), Compression::None)?;
         self.response_frame(call, Some(&def), &response)
     }
 
-    fn response_frame(&self, call: &Call, def: Option<&ServiceDef>, response: &Bytes) -> Result<Frame, String> {
+    fn response_frame(
+        &self,
+        call: &Call,
+        def: Option<&ServiceDef>,
+        response: &Bytes,
+    ) -> Result<Frame, String> {
         let format = print_format(call.compression);
         let Some(def) = def.filter(|_| call.compression != Compression::CborRaw) else {
             let mut out = Vec::with_capacity(response.len() + 128);
@@ -143,9 +187,14 @@ impl Client {
             writer.raw("values", None, response);
             writer.boolean("result", true);
             writer.end();
-            return Ok(Frame { format, bytes: out.into() });
+            return Ok(Frame {
+                format,
+                bytes: out.into(),
+            });
         };
-        answer_frame(call, format, |out| self.print_payload(&def.response, response, format, out))
+        answer_frame(call, format, |out| {
+            self.print_payload(&def.response, response, format, out)
+        })
     }
 
     /// Appends a serialized message as a payload of the format.
@@ -156,7 +205,10 @@ impl Client {
         format: Format,
         out: &mut Vec<u8>,
     ) -> Result<(), String> {
-        let json = JsonOptions { non_finite: self.shared.options.non_finite, ..JsonOptions::default() };
+        let json = JsonOptions {
+            non_finite: self.shared.options.non_finite,
+            ..JsonOptions::default()
+        };
         let printed = match format {
             Format::Json => codec::to_json(message_type, bytes, out, &json),
             Format::Cbor => codec::to_cbor(message_type, bytes, out, &CborOptions::default()),
@@ -174,7 +226,14 @@ impl Client {
         writer.text("values", reason);
         writer.boolean("result", false);
         writer.end();
-        self.send_frame(Frame { format, bytes: out.into() }, call.fragment_size, true);
+        self.send_frame(
+            Frame {
+                format,
+                bytes: out.into(),
+            },
+            call.fragment_size,
+            true,
+        );
     }
 }
 
@@ -189,5 +248,8 @@ fn answer_frame<E>(
     writer.value("values", values)?;
     writer.boolean("result", true);
     writer.end();
-    Ok(Frame { format, bytes: out.into() })
+    Ok(Frame {
+        format,
+        bytes: out.into(),
+    })
 }

@@ -35,10 +35,18 @@ struct Untyped {
 }
 
 impl Client {
-    pub(super) fn advertise(self: &Arc<Self>, op: &Advertise<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn advertise(
+        self: &Arc<Self>,
+        op: &Advertise<'_>,
+        reply: &Reply,
+    ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
         let message_type = self.publishable_type(&topic, &op.type_name)?;
-        if let Some(md5) = op.md5sum.as_deref().filter(|md5| *md5 != "*" && *md5 != message_type.md5()) {
+        if let Some(md5) = op
+            .md5sum
+            .as_deref()
+            .filter(|md5| *md5 != "*" && *md5 != message_type.md5())
+        {
             return Err(format!(
                 "type {} has MD5 {} here and {md5} there; use the definition that /rosapi/message_details shows",
                 message_type.name(),
@@ -54,8 +62,14 @@ impl Client {
         let topic = resolve(&op.topic)?;
         let gone = self.outlets.lock().open.remove(&*topic);
         match gone {
-            Some(_) => self.info(reply, &format!("unadvertise: {topic} is no longer advertised")),
-            None => self.warn(reply, &format!("unadvertise: this client does not advertise {topic}")),
+            Some(_) => self.info(
+                reply,
+                &format!("unadvertise: {topic} is no longer advertised"),
+            ),
+            None => self.warn(
+                reply,
+                &format!("unadvertise: this client does not advertise {topic}"),
+            ),
         }
         Ok(())
     }
@@ -64,11 +78,19 @@ impl Client {
     fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, String> {
         let name = plain_type(type_name);
         let graph = self.shared.bus.graph().borrow().clone();
-        let theirs = graph.topics.get(topic).map(|nodes| nodes.type_name.as_str());
-        if let Some(theirs) = theirs.filter(|theirs| !matches!(*theirs, "" | "*") && *theirs != name) {
+        let theirs = graph
+            .topics
+            .get(topic)
+            .map(|nodes| nodes.type_name.as_str());
+        if let Some(theirs) =
+            theirs.filter(|theirs| !matches!(*theirs, "" | "*") && *theirs != name)
+        {
             return Err(format!("topic {topic} has type {theirs}, not {name}"));
         }
-        self.shared.registry.message(&name).map_err(|error| format!("topic {topic}: {error}"))
+        self.shared
+            .registry
+            .message(&name)
+            .map_err(|error| format!("topic {topic}: {error}"))
     }
 
     fn open_outlet(
@@ -84,15 +106,22 @@ impl Client {
         if let Some(known) = outlets.open.get(topic) {
             if known.message_type.md5() != message_type.md5() {
                 let known = known.message_type.name();
-                return Err(format!("this client advertises {topic} as {known}; unadvertise it first"));
+                return Err(format!(
+                    "this client advertises {topic} as {known}; unadvertise it first"
+                ));
             }
             if known.latch == latch {
                 return Ok(known.clone());
             }
         } else if outlets.open.len() >= limit {
-            return Err(format!("this client advertises {limit} topics already; unadvertise one"));
+            return Err(format!(
+                "this client advertises {limit} topics already; unadvertise one"
+            ));
         }
-        let queue = queue_size.filter(|size| *size > 0).unwrap_or(DEFAULT_QUEUE).min(1000) as usize;
+        let queue = queue_size
+            .filter(|size| *size > 0)
+            .unwrap_or(DEFAULT_QUEUE)
+            .min(1000) as usize;
         let (client, reply, name) = (Arc::downgrade(self), reply.clone(), topic.to_owned());
         let failed = move |reason: String| {
             if let Some(client) = client.upgrade() {
@@ -118,7 +147,9 @@ impl Client {
         let outlet = match known {
             Some(outlet) => outlet,
             None => match self.type_to_publish(&topic, &op)? {
-                Some(message_type) => self.open_outlet(&topic, message_type, op.latch, None, reply)?,
+                Some(message_type) => {
+                    self.open_outlet(&topic, message_type, op.latch, None, reply)?
+                }
                 None => return self.publish_later(&topic, &op, reply),
             },
         };
@@ -129,7 +160,11 @@ impl Client {
     }
 
     /// What to publish as without having advertised: the type said, or the topic's.
-    fn type_to_publish(&self, topic: &str, op: &Publish<'_>) -> Result<Option<Arc<MessageType>>, String> {
+    fn type_to_publish(
+        &self,
+        topic: &str,
+        op: &Publish<'_>,
+    ) -> Result<Option<Arc<MessageType>>, String> {
         if let Some(name) = &op.type_name {
             return self.publishable_type(topic, name).map(Some);
         }
@@ -141,12 +176,19 @@ impl Client {
             }
             (_, Some(name)) => self.publishable_type(topic, &name).map(Some),
             (Some(_), None) => Ok(None),
-            (None, None) => Err(format!("topic {topic} does not exist; advertise it with its type first")),
+            (None, None) => Err(format!(
+                "topic {topic} does not exist; advertise it with its type first"
+            )),
         }
     }
 
     /// Keeps a message until the nodes have said what type the topic has.
-    fn publish_later(self: &Arc<Self>, topic: &str, op: &Publish<'_>, reply: &Reply) -> Result<(), String> {
+    fn publish_later(
+        self: &Arc<Self>,
+        topic: &str,
+        op: &Publish<'_>,
+        reply: &Reply,
+    ) -> Result<(), String> {
         let waiting = Untyped {
             format: op.msg.format,
             payload: Bytes::copy_from_slice(op.msg.bytes),
@@ -156,7 +198,9 @@ impl Client {
         let mut outlets = self.outlets.lock();
         if let Some(others) = outlets.untyped.get_mut(topic) {
             if others.len() >= MAX_UNTYPED {
-                return Err(format!("topic {topic} has no known type yet; advertise it first"));
+                return Err(format!(
+                    "topic {topic} has no known type yet; advertise it first"
+                ));
             }
             others.push(waiting);
             return Ok(());
@@ -169,14 +213,28 @@ impl Client {
                 () = client.ended() => return,
                 asked = client.shared.bus.topic_type(&topic) => asked,
             };
-            let waiting = client.outlets.lock().untyped.remove(&topic).unwrap_or_default();
+            let waiting = client
+                .outlets
+                .lock()
+                .untyped
+                .remove(&topic)
+                .unwrap_or_default();
             let found = asked.map_err(|error| error.to_string());
             let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
             for message in waiting {
                 let done = found.clone().and_then(|message_type| {
-                    let outlet = client.open_outlet(&topic, message_type, false, None, &message.reply)?;
-                    let payload = Payload { format: message.format, bytes: &message.payload };
-                    outlet.publish(decode(&outlet.message_type, payload, message.compression, None)?);
+                    let outlet =
+                        client.open_outlet(&topic, message_type, false, None, &message.reply)?;
+                    let payload = Payload {
+                        format: message.format,
+                        bytes: &message.payload,
+                    };
+                    outlet.publish(decode(
+                        &outlet.message_type,
+                        payload,
+                        message.compression,
+                        None,
+                    )?);
                     Ok(())
                 });
                 if let Err(reason) = done {
@@ -199,11 +257,16 @@ pub(super) fn decode(
         let raw = payload.raw().map_err(|error| error.to_string())?;
         codec::validate(message_type, &raw.bytes).map_err(|error| error.to_string())?;
         return Ok(match (&raw.bytes, source) {
-            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => source.slice_ref(slice),
+            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
+                source.slice_ref(slice)
+            }
             _ => Bytes::from(raw.bytes.into_owned()),
         });
     }
-    let options = FillOptions { now: Some(Time::now()), ..FillOptions::default() };
+    let options = FillOptions {
+        now: Some(Time::now()),
+        ..FillOptions::default()
+    };
     // Base64 shrinks by a quarter; everything else that matters does by more.
     let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
     let decoded = match payload.format {
@@ -227,10 +290,24 @@ pub(super) fn decode_args(
         None => decode(message_type, Payload::json("{}"), Compression::None, None),
         Some(list) if list.is_list() && compression != Compression::CborRaw => {
             let fields = message_type.fields();
-            let named = list.named(fields.iter().map(|field| field.name.as_str())).ok_or_else(|| {
-                format!("{} has {} fields, \"args\" has more", message_type.name(), fields.len())
-            })?;
-            decode(message_type, Payload { format: list.format, bytes: &named }, compression, None)
+            let named = list
+                .named(fields.iter().map(|field| field.name.as_str()))
+                .ok_or_else(|| {
+                    format!(
+                        "{} has {} fields, \"args\" has more",
+                        message_type.name(),
+                        fields.len()
+                    )
+                })?;
+            decode(
+                message_type,
+                Payload {
+                    format: list.format,
+                    bytes: &named,
+                },
+                compression,
+                None,
+            )
         }
         Some(args) => decode(message_type, args, compression, None),
     }

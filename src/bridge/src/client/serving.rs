@@ -57,19 +57,33 @@ impl ServiceHandler for Handler {
         let gone = || format!("the client that serves {} is gone", self.service);
         let client = self.client.upgrade().ok_or_else(gone)?;
         client.shared.metrics.calls_served.add(1);
-        let id = format!("service_request:{}:{}", self.service, client.shared.next_number());
+        let id = format!(
+            "service_request:{}:{}",
+            self.service,
+            client.shared.next_number()
+        );
         let frame = self.frame(&client, &id, &request)?;
         let (answer, answered) = oneshot::channel();
-        let request = Request { service: self.service.clone(), def: self.def.clone(), answer };
+        let request = Request {
+            service: self.service.clone(),
+            def: self.def.clone(),
+            answer,
+        };
         client.services.lock().requests.insert(id.clone(), request);
-        let _forget = Forget { client: self.client.clone(), id };
+        let _forget = Forget {
+            client: self.client.clone(),
+            id,
+        };
         let timeout = client.shared.options.call_timeout;
         client.send_as(frame, self.compression, None);
         drop(client);
         match tokio::time::timeout(timeout, answered).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(gone()),
-            Err(_) => Err(format!("the client that serves {} did not answer within {timeout:?}", self.service)),
+            Err(_) => Err(format!(
+                "the client that serves {} did not answer within {timeout:?}",
+                self.service
+            )),
         }
     }
 }
@@ -85,10 +99,15 @@ impl Handler {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, request);
         } else {
-            writer.value("args", |out| client.print_payload(&self.def.request, request, format, out))?;
+            writer.value("args", |out| {
+                client.print_payload(&self.def.request, request, format, out)
+            })?;
         }
         writer.end();
-        Ok(Frame { format, bytes: out.into() })
+        Ok(Frame {
+            format,
+            bytes: out.into(),
+        })
     }
 }
 
@@ -123,13 +142,23 @@ impl Client {
         let stop = CancellationToken::new();
         let mut services = self.services.lock();
         if services.len() >= limit && !services.served.contains_key(&service) {
-            return Err(format!("this client serves {limit} services already; unadvertise one"));
+            return Err(format!(
+                "this client serves {limit} services already; unadvertise one"
+            ));
         }
-        let served = Served { number, _registered: stop.clone().drop_guard() };
+        let served = Served {
+            number,
+            _registered: stop.clone().drop_guard(),
+        };
         let earlier = services.served.insert(service.clone(), served);
         drop(services);
         if earlier.is_some() {
-            self.warn(reply, &format!("advertise_service: {service} was advertised before, the new one replaces it"));
+            self.warn(
+                reply,
+                &format!(
+                    "advertise_service: {service} was advertised before, the new one replaces it"
+                ),
+            );
         }
         drop(earlier);
         let handler = Arc::new(Handler {
@@ -142,14 +171,25 @@ impl Client {
         let (client, reply) = (Arc::downgrade(self), reply.clone());
         let shared = self.shared.clone();
         tokio::spawn(async move {
-            let service_type = ServiceType { name: def.name.clone(), md5: def.md5.clone() };
+            let service_type = ServiceType {
+                name: def.name.clone(),
+                md5: def.md5.clone(),
+            };
             // An earlier handler of this client lets go at once; another client's does not.
             let patience = std::time::Duration::from_secs(1);
-            let entered = tokio::time::timeout(patience, shared.registrations.enter(&service)).await;
+            let entered =
+                tokio::time::timeout(patience, shared.registrations.enter(&service)).await;
             let Ok(registration) = entered else {
                 if let Some(client) = client.upgrade() {
-                    client.services.lock().served.retain(|_, other| other.number != number);
-                    client.error(&reply, &format!("advertise_service: another client serves {service} already"));
+                    client
+                        .services
+                        .lock()
+                        .served
+                        .retain(|_, other| other.number != number);
+                    client.error(
+                        &reply,
+                        &format!("advertise_service: another client serves {service} already"),
+                    );
                 }
                 return;
             };
@@ -166,7 +206,11 @@ impl Client {
                 }
                 Err(error) => {
                     if let Some(client) = client.upgrade() {
-                        client.services.lock().served.retain(|_, other| other.number != number);
+                        client
+                            .services
+                            .lock()
+                            .served
+                            .retain(|_, other| other.number != number);
                         client.error(&reply, &format!("advertise_service: {error}"));
                     }
                 }
@@ -176,7 +220,11 @@ impl Client {
         Ok(())
     }
 
-    pub(super) fn unadvertise_service(&self, op: &UnadvertiseService<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn unadvertise_service(
+        &self,
+        op: &UnadvertiseService<'_>,
+        reply: &Reply,
+    ) -> Result<(), String> {
         let service = resolve(&op.service)?;
         let mut services = self.services.lock();
         let gone = services.served.remove(&*service);
@@ -186,45 +234,79 @@ impl Client {
             .filter(|(_, request)| *request.service == *service)
             .map(|(id, _)| id.clone())
             .collect();
-        let unanswered: Vec<_> = unanswered.iter().filter_map(|id| services.requests.remove(id)).collect();
+        let unanswered: Vec<_> = unanswered
+            .iter()
+            .filter_map(|id| services.requests.remove(id))
+            .collect();
         drop(services);
         for request in unanswered {
             // The caller may have given up.
-            let _ = request.answer.send(Err(format!("{service} was unadvertised before it answered")));
+            let _ = request.answer.send(Err(format!(
+                "{service} was unadvertised before it answered"
+            )));
         }
         match gone {
-            Some(_) => self.info(reply, &format!("unadvertise_service: {service} is no longer advertised")),
-            None => self.warn(reply, &format!("unadvertise_service: this client does not advertise {service}")),
+            Some(_) => self.info(
+                reply,
+                &format!("unadvertise_service: {service} is no longer advertised"),
+            ),
+            None => self.warn(
+                reply,
+                &format!("unadvertise_service: this client does not advertise {service}"),
+            ),
         }
         Ok(())
     }
 
     pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), String> {
         let service = resolve(&op.service)?;
-        let id = op.id.as_ref().ok_or("field \"id\" is missing, the id of the call is expected")?.to_string();
+        let id = op
+            .id
+            .as_ref()
+            .ok_or("field \"id\" is missing, the id of the call is expected")?
+            .to_string();
         let mut services = self.services.lock();
         match services.requests.get(&id) {
             None if !services.served.contains_key(&*service) => {
-                return Err(format!("service {service} is not advertised by this client; advertise_service it first"));
+                return Err(format!(
+                    "service {service} is not advertised by this client; advertise_service it first"
+                ));
             }
-            None => return Err(format!("no call of {service} with id {id:?} waits for an answer")),
+            None => {
+                return Err(format!(
+                    "no call of {service} with id {id:?} waits for an answer"
+                ));
+            }
             Some(request) if *request.service != *service => {
-                return Err(format!("the call with id {id:?} is one of {}, not of {service}", request.service));
+                return Err(format!(
+                    "the call with id {id:?} is one of {}, not of {service}",
+                    request.service
+                ));
             }
             Some(_) => {}
         }
-        let Some(Request { def, answer, .. }) = services.requests.remove(&id) else { return Ok(()) };
+        let Some(Request { def, answer, .. }) = services.requests.remove(&id) else {
+            return Ok(());
+        };
         drop(services);
         if !op.result {
-            let reason = op.values.and_then(|values| values.text()).unwrap_or_default();
-            let reason = if reason.is_empty() { format!("service {service} said no") } else { reason.into_owned() };
+            let reason = op
+                .values
+                .and_then(|values| values.text())
+                .unwrap_or_default();
+            let reason = if reason.is_empty() {
+                format!("service {service} said no")
+            } else {
+                reason.into_owned()
+            };
             // The caller may have given up.
             let _ = answer.send(Err(reason));
             return Ok(());
         }
         let response = decode_args(&def.response, op.values, op.compression);
         let told = response.as_ref().err().cloned();
-        let _ = answer.send(response.map_err(|reason| format!("the client's answer does not fit: {reason}")));
+        let _ = answer
+            .send(response.map_err(|reason| format!("the client's answer does not fit: {reason}")));
         told.map_or(Ok(()), Err)
     }
 }

@@ -49,7 +49,11 @@ impl Listener for TopicListener {
 }
 
 impl Client {
-    pub(super) fn subscribe(self: &Arc<Self>, op: Subscribe<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn subscribe(
+        self: &Arc<Self>,
+        op: Subscribe<'_>,
+        reply: &Reply,
+    ) -> Result<(), String> {
         let name = resolve(&op.topic)?;
         let expected = self.expected_type(&name, &op)?;
         let wishes = Wishes {
@@ -62,14 +66,18 @@ impl Client {
         let mut subscribed = self.subscriptions.lock();
         if let Some(known) = subscribed.get_mut(&*op.topic) {
             if known.subscriptions.len() >= limit && !known.subscriptions.contains_key(&reply.id) {
-                return Err(format!("topic {name} has {limit} subscriptions of this client already"));
+                return Err(format!(
+                    "topic {name} has {limit} subscriptions of this client already"
+                ));
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
             self.apply_wishes(known);
             known.listening.hub().replay(known.listener.as_ref());
         } else {
             if subscribed.len() >= limit {
-                return Err(format!("this client has {limit} topics already; unsubscribe from one"));
+                return Err(format!(
+                    "this client has {limit} topics already; unsubscribe from one"
+                ));
             }
             let topic: Arc<str> = op.topic.as_ref().into();
             let key = self.outbox.add_topic(topic.clone(), wishes);
@@ -85,7 +93,15 @@ impl Client {
             let hub = self.shared.hub(&name, expected.as_deref());
             let listening = hub.listen(listener.clone());
             let subscriptions = Subscriptions::from([(reply.id.clone(), wishes)]);
-            subscribed.insert(topic, TopicSubscription { key, subscriptions, listening, listener });
+            subscribed.insert(
+                topic,
+                TopicSubscription {
+                    key,
+                    subscriptions,
+                    listening,
+                    listener,
+                },
+            );
         }
         drop(subscribed);
         self.info(reply, &format!("subscribe: subscribed to {name}"));
@@ -100,10 +116,16 @@ impl Client {
     ) -> Result<Option<Arc<ros::schema::MessageType>>, String> {
         let graph = self.shared.bus.graph().borrow().clone();
         let nodes = graph.topics.get(topic);
-        let actual = nodes.map(|nodes| nodes.type_name.as_str()).filter(|name| !name.is_empty() && *name != "*");
+        let actual = nodes
+            .map(|nodes| nodes.type_name.as_str())
+            .filter(|name| !name.is_empty() && *name != "*");
         let local = self.shared.local_type(topic);
         let actual = actual.or(local.as_deref());
-        let wanted = op.type_name.as_deref().filter(|name| *name != "*").map(plain_type);
+        let wanted = op
+            .type_name
+            .as_deref()
+            .filter(|name| *name != "*")
+            .map(plain_type);
         match (&wanted, actual) {
             (None, None) if nodes.is_none() => {
                 return Err(format!(
@@ -115,7 +137,9 @@ impl Client {
             }
             _ => {}
         }
-        let Some(name) = wanted.or(actual.map(plain_type)) else { return Ok(None) };
+        let Some(name) = wanted.or(actual.map(plain_type)) else {
+            return Ok(None);
+        };
         match self.shared.registry.message(&name) {
             Ok(found) => Ok(Some(found)),
             // A publisher brings the definition along, and for ROS bytes none is needed.
@@ -135,14 +159,23 @@ impl Client {
         let mut subscribed = self.subscriptions.lock();
         let Some(known) = subscribed.get_mut(&*op.topic) else {
             drop(subscribed);
-            self.warn(reply, &format!("unsubscribe: this client has no subscription to {}", op.topic));
+            self.warn(
+                reply,
+                &format!(
+                    "unsubscribe: this client has no subscription to {}",
+                    op.topic
+                ),
+            );
             return Ok(());
         };
         let gone = match &reply.id {
             None => true,
             id => {
                 if known.subscriptions.remove(id).is_none() {
-                    self.warn(reply, &format!("unsubscribe: no subscription to {} has this id", op.topic));
+                    self.warn(
+                        reply,
+                        &format!("unsubscribe: no subscription to {} has this id", op.topic),
+                    );
                 }
                 known.subscriptions.is_empty()
             }
@@ -156,7 +189,10 @@ impl Client {
         } else {
             self.apply_wishes(known);
         }
-        self.info(reply, &format!("unsubscribe: unsubscribed from {}", op.topic));
+        self.info(
+            reply,
+            &format!("unsubscribe: unsubscribed from {}", op.topic),
+        );
         Ok(())
     }
 }

@@ -41,32 +41,86 @@ const TEXTS: &[(&str, &str)] = &[
         "string type\nstring[] fieldnames\nstring[] fieldtypes\nint32[] fieldarraylen\nstring[] examples\n\
          string[] constnames\nstring[] constvalues\n",
     ),
-    ("rosapi/srv/GetActionServers", "---\nstring[] action_servers\n"),
+    (
+        "rosapi/srv/GetActionServers",
+        "---\nstring[] action_servers\n",
+    ),
     ("rosapi/srv/DeleteParam", "string name\n---\n"),
-    ("rosapi/srv/GetParam", "string name\nstring default\n---\nstring value\n"),
+    (
+        "rosapi/srv/GetParam",
+        "string name\nstring default\n---\nstring value\n",
+    ),
     ("rosapi/srv/GetParamNames", "---\nstring[] names\n"),
-    ("rosapi/srv/GetROSVersion", "---\nuint8 version\nstring distro\n"),
+    (
+        "rosapi/srv/GetROSVersion",
+        "---\nuint8 version\nstring distro\n",
+    ),
     ("rosapi/srv/GetTime", "---\ntime time\n"),
     ("rosapi/srv/HasParam", "string name\n---\nbool exists\n"),
-    ("rosapi/srv/MessageDetails", "string type\n---\nTypeDef[] typedefs\n"),
-    ("rosapi/srv/NodeDetails", "string node\n---\nstring[] subscribing\nstring[] publishing\nstring[] services\n"),
+    (
+        "rosapi/srv/MessageDetails",
+        "string type\n---\nTypeDef[] typedefs\n",
+    ),
+    (
+        "rosapi/srv/NodeDetails",
+        "string node\n---\nstring[] subscribing\nstring[] publishing\nstring[] services\n",
+    ),
     ("rosapi/srv/Nodes", "---\nstring[] nodes\n"),
-    ("rosapi/srv/Publishers", "string topic\n---\nstring[] publishers\n"),
-    ("rosapi/srv/SearchParam", "string name\n---\nstring global_name\n"),
-    ("rosapi/srv/ServiceHost", "string service\n---\nstring host\n"),
-    ("rosapi/srv/ServiceNode", "string service\n---\nstring node\n"),
-    ("rosapi/srv/ServiceProviders", "string service\n---\nstring[] providers\n"),
-    ("rosapi/srv/ServiceRequestDetails", "string type\n---\nTypeDef[] typedefs\n"),
-    ("rosapi/srv/ServiceResponseDetails", "string type\n---\nTypeDef[] typedefs\n"),
-    ("rosapi/srv/ServiceType", "string service\n---\nstring type\n"),
+    (
+        "rosapi/srv/Publishers",
+        "string topic\n---\nstring[] publishers\n",
+    ),
+    (
+        "rosapi/srv/SearchParam",
+        "string name\n---\nstring global_name\n",
+    ),
+    (
+        "rosapi/srv/ServiceHost",
+        "string service\n---\nstring host\n",
+    ),
+    (
+        "rosapi/srv/ServiceNode",
+        "string service\n---\nstring node\n",
+    ),
+    (
+        "rosapi/srv/ServiceProviders",
+        "string service\n---\nstring[] providers\n",
+    ),
+    (
+        "rosapi/srv/ServiceRequestDetails",
+        "string type\n---\nTypeDef[] typedefs\n",
+    ),
+    (
+        "rosapi/srv/ServiceResponseDetails",
+        "string type\n---\nTypeDef[] typedefs\n",
+    ),
+    (
+        "rosapi/srv/ServiceType",
+        "string service\n---\nstring type\n",
+    ),
     ("rosapi/srv/Services", "---\nstring[] services\n"),
-    ("rosapi/srv/ServicesForType", "string type\n---\nstring[] services\n"),
+    (
+        "rosapi/srv/ServicesForType",
+        "string type\n---\nstring[] services\n",
+    ),
     ("rosapi/srv/SetParam", "string name\nstring value\n---\n"),
-    ("rosapi/srv/Subscribers", "string topic\n---\nstring[] subscribers\n"),
+    (
+        "rosapi/srv/Subscribers",
+        "string topic\n---\nstring[] subscribers\n",
+    ),
     ("rosapi/srv/TopicType", "string topic\n---\nstring type\n"),
-    ("rosapi/srv/Topics", "---\nstring[] topics\nstring[] types\n"),
-    ("rosapi/srv/TopicsAndRawTypes", "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text\n"),
-    ("rosapi/srv/TopicsForType", "string type\n---\nstring[] topics\n"),
+    (
+        "rosapi/srv/Topics",
+        "---\nstring[] topics\nstring[] types\n",
+    ),
+    (
+        "rosapi/srv/TopicsAndRawTypes",
+        "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text\n",
+    ),
+    (
+        "rosapi/srv/TopicsForType",
+        "string type\n---\nstring[] topics\n",
+    ),
 ];
 
 /// rosapi's own definitions.
@@ -94,6 +148,9 @@ mod tests {
             registry().service(&format!("rosapi/{srv}")).unwrap();
         }
         // As rosbridge_suite's generated code has it.
-        assert_eq!(registry().service("rosapi/Topics").unwrap().md5, "d966d98fc333fa1f3135af765eac1ba8");
+        assert_eq!(
+            registry().service("rosapi/Topics").unwrap().md5,
+            "d966d98fc333fa1f3135af765eac1ba8"
+        );
     }
 }

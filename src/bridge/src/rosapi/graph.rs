@@ -18,7 +18,11 @@ const ASKED_AT_ONCE: usize = 16;
 
 /// Nobody has said yet: rosapi writes it so.
 fn type_of(nodes: &TopicNodes) -> &str {
-    if nodes.type_name == "*" { "" } else { &nodes.type_name }
+    if nodes.type_name == "*" {
+        ""
+    } else {
+        &nodes.type_name
+    }
 }
 
 pub(super) fn topics(graph: &Graph) -> Value {
@@ -29,7 +33,11 @@ pub(super) fn topics(graph: &Graph) -> Value {
 
 pub(super) fn topics_for_type(graph: &Graph, type_name: &str) -> Value {
     let wanted = plain_type(type_name);
-    let topics = graph.topics.iter().filter(|(_, nodes)| nodes.type_name == wanted).map(|(topic, _)| topic);
+    let topics = graph
+        .topics
+        .iter()
+        .filter(|(_, nodes)| nodes.type_name == wanted)
+        .map(|(topic, _)| topic);
     json!({ "topics": topics.collect::<Vec<_>>() })
 }
 
@@ -37,7 +45,9 @@ pub(super) fn topics_and_raw_types(graph: &Graph, registry: &Registry) -> Value 
     let mut answer = topics(graph);
     let texts = graph.topics.values().map(|nodes| {
         let found = with_own(registry, |registry| registry.message(type_of(nodes)));
-        found.map(|found| found.full_text().to_owned()).unwrap_or_default()
+        found
+            .map(|found| found.full_text().to_owned())
+            .unwrap_or_default()
     });
     answer["typedefs_full_text"] = texts.collect::<Vec<_>>().into();
     answer
@@ -63,7 +73,10 @@ pub(super) fn nodes(graph: &Graph) -> Value {
 
 pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
     let topics = |ends: fn(&TopicNodes) -> &Vec<String>| -> Vec<&String> {
-        let of_node = graph.topics.iter().filter(|(_, nodes)| ends(nodes).iter().any(|end| end == node));
+        let of_node = graph
+            .topics
+            .iter()
+            .filter(|(_, nodes)| ends(nodes).iter().any(|end| end == node));
         of_node.map(|(topic, _)| topic).collect()
     };
     let served = graph.services.iter().filter(|(_, server)| *server == node);
@@ -83,19 +96,30 @@ pub(super) fn action_servers(graph: &Graph) -> Value {
     const PARTS: [&str; 5] = ["cancel", "feedback", "goal", "result", "status"];
     let mut found: BTreeMap<&str, u8> = BTreeMap::new();
     for topic in graph.topics.keys() {
-        let Some((namespace, part)) = topic.rsplit_once('/').filter(|(namespace, _)| !namespace.is_empty()) else {
+        let Some((namespace, part)) = topic
+            .rsplit_once('/')
+            .filter(|(namespace, _)| !namespace.is_empty())
+        else {
             continue;
         };
         if let Some(at) = PARTS.iter().position(|known| *known == part) {
             *found.entry(namespace).or_default() |= 1 << at;
         }
     }
-    let servers = found.into_iter().filter(|(_, parts)| *parts == 0b11111).map(|(namespace, _)| namespace);
+    let servers = found
+        .into_iter()
+        .filter(|(_, parts)| *parts == 0b11111)
+        .map(|(namespace, _)| namespace);
     json!({ "action_servers": servers.collect::<Vec<_>>() })
 }
 
 fn all_services(graph: &Graph) -> BTreeSet<String> {
-    graph.services.keys().cloned().chain(Service::all().map(Service::full_name)).collect()
+    graph
+        .services
+        .keys()
+        .cloned()
+        .chain(Service::all().map(Service::full_name))
+        .collect()
 }
 
 pub(super) fn services(graph: &Graph) -> Value {
@@ -116,7 +140,10 @@ pub(super) fn service_node(graph: &Graph, service: &str) -> Value {
 
 pub(super) fn service_host(graph: &Graph, service: &str) -> Value {
     let node = server(graph, service);
-    let address = graph.nodes.get(node).map_or(if node == NODE { "localhost" } else { "" }, String::as_str);
+    let address = graph
+        .nodes
+        .get(node)
+        .map_or(if node == NODE { "localhost" } else { "" }, String::as_str);
     let host = address.split_once("://").map_or(address, |(_, rest)| rest);
     json!({ "host": host.split([':', '/']).next().unwrap_or_default() })
 }
@@ -127,7 +154,10 @@ async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
     match Service::find(service) {
         Some(own) if !served => own.type_name(),
         _ => {
-            let found = shared.service_types.find(shared.bus.as_ref(), service).await;
+            let found = shared
+                .service_types
+                .find(shared.bus.as_ref(), service)
+                .await;
             found.map(|found| found.name).unwrap_or_default()
         }
     }
@@ -147,16 +177,34 @@ async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<St
             (service, found)
         }
     });
-    let answers: BTreeMap<String, String> = stream::iter(asked).buffer_unordered(ASKED_AT_ONCE).collect().await;
-    answers.into_iter().filter(|(_, found)| **found == *wanted).map(|(service, _)| service).collect()
+    let answers: BTreeMap<String, String> = stream::iter(asked)
+        .buffer_unordered(ASKED_AT_ONCE)
+        .collect()
+        .await;
+    answers
+        .into_iter()
+        .filter(|(_, found)| **found == *wanted)
+        .map(|(service, _)| service)
+        .collect()
 }
 
-pub(super) async fn services_for_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Value {
+pub(super) async fn services_for_type(
+    shared: &Arc<Shared>,
+    graph: &Graph,
+    type_name: &str,
+) -> Value {
     json!({ "services": of_type(shared, graph, type_name).await })
 }
 
-pub(super) async fn service_providers(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Value {
+pub(super) async fn service_providers(
+    shared: &Arc<Shared>,
+    graph: &Graph,
+    type_name: &str,
+) -> Value {
     let services = of_type(shared, graph, type_name).await;
-    let providers: Vec<_> = services.iter().map(|service| server(graph, service)).collect();
+    let providers: Vec<_> = services
+        .iter()
+        .map(|service| server(graph, service))
+        .collect();
     json!({ "providers": providers })
 }

@@ -25,7 +25,11 @@ pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
     let value = match shared.bus.get_param(&key(args)?).await {
         Ok(value) => serde_json::to_string(&value).map_err(|error| error.to_string())?,
         Err(BusError::NoParam(_)) => {
-            let default = if args.default.is_empty() { &args.default_value } else { &args.default };
+            let default = if args.default.is_empty() {
+                &args.default_value
+            } else {
+                &args.default
+            };
             match serde_json::from_str::<Value>(default) {
                 Ok(value) => value.to_string(),
                 Err(_) if default.is_empty() => "null".to_owned(),
@@ -45,7 +49,11 @@ pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
             args.value.chars().take(48).collect::<String>()
         )
     })?;
-    shared.bus.set_param(&key(args)?, value).await.map_err(failed)?;
+    shared
+        .bus
+        .set_param(&key(args)?, value)
+        .await
+        .map_err(failed)?;
     Ok(json!({}))
 }
 
@@ -54,7 +62,11 @@ pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
 }
 
 pub(super) async fn search(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let found = shared.bus.search_param("/", args.name.trim_start_matches('/')).await.map_err(failed)?;
+    let found = shared
+        .bus
+        .search_param("/", args.name.trim_start_matches('/'))
+        .await
+        .map_err(failed)?;
     Ok(json!({ "global_name": found.unwrap_or_default() }))
 }
 

@@ -18,19 +18,25 @@ pub(super) fn message(registry: &Registry, type_name: &str) -> Result<Value, Str
         return Ok(json!({ "typedefs": [] }));
     }
     let found = with_own(registry, |registry| registry.message(&name));
-    found.map(|found| typedefs(&found)).map_err(|error| error.to_string())
+    found
+        .map(|found| typedefs(&found))
+        .map_err(|error| error.to_string())
 }
 
 pub(super) fn request(registry: &Registry, type_name: &str) -> Result<Value, String> {
     let name = plain_type(type_name);
     let found = with_own(registry, |registry| registry.service(&name));
-    found.map(|found| typedefs(&found.request)).map_err(|error| error.to_string())
+    found
+        .map(|found| typedefs(&found.request))
+        .map_err(|error| error.to_string())
 }
 
 pub(super) fn response(registry: &Registry, type_name: &str) -> Result<Value, String> {
     let name = plain_type(type_name);
     let found = with_own(registry, |registry| registry.service(&name));
-    found.map(|found| typedefs(&found.response)).map_err(|error| error.to_string())
+    found
+        .map(|found| typedefs(&found.response))
+        .map_err(|error| error.to_string())
 }
 
 fn typedefs(message: &Arc<MessageType>) -> Value {
@@ -119,11 +125,26 @@ mod tests {
     #[test]
     fn a_type_is_described_with_all_it_contains() {
         let registry = Registry::new();
-        registry.insert("x/msg/Pair", "uint8 ONE=1\nHeader header\nfloat64[2] both\nInner[] more\nbool ok\n").unwrap();
-        registry.insert("x/msg/Inner", "duration wait\nstring name\n").unwrap();
+        registry
+            .insert(
+                "x/msg/Pair",
+                "uint8 ONE=1\nHeader header\nfloat64[2] both\nInner[] more\nbool ok\n",
+            )
+            .unwrap();
+        registry
+            .insert("x/msg/Inner", "duration wait\nstring name\n")
+            .unwrap();
         let answer = message(&registry, "x/msg/Pair").unwrap();
-        let types: Vec<_> = answer["typedefs"].as_array().unwrap().iter().map(|def| def["type"].clone()).collect();
-        assert_eq!(types, ["x/Pair", "std_msgs/Header", "time", "x/Inner", "duration"]);
+        let types: Vec<_> = answer["typedefs"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|def| def["type"].clone())
+            .collect();
+        assert_eq!(
+            types,
+            ["x/Pair", "std_msgs/Header", "time", "x/Inner", "duration"]
+        );
         assert_eq!(
             answer["typedefs"][0],
             json!({
@@ -136,18 +157,30 @@ mod tests {
                 "constvalues": ["1"],
             })
         );
-        assert!(message(&registry, "x/Nothing").unwrap_err().contains("no definition of x/Nothing is known"));
-        assert_eq!(message(&registry, "time").unwrap()["typedefs"][0]["fieldnames"], json!(["secs", "nsecs"]));
+        assert!(
+            message(&registry, "x/Nothing")
+                .unwrap_err()
+                .contains("no definition of x/Nothing is known")
+        );
+        assert_eq!(
+            message(&registry, "time").unwrap()["typedefs"][0]["fieldnames"],
+            json!(["secs", "nsecs"])
+        );
     }
 
     #[test]
     fn services_are_described_by_halves() {
         let registry = Registry::new();
-        registry.insert("x/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n").unwrap();
+        registry
+            .insert("x/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n")
+            .unwrap();
         let asked = request(&registry, "x/Add").unwrap();
         assert_eq!(asked["typedefs"][0]["type"], "x/AddRequest");
         assert_eq!(asked["typedefs"][0]["fieldnames"], json!(["a", "b"]));
-        assert_eq!(response(&registry, "x/Add").unwrap()["typedefs"][0]["fieldnames"], json!(["sum"]));
+        assert_eq!(
+            response(&registry, "x/Add").unwrap()["typedefs"][0]["fieldnames"],
+            json!(["sum"])
+        );
         let own = response(&registry, "rosapi/Topics").unwrap();
         assert_eq!(own["typedefs"][0]["fieldnames"], json!(["topics", "types"]));
     }

@@ -8,7 +8,10 @@ use super::*;
 const LIMIT: usize = 1 << 20;
 
 /// Our end and one of tungstenite's.
-async fn pair() -> (WebSocket<tokio::io::DuplexStream>, WebSocketStream<tokio::io::DuplexStream>) {
+async fn pair() -> (
+    WebSocket<tokio::io::DuplexStream>,
+    WebSocketStream<tokio::io::DuplexStream>,
+) {
     let (ours, theirs) = tokio::io::duplex(4096);
     let theirs = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
     (WebSocket::new(ours, b"", LIMIT, LIMIT), theirs)
@@ -25,16 +28,28 @@ async fn messages_of_all_sizes_cross_unchanged_both_ways() {
     let there = async {
         for size in sizes {
             theirs.send(Theirs::binary(vec![7; size])).await.unwrap();
-            theirs.send(Theirs::text("ü".repeat(size / 2))).await.unwrap();
+            theirs
+                .send(Theirs::text("ü".repeat(size / 2)))
+                .await
+                .unwrap();
         }
         for size in sizes {
-            assert_eq!(theirs.next().await.unwrap().unwrap(), Theirs::binary(vec![9; size]));
+            assert_eq!(
+                theirs.next().await.unwrap().unwrap(),
+                Theirs::binary(vec![9; size])
+            );
         }
     };
     let here = async {
         for size in sizes {
-            assert_eq!(next(&mut ours).await.unwrap(), Message::Binary(vec![7; size].into()));
-            assert_eq!(next(&mut ours).await.unwrap(), Message::Text("ü".repeat(size / 2).into()));
+            assert_eq!(
+                next(&mut ours).await.unwrap(),
+                Message::Binary(vec![7; size].into())
+            );
+            assert_eq!(
+                next(&mut ours).await.unwrap(),
+                Message::Text("ü".repeat(size / 2).into())
+            );
         }
         for size in sizes {
             ours.queue(frame::BINARY, vec![9; size].into());
@@ -48,14 +63,28 @@ async fn messages_of_all_sizes_cross_unchanged_both_ways() {
 #[tokio::test]
 async fn control_frames_and_close_cross() {
     let (mut ours, mut theirs) = pair().await;
-    theirs.send(Theirs::Ping(Bytes::from_static(b"p"))).await.unwrap();
-    assert_eq!(next(&mut ours).await.unwrap(), Message::Ping(Bytes::from_static(b"p")));
+    theirs
+        .send(Theirs::Ping(Bytes::from_static(b"p")))
+        .await
+        .unwrap();
+    assert_eq!(
+        next(&mut ours).await.unwrap(),
+        Message::Ping(Bytes::from_static(b"p"))
+    );
     theirs.close(None).await.unwrap();
-    assert_eq!(next(&mut ours).await.unwrap(), Message::Close(1005, String::new()));
+    assert_eq!(
+        next(&mut ours).await.unwrap(),
+        Message::Close(1005, String::new())
+    );
     ours.queue_close(1009, &"ü".repeat(100));
     poll_fn(|cx| ours.poll_flush(cx)).await.unwrap();
-    let Theirs::Close(Some(close)) = theirs.next().await.unwrap().unwrap() else { panic!("not closed") };
-    assert_eq!((u16::from(close.code), close.reason.chars().count()), (1009, 61));
+    let Theirs::Close(Some(close)) = theirs.next().await.unwrap().unwrap() else {
+        panic!("not closed")
+    };
+    assert_eq!(
+        (u16::from(close.code), close.reason.chars().count()),
+        (1009, 61)
+    );
     drop(theirs);
     assert!(matches!(next(&mut ours).await, Err(WsError::Eof)));
 }
@@ -79,25 +108,63 @@ fn masked(first: u8, length: u16) -> Vec<u8> {
 
 #[tokio::test]
 async fn limits_and_rules_are_kept() {
-    assert_eq!(refusal(&masked(0x81, 1001)).await, (1009, "a frame of 1001 bytes is over the limit of 1000".into()));
     assert_eq!(
-        refusal(&[0x82, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0]).await,
-        (1009, format!("a frame of {} bytes is over the limit of 1000", u64::MAX))
+        refusal(&masked(0x81, 1001)).await,
+        (
+            1009,
+            "a frame of 1001 bytes is over the limit of 1000".into()
+        )
+    );
+    assert_eq!(
+        refusal(&[
+            0x82, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0
+        ])
+        .await,
+        (
+            1009,
+            format!("a frame of {} bytes is over the limit of 1000", u64::MAX)
+        )
     );
     let parts = [masked(0x01, 800), masked(0x80, 800)].concat();
-    assert_eq!(refusal(&parts).await, (1009, "a message of 1600 bytes is over the limit of 1500".into()));
-    assert_eq!(refusal(&[0x81, 0x00]).await, (1002, "a client's frames must be masked".into()));
+    assert_eq!(
+        refusal(&parts).await,
+        (
+            1009,
+            "a message of 1600 bytes is over the limit of 1500".into()
+        )
+    );
+    assert_eq!(
+        refusal(&[0x81, 0x00]).await,
+        (1002, "a client's frames must be masked".into())
+    );
     assert_eq!(refusal(&masked(0x80, 1)).await.0, 1002);
-    assert_eq!(refusal(&[masked(0x01, 1), masked(0x01, 1)].concat()).await.0, 1002);
+    assert_eq!(
+        refusal(&[masked(0x01, 1), masked(0x01, 1)].concat())
+            .await
+            .0,
+        1002
+    );
     assert_eq!(refusal(&[0x88, 0x81, 0, 0, 0, 0, 3]).await.0, 1002);
     assert_eq!(refusal(b"\x13\x37\xde\xad\xbe\xef").await.0, 1002);
 }
 
 #[tokio::test]
 async fn parts_make_one_message_with_control_frames_between() {
-    let bytes = [masked(0x01, 2), masked(0x89, 0), masked(0x00, 2), masked(0x80, 2)].concat();
+    let bytes = [
+        masked(0x01, 2),
+        masked(0x89, 0),
+        masked(0x00, 2),
+        masked(0x80, 2),
+    ]
+    .concat();
     let (io, _keep) = tokio::io::duplex(64);
     let mut socket = WebSocket::new(io, &bytes, 1000, 1000);
-    assert_eq!(next(&mut socket).await.unwrap(), Message::Ping(Bytes::new()));
-    assert_eq!(next(&mut socket).await.unwrap(), Message::Text(vec![0; 6].into()));
+    assert_eq!(
+        next(&mut socket).await.unwrap(),
+        Message::Ping(Bytes::new())
+    );
+    assert_eq!(
+        next(&mut socket).await.unwrap(),
+        Message::Text(vec![0; 6].into())
+    );
 }

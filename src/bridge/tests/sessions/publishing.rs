@@ -10,15 +10,24 @@ async fn what_is_published_right_behind_advertise_arrives() {
     let world = World::new().await;
     let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
     let mut client = world.client().await;
-    client.send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"})).await;
+    client
+        .send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"}))
+        .await;
     for number in 0..20 {
-        client.send(json!({"op": "publish", "topic": "/text", "msg": {"data": format!("{number}")}})).await;
+        client
+            .send(json!({"op": "publish", "topic": "/text", "msg": {"data": format!("{number}")}}))
+            .await;
     }
-    client.send(json!({"op": "unadvertise", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "unadvertise", "topic": "/text"}))
+        .await;
     client.lose().await;
     for number in 0..20 {
         let message = patiently(heard.messages.recv()).await.unwrap();
-        assert_eq!(world.json("std_msgs/String", &message.bytes), json!({"data": format!("{number}")}));
+        assert_eq!(
+            world.json("std_msgs/String", &message.bytes),
+            json!({"data": format!("{number}")})
+        );
     }
 }
 
@@ -27,11 +36,18 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
     let world = World::new().await;
     let mut heard = world.node_subscribes("/place", "x_msgs/Place").await;
     let mut client = world.client().await;
-    client.send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/msg/Place"})).await;
-    client.send(json!({"op": "publish", "topic": "/place", "msg": {"x": 2}})).await;
+    client
+        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/msg/Place"}))
+        .await;
+    client
+        .send(json!({"op": "publish", "topic": "/place", "msg": {"x": 2}}))
+        .await;
     let message = patiently(heard.messages.recv()).await.unwrap();
     let value = world.json("x_msgs/Place", &message.bytes);
-    assert_eq!((&value["x"], &value["near"], &value["tags"]), (&json!(2.0), &json!([]), &json!([])));
+    assert_eq!(
+        (&value["x"], &value["near"], &value["tags"]),
+        (&json!(2.0), &json!([]), &json!([]))
+    );
     assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
 }
 
@@ -39,13 +55,19 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
 async fn without_advertise_the_type_is_the_topics() {
     let world = World::new().await;
     let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
-    world.in_graph(|graph| graph.topics.contains_key("/text")).await;
+    world
+        .in_graph(|graph| graph.topics.contains_key("/text"))
+        .await;
     let mut client = world.client().await;
     client.settled().await;
-    client.send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}})).await;
+    client
+        .send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}}))
+        .await;
     let message = patiently(heard.messages.recv()).await.unwrap();
     assert_eq!(&*message.bytes, b"\x01\0\0\0x");
-    client.send(json!({"op": "publish", "topic": "/nothing", "msg": {}})).await;
+    client
+        .send(json!({"op": "publish", "topic": "/nothing", "msg": {}}))
+        .await;
     assert_eq!(
         client.refusal().await,
         "publish: topic /nothing does not exist; advertise it with its type first"
@@ -55,13 +77,18 @@ async fn without_advertise_the_type_is_the_topics() {
 #[tokio::test]
 async fn ros_bytes_pass_through_untouched_and_are_checked() {
     let world = World::new().await;
-    let mut heard = world.node_subscribes("/bytes", "std_msgs/UInt8MultiArray").await;
+    let mut heard = world
+        .node_subscribes("/bytes", "std_msgs/UInt8MultiArray")
+        .await;
     let mut client = world.client().await;
     let md5 = world.wire_type("std_msgs/UInt8MultiArray").md5;
     client
         .send(json!({"op": "advertise", "topic": "/bytes", "type": "std_msgs/UInt8MultiArray", "md5sum": md5}))
         .await;
-    let message = world.message("std_msgs/UInt8MultiArray", json!({"data": vec![5; 100_000]}));
+    let message = world.message(
+        "std_msgs/UInt8MultiArray",
+        json!({"data": vec![5; 100_000]}),
+    );
     let frame = |bytes: &[u8]| {
         let mut msg = Vec::new();
         let mut writer = rosbridge::Writer::new(&mut msg, Format::Cbor);
@@ -80,32 +107,63 @@ async fn ros_bytes_pass_through_untouched_and_are_checked() {
         out
     };
     client.send_binary(frame(&message)).await;
-    assert_eq!(patiently(heard.messages.recv()).await.unwrap().bytes, message);
+    assert_eq!(
+        patiently(heard.messages.recv()).await.unwrap().bytes,
+        message
+    );
     client.send_binary(frame(&message[..1000])).await;
     let status = client.binary().await;
-    let Op::Status(status) = Op::parse(rosbridge::Frame::Binary(&status)).unwrap() else { panic!("{status:?}") };
+    let Op::Status(status) = Op::parse(rosbridge::Frame::Binary(&status)).unwrap() else {
+        panic!("{status:?}")
+    };
     assert_eq!(status.id, Some("p1".into()));
-    assert!(status.msg.starts_with("publish: topic /bytes: field data of std_msgs/UInt8MultiArray: "), "{}", status.msg);
-    client.send(json!({"op": "advertise", "topic": "/other", "type": "std_msgs/String", "md5sum": md5})).await;
-    assert!(client.refusal().await.contains("has MD5 992ce8a1687cec8c8bd883ec73ca41d1 here and "));
+    assert!(
+        status
+            .msg
+            .starts_with("publish: topic /bytes: field data of std_msgs/UInt8MultiArray: "),
+        "{}",
+        status.msg
+    );
+    client
+        .send(
+            json!({"op": "advertise", "topic": "/other", "type": "std_msgs/String", "md5sum": md5}),
+        )
+        .await;
+    assert!(
+        client
+            .refusal()
+            .await
+            .contains("has MD5 992ce8a1687cec8c8bd883ec73ca41d1 here and ")
+    );
 }
 
 #[tokio::test]
 async fn a_client_latches_for_nodes_and_clients_that_come_later() {
     let world = World::new().await;
     let mut client = world.client().await;
-    client.send(json!({"op": "advertise", "topic": "/map", "type": "std_msgs/Int32", "latch": true})).await;
-    client.send(json!({"op": "publish", "topic": "/map", "msg": {"data": 42}})).await;
+    client
+        .send(json!({"op": "advertise", "topic": "/map", "type": "std_msgs/Int32", "latch": true}))
+        .await;
+    client
+        .send(json!({"op": "publish", "topic": "/map", "msg": {"data": 42}}))
+        .await;
     client.settled().await;
     let mut late = world.client().await;
     late.send(json!({"op": "subscribe", "topic": "/map"})).await;
     assert_eq!(late.json().await["msg"], json!({"data": 42}));
     let mut heard = world.node_subscribes("/map", "std_msgs/Int32").await;
-    assert_eq!(&*patiently(heard.messages.recv()).await.unwrap().bytes, [42, 0, 0, 0]);
-    client.send(json!({"op": "unadvertise", "topic": "/map"})).await;
+    assert_eq!(
+        &*patiently(heard.messages.recv()).await.unwrap().bytes,
+        [42, 0, 0, 0]
+    );
+    client
+        .send(json!({"op": "unadvertise", "topic": "/map"}))
+        .await;
     client.settled().await;
     let mut later = world.client().await;
-    later.send(json!({"op": "subscribe", "topic": "/map", "type": "std_msgs/Int32"})).await;
+    later
+        .send(json!({"op": "subscribe", "topic": "/map", "type": "std_msgs/Int32"}))
+        .await;
     later.settled().await;
 }
 
@@ -113,31 +171,56 @@ async fn a_client_latches_for_nodes_and_clients_that_come_later() {
 async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
     let world = World::new().await;
     let _heard = world.node_subscribes("/text", "std_msgs/String").await;
-    world.in_graph(|graph| graph.topics.contains_key("/text")).await;
+    world
+        .in_graph(|graph| graph.topics.contains_key("/text"))
+        .await;
     let mut client = world.client().await;
     client.settled().await;
-    client.send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"})).await;
+    client
+        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
+        .await;
     for (msg, field) in [
         (json!({"x": "far"}), "x"),
         (json!({"tags": [{"number": 300}]}), "tags[0].number"),
         (json!({"header": {"stamp": 5}}), "header.stamp"),
         (json!({"y": 1}), "y"),
     ] {
-        client.send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": msg})).await;
+        client
+            .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": msg}))
+            .await;
         let text = client.refusal().await;
         let expected = format!("publish: topic /place: field {field} of x_msgs/Place: ");
         assert!(text.starts_with(&expected), "{text}");
     }
-    client.send(json!({"op": "advertise", "topic": "/lost", "type": "x_msgs/Lost"})).await;
+    client
+        .send(json!({"op": "advertise", "topic": "/lost", "type": "x_msgs/Lost"}))
+        .await;
     assert_eq!(
         client.refusal().await,
         "advertise: topic /lost: no definition of x_msgs/Lost is known, install the package that has it or supply its text"
     );
-    client.send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/Int32"})).await;
-    assert_eq!(client.refusal().await, "advertise: topic /text has type std_msgs/String, not std_msgs/Int32");
-    client.send_text(r#"{"op":"publish","topic":"/place","msg":{"x":1}"#).await;
-    assert_eq!(client.refusal().await, "invalid JSON at byte 46: a comma or the object's end is expected");
-    client.send_text(r#"{"op":"publish","topic":"/place","msg":{"x":01}}"#).await;
-    assert!(client.refusal().await.starts_with("publish: topic /place: "));
+    client
+        .send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/Int32"}))
+        .await;
+    assert_eq!(
+        client.refusal().await,
+        "advertise: topic /text has type std_msgs/String, not std_msgs/Int32"
+    );
+    client
+        .send_text(r#"{"op":"publish","topic":"/place","msg":{"x":1}"#)
+        .await;
+    assert_eq!(
+        client.refusal().await,
+        "invalid JSON at byte 46: a comma or the object's end is expected"
+    );
+    client
+        .send_text(r#"{"op":"publish","topic":"/place","msg":{"x":01}}"#)
+        .await;
+    assert!(
+        client
+            .refusal()
+            .await
+            .starts_with("publish: topic /place: ")
+    );
     client.settled().await;
 }

@@ -13,7 +13,10 @@ use tokio::sync::Notify;
 use crate::support::{World, connected, patiently};
 
 fn with_token(token: &str) -> SessionOptions {
-    SessionOptions { resume: Some(token.to_owned()), ..SessionOptions::default() }
+    SessionOptions {
+        resume: Some(token.to_owned()),
+        ..SessionOptions::default()
+    }
 }
 
 struct Gated(Arc<Notify>);
@@ -29,25 +32,46 @@ impl ServiceHandler for Gated {
 #[tokio::test]
 async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut heard = world.node_subscribes("/number", "std_msgs/Int32").await;
     let def = world.registry.service("x_msgs/Nothing").unwrap();
     let gate = Arc::new(Notify::new());
-    let service_type = ServiceType { name: def.name.clone(), md5: def.md5.clone() };
-    let _served = world.node.serve("/gated", service_type, Arc::new(Gated(gate.clone()))).await.unwrap();
-    world.in_graph(|graph| graph.services.contains_key("/gated")).await;
+    let service_type = ServiceType {
+        name: def.name.clone(),
+        md5: def.md5.clone(),
+    };
+    let _served = world
+        .node
+        .serve("/gated", service_type, Arc::new(Gated(gate.clone())))
+        .await
+        .unwrap();
+    world
+        .in_graph(|graph| graph.services.contains_key("/gated"))
+        .await;
 
     let mut client = world.client_with(with_token("secret")).await;
-    client.send(json!({"op": "subscribe", "topic": "/text"})).await;
-    client.send(json!({"op": "advertise", "topic": "/number", "type": "std_msgs/Int32"})).await;
-    client.send(json!({"op": "publish", "topic": "/number", "msg": {"data": 1}})).await;
-    client.send(json!({"op": "call_service", "id": "c", "service": "/gated"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text"}))
+        .await;
+    client
+        .send(json!({"op": "advertise", "topic": "/number", "type": "std_msgs/Int32"}))
+        .await;
+    client
+        .send(json!({"op": "publish", "topic": "/number", "msg": {"data": 1}}))
+        .await;
+    client
+        .send(json!({"op": "call_service", "id": "c", "service": "/gated"}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     assert!(patiently(heard.messages.recv()).await.is_some());
     assert!(matches!(client.lose().await, SessionEnd::Lost(_)));
     let mut sessions = world.bridge.sessions();
-    patiently(sessions.wait_for(|count| count.away == 1 && count.connected == 0)).await.unwrap();
+    patiently(sessions.wait_for(|count| count.away == 1 && count.connected == 0))
+        .await
+        .unwrap();
 
     publisher.publish(world.message("std_msgs/String", json!({"data": "meanwhile"})));
     gate.notify_one();
@@ -57,11 +81,17 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     stranger.settled().await;
 
     let mut client = world.client_with(with_token("secret")).await;
-    let mut got = [client.json().await, client.json().await].map(|message| message["op"].to_string());
+    let mut got =
+        [client.json().await, client.json().await].map(|message| message["op"].to_string());
     got.sort();
     assert_eq!(got, ["\"publish\"", "\"service_response\""]);
-    client.send(json!({"op": "publish", "topic": "/number", "msg": {"data": 2}})).await;
-    assert_eq!(&*patiently(heard.messages.recv()).await.unwrap().bytes, [2, 0, 0, 0]);
+    client
+        .send(json!({"op": "publish", "topic": "/number", "msg": {"data": 2}}))
+        .await;
+    assert_eq!(
+        &*patiently(heard.messages.recv()).await.unwrap().bytes,
+        [2, 0, 0, 0]
+    );
     client.settled().await;
     assert_eq!(*publisher.subscribers().borrow(), 1);
     assert_eq!(world.bridge.metrics().resumed.get(), 1);
@@ -71,29 +101,49 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
 async fn the_newer_connection_takes_over() {
     let world = World::new().await;
     let mut old = world.client_with(with_token("secret")).await;
-    old.send(json!({"op": "subscribe", "topic": "/x", "type": "std_msgs/String"})).await;
+    old.send(json!({"op": "subscribe", "topic": "/x", "type": "std_msgs/String"}))
+        .await;
     old.settled().await;
     let mut new = world.client_with(with_token("secret")).await;
-    assert_eq!(old.closed().await, (4001, "a newer connection has taken this session over".into()));
+    assert_eq!(
+        old.closed().await,
+        (
+            4001,
+            "a newer connection has taken this session over".into()
+        )
+    );
     old.lose().await;
-    new.send(json!({"op": "advertise", "topic": "/x", "type": "std_msgs/String"})).await;
-    new.send(json!({"op": "publish", "topic": "/x", "msg": {"data": "mine"}})).await;
+    new.send(json!({"op": "advertise", "topic": "/x", "type": "std_msgs/String"}))
+        .await;
+    new.send(json!({"op": "publish", "topic": "/x", "msg": {"data": "mine"}}))
+        .await;
     assert_eq!(new.json().await["msg"]["data"], "mine");
     let mut sessions = world.bridge.sessions();
-    patiently(sessions.wait_for(|count| count.away == 0 && count.connected == 1)).await.unwrap();
+    patiently(sessions.wait_for(|count| count.away == 0 && count.connected == 1))
+        .await
+        .unwrap();
 }
 
 #[tokio::test]
 async fn who_does_not_come_back_in_time_has_lost_everything() {
-    let options = BridgeOptions { resume_grace: Duration::from_millis(50), ..BridgeOptions::default() };
+    let options = BridgeOptions {
+        resume_grace: Duration::from_millis(50),
+        ..BridgeOptions::default()
+    };
     let world = World::with(options).await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client_with(with_token("secret")).await;
-    client.send(json!({"op": "subscribe", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text"}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     client.lose().await;
-    patiently(publisher.subscribers().wait_for(|count| *count == 0)).await.unwrap();
+    patiently(publisher.subscribers().wait_for(|count| *count == 0))
+        .await
+        .unwrap();
     let mut client = world.client_with(with_token("secret")).await;
     client.settled().await;
     assert_eq!(world.bridge.metrics().resumed.get(), 0);
@@ -102,11 +152,17 @@ async fn who_does_not_come_back_in_time_has_lost_everything() {
 #[tokio::test]
 async fn a_client_without_token_leaves_nothing_behind() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text"}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     client.lose().await;
-    patiently(publisher.subscribers().wait_for(|count| *count == 0)).await.unwrap();
+    patiently(publisher.subscribers().wait_for(|count| *count == 0))
+        .await
+        .unwrap();
 }

@@ -6,9 +6,15 @@ use serde_json::{Value, json};
 use crate::support::{Client, World};
 
 async fn ask(client: &mut Client, service: &str, args: Value) -> Value {
-    client.send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args})).await;
+    client
+        .send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args}))
+        .await;
     let answer = client.json().await;
-    assert_eq!((&answer["op"], &answer["result"]), (&json!("service_response"), &json!(true)), "{answer}");
+    assert_eq!(
+        (&answer["op"], &answer["result"]),
+        (&json!("service_response"), &json!(true)),
+        "{answer}"
+    );
     answer["values"].clone()
 }
 
@@ -19,80 +25,223 @@ fn holds(list: &Value, item: &str) -> bool {
 #[tokio::test]
 async fn topics_nodes_and_services_are_found() {
     let world = World::new().await;
-    let _publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let _publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let _subscriber = world.node_subscribes("/number", "std_msgs/Int32").await;
     let mut client = world.client().await;
-    client.send(json!({"op": "set_level", "level": "info"})).await;
-    client.send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"})).await;
+    client
+        .send(json!({"op": "set_level", "level": "info"}))
+        .await;
+    client
+        .send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"}))
+        .await;
     client.json().await;
-    client.send(json!({"op": "set_level", "level": "error"})).await;
-    world.in_graph(|graph| graph.services.contains_key("/add") && graph.topics.contains_key("/number")).await;
+    client
+        .send(json!({"op": "set_level", "level": "error"}))
+        .await;
+    world
+        .in_graph(|graph| {
+            graph.services.contains_key("/add") && graph.topics.contains_key("/number")
+        })
+        .await;
     // The bridge sees a change of the graph when the node does, or a moment later.
-    while !holds(&ask(&mut client, "services", json!({})).await["services"], "/add") {}
+    while !holds(
+        &ask(&mut client, "services", json!({})).await["services"],
+        "/add",
+    ) {}
 
     let topics = ask(&mut client, "topics", json!({})).await;
-    assert_eq!(topics, json!({"topics": ["/number", "/text"], "types": ["std_msgs/Int32", "std_msgs/String"]}));
+    assert_eq!(
+        topics,
+        json!({"topics": ["/number", "/text"], "types": ["std_msgs/Int32", "std_msgs/String"]})
+    );
     let raw = ask(&mut client, "topics_and_raw_types", json!({})).await;
-    assert_eq!(raw["typedefs_full_text"], json!(["int32 data\n", "string data\n"]));
-    assert_eq!(ask(&mut client, "topic_type", json!({"topic": "/text"})).await, json!({"type": "std_msgs/String"}));
-    assert_eq!(ask(&mut client, "topic_type", json!({"topic": "/none"})).await, json!({"type": ""}));
-    let of_type = ask(&mut client, "topics_for_type", json!({"type": "std_msgs/String"})).await;
+    assert_eq!(
+        raw["typedefs_full_text"],
+        json!(["int32 data\n", "string data\n"])
+    );
+    assert_eq!(
+        ask(&mut client, "topic_type", json!({"topic": "/text"})).await,
+        json!({"type": "std_msgs/String"})
+    );
+    assert_eq!(
+        ask(&mut client, "topic_type", json!({"topic": "/none"})).await,
+        json!({"type": ""})
+    );
+    let of_type = ask(
+        &mut client,
+        "topics_for_type",
+        json!({"type": "std_msgs/String"}),
+    )
+    .await;
     assert_eq!(of_type, json!({"topics": ["/text"]}));
-    assert_eq!(ask(&mut client, "publishers", json!({"topic": "/text"})).await, json!({"publishers": ["/node"]}));
-    assert_eq!(ask(&mut client, "subscribers", json!({"topic": "/number"})).await, json!({"subscribers": ["/node"]}));
+    assert_eq!(
+        ask(&mut client, "publishers", json!({"topic": "/text"})).await,
+        json!({"publishers": ["/node"]})
+    );
+    assert_eq!(
+        ask(&mut client, "subscribers", json!({"topic": "/number"})).await,
+        json!({"subscribers": ["/node"]})
+    );
 
     let nodes = ask(&mut client, "nodes", json!({})).await;
     assert!(holds(&nodes["nodes"], "/node") && holds(&nodes["nodes"], "/rosapi"));
     let details = ask(&mut client, "node_details", json!({"node": "/node"})).await;
-    assert_eq!(details, json!({"subscribing": ["/number"], "publishing": ["/text"], "services": []}));
+    assert_eq!(
+        details,
+        json!({"subscribing": ["/number"], "publishing": ["/text"], "services": []})
+    );
 
     let services = ask(&mut client, "services", json!({})).await;
     assert!(holds(&services["services"], "/add") && holds(&services["services"], "/rosapi/topics"));
-    assert_eq!(ask(&mut client, "service_type", json!({"service": "/add"})).await, json!({"type": "x_msgs/Add"}));
-    assert_eq!(ask(&mut client, "service_type", json!(["/rosapi/topics"])).await, json!({"type": "rosapi/Topics"}));
-    assert_eq!(ask(&mut client, "service_type", json!({"service": "/no"})).await, json!({"type": ""}));
+    assert_eq!(
+        ask(&mut client, "service_type", json!({"service": "/add"})).await,
+        json!({"type": "x_msgs/Add"})
+    );
+    assert_eq!(
+        ask(&mut client, "service_type", json!(["/rosapi/topics"])).await,
+        json!({"type": "rosapi/Topics"})
+    );
+    assert_eq!(
+        ask(&mut client, "service_type", json!({"service": "/no"})).await,
+        json!({"type": ""})
+    );
     let node = ask(&mut client, "service_node", json!({"service": "/add"})).await;
     assert_eq!(node, json!({"node": "/cloudroid_bridge"}));
-    assert_eq!(ask(&mut client, "service_host", json!({"service": "/add"})).await, json!({"host": "127.0.0.1"}));
-    let of_type = ask(&mut client, "services_for_type", json!({"type": "x_msgs/Add"})).await;
+    assert_eq!(
+        ask(&mut client, "service_host", json!({"service": "/add"})).await,
+        json!({"host": "127.0.0.1"})
+    );
+    let of_type = ask(
+        &mut client,
+        "services_for_type",
+        json!({"type": "x_msgs/Add"}),
+    )
+    .await;
     assert_eq!(of_type, json!({"services": ["/add"]}));
-    let providers = ask(&mut client, "service_providers", json!({"service": "x_msgs/Add"})).await;
+    let providers = ask(
+        &mut client,
+        "service_providers",
+        json!({"service": "x_msgs/Add"}),
+    )
+    .await;
     assert_eq!(providers, json!({"providers": ["/cloudroid_bridge"]}));
 
-    let request = ask(&mut client, "service_request_details", json!({"type": "x_msgs/Add"})).await;
+    let request = ask(
+        &mut client,
+        "service_request_details",
+        json!({"type": "x_msgs/Add"}),
+    )
+    .await;
     assert_eq!(request["typedefs"][0]["fieldnames"], json!(["a", "b"]));
-    let response = ask(&mut client, "service_response_details", json!({"type": "x_msgs/Add"})).await;
+    let response = ask(
+        &mut client,
+        "service_response_details",
+        json!({"type": "x_msgs/Add"}),
+    )
+    .await;
     assert_eq!(response["typedefs"][0]["fieldtypes"], json!(["int64"]));
-    let message = ask(&mut client, "message_details", json!({"type": "x_msgs/Place"})).await;
+    let message = ask(
+        &mut client,
+        "message_details",
+        json!({"type": "x_msgs/Place"}),
+    )
+    .await;
     assert_eq!(message["typedefs"].as_array().unwrap().len(), 4);
-    assert_eq!(ask(&mut client, "action_servers", json!({})).await, json!({"action_servers": []}));
-    assert_eq!(ask(&mut client, "get_ros_version", json!({})).await, json!({"version": 1, "distro": "noetic"}));
+    assert_eq!(
+        ask(&mut client, "action_servers", json!({})).await,
+        json!({"action_servers": []})
+    );
+    assert_eq!(
+        ask(&mut client, "get_ros_version", json!({})).await,
+        json!({"version": 1, "distro": "noetic"})
+    );
     let time = ask(&mut client, "get_time", json!({})).await;
     assert!(time["time"]["secs"].as_u64().unwrap() > 1_500_000_000);
+}
+
+#[tokio::test]
+async fn who_is_connected_can_be_followed() {
+    let world = World::new().await;
+    let named = |name: &str| bridge::SessionOptions {
+        client: name.to_owned(),
+        ..Default::default()
+    };
+    let mut client = world.client_with(named("10.0.0.1")).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/client_count", "type": "std_msgs/Int32"}))
+        .await;
+    assert_eq!(client.json().await["msg"], json!({"data": 1}));
+    let mut other = world.client_with(named("10.0.0.2")).await;
+    assert_eq!(client.json().await["msg"], json!({"data": 2}));
+    other
+        .send(json!({"op": "subscribe", "topic": "/connected_clients"}))
+        .await;
+    let clients = other.json().await["msg"]["clients"].clone();
+    assert_eq!(
+        (&clients[0]["ip_address"], &clients[1]["ip_address"]),
+        (&json!("10.0.0.1"), &json!("10.0.0.2"))
+    );
+    other.lose().await;
+    assert_eq!(client.json().await["msg"], json!({"data": 1}));
 }
 
 #[tokio::test]
 async fn parameters_are_set_found_and_deleted() {
     let world = World::new().await;
     let mut client = world.client().await;
-    for value in [json!(5), json!(1.5), json!("text"), json!([1, "a", true]), json!({"x": {"y": 2}})] {
+    for value in [
+        json!(5),
+        json!(1.5),
+        json!("text"),
+        json!([1, "a", true]),
+        json!({"x": {"y": 2}}),
+    ] {
         let set = json!({"name": "/p/q", "value": value.to_string()});
         assert_eq!(ask(&mut client, "set_param", set).await, json!({}));
         let got = ask(&mut client, "get_param", json!({"name": "p/q"})).await;
-        assert_eq!(serde_json::from_str::<Value>(got["value"].as_str().unwrap()).unwrap(), value);
+        assert_eq!(
+            serde_json::from_str::<Value>(got["value"].as_str().unwrap()).unwrap(),
+            value
+        );
     }
-    assert_eq!(ask(&mut client, "has_param", json!({"name": "/p/q/x/y"})).await, json!({"exists": true}));
+    assert_eq!(
+        ask(&mut client, "has_param", json!({"name": "/p/q/x/y"})).await,
+        json!({"exists": true})
+    );
     let found = ask(&mut client, "search_param", json!({"name": "p"})).await;
     assert_eq!(found, json!({"global_name": "/p"}));
-    assert!(holds(&ask(&mut client, "get_param_names", json!({})).await["names"], "/p/q/x/y"));
-    assert_eq!(ask(&mut client, "delete_param", json!({"name": "/p"})).await, json!({}));
-    assert_eq!(ask(&mut client, "delete_param", json!({"name": "/p"})).await, json!({}));
-    assert_eq!(ask(&mut client, "has_param", json!({"name": "/p/q"})).await, json!({"exists": false}));
-    assert_eq!(ask(&mut client, "get_param", json!({"name": "/p"})).await, json!({"value": "null"}));
+    assert!(holds(
+        &ask(&mut client, "get_param_names", json!({})).await["names"],
+        "/p/q/x/y"
+    ));
+    assert_eq!(
+        ask(&mut client, "delete_param", json!({"name": "/p"})).await,
+        json!({})
+    );
+    assert_eq!(
+        ask(&mut client, "delete_param", json!({"name": "/p"})).await,
+        json!({})
+    );
+    assert_eq!(
+        ask(&mut client, "has_param", json!({"name": "/p/q"})).await,
+        json!({"exists": false})
+    );
+    assert_eq!(
+        ask(&mut client, "get_param", json!({"name": "/p"})).await,
+        json!({"value": "null"})
+    );
     let get = json!({"name": "/p", "default": "7"});
-    assert_eq!(ask(&mut client, "get_param", get).await, json!({"value": "7"}));
+    assert_eq!(
+        ask(&mut client, "get_param", get).await,
+        json!({"value": "7"})
+    );
     let get = json!({"name": "/p", "default": "seven"});
-    assert_eq!(ask(&mut client, "get_param", get).await, json!({"value": "\"seven\""}));
+    assert_eq!(
+        ask(&mut client, "get_param", get).await,
+        json!({"value": "\"seven\""})
+    );
 }
 
 #[tokio::test]
@@ -100,17 +249,38 @@ async fn questions_that_make_no_sense_are_answered_with_the_reason() {
     let world = World::new().await;
     let mut client = world.client().await;
     for (service, args, reason) in [
-        ("set_param", json!({"name": "/p", "value": "{"}), "field \"value\" is \"{\", JSON text"),
+        (
+            "set_param",
+            json!({"name": "/p", "value": "{"}),
+            "field \"value\" is \"{\", JSON text",
+        ),
         ("get_param", json!({}), "field \"name\" is missing"),
-        ("get_param", json!({"name": 5}), "args: invalid type: integer `5`, expected a string"),
-        ("message_details", json!({"type": "x_msgs/Lost"}), "no definition of x_msgs/Lost is known"),
-        ("no_such", json!({}), "service /rosapi/no_such has no server"),
+        (
+            "get_param",
+            json!({"name": 5}),
+            "args: invalid type: integer `5`, expected a string",
+        ),
+        (
+            "message_details",
+            json!({"type": "x_msgs/Lost"}),
+            "no definition of x_msgs/Lost is known",
+        ),
+        (
+            "no_such",
+            json!({}),
+            "service /rosapi/no_such has no server",
+        ),
     ] {
         let service = format!("/rosapi/{service}");
-        client.send(json!({"op": "call_service", "id": 1, "service": service, "args": args})).await;
+        client
+            .send(json!({"op": "call_service", "id": 1, "service": service, "args": args}))
+            .await;
         let answer = client.json().await;
         assert_eq!(answer["result"], false);
-        assert!(answer["values"].as_str().unwrap().starts_with(reason), "{answer}");
+        assert!(
+            answer["values"].as_str().unwrap().starts_with(reason),
+            "{answer}"
+        );
     }
 }
 
@@ -132,10 +302,14 @@ async fn rosapi_speaks_cbor_and_ros_bytes_too() {
         .print(&mut out, Format::Cbor);
         client.send_binary(out).await;
         let answer = client.binary().await;
-        let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else { panic!("{answer:?}") };
+        let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+            panic!("{answer:?}")
+        };
         let values = answer.values.unwrap();
         match compression {
-            Compression::CborRaw => assert_eq!(&*values.raw().unwrap().bytes, b"\x01\x06\0\0\0noetic"),
+            Compression::CborRaw => {
+                assert_eq!(&*values.raw().unwrap().bytes, b"\x01\x06\0\0\0noetic")
+            }
             _ => assert_eq!(values.bytes, b"\xa2\x67version\x01\x66distro\x66noetic"),
         }
     }

@@ -34,9 +34,18 @@ impl ServiceHandler for Add {
 
 async fn serves(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn Send + Sync> {
     let def = world.registry.service("x_msgs/Add").unwrap();
-    let service_type = ServiceType { name: def.name.clone(), md5: def.md5.clone() };
-    let guard = world.node.serve(name, service_type, Arc::new(Add { gate })).await.unwrap();
-    world.in_graph(|graph| graph.services.contains_key(name)).await;
+    let service_type = ServiceType {
+        name: def.name.clone(),
+        md5: def.md5.clone(),
+    };
+    let guard = world
+        .node
+        .serve(name, service_type, Arc::new(Add { gate }))
+        .await
+        .unwrap();
+    world
+        .in_graph(|graph| graph.services.contains_key(name))
+        .await;
     guard
 }
 
@@ -45,14 +54,21 @@ async fn a_service_is_called_with_names_by_position_and_with_nothing() {
     let world = World::new().await;
     let _served = serves(&world, "/add", None).await;
     let mut client = world.client().await;
-    for (args, sum) in [(json!({"a": 1, "b": 2}), 3), (json!([4, 5]), 9), (json!([7]), 7), (json!([]), 0)] {
+    for (args, sum) in [
+        (json!({"a": 1, "b": 2}), 3),
+        (json!([4, 5]), 9),
+        (json!([7]), 7),
+        (json!([]), 0),
+    ] {
         client.send(json!({"op": "call_service", "id": 5, "service": "add", "args": args, "type": "x_msgs/Add"})).await;
         assert_eq!(
             client.json().await,
             json!({"op": "service_response", "id": 5, "service": "add", "values": {"sum": sum}, "result": true})
         );
     }
-    client.send(json!({"op": "call_service", "service": "/add#77"})).await;
+    client
+        .send(json!({"op": "call_service", "service": "/add#77"}))
+        .await;
     assert_eq!(client.json().await["id"], "77");
     assert_eq!(world.bridge.metrics().calls_failed.get(), 0);
 }
@@ -64,18 +80,37 @@ async fn calls_fail_with_a_reason() {
     let mut client = world.client().await;
     let max = i64::MAX;
     for (call, reason) in [
-        (json!({"service": "/add", "args": {"a": max, "b": max}}), "service /add failed: too much"),
-        (json!({"service": "/nothing"}), "service /nothing has no server"),
-        (json!({"service": "/add", "args": {"c": 1}}), "field c of x_msgs/AddRequest: there is no such field"),
-        (json!({"service": "/add", "args": [1, 2, 3]}), "x_msgs/AddRequest has 2 fields, \"args\" has more"),
-        (json!({"service": "/1add"}), "\"/1add\" is not a ROS name: letters, digits, _ and / are allowed, a letter comes first"),
+        (
+            json!({"service": "/add", "args": {"a": max, "b": max}}),
+            "service /add failed: too much",
+        ),
+        (
+            json!({"service": "/nothing"}),
+            "service /nothing has no server",
+        ),
+        (
+            json!({"service": "/add", "args": {"c": 1}}),
+            "field c of x_msgs/AddRequest: there is no such field",
+        ),
+        (
+            json!({"service": "/add", "args": [1, 2, 3]}),
+            "x_msgs/AddRequest has 2 fields, \"args\" has more",
+        ),
+        (
+            json!({"service": "/1add"}),
+            "\"/1add\" is not a ROS name: letters, digits, _ and / are allowed, a letter comes first",
+        ),
     ] {
         let mut op = call.clone();
         op["op"] = "call_service".into();
         op["id"] = "c".into();
         client.send(op).await;
         let answer = client.json().await;
-        assert_eq!((&answer["result"], &answer["id"]), (&json!(false), &json!("c")), "{answer}");
+        assert_eq!(
+            (&answer["result"], &answer["id"]),
+            (&json!(false), &json!("c")),
+            "{answer}"
+        );
         assert_eq!(answer["values"], reason);
     }
 }
@@ -87,29 +122,55 @@ async fn a_slow_call_holds_up_no_other_and_ends_by_its_timeout() {
     let _slow = serves(&world, "/slow", Some(gate.clone())).await;
     let _fast = serves(&world, "/fast", None).await;
     let mut client = world.client().await;
-    client.send(json!({"op": "call_service", "id": "slow", "service": "/slow", "args": [1, 2]})).await;
-    client.send(json!({"op": "call_service", "id": "fast", "service": "/fast", "args": [1, 2]})).await;
+    client
+        .send(json!({"op": "call_service", "id": "slow", "service": "/slow", "args": [1, 2]}))
+        .await;
+    client
+        .send(json!({"op": "call_service", "id": "fast", "service": "/fast", "args": [1, 2]}))
+        .await;
     assert_eq!(client.json().await["id"], "fast");
     gate.notify_one();
     assert_eq!(client.json().await["id"], "slow");
-    client.send(json!({"op": "call_service", "id": "never", "service": "/slow", "timeout": 0.05})).await;
+    client
+        .send(json!({"op": "call_service", "id": "never", "service": "/slow", "timeout": 0.05}))
+        .await;
     let answer = client.json().await;
-    assert_eq!((&answer["id"], &answer["result"]), (&json!("never"), &json!(false)));
-    assert!(answer["values"].as_str().unwrap().contains("did not answer within 50ms"), "{answer}");
+    assert_eq!(
+        (&answer["id"], &answer["result"]),
+        (&json!("never"), &json!(false))
+    );
+    assert!(
+        answer["values"]
+            .as_str()
+            .unwrap()
+            .contains("did not answer within 50ms"),
+        "{answer}"
+    );
 }
 
 #[tokio::test]
 async fn too_many_calls_at_once_are_refused() {
-    let world = World::with(BridgeOptions { max_calls: 2, ..BridgeOptions::default() }).await;
+    let world = World::with(BridgeOptions {
+        max_calls: 2,
+        ..BridgeOptions::default()
+    })
+    .await;
     let gate = Arc::new(Notify::new());
     let _slow = serves(&world, "/slow", Some(gate.clone())).await;
     let mut client = world.client().await;
     for id in 0..3 {
-        client.send(json!({"op": "call_service", "id": id, "service": "/slow"})).await;
+        client
+            .send(json!({"op": "call_service", "id": id, "service": "/slow"}))
+            .await;
     }
     let answer = client.json().await;
     assert_eq!(answer["id"], 2);
-    assert!(answer["values"].as_str().unwrap().starts_with("2 calls and goals of this client are under way"));
+    assert!(
+        answer["values"]
+            .as_str()
+            .unwrap()
+            .starts_with("2 calls and goals of this client are under way")
+    );
     gate.notify_one();
     gate.notify_one();
     client.json().await;
@@ -136,22 +197,39 @@ async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
         .print(&mut out, Format::Cbor);
         out
     };
-    client.send_binary(call(b"\xa2\x61a\x01\x61b\x02", None)).await;
+    client
+        .send_binary(call(b"\xa2\x61a\x01\x61b\x02", None))
+        .await;
     let answer = client.binary().await;
-    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else { panic!("{answer:?}") };
+    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+        panic!("{answer:?}")
+    };
     assert_eq!(answer.values, Some(Payload::cbor(b"\xa1\x63sum\x03")));
     let mut args = b"\xa1\x65bytes\x50".to_vec();
     args.extend_from_slice(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
-    client.send_binary(call(&args, Some(Compression::CborRaw))).await;
+    client
+        .send_binary(call(&args, Some(Compression::CborRaw)))
+        .await;
     let answer = client.binary().await;
-    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else { panic!("{answer:?}") };
+    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+        panic!("{answer:?}")
+    };
     assert_eq!(answer.compression, Compression::CborRaw);
-    assert_eq!(*answer.values.unwrap().raw().unwrap().bytes, [3, 0, 0, 0, 0, 0, 0, 0]);
-    client.send(json!({"op": "call_service", "service": "/add", "args": [1, 2], "compression": "png"})).await;
+    assert_eq!(
+        *answer.values.unwrap().raw().unwrap().bytes,
+        [3, 0, 0, 0, 0, 0, 0, 0]
+    );
+    client
+        .send(
+            json!({"op": "call_service", "service": "/add", "args": [1, 2], "compression": "png"}),
+        )
+        .await;
     let packed = client.json().await;
     let text = rosbridge::decode_png(packed["data"].as_str().unwrap(), 10_000).unwrap();
     assert!(text.contains(r#""values":{"sum":3}"#), "{text}");
-    client.send(json!({"op": "call_service", "service": "/add", "args": [1, 2], "fragment_size": 20})).await;
+    client
+        .send(json!({"op": "call_service", "service": "/add", "args": [1, 2], "fragment_size": 20}))
+        .await;
     assert_eq!(client.json().await["op"], "fragment");
 }
 
@@ -159,40 +237,86 @@ async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
 async fn a_client_serves_and_each_call_is_answered_once() {
     let world = World::new().await;
     let mut server = world.client().await;
-    server.send(json!({"op": "set_level", "level": "info"})).await;
-    server.send(json!({"op": "advertise_service", "service": "/twice", "type": "x_msgs/Add"})).await;
-    assert_eq!(server.json().await["msg"], "advertise_service: advertised /twice");
-    server.send(json!({"op": "set_level", "level": "error"})).await;
+    server
+        .send(json!({"op": "set_level", "level": "info"}))
+        .await;
+    server
+        .send(json!({"op": "advertise_service", "service": "/twice", "type": "x_msgs/Add"}))
+        .await;
+    assert_eq!(
+        server.json().await["msg"],
+        "advertise_service: advertised /twice"
+    );
+    server
+        .send(json!({"op": "set_level", "level": "error"}))
+        .await;
     let call = |request: &'static [u8]| {
         let node = world.node.clone();
-        tokio::spawn(async move { node.call("/twice", Bytes::from_static(request), Duration::from_secs(20)).await })
+        tokio::spawn(async move {
+            node.call(
+                "/twice",
+                Bytes::from_static(request),
+                Duration::from_secs(20),
+            )
+            .await
+        })
     };
     let first = call(&[1; 16]);
     let request = server.json().await;
-    assert_eq!((&request["op"], &request["service"]), (&json!("call_service"), &json!("/twice")));
-    assert_eq!(request["args"], json!({"a": 0x0101010101010101i64, "b": 0x0101010101010101i64}));
+    assert_eq!(
+        (&request["op"], &request["service"]),
+        (&json!("call_service"), &json!("/twice"))
+    );
+    assert_eq!(
+        request["args"],
+        json!({"a": 0x0101010101010101i64, "b": 0x0101010101010101i64})
+    );
     let answer = json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 6}, "result": true});
     server.send(answer.clone()).await;
-    assert_eq!(&*patiently(first).await.unwrap().unwrap(), [6, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(
+        &*patiently(first).await.unwrap().unwrap(),
+        [6, 0, 0, 0, 0, 0, 0, 0]
+    );
     server.send(answer).await;
     assert!(server.refusal().await.contains("waits for an answer"));
 
     let failing = call(&[0; 16]);
     let request = server.json().await;
     server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": "not today", "result": false})).await;
-    assert!(patiently(failing).await.unwrap().unwrap_err().to_string().contains("not today"));
+    assert!(
+        patiently(failing)
+            .await
+            .unwrap()
+            .unwrap_err()
+            .to_string()
+            .contains("not today")
+    );
 
     let misfit = call(&[0; 16]);
     let request = server.json().await;
     server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": "x"}, "result": true})).await;
-    assert!(server.refusal().await.contains("field sum of x_msgs/AddResponse"));
+    assert!(
+        server
+            .refusal()
+            .await
+            .contains("field sum of x_msgs/AddResponse")
+    );
     assert!(patiently(misfit).await.unwrap().is_err());
 
     let left = call(&[0; 16]);
     server.json().await;
     server.lose().await;
-    assert!(patiently(left).await.unwrap().unwrap_err().to_string().contains("/twice"));
-    world.in_graph(|graph| !graph.services.contains_key("/twice")).await;
+    assert!(
+        patiently(left)
+            .await
+            .unwrap()
+            .unwrap_err()
+            .to_string()
+            .contains("/twice")
+    );
+    world
+        .in_graph(|graph| !graph.services.contains_key("/twice"))
+        .await;
 }
 
 #[tokio::test]
@@ -200,30 +324,67 @@ async fn services_are_advertised_anew_and_taken_back() {
     let world = World::new().await;
     let mut server = world.client().await;
     let mut other = world.client().await;
-    server.send(json!({"op": "set_level", "level": "info"})).await;
+    server
+        .send(json!({"op": "set_level", "level": "info"}))
+        .await;
     let advertise = json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Nothing"});
     server.send(advertise.clone()).await;
     assert_eq!(server.json().await["level"], "info");
     server.send(advertise.clone()).await;
     assert_eq!(server.json().await["level"], "warning");
-    assert_eq!(server.json().await["msg"], "advertise_service: advertised /s");
+    assert_eq!(
+        server.json().await["msg"],
+        "advertise_service: advertised /s"
+    );
     other.send(advertise).await;
-    assert_eq!(other.refusal().await, "advertise_service: another client serves /s already");
-    other.send(json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Lost"})).await;
-    assert!(other.refusal().await.contains("no definition of x_msgs/Lost is known"));
-    other.send(json!({"op": "service_response", "id": "1", "service": "/s", "result": true})).await;
-    assert!(other.refusal().await.contains("/s is not advertised by this client"));
+    assert_eq!(
+        other.refusal().await,
+        "advertise_service: another client serves /s already"
+    );
+    other
+        .send(json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Lost"}))
+        .await;
+    assert!(
+        other
+            .refusal()
+            .await
+            .contains("no definition of x_msgs/Lost is known")
+    );
+    other
+        .send(json!({"op": "service_response", "id": "1", "service": "/s", "result": true}))
+        .await;
+    assert!(
+        other
+            .refusal()
+            .await
+            .contains("/s is not advertised by this client")
+    );
 
     // One client calls what another serves.
-    other.send(json!({"op": "call_service", "id": "n", "service": "/s"})).await;
+    other
+        .send(json!({"op": "call_service", "id": "n", "service": "/s"}))
+        .await;
     let request = server.json().await;
-    server.send(json!({"op": "service_response", "id": request["id"], "service": "/s", "result": true})).await;
+    server
+        .send(
+            json!({"op": "service_response", "id": request["id"], "service": "/s", "result": true}),
+        )
+        .await;
     let answer = other.json().await;
-    assert_eq!((&answer["values"], &answer["result"]), (&json!({}), &json!(true)));
+    assert_eq!(
+        (&answer["values"], &answer["result"]),
+        (&json!({}), &json!(true))
+    );
 
-    other.send(json!({"op": "call_service", "id": "m", "service": "/s"})).await;
+    other
+        .send(json!({"op": "call_service", "id": "m", "service": "/s"}))
+        .await;
     server.json().await;
-    server.send(json!({"op": "unadvertise_service", "service": "/s"})).await;
+    server
+        .send(json!({"op": "unadvertise_service", "service": "/s"}))
+        .await;
     assert_eq!(other.json().await["result"], false);
-    world.in_graph(|graph| !graph.services.contains_key("/s")).await;
+    world
+        .in_graph(|graph| !graph.services.contains_key("/s"))
+        .await;
 }

@@ -18,47 +18,71 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
     let bytes = world.message("x_msgs/Place", value.clone());
     for compression in ["none", "png", "cbor", "cbor-raw"] {
         let mut client = world.client().await;
-        client.send(json!({"op": "subscribe", "topic": "/place", "compression": compression})).await;
+        client
+            .send(json!({"op": "subscribe", "topic": "/place", "compression": compression}))
+            .await;
         client.settled().await;
         connected(publisher.as_ref(), 1).await;
         publisher.publish(bytes.clone());
         match compression {
-            "none" => assert_eq!(client.json().await, json!({"op": "publish", "topic": "/place", "msg": value})),
+            "none" => assert_eq!(
+                client.json().await,
+                json!({"op": "publish", "topic": "/place", "msg": value})
+            ),
             "png" => {
                 let packed = client.json().await;
                 assert_eq!(packed["op"], "png");
                 let text = rosbridge::decode_png(packed["data"].as_str().unwrap(), 10_000).unwrap();
                 let unpacked: serde_json::Value = serde_json::from_str(&text).unwrap();
-                assert_eq!(unpacked, json!({"op": "publish", "topic": "/place", "msg": value}));
+                assert_eq!(
+                    unpacked,
+                    json!({"op": "publish", "topic": "/place", "msg": value})
+                );
             }
             _ => {
                 let frame = client.binary().await;
-                let Op::Publish(publish) = Op::parse(Frame::Binary(&frame)).unwrap() else { panic!("{frame:?}") };
+                let Op::Publish(publish) = Op::parse(Frame::Binary(&frame)).unwrap() else {
+                    panic!("{frame:?}")
+                };
                 assert_eq!(publish.topic, "/place");
                 if compression == "cbor-raw" {
                     assert_eq!(&*publish.msg.raw().unwrap().bytes, &*bytes);
                 } else {
                     let message_type = world.registry.message("x_msgs/Place").unwrap();
                     let mut back = Vec::new();
-                    codec::from_cbor(&message_type, publish.msg.bytes, &mut back, &FillOptions::default()).unwrap();
+                    codec::from_cbor(
+                        &message_type,
+                        publish.msg.bytes,
+                        &mut back,
+                        &FillOptions::default(),
+                    )
+                    .unwrap();
                     assert_eq!(back, bytes);
                 }
             }
         }
-        client.send(json!({"op": "unsubscribe", "topic": "/place"})).await;
+        client
+            .send(json!({"op": "unsubscribe", "topic": "/place"}))
+            .await;
         client.settled().await;
         client.lose().await;
         let mut subscribers = publisher.subscribers();
-        crate::support::patiently(subscribers.wait_for(|count| *count == 0)).await.unwrap();
+        crate::support::patiently(subscribers.wait_for(|count| *count == 0))
+            .await
+            .unwrap();
     }
 }
 
 #[tokio::test]
 async fn long_messages_come_in_fragments_where_asked_for() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "topic": "/text", "fragment_size": 50})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text", "fragment_size": 50}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     let long = "äöü ".repeat(100);
@@ -80,20 +104,28 @@ async fn long_messages_come_in_fragments_where_asked_for() {
 async fn each_latching_publisher_is_replayed_to_a_newcomer() {
     let world = World::new().await;
     let other = world.another_node("/other").await;
-    let one = world.node_publishes("/latched", "std_msgs/String", true).await;
-    let two = world.publishes(&other, "/latched", "std_msgs/String", true).await;
+    let one = world
+        .node_publishes("/latched", "std_msgs/String", true)
+        .await;
+    let two = world
+        .publishes(&other, "/latched", "std_msgs/String", true)
+        .await;
     one.publish(world.message("std_msgs/String", json!({"data": "one"})));
     two.publish(world.message("std_msgs/String", json!({"data": "two"})));
-    let subscribe = json!({"op": "subscribe", "topic": "/latched", "queue_length": 1, "throttle_rate": 60000});
+    let subscribe =
+        json!({"op": "subscribe", "topic": "/latched", "queue_length": 1, "throttle_rate": 60000});
     let mut clients = [world.client().await, world.client().await];
     for client in &mut clients {
         client.send(subscribe.clone()).await;
-        let mut heard = [client.json().await, client.json().await].map(|message| message["msg"]["data"].to_string());
+        let mut heard = [client.json().await, client.json().await]
+            .map(|message| message["msg"]["data"].to_string());
         heard.sort();
         assert_eq!(heard, ["\"one\"", "\"two\""]);
     }
     // Who subscribes once more, under another id, hears them too.
-    clients[0].send(json!({"op": "subscribe", "id": "again", "topic": "/latched"})).await;
+    clients[0]
+        .send(json!({"op": "subscribe", "id": "again", "topic": "/latched"}))
+        .await;
     clients[0].json().await;
     clients[0].json().await;
     clients[0].settled().await;
@@ -102,11 +134,15 @@ async fn each_latching_publisher_is_replayed_to_a_newcomer() {
 #[tokio::test]
 async fn subscribers_share_an_encoding() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut clients = Vec::new();
     for compression in ["none", "none", "none", "cbor", "cbor"] {
         let mut client = world.client().await;
-        client.send(json!({"op": "subscribe", "topic": "/text", "compression": compression})).await;
+        client
+            .send(json!({"op": "subscribe", "topic": "/text", "compression": compression}))
+            .await;
         client.settled().await;
         clients.push(client);
     }
@@ -122,61 +158,98 @@ async fn subscribers_share_an_encoding() {
 #[tokio::test]
 async fn subscriptions_are_ended_one_by_one_or_all_at_once() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "id": "a", "topic": "/text"})).await;
-    client.send(json!({"op": "subscribe", "id": "b", "topic": "/text", "compression": "cbor"})).await;
+    client
+        .send(json!({"op": "subscribe", "id": "a", "topic": "/text"}))
+        .await;
+    client
+        .send(json!({"op": "subscribe", "id": "b", "topic": "/text", "compression": "cbor"}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     let message = world.message("std_msgs/String", json!({"data": "x"}));
     publisher.publish(message.clone());
     client.binary().await;
-    client.send(json!({"op": "unsubscribe", "id": "b", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "unsubscribe", "id": "b", "topic": "/text"}))
+        .await;
     client.settled().await;
     publisher.publish(message.clone());
     client.json().await;
-    client.send(json!({"op": "unsubscribe", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "unsubscribe", "topic": "/text"}))
+        .await;
     client.settled().await;
     let mut subscribers = publisher.subscribers();
-    crate::support::patiently(subscribers.wait_for(|count| *count == 0)).await.unwrap();
+    crate::support::patiently(subscribers.wait_for(|count| *count == 0))
+        .await
+        .unwrap();
     client.settled().await;
 }
 
 #[tokio::test]
 async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
     let world = World::new().await;
-    let _publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let _publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "topic": "/nothing"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/nothing"}))
+        .await;
     assert_eq!(
         client.refusal().await,
         "subscribe: topic /nothing does not exist; say its \"type\" to wait for it, /rosapi/topics lists those that do"
     );
-    client.send(json!({"op": "subscribe", "topic": "/nothing", "type": "x_msgs/Lost"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/nothing", "type": "x_msgs/Lost"}))
+        .await;
     assert_eq!(
         client.refusal().await,
         "subscribe: topic /nothing: no definition of x_msgs/Lost is known, install the package that has it or supply its text"
     );
-    client.send(json!({"op": "subscribe", "topic": "/text", "type": "std_msgs/Int32"})).await;
-    assert_eq!(client.refusal().await, "subscribe: topic /text has type std_msgs/String, not std_msgs/Int32");
-    client.send(json!({"op": "subscribe", "topic": "/no spaces"})).await;
-    assert!(client.refusal().await.starts_with("subscribe: \"/no spaces\" is not a ROS name"));
+    client
+        .send(json!({"op": "subscribe", "topic": "/text", "type": "std_msgs/Int32"}))
+        .await;
+    assert_eq!(
+        client.refusal().await,
+        "subscribe: topic /text has type std_msgs/String, not std_msgs/Int32"
+    );
+    client
+        .send(json!({"op": "subscribe", "topic": "/no spaces"}))
+        .await;
+    assert!(
+        client
+            .refusal()
+            .await
+            .starts_with("subscribe: \"/no spaces\" is not a ROS name")
+    );
     client.settled().await;
 }
 
 #[tokio::test]
 async fn a_node_that_sends_rubbish_is_named_and_harms_nobody() {
     let world = World::new().await;
-    let publisher = world.node_publishes("/text", "std_msgs/String", false).await;
+    let publisher = world
+        .node_publishes("/text", "std_msgs/String", false)
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "topic": "/text"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text"}))
+        .await;
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     for _ in 0..100 {
         publisher.publish(vec![0xff, 0xff, 0xff, 0xff, b'x'].into());
     }
     let text = client.refusal().await;
-    assert!(text.starts_with("subscribe: topic /text: field data of std_msgs/String: "), "{text}");
+    assert!(
+        text.starts_with("subscribe: topic /text: field data of std_msgs/String: "),
+        "{text}"
+    );
     assert!(text.ends_with("(from /node)"), "{text}");
     publisher.publish(world.message("std_msgs/String", json!({"data": "well"})));
     assert_eq!(client.json().await["msg"]["data"], "well");
@@ -187,14 +260,27 @@ async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
     let world = World::new().await;
     let definition = "int32 a\nstring b\n".to_owned();
     let message_type = ros::schema::MessageType::from_full_text("y_msgs/New", &definition).unwrap();
-    let wire_type =
-        ros::bus::WireType { name: "y_msgs/New".into(), md5: message_type.md5().into(), definition };
-    let options = ros::bus::AdvertiseOptions { wire_type, latch: true, queue: 1 };
-    let publisher = ros::bus::Bus::advertise(world.node.as_ref(), "/new", options).await.unwrap();
+    let wire_type = ros::bus::WireType {
+        name: "y_msgs/New".into(),
+        md5: message_type.md5().into(),
+        definition,
+    };
+    let options = ros::bus::AdvertiseOptions {
+        wire_type,
+        latch: true,
+        queue: 1,
+    };
+    let publisher = ros::bus::Bus::advertise(world.node.as_ref(), "/new", options)
+        .await
+        .unwrap();
     publisher.publish(vec![1, 0, 0, 0, 1, 0, 0, 0, b'x'].into());
-    world.in_graph(|graph| graph.topics.contains_key("/new")).await;
+    world
+        .in_graph(|graph| graph.topics.contains_key("/new"))
+        .await;
     let mut client = world.client().await;
-    client.send(json!({"op": "subscribe", "topic": "/new"})).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/new"}))
+        .await;
     assert_eq!(client.json().await["msg"], json!({"a": 1, "b": "x"}));
 }
 
@@ -203,17 +289,27 @@ async fn clients_hear_each_other_and_themselves_but_links_do_not() {
     let world = World::new().await;
     let mut speaker = world.client().await;
     let mut hearer = world.client().await;
-    let link = SessionOptions { hears_clients: false, ..SessionOptions::default() };
+    let link = SessionOptions {
+        hears_clients: false,
+        ..SessionOptions::default()
+    };
     let mut link = world.client_with(link).await;
     let subscribe = json!({"op": "subscribe", "topic": "chatter", "type": "std_msgs/String"});
     for client in [&mut speaker, &mut hearer, &mut link] {
         client.send(subscribe.clone()).await;
         client.settled().await;
     }
-    speaker.send(json!({"op": "advertise", "topic": "/chatter", "type": "std_msgs/String"})).await;
-    speaker.send(json!({"op": "publish", "topic": "/chatter", "msg": {"data": "hi"}})).await;
+    speaker
+        .send(json!({"op": "advertise", "topic": "/chatter", "type": "std_msgs/String"}))
+        .await;
+    speaker
+        .send(json!({"op": "publish", "topic": "/chatter", "msg": {"data": "hi"}}))
+        .await;
     for client in [&mut speaker, &mut hearer] {
-        assert_eq!(client.json().await, json!({"op": "publish", "topic": "chatter", "msg": {"data": "hi"}}));
+        assert_eq!(
+            client.json().await,
+            json!({"op": "publish", "topic": "chatter", "msg": {"data": "hi"}})
+        );
     }
     link.settled().await;
 }

@@ -26,11 +26,17 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ("std_msgs/msg/String", "string data\n"),
     ("std_msgs/msg/Int32", "int32 data\n"),
     ("std_msgs/msg/UInt8MultiArray", "uint8[] data\n"),
-    ("x_msgs/msg/Place", "std_msgs/Header header\nfloat64 x\nfloat64[] near\nx_msgs/Tag[] tags\n"),
+    (
+        "x_msgs/msg/Place",
+        "std_msgs/Header header\nfloat64 x\nfloat64[] near\nx_msgs/Tag[] tags\n",
+    ),
     ("x_msgs/msg/Tag", "string name\nuint8 number\n"),
     ("x_msgs/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n"),
     ("x_msgs/srv/Nothing", "---\n"),
-    ("x_msgs/action/Count", "int32 to\n---\nint32[] all\n---\nint32 at\n"),
+    (
+        "x_msgs/action/Count",
+        "int32 to\n---\nint32[] all\n---\nint32 at\n",
+    ),
 ];
 
 /// A ROS system with a node in it, and a bridge.
@@ -51,27 +57,47 @@ impl World {
     pub async fn with(options: BridgeOptions) -> World {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let master = Master::new(MasterOptions { uri: format!("http://{address}/"), ..MasterOptions::default() });
-        let master = tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        let master = Master::new(MasterOptions {
+            uri: format!("http://{address}/"),
+            ..MasterOptions::default()
+        });
+        let master =
+            tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
         let registry = Registry::new();
         for (key, text) in DEFINITIONS {
             registry.insert(key, text).unwrap();
         }
         let registry = Arc::new(registry);
-        let node = Ros1Bus::connect(Arc::new(HostSockets), address, "/node").await.unwrap();
-        let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/cloudroid_bridge").await.unwrap();
+        let node = Ros1Bus::connect(Arc::new(HostSockets), address, "/node")
+            .await
+            .unwrap();
+        let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/cloudroid_bridge")
+            .await
+            .unwrap();
         let bridge = Bridge::new(bus, registry.clone(), options);
-        World { bridge, node, registry, address, master }
+        World {
+            bridge,
+            node,
+            registry,
+            address,
+            master,
+        }
     }
 
     /// Another node.
     pub async fn another_node(&self, name: &str) -> Arc<Ros1Bus> {
-        Ros1Bus::connect(Arc::new(HostSockets), self.address, name).await.unwrap()
+        Ros1Bus::connect(Arc::new(HostSockets), self.address, name)
+            .await
+            .unwrap()
     }
 
     /// A bridge of its own at the same Master.
     pub async fn another_bridge(&self) -> Arc<Bridge> {
-        Bridge::new(self.another_node("/other_bridge").await, self.registry.clone(), BridgeOptions::default())
+        Bridge::new(
+            self.another_node("/other_bridge").await,
+            self.registry.clone(),
+            BridgeOptions::default(),
+        )
     }
 
     pub async fn client(&self) -> Client {
@@ -86,7 +112,13 @@ impl World {
     pub fn message(&self, type_name: &str, json: Value) -> Bytes {
         let message_type = self.registry.message(type_name).unwrap();
         let mut out = Vec::new();
-        codec::from_json(&message_type, json.to_string().as_bytes(), &mut out, &FillOptions::default()).unwrap();
+        codec::from_json(
+            &message_type,
+            json.to_string().as_bytes(),
+            &mut out,
+            &FillOptions::default(),
+        )
+        .unwrap();
         out.into()
     }
 
@@ -106,7 +138,12 @@ impl World {
         }
     }
 
-    pub async fn node_publishes(&self, topic: &str, type_name: &str, latch: bool) -> Box<dyn Publisher> {
+    pub async fn node_publishes(
+        &self,
+        topic: &str,
+        type_name: &str,
+        latch: bool,
+    ) -> Box<dyn Publisher> {
         self.publishes(&self.node, topic, type_name, latch).await
     }
 
@@ -117,21 +154,31 @@ impl World {
         type_name: &str,
         latch: bool,
     ) -> Box<dyn Publisher> {
-        let options = AdvertiseOptions { wire_type: self.wire_type(type_name), latch, queue: 10_000 };
+        let options = AdvertiseOptions {
+            wire_type: self.wire_type(type_name),
+            latch,
+            queue: 10_000,
+        };
         let publisher = node.advertise(topic, options).await.unwrap();
-        self.in_graph(|graph| graph.topics.contains_key(topic)).await;
+        self.in_graph(|graph| graph.topics.contains_key(topic))
+            .await;
         publisher
     }
 
     pub async fn node_subscribes(&self, topic: &str, type_name: &str) -> Subscription {
-        let options = SubscribeOptions { wire_type: Some(self.wire_type(type_name)), queue: 10_000 };
+        let options = SubscribeOptions {
+            wire_type: Some(self.wire_type(type_name)),
+            queue: 10_000,
+        };
         self.node.subscribe(topic, options).await.unwrap()
     }
 
     /// Waits until the node sees the graph so; the bridge sees it then or soon.
     pub async fn in_graph(&self, condition: impl Fn(&ros::bus::Graph) -> bool) {
         let mut graph = self.node.graph();
-        patiently(graph.wait_for(|graph| condition(graph))).await.unwrap();
+        patiently(graph.wait_for(|graph| condition(graph)))
+            .await
+            .unwrap();
     }
 }
 
@@ -143,12 +190,20 @@ impl Drop for World {
 
 /// Waits for something that must come.
 pub async fn patiently<F: Future>(future: F) -> F::Output {
-    tokio::time::timeout(PATIENCE, future).await.expect("it did not happen in time")
+    tokio::time::timeout(PATIENCE, future)
+        .await
+        .expect("it did not happen in time")
 }
 
 /// Waits until somebody has connected to a publisher.
 pub async fn connected(publisher: &dyn Publisher, count: usize) {
-    patiently(publisher.subscribers().wait_for(|subscribers| *subscribers >= count)).await.unwrap();
+    patiently(
+        publisher
+            .subscribers()
+            .wait_for(|subscribers| *subscribers >= count),
+    )
+    .await
+    .unwrap();
 }
 
 /// A client of the bridge.
@@ -162,8 +217,13 @@ impl Client {
         let (ours, theirs) = tokio::io::duplex(64 * 1024);
         let bridge = bridge.clone();
         let session = tokio::spawn(async move { bridge.serve(theirs, options).await });
-        let config = WebSocketConfig::default().max_frame_size(None).max_message_size(None);
-        Client { socket: WebSocketStream::from_raw_socket(ours, Role::Client, Some(config)).await, session }
+        let config = WebSocketConfig::default()
+            .max_frame_size(None)
+            .max_message_size(None);
+        Client {
+            socket: WebSocketStream::from_raw_socket(ours, Role::Client, Some(config)).await,
+            session,
+        }
     }
 
     pub async fn send(&mut self, message: Value) {
@@ -171,21 +231,32 @@ impl Client {
     }
 
     pub async fn send_text(&mut self, text: &str) {
-        patiently(self.socket.send(Message::text(text))).await.unwrap();
+        patiently(self.socket.send(Message::text(text)))
+            .await
+            .unwrap();
     }
 
     pub async fn send_binary(&mut self, bytes: Vec<u8>) {
-        patiently(self.socket.send(Message::binary(bytes))).await.unwrap();
+        patiently(self.socket.send(Message::binary(bytes)))
+            .await
+            .unwrap();
     }
 
-    pub async fn send_raw(&mut self, message: Message) -> Result<(), tokio_tungstenite::tungstenite::Error> {
+    pub async fn send_raw(
+        &mut self,
+        message: Message,
+    ) -> Result<(), tokio_tungstenite::tungstenite::Error> {
         patiently(self.socket.send(message)).await
     }
 
     /// The next WebSocket message, whatever it is.
     pub async fn next(&mut self) -> Message {
         loop {
-            match patiently(self.socket.next()).await.expect("the connection ended").unwrap() {
+            match patiently(self.socket.next())
+                .await
+                .expect("the connection ended")
+                .unwrap()
+            {
                 Message::Ping(_) | Message::Pong(_) => {}
                 message => return message,
             }
@@ -216,7 +287,11 @@ impl Client {
     /// Checks that the next message is a status error, and gives its text.
     pub async fn refusal(&mut self) -> String {
         let status = self.json().await;
-        assert_eq!((&status["op"], &status["level"]), (&"status".into(), &"error".into()), "{status}");
+        assert_eq!(
+            (&status["op"], &status["level"]),
+            (&"status".into(), &"error".into()),
+            "{status}"
+        );
         status["msg"].as_str().unwrap().to_owned()
     }
 
@@ -231,7 +306,9 @@ impl Client {
     pub async fn closed(&mut self) -> (u16, String) {
         loop {
             match self.next().await {
-                Message::Close(Some(close)) => return (close.code.into(), close.reason.to_string()),
+                Message::Close(Some(close)) => {
+                    return (close.code.into(), close.reason.to_string());
+                }
                 Message::Close(None) => return (1005, String::new()),
                 _ => {}
             }

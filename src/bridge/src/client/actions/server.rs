@@ -1,4 +1,4 @@
-//! `advertise_action`, `action_feedback`, `action_result` from the client: it is an action server.
+//! A client as an action server, on actionlib's topics.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -8,18 +8,13 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::codec::Time;
 use ros::schema::{ActionDef, MessageType};
-use rosbridge::{
-    ActionFeedback, ActionResult, AdvertiseAction, CancelActionGoal, Compression, GoalStatus, Id, UnadvertiseAction,
-    Writer,
-};
+use rosbridge::{AdvertiseAction, CancelActionGoal, Compression, Id, Writer};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::{common_type, is_type};
 use crate::actionlib::{self, GoalId, GoalState, Status};
-use crate::client::publishing::{decode, decode_args};
-use crate::client::{Client, Reply, print_format};
+use crate::client::{Client, print_format};
 use crate::hub::{Listener, Listening};
-use crate::names::resolve;
 use crate::outlet::Outlet;
 use crate::sample::{Frame, Sample};
 
@@ -35,7 +30,7 @@ pub(super) struct ActionServer {
     name: String,
     /// As the client wrote it.
     written: String,
-    def: Arc<ActionDef>,
+    pub(super) def: Arc<ActionDef>,
     compression: Compression,
     status: Arc<Outlet>,
     feedback: Arc<Outlet>,
@@ -68,7 +63,9 @@ struct TopicListener {
 
 impl Listener for TopicListener {
     fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
-        let Some(server) = self.server.upgrade() else { return };
+        let Some(server) = self.server.upgrade() else {
+            return;
+        };
         if !is_type(&sample.wire_type, &self.expected) {
             return;
         }
@@ -83,13 +80,23 @@ impl Listener for TopicListener {
             && let Some(client) = server.client.upgrade()
         {
             let text = format!("advertise_action: action {}: {reason}", server.name);
-            client.status(rosbridge::Level::Error, None, print_format(server.compression), &text);
+            client.status(
+                rosbridge::Level::Error,
+                None,
+                print_format(server.compression),
+                &text,
+            );
         }
     }
 }
 
 impl ActionServer {
-    fn open(client: &Arc<Client>, name: &str, op: &AdvertiseAction<'_>, def: Arc<ActionDef>) -> Result<Arc<Self>, String> {
+    pub(super) fn open(
+        client: &Arc<Client>,
+        name: &str,
+        op: &AdvertiseAction<'_>,
+        def: Arc<ActionDef>,
+    ) -> Result<Arc<Self>, String> {
         let shared = &client.shared;
         let goal_id = common_type(shared, "actionlib_msgs/GoalID")?;
         let states = common_type(shared, "actionlib_msgs/GoalStatusArray")?;
@@ -108,11 +115,19 @@ impl ActionServer {
             _ticking: ticking.clone().drop_guard(),
         });
         let listen = |part: &str, topic, expected: &Arc<MessageType>| {
-            let listener = TopicListener { server: Arc::downgrade(&server), topic, expected: expected.clone() };
-            shared.hub(&format!("{name}/{part}"), Some(expected)).listen(Arc::new(listener))
+            let listener = TopicListener {
+                server: Arc::downgrade(&server),
+                topic,
+                expected: expected.clone(),
+            };
+            shared
+                .hub(&format!("{name}/{part}"), Some(expected))
+                .listen(Arc::new(listener))
         };
-        let listening =
-            vec![listen("goal", Topic::Goal, &def.action_goal), listen("cancel", Topic::Cancel, &goal_id)];
+        let listening = vec![
+            listen("goal", Topic::Goal, &def.action_goal),
+            listen("cancel", Topic::Cancel, &goal_id),
+        ];
         *server.listening.lock() = listening;
         server.publish_status();
         tokio::spawn(tick(Arc::downgrade(&server), ticking));
@@ -120,8 +135,12 @@ impl ActionServer {
     }
 
     fn goal(&self, bytes: &Bytes) {
-        let Some((mut goal, body)) = actionlib::read_goal(bytes) else { return };
-        let Some(client) = self.client.upgrade() else { return };
+        let Some((mut goal, body)) = actionlib::read_goal(bytes) else {
+            return;
+        };
+        let Some(client) = self.client.upgrade() else {
+            return;
+        };
         let number = client.shared.next_number();
         if goal.id.is_empty() {
             goal.id = format!("{}-{number}", self.name);
@@ -136,11 +155,26 @@ impl ActionServer {
         } else {
             self.frame(&client, &request, &body)
         };
-        let status = if frame.is_ok() { Status::Active } else { Status::Rejected };
+        let status = if frame.is_ok() {
+            Status::Active
+        } else {
+            Status::Rejected
+        };
         let text = frame.as_ref().err().cloned().unwrap_or_default();
-        let state = GoalState { goal: goal.clone(), status, text };
+        let state = GoalState {
+            goal: goal.clone(),
+            status,
+            text,
+        };
         let ended = status.is_terminal().then(Instant::now);
-        goals.insert(goal.id, Served { state: state.clone(), request, ended });
+        goals.insert(
+            goal.id,
+            Served {
+                state: state.clone(),
+                request,
+                ended,
+            },
+        );
         drop(goals);
         self.publish_status();
         match frame {
@@ -152,46 +186,93 @@ impl ActionServer {
     fn frame(&self, client: &Client, request: &str, body: &Bytes) -> Result<Frame, String> {
         let format = print_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
-        let mut writer = Writer::op(&mut out, format, "send_action_goal", Some(&Id::from(request)));
+        let mut writer = Writer::op(
+            &mut out,
+            format,
+            "send_action_goal",
+            Some(&Id::from(request)),
+        );
         writer.text("action", &self.written);
         writer.text("action_type", &self.def.name);
         if self.compression == Compression::CborRaw {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, body);
         } else {
-            writer.value("args", |out| client.print_payload(&self.def.goal, body, format, out))?;
+            writer.value("args", |out| {
+                client.print_payload(&self.def.goal, body, format, out)
+            })?;
         }
         writer.boolean("feedback", true);
         writer.end();
-        Ok(Frame { format, bytes: out.into() })
+        Ok(Frame {
+            format,
+            bytes: out.into(),
+        })
     }
 
     /// actionlib's policy: an empty id means all goals up to the stamp, a zero stamp with it means all.
     fn cancel(&self, bytes: &[u8]) {
-        let Some(wanted) = actionlib::read_cancel(bytes) else { return };
-        let Some(client) = self.client.upgrade() else { return };
+        let Some(wanted) = actionlib::read_cancel(bytes) else {
+            return;
+        };
+        let Some(client) = self.client.upgrade() else {
+            return;
+        };
         let zero = wanted.stamp == Time::default();
         let matches = |goal: &GoalId| {
-            goal.id == wanted.id || (wanted.id.is_empty() && zero) || (!zero && goal.stamp <= wanted.stamp)
+            goal.id == wanted.id
+                || (wanted.id.is_empty() && zero)
+                || (!zero && goal.stamp <= wanted.stamp)
         };
         let mut requests = Vec::new();
         for served in self.goals.lock().values_mut() {
-            if served.ended.is_none() && served.state.status == Status::Active && matches(&served.state.goal) {
+            if served.ended.is_none()
+                && served.state.status == Status::Active
+                && matches(&served.state.goal)
+            {
                 served.state.status = Status::Preempting;
                 requests.push(served.request.clone());
             }
         }
         self.publish_status();
         for request in requests {
-            let op = CancelActionGoal { id: request.into(), action: (&*self.written).into() };
+            let op = CancelActionGoal {
+                id: request.into(),
+                action: (&*self.written).into(),
+            };
             client.send(op.into(), print_format(self.compression));
         }
     }
 
+    /// Passes on how the goal that the client calls `request` gets on.
+    pub(super) fn publish_feedback(&self, request: &str, body: &[u8]) -> Result<(), String> {
+        let state = {
+            let goals = self.goals.lock();
+            let served = goals
+                .values()
+                .find(|served| served.request == request && served.ended.is_none());
+            served
+                .ok_or_else(|| no_such_goal(&self.name, request))?
+                .state
+                .clone()
+        };
+        self.feedback
+            .publish(actionlib::write_state(Time::now(), &state, body));
+        Ok(())
+    }
+
     /// Ends the goal that the client calls `request`.
-    fn end_goal(&self, request: &str, status: Status, text: &str, body: &[u8]) -> Result<(), String> {
+    pub(super) fn end_goal(
+        &self,
+        request: &str,
+        status: Status,
+        text: &str,
+        body: &[u8],
+    ) -> Result<(), String> {
         let mut goals = self.goals.lock();
-        let served = goals.values_mut().find(|served| served.request == request && served.ended.is_none());
+        let served = goals
+            .values_mut()
+            .find(|served| served.request == request && served.ended.is_none());
         let served = served.ok_or_else(|| no_such_goal(&self.name, request))?;
         served.state.status = status;
         served.state.text = text.to_owned();
@@ -204,25 +285,37 @@ impl ActionServer {
     }
 
     fn publish_result(&self, state: &GoalState, body: &[u8]) {
-        self.result.publish(actionlib::write_state(Time::now(), state, body));
+        self.result
+            .publish(actionlib::write_state(Time::now(), state, body));
     }
 
     fn publish_status(&self) {
         let mut goals = self.goals.lock();
-        goals.retain(|_, served| served.ended.is_none_or(|ended| ended.elapsed() < STATUS_KEPT));
+        goals.retain(|_, served| {
+            served
+                .ended
+                .is_none_or(|ended| ended.elapsed() < STATUS_KEPT)
+        });
         let states: Vec<_> = goals.values().map(|served| served.state.clone()).collect();
         drop(goals);
-        self.status.publish(actionlib::write_states(Time::now(), states.iter()));
+        self.status
+            .publish(actionlib::write_states(Time::now(), states.iter()));
     }
 }
 
 impl Drop for ActionServer {
     fn drop(&mut self) {
         let body = vec![0; self.def.result.min_size()];
-        for served in self.goals.get_mut().values_mut().filter(|served| served.ended.is_none()) {
+        for served in self
+            .goals
+            .get_mut()
+            .values_mut()
+            .filter(|served| served.ended.is_none())
+        {
             served.state.status = Status::Aborted;
             served.state.text = "the client that serves this action is gone".to_owned();
-            self.result.publish(actionlib::write_state(Time::now(), &served.state, &body));
+            self.result
+                .publish(actionlib::write_state(Time::now(), &served.state, &body));
         }
     }
 }
@@ -242,78 +335,4 @@ async fn tick(server: Weak<ActionServer>, stop: CancellationToken) {
 
 fn no_such_goal(action: &str, request: &str) -> String {
     format!("action {action} has no goal with id {request:?} under way")
-}
-
-impl Client {
-    pub(in crate::client) fn advertise_action(self: &Arc<Self>, op: &AdvertiseAction<'_>, reply: &Reply) -> Result<(), String> {
-        let name = resolve(&op.action)?.into_owned();
-        let def = self.action_def(&name, &op.type_name)?;
-        let limit = self.shared.options.max_advertisements;
-        if self.actions.lock().served.len() >= limit {
-            return Err(format!("this client serves {limit} actions already; unadvertise one"));
-        }
-        // The earlier one first: it says of its goals that they are given up.
-        let earlier = self.actions.lock().served.remove(&name);
-        if earlier.is_some() {
-            self.warn(reply, &format!("advertise_action: {name} was advertised before, the new one replaces it"));
-        }
-        drop(earlier);
-        let server = ActionServer::open(self, &name, op, def)?;
-        let replaced = self.actions.lock().served.insert(name.clone(), server);
-        drop(replaced);
-        self.info(reply, &format!("advertise_action: advertised {name}"));
-        Ok(())
-    }
-
-    pub(in crate::client) fn unadvertise_action(&self, op: &UnadvertiseAction<'_>, reply: &Reply) -> Result<(), String> {
-        let name = resolve(&op.action)?;
-        let gone = self.actions.lock().served.remove(&*name);
-        match gone {
-            Some(_) => self.info(reply, &format!("unadvertise_action: {name} is no longer advertised")),
-            None => self.warn(reply, &format!("unadvertise_action: this client does not advertise {name}")),
-        }
-        Ok(())
-    }
-
-    fn action_server(&self, action: &str) -> Result<Arc<ActionServer>, String> {
-        let name = resolve(action)?;
-        let server = self.actions.lock().served.get(&*name).cloned();
-        server.ok_or_else(|| format!("action {name} is not advertised by this client; advertise_action it first"))
-    }
-
-    pub(in crate::client) fn action_feedback(&self, op: &ActionFeedback<'_>) -> Result<(), String> {
-        let server = self.action_server(&op.action)?;
-        let request = op.id.to_string();
-        let body = decode(&server.def.feedback, op.values, op.compression, None)?;
-        let state = {
-            let goals = server.goals.lock();
-            let served = goals.values().find(|served| served.request == request && served.ended.is_none());
-            served.ok_or_else(|| no_such_goal(&server.name, &request))?.state.clone()
-        };
-        server.feedback.publish(actionlib::write_state(Time::now(), &state, &body));
-        Ok(())
-    }
-
-    pub(in crate::client) fn action_result(&self, op: &ActionResult<'_>) -> Result<(), String> {
-        let server = self.action_server(&op.action)?;
-        let request = op.id.as_ref().ok_or("field \"id\" is missing, the goal's id is expected")?.to_string();
-        if !op.result {
-            let text = op.values.and_then(|values| values.text()).unwrap_or_default();
-            let body = vec![0; server.def.result.min_size()];
-            return server.end_goal(&request, Status::Aborted, &text, &body);
-        }
-        let status = match op.status {
-            Some(GoalStatus::Canceled) => Status::Preempted,
-            Some(GoalStatus::Aborted) => Status::Aborted,
-            _ => Status::Succeeded,
-        };
-        match decode_args(&server.def.result, op.values, op.compression) {
-            Ok(body) => server.end_goal(&request, status, "", &body),
-            Err(reason) => {
-                let body = vec![0; server.def.result.min_size()];
-                server.end_goal(&request, Status::Aborted, &format!("the result does not fit: {reason}"), &body)?;
-                Err(reason)
-            }
-        }
-    }
 }

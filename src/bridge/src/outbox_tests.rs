@@ -1,0 +1,187 @@
+use std::time::Duration;
+
+use ros::bus::{Message, WireType};
+use ros::schema::Registry;
+use rosbridge::Format;
+
+use super::*;
+use crate::sample::TopicTypes;
+
+fn outbox(options: BridgeOptions) -> (Outbox, Arc<Metrics>) {
+    let metrics = Arc::new(Metrics::default());
+    (Outbox::new(&options, metrics.clone()), metrics)
+}
+
+fn sample(size: usize) -> Arc<Sample> {
+    let wire_type = Arc::new(WireType {
+        name: "a/B".into(),
+        md5: "*".into(),
+        definition: String::new(),
+    });
+    let message = Message {
+        bytes: vec![0; size].into(),
+        wire_type,
+        publisher: "/p".into(),
+        latching: false,
+    };
+    Arc::new(Sample::new(
+        message,
+        false,
+        Arc::new(TopicTypes::new(Arc::new(Registry::new()))),
+    ))
+}
+
+fn control(size: usize) -> Control {
+    let frame = Frame {
+        format: Format::Json,
+        bytes: vec![b'x'; size].into(),
+    };
+    Control {
+        frame,
+        fragment_size: None,
+        answer: false,
+    }
+}
+
+fn wishes() -> Wishes {
+    Wishes {
+        throttle_rate: Duration::ZERO,
+        queue_length: 0,
+        fragment_size: None,
+        compression: Compression::None,
+    }
+}
+
+/// What comes out: `c` for control, else the topic and size.
+fn drain(outbox: &Outbox, now: Instant) -> Vec<String> {
+    let mut out = Vec::new();
+    while let Some(next) = outbox.next(now) {
+        out.push(match next {
+            Outgoing::Control(_) => "c".to_owned(),
+            Outgoing::Sample { topic, sample, .. } => format!("{topic}{}", sample.bytes.len()),
+        });
+    }
+    out
+}
+
+#[test]
+fn control_goes_first_and_topics_take_turns() {
+    let (outbox, _) = outbox(BridgeOptions::default());
+    let (a, b) = (
+        outbox.add_topic("/a".into(), wishes()),
+        outbox.add_topic("/b".into(), wishes()),
+    );
+    for size in 1..=3 {
+        outbox.sample(a, sample(size), false);
+    }
+    outbox.sample(b, sample(9), false);
+    outbox.control(control(1));
+    assert_eq!(
+        drain(&outbox, Instant::now()),
+        ["c", "/a1", "/b9", "/a2", "/a3"]
+    );
+    outbox.sample(a, sample(1), false);
+    outbox.remove_topic(a);
+    outbox.sample(a, sample(1), false);
+    assert!(drain(&outbox, Instant::now()).is_empty());
+}
+
+#[test]
+fn a_topic_in_fragments_waits_and_others_do_not() {
+    let (outbox, _) = outbox(BridgeOptions::default());
+    let (a, b) = (
+        outbox.add_topic("/a".into(), wishes()),
+        outbox.add_topic("/b".into(), wishes()),
+    );
+    outbox.sample(a, sample(1), false);
+    outbox.sample(a, sample(2), false);
+    let now = Instant::now();
+    assert!(matches!(outbox.next(now), Some(Outgoing::Sample { key, .. }) if key == a));
+    outbox.sending_fragments(a);
+    outbox.sample(b, sample(3), false);
+    outbox.sample(a, sample(4), false);
+    assert_eq!(drain(&outbox, now), ["/b3"]);
+    outbox.fragments_sent(a);
+    assert_eq!(drain(&outbox, Instant::now()), ["/a2", "/a4"]);
+}
+
+#[test]
+fn one_client_holds_bounded_memory_whatever_it_subscribes_to() {
+    let (outbox, metrics) = outbox(BridgeOptions {
+        session_bytes: 1000,
+        ..BridgeOptions::default()
+    });
+    let topics: Vec<_> = (0..10)
+        .map(|number| outbox.add_topic(format!("/{number}").into(), wishes()))
+        .collect();
+    for _ in 0..100 {
+        for key in &topics {
+            outbox.sample(*key, sample(90), false);
+            assert!(outbox.queues.lock().bytes <= 1000);
+        }
+    }
+    assert!(metrics.dropped.get() >= 985);
+    // A message larger than all that is allowed gets through as the only one of its topic.
+    outbox.sample(topics[0], sample(3000), false);
+    let sent = drain(&outbox, Instant::now());
+    assert!(sent.contains(&"/03000".to_owned()), "{sent:?}");
+    // But not when it alone is many times too much and others are there.
+    outbox.sample(topics[1], sample(10), false);
+    outbox.sample(topics[0], sample(3000), false);
+    outbox.sample(topics[2], sample(3000), false);
+    assert!(outbox.queues.lock().bytes <= 4000);
+}
+
+#[test]
+fn who_reads_no_answers_is_told_goodbye() {
+    let (outbox, _) = outbox(BridgeOptions {
+        control_messages: 2,
+        ..BridgeOptions::default()
+    });
+    outbox.control(control(1));
+    outbox.control(control(1));
+    assert_eq!(outbox.goodbye(), None);
+    outbox.control(control(1));
+    assert_eq!(
+        outbox.goodbye(),
+        Some(Goodbye {
+            code: 1008,
+            reason: "2 answers wait and none is read".to_owned()
+        })
+    );
+}
+
+#[test]
+fn throttled_topics_come_when_they_are_due() {
+    let (outbox, metrics) = outbox(BridgeOptions::default());
+    let rate = Duration::from_secs(60);
+    let key = outbox.add_topic(
+        "/a".into(),
+        Wishes {
+            throttle_rate: rate,
+            queue_length: 5,
+            ..wishes()
+        },
+    );
+    outbox.sample(key, sample(1), false);
+    outbox.sample(key, sample(2), false);
+    let now = Instant::now();
+    assert_eq!(drain(&outbox, now), ["/a1"]);
+    assert_eq!(outbox.next_due(), Some(now + rate));
+    assert_eq!(drain(&outbox, now + rate), ["/a2"]);
+    assert_eq!(metrics.throttled.get(), 0);
+    outbox.change_topic(key, wishes());
+    outbox.sample(key, sample(3), false);
+    assert_eq!(drain(&outbox, now), ["/a3"]);
+}
+
+#[test]
+fn the_newer_socket_takes_the_older_ones_place() {
+    let (outbox, _) = outbox(BridgeOptions::default());
+    let waker = Waker::noop();
+    let old = outbox.attach();
+    assert!(outbox.register(old, waker));
+    let new = outbox.attach();
+    assert!(!outbox.register(old, waker));
+    assert!(outbox.register(new, waker) && outbox.is_attached(new) && !outbox.is_attached(old));
+}
