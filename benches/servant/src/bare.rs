@@ -83,6 +83,7 @@ pub(crate) fn run(place: &Path) -> Result<()> {
 pub(crate) fn configuration(spec: &Spec, staged: &Staged, uid_range: (u32, u32)) -> Result<Value> {
     let mut config = serde_json::to_value(servant::bundle::config(spec, staged, uid_range)?)?;
     config["process"]["args"] = json!(PROGRAM);
+    config["process"]["env"] = json!(["PATH=/usr/bin:/bin", "HOME=/"]);
     let namespaces = config["linux"]["namespaces"]
         .as_array_mut()
         .context("namespaces")?;
