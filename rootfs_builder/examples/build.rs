@@ -2,7 +2,7 @@
 //!
 //!     cargo run -p rootfs_builder --example build -- [--home DIR] [--cache DIR] [--base NAME] [--launch FILE]
 //!         [--node EXE]... [--param K=V]... [--arg K:=V]... [--remap A:=B]... [--map K=DEB]... [--with NAME]...
-//!         [--no-probe] (PATH | --apt NAME)
+//!         [--no-probe] [--cancel-after SECONDS] (PATH | --apt NAME)
 //!
 //! The program is its own shim (`build shim DIRECTORY`). The init is found by CLOUDROID_INIT, or beside the build's
 //! other profiles. A PATH is copied before it is built.
@@ -106,6 +106,7 @@ struct Wish {
     home: PathBuf,
     cache: PathBuf,
     probe: bool,
+    cancel_after: Option<f64>,
     path: Option<PathBuf>,
     request: PushRequest,
 }
@@ -116,6 +117,7 @@ fn parse() -> Result<Wish, Failure> {
         home: scratch.join("home"),
         cache: scratch.join("cache"),
         probe: true,
+        cancel_after: None,
         path: None,
         request: PushRequest {
             id: format!("try-{}", std::process::id()),
@@ -145,6 +147,7 @@ fn parse() -> Result<Wish, Failure> {
         match word.as_str() {
             "--home" => wish.home = std::path::absolute(&value)?,
             "--cache" => wish.cache = std::path::absolute(&value)?,
+            "--cancel-after" => wish.cancel_after = Some(value.parse()?),
             "--apt" => request.source = Source::Packaged(value),
             "--base" => request.base = Some(value),
             "--launch" => request.launch = Some(value),
@@ -232,11 +235,17 @@ async fn run() -> Result<(), Failure> {
             }
         }
     });
-    let result = builder.build(&wish.request, sender).await;
+    let build = builder.build(&wish.request, sender);
+    let result = match wish.cancel_after {
+        None => build.await,
+        Some(seconds) => {
+            match tokio::time::timeout(Duration::from_secs_f64(seconds), build).await {
+                Ok(result) => result,
+                Err(_) => return cancelled(&wish).await,
+            }
+        }
+    };
     printer.await?;
-    if let Source::Tree(copy) = &wish.request.source {
-        let _ = std::fs::remove_dir_all(copy);
-    }
     let outcome = result?;
     println!(
         "{:7.2} == built {} {}: {}",
@@ -264,6 +273,23 @@ async fn run() -> Result<(), Failure> {
         look(&wish, &outcome, &store, &*engine).await?;
         println!("probed in {:.2} s", begun.elapsed().as_secs_f64());
     }
+    Ok(())
+}
+
+/// What a cancelled build leaves is removed in the background.
+async fn cancelled(wish: &Wish) -> Result<(), Failure> {
+    let begun = Instant::now();
+    let left =
+        |name: &str| std::fs::read_dir(wish.home.join(name)).map_or(0, |entries| entries.count());
+    while left("build") + left("servants") > 0 && begun.elapsed() < Duration::from_secs(30) {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    println!(
+        "cancelled; after {:.2} s {} builds and {} servants are left",
+        begun.elapsed().as_secs_f64(),
+        left("build"),
+        left("servants")
+    );
     Ok(())
 }
 

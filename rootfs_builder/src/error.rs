@@ -42,6 +42,12 @@ pub enum Error {
         /// The last lines it printed.
         last_lines: String,
     },
+    /// `--apt` names something that is no ROS package.
+    #[error("the Debian package {name} holds no ROS package; `--with {name}` adds it to one")]
+    NotRos {
+        /// What was asked for.
+        name: String,
+    },
     /// apt knows no way to install these packages together.
     #[error("apt cannot install {wanted}: {words}")]
     Unsolvable {

@@ -27,6 +27,11 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     } else {
         Vec::new()
     };
+    if packages.is_empty() && archive.names.contains(name) {
+        return Err(Error::NotRos {
+            name: name.to_owned(),
+        });
+    }
     if packages.is_empty() {
         let similar = archive.similar(name);
         let hint = if similar.is_empty() {

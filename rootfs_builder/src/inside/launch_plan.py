@@ -143,6 +143,15 @@ def from_launch_file(ask, rospack, plan):
     path = find_launch_file(rospack, ask["packages"], ask["launch"])
     argv = ["%s:=%s" % (name, value) for name, value in ask["args"].items()]
     try:
+        # roslaunch takes no notice of an argument that the file does not have; whoever misspelt one would like to know.
+        arguments = roslaunch.xmlloader.XmlLoader(resolve_anon=False, args_only=True)
+        arguments.ignore_unset_args = True
+        arguments.load(path, roslaunch.config.ROSLaunchConfig(), argv=argv, verbose=False)
+        declared = arguments.root_context.resolve_dict.get("arg_doc", {})
+        unknown = [name for name in ask["args"] if name not in declared]
+        if unknown:
+            words = "it has no argument %s; it has: %s" % (", ".join(unknown), ", ".join(declared) or "none")
+            raise Refused("launch", file=path, words=words)
         loader = roslaunch.xmlloader.XmlLoader(resolve_anon=True)
         # Read by the loader but set only by roslaunch's own callers of it.
         loader.ignore_unset_args = False
