@@ -208,10 +208,10 @@ async fn run() -> Result<(), Failure> {
         engine: engine.clone(),
     })?;
     if let Some(path) = &wish.path {
-        let copy = wish
-            .home
-            .join("build")
-            .join(format!("{}-pushed", wish.request.id));
+        // In the build's own directory, as the daemon unpacks it: it goes with all the rest.
+        let site = wish.home.join("build").join(&wish.request.id);
+        std::fs::create_dir_all(&site)?;
+        let copy = site.join("pushed");
         let status = Command::new("cp")
             .arg("-rP")
             .arg(path)
