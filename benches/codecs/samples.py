@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Fetches scikit-image's samples for `make bench`: the motorcycle disparity, a real float depth image.
+"""Fetches scikit-image's samples for `make bench`: photographs, and the motorcycle disparity, a real float depth image.
 
-samples.py DIRECTORY writes DIRECTORY/motorcycle_disp.f32: height, width (uint32), then floats, all little endian.
+samples.py DIRECTORY writes pictures and motorcycle_disp.f32: height, width (uint32), then floats, all little endian.
 The last scikit-image whose wheel carries its pictures is 0.16; pip fetches it from the configured index.
 """
 
@@ -13,6 +13,8 @@ import sys
 import tempfile
 import zipfile
 
+PICTURES = ["astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png"]
+
 
 def main(directory):
     with tempfile.TemporaryDirectory() as work:
@@ -23,6 +25,9 @@ def main(directory):
             check=True,
         )
         wheel = next(pathlib.Path(work).glob("*.whl"))
+        directory.mkdir(parents=True, exist_ok=True)
+        for name in PICTURES:
+            (directory / name).write_bytes(zipfile.ZipFile(wheel).read("skimage/data/" + name))
         with zipfile.ZipFile(wheel).open("skimage/data/motorcycle_disp.npz") as archive:
             with zipfile.ZipFile(archive).open("arr_0.npy") as array:
                 data = array.read()
@@ -31,7 +36,6 @@ def main(directory):
     header = ast.literal_eval(data[10 : 10 + length].decode())
     assert header["descr"] == "<f4" and not header["fortran_order"], header
     height, width = header["shape"]
-    directory.mkdir(parents=True, exist_ok=True)
     target = directory / "motorcycle_disp.f32"
     target.write_bytes(struct.pack("<II", height, width) + data[10 + length :])
 

@@ -64,9 +64,29 @@ pub fn colours() -> Result<Vec<Picture>> {
     }
 }
 
-/// Photographs that are on any machine with `opencv-doc`.
+/// Photographs of packages: `opencv-doc`'s, and scikit-image's where they could be fetched.
 pub fn packaged_colours() -> Result<Vec<Picture>> {
-    pictures(&packaged(), &["rubberwhale1.png", "graf1.png", "basketball1.png"])
+    let mut pictures = pictures(&packaged(), &["graf1.png", "graf3.png"])?;
+    if let Some(directory) = fetched() {
+        let names = ["astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png"];
+        pictures.extend(self::pictures(&directory, &names)?);
+    }
+    pictures.retain(|picture| picture.depth == 3);
+    Ok(pictures)
+}
+
+/// scikit-image's samples, if `samples.py` has fetched or can fetch them.
+fn fetched() -> Option<PathBuf> {
+    let directory = bench_report::root().join("target/bench/samples");
+    if !directory.join("motorcycle_disp.f32").exists() {
+        let script = bench_report::root().join("benches/codecs/samples.py");
+        let status = Command::new("python3").arg(script).arg(&directory).status();
+        if !status.is_ok_and(|status| status.success()) {
+            eprintln!("scikit-image's samples are not at hand: they are left out");
+            return None;
+        }
+    }
+    Some(directory)
 }
 
 /// Depth frames; without recordings, the packaged disparity.
@@ -96,17 +116,9 @@ impl Disparity {
     }
 }
 
-/// scikit-image's motorcycle, if `samples.py` could fetch it: `height · width · floats`, little endian.
+/// scikit-image's motorcycle: `height · width · floats`, little endian.
 pub fn motorcycle() -> Option<Disparity> {
-    let path = bench_report::root().join("target/bench/samples/motorcycle_disp.f32");
-    if !path.exists() {
-        let script = bench_report::root().join("benches/codecs/samples.py");
-        let fetched = Command::new("python3").arg(script).arg(path.parent()?).status();
-        if !fetched.is_ok_and(|status| status.success()) {
-            eprintln!("scikit-image's samples are not at hand: the float disparity is left out");
-            return None;
-        }
-    }
+    let path = fetched()?.join("motorcycle_disp.f32");
     let bytes = std::fs::read(path).ok()?;
     let size = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     let (height, width) = (size(0)?, size(4)?);

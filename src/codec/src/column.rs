@@ -58,18 +58,21 @@ impl Shape {
                 Kind::Median,
                 Kind::Middle,
             ],
-            Self::Sequence(_) => &[Kind::West, Kind::North, Kind::Line],
+            Self::Sequence(_) => &[Kind::West, Kind::Line],
         }
     }
 }
 
-/// Fills lanes of one plane from samples in order.
-fn fill<T: Copy + Default>(lanes: &mut Lanes<T>, mut samples: impl Iterator<Item = T>) {
+/// Fills lanes of one plane from samples in order, each mapped.
+fn fill<S: Copy, T: Copy + Default>(lanes: &mut Lanes<T>, samples: &[S], map: impl Fn(S) -> T) {
+    let mut rest = samples;
     for lane in &mut lanes.lanes {
         for y in 0..lane.height {
-            for (slot, sample) in lane.row_mut(y).iter_mut().zip(&mut samples) {
-                *slot = sample;
+            let (row, after) = rest.split_at(lane.width);
+            for (slot, &sample) in lane.row_mut(y).iter_mut().zip(row) {
+                *slot = map(sample);
             }
+            rest = after;
         }
     }
 }
@@ -103,10 +106,7 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     }
     let missing = (zeros > 0 && smallest >= 15).then(|| {
         let mut lanes = shape.lanes();
-        fill(
-            &mut lanes,
-            samples.iter().map(|&sample| u8::from(sample == 0)),
-        );
+        fill(&mut lanes, samples, |sample| u8::from(sample == 0));
         lanes
     });
     let flags = if missing.is_some() { MISSING } else { 0 };
@@ -115,6 +115,9 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
 
 /// The ranks of the values of `samples` where `counted` holds, when so few occur that ranks are worth a list.
 fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<u16>)> {
+    if samples.len() < 4096 {
+        return None;
+    }
     let mut present = vec![false; 1 << 16];
     match missing {
         None => samples
@@ -162,15 +165,12 @@ fn encode_plane16(
             }
             put_varint(out, values.len() as u64);
             put_packed(&steps, out);
-            fill(
-                &mut lanes,
-                samples.iter().map(|&sample| rank[usize::from(sample)]),
-            );
+            fill(&mut lanes, samples, |sample| rank[usize::from(sample)]);
         }
         None => {
             out.push(flags);
             out.extend_from_slice(preamble);
-            fill(&mut lanes, samples.iter().copied());
+            fill(&mut lanes, samples, |sample| sample);
         }
     }
     Wide {
@@ -196,7 +196,7 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
         out.push(WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        fill(&mut lanes, samples.iter().map(|&sample| sample - smallest));
+        fill(&mut lanes, samples, |sample| sample - smallest);
         Wide {
             samples: lanes,
             missing: None,
@@ -208,7 +208,7 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
 /// Encodes differences that are small numbers already.
 pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut lanes = shape.lanes();
-    fill(&mut lanes, samples.iter().copied());
+    fill(&mut lanes, samples, |sample| sample);
     Wide {
         samples: lanes,
         missing: None,
@@ -273,10 +273,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
             .map(|(&bits, _)| bits);
         put_apart(apart, &mut preamble);
         let mut lanes = shape.lanes();
-        fill(
-            &mut lanes,
-            multiples.iter().map(|&multiple| u8::from(!fits(multiple))),
-        );
+        fill(&mut lanes, &multiples, |multiple| u8::from(!fits(multiple)));
         lanes
     });
     put_varint(&mut preamble, zigzag(i64::from(smallest)));
@@ -297,10 +294,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
         out.push(flags | WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        fill(
-            &mut lanes,
-            multiples.iter().map(|&multiple| above(multiple)),
-        );
+        fill(&mut lanes, &multiples, above);
         Wide {
             samples: lanes,
             missing,
@@ -325,17 +319,14 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
             &mut preamble,
         );
         let mut lanes = shape.lanes();
-        fill(
-            &mut lanes,
-            bits.iter().map(|&bits| u8::from(!measured(bits))),
-        );
+        fill(&mut lanes, bits, |bits| u8::from(!measured(bits)));
         lanes
     });
     put_varint(&mut preamble, 0);
     out.push(flags);
     out.extend_from_slice(&preamble);
     let mut lanes = shape.lanes();
-    fill(&mut lanes, bits.iter().map(|&bits| ordered(bits)));
+    fill(&mut lanes, bits, ordered);
     Wide {
         samples: lanes,
         missing,
@@ -587,8 +578,12 @@ mod tests {
 
     #[test]
     fn shorts_with_holes_and_steps_come_back() {
-        for shape in [PICTURE, Shape::Sequence(2000)] {
-            let samples: Vec<u16> = (0..2000u16)
+        let picture = Shape::Picture {
+            width: 80,
+            height: 100,
+        };
+        for shape in [picture, Shape::Sequence(8000)] {
+            let samples: Vec<u16> = (0..8000u16)
                 .map(|index| {
                     if index % 11 == 0 {
                         0

@@ -36,6 +36,10 @@ impl<T: Copy + Default> Padded<T> {
         }
     }
 
+    pub(crate) fn is_sequence(&self) -> bool {
+        self.lag == 2
+    }
+
     /// Where the samples of row `y` begin.
     #[inline]
     pub(crate) fn start(&self, y: usize) -> usize {

@@ -7,7 +7,7 @@
 
 use crate::Error;
 use crate::entropy::counts::Order;
-use crate::entropy::tans::{Decoder, Encoder, Histogram, Lane};
+use crate::entropy::tans::{BATCH, Decoder, Encoder, Histogram, Lane};
 use crate::padded::{Lanes, Padded};
 use crate::predict::{self, Kind, Predictor};
 use crate::wire::{Cursor, put_block};
@@ -39,7 +39,7 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
     let shift = merge(count / planes.max(1));
     let kind = choose(lanes);
     out.push(kind as u8);
-    let mut histogram = Histogram::new();
+    let mut histogram = Histogram::new(contexts(planes));
     let keys: Vec<Vec<u16>> = lanes
         .lanes
         .iter()
@@ -63,7 +63,7 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
             keys
         })
         .collect();
-    let encoder = Encoder::new(&histogram, contexts(planes), Order::Signed, out);
+    let encoder = Encoder::new(histogram, Order::Signed, out);
     for group in lanes.groups() {
         let keys = &keys[group];
         match *keys {
@@ -199,12 +199,16 @@ fn decode_group<const N: usize>(
 ) -> Result<(), Error> {
     let mut lanes = Vec::with_capacity(N);
     for _ in 0..N {
-        lanes.push(Lane::new(input.block()?, tables.log)?);
+        lanes.push(tables.lane(input.block()?)?);
     }
     let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else {
         unreachable!("N lanes were pushed")
     };
     let bases: [&[u16; 1024]; N] = std::array::from_fn(|index| &bases[index.min(bases.len() - 1)]);
+    if planes[0].is_sequence() {
+        decode_sequence(tables, bases, &mut planes, &mut lanes);
+        return lanes.iter().try_for_each(Lane::finish);
+    }
     for y in 0..planes[0].height {
         match if y == 0 { Kind::West } else { kind } {
             Kind::Median => {
@@ -219,6 +223,71 @@ fn decode_group<const N: usize>(
     lanes.iter().try_for_each(Lane::finish)
 }
 
+/// Decodes sequences, in which the neighbours above are the samples just decoded.
+fn decode_sequence<const N: usize>(
+    tables: &Decoder,
+    bases: [&[u16; 1024]; N],
+    planes: &mut [&mut Padded<u8>; N],
+    lanes: &mut [Lane<'_>; N],
+) {
+    let (width, start) = (planes[0].width, planes[0].start(0));
+    let mut windows = lanes.each_ref().map(Lane::window);
+    // The last three samples, the newest first.
+    let mut last = [[0i16; 3]; N];
+    for at in 0..width {
+        for lane in 0..N {
+            if at % BATCH == 0 {
+                windows[lane] = lanes[lane].refill(windows[lane]);
+            }
+            let [a, b, c] = last[lane];
+            let base = bases[lane][unease(a, b, c, a) as usize & 1023];
+            let value = (a as u8).wrapping_add(tables.symbol(base, &mut windows[lane]));
+            planes[lane].samples[start + at] = value;
+            last[lane] = [value.into(), a, b];
+        }
+    }
+    for lane in 0..N {
+        lanes[lane].leave(windows[lane]);
+    }
+}
+
+/// Samples decoded at a time: what does not depend on them is worked out before, in vector code.
+const CHUNK: usize = 16 * BATCH;
+
+/// What the row above says about a chunk.
+#[derive(Clone, Copy)]
+struct Above {
+    /// The unease without the sample to the left.
+    ease: [i16; CHUNK],
+    corner: [i16; CHUNK],
+    north: [i16; CHUNK],
+    /// A quarter of the slope.
+    tilt: [i16; CHUNK],
+}
+
+impl Above {
+    const NONE: Self = Self {
+        ease: [0; CHUNK],
+        corner: [0; CHUNK],
+        north: [0; CHUNK],
+        tilt: [0; CHUNK],
+    };
+
+    /// `row` begins one sample left of the chunk and ends one to the right.
+    #[inline(always)]
+    fn look(&mut self, row: &[u8]) {
+        let length = (row.len() - 2).min(CHUNK);
+        let (corner, north, east) = (&row[..length], &row[1..=length], &row[2..length + 2]);
+        for x in 0..length {
+            let [c, b, d] = [corner[x], north[x], east[x]].map(i16::from);
+            self.ease[x] = (c - b).abs() + (b - d).abs();
+            self.corner[x] = c;
+            self.north[x] = b;
+            self.tilt[x] = (d - c) >> 2;
+        }
+    }
+}
+
 #[inline(never)]
 fn decode_row<P: Predictor, const N: usize>(
     tables: &Decoder,
@@ -228,34 +297,49 @@ fn decode_row<P: Predictor, const N: usize>(
     y: usize,
 ) {
     let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
-    let mut rows = planes.each_mut().map(|plane| {
-        plane.close_row_before(y);
-        let (above, here) = plane.samples.split_at_mut(start);
-        (
-            &above[start - lag - 1..start - lag + width + 1],
-            &mut here[..width],
-        )
-    });
-    let mut a: [i16; N] = [0; N];
-    let (mut b, mut c) = ([0i16; N], [0i16; N]);
+    let mut windows = lanes.each_ref().map(Lane::window);
+    let mut west = [0i16; N];
     for lane in 0..N {
-        c[lane] = rows[lane].0[0].into();
-        b[lane] = rows[lane].0[1].into();
-        a[lane] = if y > 0 { b[lane] } else { 0 };
+        planes[lane].open_row(y);
+        west[lane] = planes[lane].samples[start - 1].into();
     }
-    for x in 0..width {
+    let mut above = [Above::NONE; N];
+    let mut here = [[0u8; CHUNK]; N];
+    let mut x = 0;
+    while x < width {
+        let length = (width - x).min(CHUNK);
         for lane in 0..N {
-            let (above, here) = &mut rows[lane];
-            let d = i16::from(above[x + 2]);
-            let unease = unease(a[lane], b[lane], c[lane], d);
-            let base = bases[lane][unease as usize & 1023];
-            let difference = tables.symbol(base, &mut lanes[lane]);
-            let value = (guess::<P>(a[lane], b[lane], c[lane], d) as u8).wrapping_add(difference);
-            here[x] = value;
-            a[lane] = value.into();
-            c[lane] = b[lane];
-            b[lane] = d;
+            above[lane].look(&planes[lane].samples[start + x - lag - 1..][..length + 2]);
         }
+        for first in (0..length).step_by(BATCH) {
+            for lane in 0..N {
+                windows[lane] = lanes[lane].refill(windows[lane]);
+            }
+            let end = (first + BATCH).min(length).min(CHUNK);
+            for at in first.min(end)..end {
+                for lane in 0..N {
+                    let (above, a) = (&above[lane], west[lane]);
+                    let unease = above.ease[at] + (a - above.corner[at]).abs();
+                    let base = bases[lane][unease as usize & 1023];
+                    let difference = tables.symbol(base, &mut windows[lane]);
+                    let guess = match P::KIND {
+                        Kind::Slope => ((a + above.north[at]) >> 1) + above.tilt[at],
+                        _ => guess::<P>(a, above.north[at], above.corner[at], 0),
+                    };
+                    let value = (guess as u8).wrapping_add(difference);
+                    here[lane][at] = value;
+                    west[lane] = value.into();
+                }
+            }
+        }
+        for lane in 0..N {
+            planes[lane].samples[start + x..start + x + length]
+                .copy_from_slice(&here[lane][..length]);
+        }
+        x += length;
+    }
+    for lane in 0..N {
+        lanes[lane].leave(windows[lane]);
     }
 }
 

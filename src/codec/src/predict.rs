@@ -82,8 +82,12 @@ pub(crate) trait Sample: Copy + Default + Eq {
     fn residual<P: Predictor>(self, a: Self, b: Self, c: Self, d: Self) -> u32;
     /// The sample whose [`Sample::residual`] is `residual`.
     fn restore<P: Predictor>(residual: u32, a: Self, b: Self, c: Self, d: Self) -> Self;
-    /// How uneasy the neighbourhood is, as a number below 29.
-    fn context<P: Predictor>(a: Self, b: Self, c: Self, d: Self) -> u16;
+    /// The part of the unease that does not depend on a.
+    fn ease<P: Predictor>(b: Self, c: Self, d: Self) -> u32;
+    /// How uneasy the neighbourhood is.
+    fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32;
+    /// The context of an unease, below [`EASE`].
+    fn context(unease: u32) -> u16;
     fn widen(self) -> u32;
 }
 
@@ -129,6 +133,31 @@ pub(crate) fn unzigzag(value: u32) -> i32 {
 /// The first context that is not about unease.
 pub(crate) const EASE: u16 = 29;
 
+/// Two contexts per octave.
+const fn half_octave(unease: u32) -> u8 {
+    if unease < 4 {
+        return unease as u8;
+    }
+    let octave = unease.ilog2();
+    let context = 2 * octave + ((unease >> (octave - 1)) & 1);
+    if context < EASE as u32 {
+        context as u8
+    } else {
+        EASE as u8 - 1
+    }
+}
+
+/// [`half_octave`] of small numbers, to be looked up.
+const HALF_OCTAVES: [u8; 1024] = {
+    let mut contexts = [0; 1024];
+    let mut unease = 0;
+    while unease < contexts.len() {
+        contexts[unease] = half_octave(unease as u32);
+        unease += 1;
+    }
+    contexts
+};
+
 impl Sample for u16 {
     #[inline(always)]
     fn residual<P: Predictor>(self, a: Self, b: Self, c: Self, d: Self) -> u32 {
@@ -141,18 +170,29 @@ impl Sample for u16 {
     }
 
     #[inline(always)]
-    fn context<P: Predictor>(a: Self, b: Self, c: Self, d: Self) -> u16 {
-        let unease = if matches!(P::KIND, Kind::Zero) {
-            u32::from(a) + u32::from(b)
-        } else {
-            u32::from(a.abs_diff(c)) + u32::from(c.abs_diff(b)) + u32::from(b.abs_diff(d))
-        };
-        // Two contexts per octave.
-        if unease < 4 {
-            return unease as u16;
+    fn ease<P: Predictor>(b: Self, c: Self, d: Self) -> u32 {
+        if matches!(P::KIND, Kind::Zero) {
+            return b.into();
         }
-        let octave = unease.ilog2();
-        ((2 * octave + ((unease >> (octave - 1)) & 1)) as u16).min(EASE - 1)
+        u32::from(c.abs_diff(b)) + u32::from(b.abs_diff(d))
+    }
+
+    #[inline(always)]
+    fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32 {
+        let left = if matches!(P::KIND, Kind::Zero) {
+            a
+        } else {
+            a.abs_diff(c)
+        };
+        ease + u32::from(left)
+    }
+
+    #[inline(always)]
+    fn context(unease: u32) -> u16 {
+        match HALF_OCTAVES.get(unease as usize) {
+            Some(&context) => context.into(),
+            None => half_octave(unease).into(),
+        }
     }
 
     #[inline(always)]
@@ -173,14 +213,25 @@ impl Sample for u32 {
     }
 
     #[inline(always)]
-    fn context<P: Predictor>(a: Self, b: Self, c: Self, d: Self) -> u16 {
-        let unease = if matches!(P::KIND, Kind::Zero) {
-            a.saturating_add(b)
+    fn ease<P: Predictor>(b: Self, c: Self, d: Self) -> u32 {
+        if matches!(P::KIND, Kind::Zero) {
+            b
+        } else {
+            c.abs_diff(b).saturating_add(b.abs_diff(d))
+        }
+    }
+
+    #[inline(always)]
+    fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32 {
+        ease.saturating_add(if matches!(P::KIND, Kind::Zero) {
+            a
         } else {
             a.abs_diff(c)
-                .saturating_add(c.abs_diff(b))
-                .saturating_add(b.abs_diff(d))
-        };
+        })
+    }
+
+    #[inline(always)]
+    fn context(unease: u32) -> u16 {
         ((32 - unease.leading_zeros()) as u16).min(EASE - 1)
     }
 
@@ -235,7 +286,10 @@ mod tests {
                             u16::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d),
                             v
                         );
-                        assert!(u16::context::<P>(a, b, c, d) < EASE);
+                        let unease = u16::unease::<P>(u16::ease::<P>(b, c, d), a, c);
+                        assert!(
+                            u16::context(unease) < EASE && u32::context(u32::MAX - unease) < EASE
+                        );
                     }
                 }
             }

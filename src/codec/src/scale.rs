@@ -94,22 +94,27 @@ impl Scale {
 
     /// The coarsest scale that nearly all of the floats measured are multiples of.
     pub(crate) fn find(bits: &[u32]) -> Option<Self> {
-        let step = (bits.len() / 256).max(1);
+        // Few are enough to tell: a chance multiple of a coarse scale is one in thousands.
+        // An odd step, lest all of a pattern's even values be taken.
+        let step = bits.len() / 96 | 1;
         let sample: Vec<u32> = bits
             .iter()
             .step_by(step)
             .copied()
             .filter(|&bits| f32::from_bits(bits).is_finite() && bits << 1 != 0)
+            .take(64)
             .collect();
+        let misses = sample.len() / 16;
+        let fits = |scale: &Self| {
+            let unfit = sample
+                .iter()
+                .filter(|&&bits| scale.multiple(bits) == Self::NONE);
+            unfit.take(misses + 1).count() <= misses
+        };
         (0..SCALES.len() as u8)
             .filter_map(|name| Self::named(name).ok())
-            .find(|scale| {
-                let fit = sample
-                    .iter()
-                    .filter(|&&bits| scale.multiple(bits) != Self::NONE)
-                    .count();
-                fit * 16 >= sample.len() * 15 && fit > 0
-            })
+            .find(fits)
+            .filter(|_| !sample.is_empty())
     }
 }
 

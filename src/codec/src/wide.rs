@@ -6,51 +6,72 @@
 //!
 //! Layout: `predictor · tables`, then per lane `tokens · plain bits`, each preceded by its length.
 
-use crate::Error;
-use crate::entropy::bits::{BitReader, BitWriter};
+mod decode;
+
+use crate::entropy::bits::BitWriter;
 use crate::entropy::counts::{CONTEXTS, Order};
-use crate::entropy::tans::{Decoder, Encoder, Histogram, Lane};
+use crate::entropy::tans::{Encoder, Histogram};
 use crate::padded::{Lanes, Padded};
 use crate::predict::{EASE, Kind, Predictor, Sample, with_predictor};
-use crate::wire::{Cursor, put_block};
+use crate::wire::put_block;
 
 /// The token of a missing sample.
 const MISSING: u8 = 200;
-/// Differences below this are their own token.
+/// Differences below this are their own token; above it there are four tokens per octave.
 const EXACT: u32 = 16;
-/// Above it, four tokens per octave.
+/// The token of the largest difference.
 const LAST_TOKEN: usize = 16 + 27 * 4 + 3;
 
-#[inline(always)]
-fn token(residual: u32) -> (u8, u32) {
+/// The token of a difference.
+const fn token_of(residual: u32) -> u8 {
     if residual < EXACT {
-        return (residual as u8, 0);
+        return residual as u8;
     }
     let octave = residual.ilog2();
-    (
-        (16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8,
-        octave - 2,
-    )
+    (16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8
 }
 
-/// Per token: the smallest residual, and how many plain bits tell the rest.
-fn residuals() -> [(u32, u32); 256] {
-    std::array::from_fn(|token| match token {
-        0..16 => (token as u32, 0),
-        16..=LAST_TOKEN => {
+/// Tokens of small differences, to be looked up: computing them takes a branch nobody can foresee.
+const TOKENS: [u8; 1024] = {
+    let mut tokens = [0; 1024];
+    let mut residual = 0;
+    while residual < tokens.len() {
+        tokens[residual] = token_of(residual as u32);
+        residual += 1;
+    }
+    tokens
+};
+
+/// Per token: the smallest difference, and how many plain bits tell the rest.
+const RESIDUALS: [(u32, u32); 256] = {
+    let mut residuals = [(0, 0); 256];
+    let mut token = 0;
+    while token <= LAST_TOKEN {
+        residuals[token] = if token < EXACT as usize {
+            (token as u32, 0)
+        } else {
             let octave = (token as u32 - 16) / 4 + 4;
             ((4 + token as u32 % 4) << (octave - 2), octave - 2)
-        }
-        _ => (0, 0),
-    })
+        };
+        token += 1;
+    }
+    residuals
+};
+
+#[inline(always)]
+fn token(residual: u32) -> u8 {
+    match TOKENS.get(residual as usize) {
+        Some(&token) => token,
+        None => token_of(residual),
+    }
 }
 
-/// How many neighbouring contexts are merged into one (as a shift): tables cost bytes.
+/// How many neighbouring contexts are merged into one (as a shift): tables cost bytes, and time.
 fn merge(samples: usize) -> u32 {
     match samples {
         0..0x200 => 5,
-        0x200..0x800 => 3,
-        0x800..0x2000 => 2,
+        0x200..0x1000 => 3,
+        0x1000..0x2000 => 2,
         0x2000..0x8000 => 1,
         _ => 0,
     }
@@ -71,13 +92,8 @@ impl<T: Sample> Wide<T> {
         missing.close();
         for (plane, gaps) in self.samples.lanes.iter_mut().zip(&missing.lanes) {
             for y in 0..plane.height {
-                plane.close_row_before(y);
-                let start = plane.start(y);
-                let mut last = if y > 0 {
-                    plane.samples[start - plane.lag]
-                } else {
-                    T::default()
-                };
+                plane.open_row(y);
+                let mut last = plane.samples[plane.start(y) - 1];
                 for (sample, &gap) in plane.row_mut(y).iter_mut().zip(gaps.row(y)) {
                     if gap != 0 {
                         *sample = last;
@@ -95,7 +111,7 @@ impl<T: Sample> Wide<T> {
         let kind = self.choose(kinds);
         let shift = merge(self.samples.count());
         out.push(kind as u8);
-        let mut histogram = Histogram::new();
+        let mut histogram = Histogram::new(CONTEXTS >> shift);
         let mut keys = Vec::with_capacity(self.samples.lanes.len());
         let mut plain = Vec::with_capacity(self.samples.lanes.len());
         for (index, plane) in self.samples.lanes.iter().enumerate() {
@@ -110,7 +126,7 @@ impl<T: Sample> Wide<T> {
             keys.push(lane);
             plain.push(bits.finish());
         }
-        let encoder = Encoder::new(&histogram, CONTEXTS >> shift, Order::Natural, out);
+        let encoder = Encoder::new(histogram, Order::Natural, out);
         for group in self.samples.groups() {
             let first = group.start;
             let mut put = |lanes: &[Vec<u8>]| {
@@ -127,8 +143,10 @@ impl<T: Sample> Wide<T> {
         }
     }
 
-    /// The predictor whose differences take the fewest bits on every sixteenth row, or on all of a short plane.
+    /// The predictor whose differences take the fewest bits on some rows of a picture, or the beginning of a sequence.
     fn choose(&self, kinds: &[Kind]) -> Kind {
+        /// Samples of a row that are looked at.
+        const SOME: usize = 128;
         if let [only] = kinds {
             return *only;
         }
@@ -137,8 +155,13 @@ impl<T: Sample> Wide<T> {
         let cost = |kind: Kind| -> u64 {
             let mut cost = 0;
             for plane in &self.samples.lanes {
+                let some = if plane.is_sequence() {
+                    SOME
+                } else {
+                    usize::MAX
+                };
                 for y in (usize::from(plane.height > 1)..plane.height).step_by(step) {
-                    cost += with_predictor!(kind, row_cost::<T>(plane, y));
+                    cost += with_predictor!(kind, row_cost::<T>(plane, y, some));
                 }
             }
             cost
@@ -148,37 +171,6 @@ impl<T: Sample> Wide<T> {
             .copied()
             .min_by_key(|&kind| cost(kind))
             .unwrap_or(Kind::West)
-    }
-
-    /// Decodes into samples (and gaps) of the shape they were encoded with.
-    pub(crate) fn decode(&mut self, input: &mut Cursor<'_>) -> Result<(), Error> {
-        let kind = Kind::read(input.byte()?)?;
-        let shift = merge(self.samples.count());
-        let mut rest = *input;
-        let (tables, used) = Decoder::read(rest.take_rest(), CONTEXTS >> shift, Order::Natural)?;
-        input.take(used)?;
-        let model = Model {
-            bases: std::array::from_fn(|context| tables.base(context >> shift)),
-            residuals: residuals(),
-            tables,
-        };
-        for group in self.samples.groups() {
-            let gaps = self
-                .missing
-                .as_mut()
-                .map(|missing| &mut missing.lanes[group.clone()]);
-            let planes = &mut self.samples.lanes[group];
-            match (planes, gaps) {
-                ([a], None) => model.group::<T, 1>(kind, [a], None, input)?,
-                ([a], Some([x])) => model.group(kind, [a], Some([x]), input)?,
-                ([a, b, c, d], None) => model.group::<T, 4>(kind, [a, b, c, d], None, input)?,
-                ([a, b, c, d], Some([x, y, z, w])) => {
-                    model.group(kind, [a, b, c, d], Some([x, y, z, w]), input)?;
-                }
-                _ => unreachable!("one plane makes one lane or four, and gaps have its shape"),
-            }
-        }
-        Ok(())
     }
 }
 
@@ -191,10 +183,10 @@ fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
     }
 }
 
-fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize) -> u64 {
+fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize, some: usize) -> u64 {
     let [a, b, c, d, v] = plane.neighbours(y);
     let mut sum = 0u64;
-    for x in 0..v.len() {
+    for x in 0..v.len().min(some) {
         sum += u64::from(32 - v[x].residual::<P>(a[x], b[x], c[x], d[x]).leading_zeros());
     }
     sum
@@ -215,160 +207,48 @@ fn row_keys<P: Predictor, T: Sample>(
     keys: &mut [u16],
     plain: &mut BitWriter,
 ) {
+    /// Samples worked on at a time: first what the vectoriser can do, then the rest.
+    const CHUNK: usize = 64;
     let width = keys.len();
-    let [a, b, c, d, v] = plane.neighbours(y).map(|row| &row[..width]);
-    let gaps = gaps.map(|gaps| {
-        let [left, above, _, _, here] = gaps.neighbours(y).map(|row| &row[..width]);
-        (left, above, here)
-    });
-    for x in 0..width {
-        let mut context = T::context::<P>(a[x], b[x], c[x], d[x]);
-        let mut missing = false;
-        if let Some((left, above, here)) = gaps {
-            if left[x] | above[x] != 0 {
-                context = gap_context(left[x], above[x]);
+    let rows = plane.neighbours(y).map(|row| &row[..width]);
+    let gaps = gaps.map(|gaps| gaps.neighbours(y).map(|row| &row[..width]));
+    let mut residuals = [0u32; CHUNK];
+    let mut uneases = [0u32; CHUNK];
+    for (index, keys) in keys.chunks_mut(CHUNK).enumerate() {
+        let range = index * CHUNK..index * CHUNK + keys.len();
+        let [a, b, c, d, v] = rows.map(|row| &row[range.clone()]);
+        let length = keys.len().min(CHUNK);
+        for x in 0..length {
+            residuals[x] = v[x].residual::<P>(a[x], b[x], c[x], d[x]);
+            uneases[x] = T::unease::<P>(T::ease::<P>(b[x], c[x], d[x]), a[x], c[x]);
+        }
+        match gaps {
+            None => {
+                for (key, (&residual, &unease)) in
+                    keys.iter_mut().zip(residuals.iter().zip(&uneases))
+                {
+                    let token = token(residual);
+                    let (smallest, bits) = RESIDUALS[usize::from(token)];
+                    plain.put(residual - smallest, bits);
+                    *key = (T::context(unease) >> shift) << 8 | u16::from(token);
+                }
             }
-            missing = here[x] != 0;
-        }
-        let token = if missing {
-            MISSING
-        } else {
-            let residual = v[x].residual::<P>(a[x], b[x], c[x], d[x]);
-            let (token, bits) = token(residual);
-            plain.put(residual & ((1 << bits) - 1), bits);
-            token
-        };
-        keys[x] = (context >> shift) << 8 | u16::from(token);
-    }
-}
-
-struct Model {
-    tables: Decoder,
-    bases: [u16; CONTEXTS],
-    residuals: [(u32, u32); 256],
-}
-
-impl Model {
-    fn group<T: Sample, const N: usize>(
-        &self,
-        kind: Kind,
-        mut planes: [&mut Padded<T>; N],
-        mut gaps: Option<[&mut Padded<u8>; N]>,
-        input: &mut Cursor<'_>,
-    ) -> Result<(), Error> {
-        let mut lanes = Vec::with_capacity(N);
-        let mut plain = [BitReader::default(); N];
-        for plain in &mut plain {
-            lanes.push(Lane::new(input.block()?, self.tables.log)?);
-            *plain = BitReader::new(input.block()?);
-        }
-        let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else {
-            unreachable!("N lanes were pushed")
-        };
-        for y in 0..planes[0].height {
-            let kind = row_kind(kind, y, planes[0].height);
-            match &mut gaps {
-                None => with_predictor!(
-                    kind,
-                    row_all::<T, N>(self, &mut planes, &mut lanes, &mut plain, y)
-                ),
-                Some(gaps) => with_predictor!(
-                    kind,
-                    row_gaps::<T, N>(self, &mut planes, gaps, &mut lanes, &mut plain, y)
-                ),
-            }
-        }
-        lanes.iter().try_for_each(Lane::finish)?;
-        if plain.iter().any(BitReader::overran) {
-            Err(Error::Truncated)
-        } else {
-            Ok(())
-        }
-    }
-
-    #[inline(always)]
-    fn residual(&self, token: u8, plain: &mut BitReader<'_>) -> u32 {
-        let (smallest, bits) = self.residuals[usize::from(token)];
-        if bits == 0 {
-            smallest
-        } else {
-            smallest | plain.take(bits)
-        }
-    }
-}
-
-/// Decodes row `y` of every lane where no sample can be missing.
-#[inline(never)]
-fn row_all<P: Predictor, T: Sample, const N: usize>(
-    model: &Model,
-    planes: &mut [&mut Padded<T>; N],
-    lanes: &mut [Lane<'_>; N],
-    plain: &mut [BitReader<'_>; N],
-    y: usize,
-) {
-    let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
-    let mut a = [T::default(); N];
-    let (mut b, mut c) = (a, a);
-    for lane in 0..N {
-        planes[lane].open_row(y);
-        a[lane] = planes[lane].samples[start - 1];
-        b[lane] = planes[lane].samples[start - lag];
-        c[lane] = planes[lane].samples[start - lag - 1];
-    }
-    for at in start..start + width {
-        for lane in 0..N {
-            let samples = &mut planes[lane].samples;
-            let d = samples[at + 1 - lag];
-            let base = model.bases[usize::from(T::context::<P>(a[lane], b[lane], c[lane], d))];
-            let token = model.tables.symbol(base, &mut lanes[lane]);
-            let residual = model.residual(token, &mut plain[lane]);
-            let value = T::restore::<P>(residual, a[lane], b[lane], c[lane], d);
-            samples[at] = value;
-            a[lane] = value;
-            c[lane] = b[lane];
-            b[lane] = d;
-        }
-    }
-}
-
-/// Decodes row `y` of every lane, and where its samples are missing.
-#[inline(never)]
-fn row_gaps<P: Predictor, T: Sample, const N: usize>(
-    model: &Model,
-    planes: &mut [&mut Padded<T>; N],
-    gaps: &mut [&mut Padded<u8>; N],
-    lanes: &mut [Lane<'_>; N],
-    plain: &mut [BitReader<'_>; N],
-    y: usize,
-) {
-    let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
-    for lane in 0..N {
-        planes[lane].open_row(y);
-        gaps[lane].open_row(y);
-    }
-    for at in start..start + width {
-        for lane in 0..N {
-            let samples = &mut planes[lane].samples;
-            let [a, b, c, d] = [
-                samples[at - 1],
-                samples[at - lag],
-                samples[at - lag - 1],
-                samples[at + 1 - lag],
-            ];
-            let (left, above) = (gaps[lane].samples[at - 1], gaps[lane].samples[at - lag]);
-            let context = if left | above == 0 {
-                T::context::<P>(a, b, c, d)
-            } else {
-                gap_context(left, above)
-            };
-            let token = model
-                .tables
-                .symbol(model.bases[usize::from(context)], &mut lanes[lane]);
-            if token == MISSING {
-                samples[at] = a;
-                gaps[lane].samples[at] = 1;
-            } else {
-                samples[at] = T::restore::<P>(model.residual(token, &mut plain[lane]), a, b, c, d);
+            Some(gaps) => {
+                let [left, above, _, _, here] = gaps.map(|row| &row[range.clone()]);
+                for (x, key) in keys.iter_mut().enumerate() {
+                    let context = match left[x] | above[x] {
+                        0 => T::context(uneases[x & (CHUNK - 1)]),
+                        _ => gap_context(left[x], above[x]),
+                    };
+                    let mut symbol = MISSING;
+                    if here[x] == 0 {
+                        let residual = residuals[x & (CHUNK - 1)];
+                        symbol = token(residual);
+                        let (smallest, bits) = RESIDUALS[usize::from(symbol)];
+                        plain.put(residual - smallest, bits);
+                    }
+                    *key = (context >> shift) << 8 | u16::from(symbol);
+                }
             }
         }
     }
@@ -377,29 +257,25 @@ fn row_gaps<P: Predictor, T: Sample, const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::Cursor;
 
-    const KINDS: [Kind; 7] = [
+    const PICTURE: [Kind; 6] = [
         Kind::West,
         Kind::North,
         Kind::Slope,
         Kind::Plane,
         Kind::Median,
         Kind::Middle,
-        Kind::Line,
     ];
+    const SEQUENCE: [Kind; 2] = [Kind::West, Kind::Line];
 
     #[test]
     fn tokens_name_every_residual() {
-        let table = residuals();
         for residual in (0..70_000).chain([1 << 20, 1 << 31, u32::MAX]) {
-            let (token, bits) = token(residual);
-            assert!(usize::from(token) <= LAST_TOKEN);
-            let low = if bits == 0 {
-                0
-            } else {
-                residual & ((1 << bits) - 1)
-            };
-            assert_eq!(table[usize::from(token)], (residual - low, bits));
+            let token = token(residual);
+            let (smallest, bits) = RESIDUALS[usize::from(token)];
+            assert!(usize::from(token) <= LAST_TOKEN && token == token_of(residual));
+            assert!((smallest..=smallest + ((1u32 << bits) - 1)).contains(&residual));
         }
     }
 
@@ -455,7 +331,7 @@ mod tests {
     #[test]
     fn planes_of_all_shapes_come_back() {
         for (width, height) in [(1, 1), (1, 40), (40, 1), (31, 33), (64, 67)] {
-            for kind in KINDS {
+            for kind in PICTURE {
                 let size = width * height;
                 let noise = |index: usize| (index as u32).wrapping_mul(2_654_435_761);
                 round_trip(
@@ -479,7 +355,7 @@ mod tests {
                 round_trip(
                     || Lanes::sequence(size),
                     || Some(Lanes::sequence(size)),
-                    &KINDS,
+                    &SEQUENCE,
                     |index| (index % 7 != 0).then_some(index as u16),
                 );
             }
@@ -491,7 +367,7 @@ mod tests {
         let size = round_trip(
             || Lanes::pictures(1, 640, 480),
             || Some(Lanes::pictures(1, 640, 480)),
-            &KINDS,
+            &PICTURE,
             |index| {
                 let (x, y) = (index % 640, index / 640);
                 (!(200..300).contains(&x) || !(100..200).contains(&y))
@@ -515,7 +391,7 @@ mod tests {
                 .for_each(|(x, slot)| *slot = (x * y * y) as u16);
         }
         let mut bytes = Vec::new();
-        wide.encode(&KINDS, &mut bytes);
+        wide.encode(&PICTURE, &mut bytes);
         for length in 0..bytes.len() {
             let mut back = Wide {
                 samples: Lanes::<u16>::pictures(1, 40, 40),

@@ -8,35 +8,38 @@
 //! A symbol travels as `context << 8 | symbol`.
 
 use super::bits::{BitReader, BitWriter};
-use super::counts::{self, CONTEXTS, Counts, MAX_LOG, Order, SYMBOLS};
+use super::counts::{self, Counts, MAX_LOG, Order, SYMBOLS};
 use crate::Error;
 
-/// Keys `context << 8 | symbol` are below this.
-pub(crate) const KEYS: usize = CONTEXTS * SYMBOLS;
-/// Entries of the tables of all contexts together.
-const STATES: usize = CONTEXTS << MAX_LOG;
-
 /// How often each key occurs.
-pub(crate) struct Histogram(Box<[u32; KEYS]>);
+///
+/// Even and odd places are counted apart: the same key twice in a row would wait for its own last count.
+pub(crate) struct Histogram([Vec<u32>; 2]);
 
 impl Histogram {
-    pub(crate) fn new() -> Self {
-        Self(boxed())
+    pub(crate) fn new(contexts: usize) -> Self {
+        Self([vec![0; contexts * SYMBOLS], vec![0; contexts * SYMBOLS]])
     }
 
-    #[inline]
     pub(crate) fn add(&mut self, keys: &[u16]) {
-        for &key in keys {
-            self.0[usize::from(key) & (KEYS - 1)] += 1;
+        let [even, odd] = &mut self.0;
+        let pairs = keys.chunks_exact(2);
+        pairs
+            .remainder()
+            .iter()
+            .for_each(|&key| even[usize::from(key)] += 1);
+        for pair in pairs {
+            even[usize::from(pair[0])] += 1;
+            odd[usize::from(pair[1])] += 1;
         }
     }
-}
 
-/// An array that is never on the stack.
-fn boxed<T: Copy + Default, const N: usize>() -> Box<[T; N]> {
-    match vec![T::default(); N].into_boxed_slice().try_into() {
-        Ok(array) => array,
-        Err(_) => unreachable!("the vector has N elements"),
+    fn counts(self) -> Vec<u32> {
+        let [mut even, odd] = self.0;
+        even.iter_mut()
+            .zip(odd)
+            .for_each(|(even, odd)| *even += odd);
+        even
     }
 }
 
@@ -59,31 +62,27 @@ fn spread(counts: &Counts, log: u32) -> [u8; 1 << MAX_LOG] {
 pub(crate) struct Encoder {
     log: u32,
     /// Per key: what to add to the state so that its high half is the number of bits to shed; where its states begin.
-    shed: Box<[(u32, i32); KEYS]>,
+    shed: Vec<(u32, i32)>,
     /// The state after, by context and position.
-    next: Box<[u16; STATES]>,
+    next: Vec<u16>,
 }
 
 impl Encoder {
     /// Builds the tables and writes their description to `out`.
-    pub(crate) fn new(
-        histogram: &Histogram,
-        contexts: usize,
-        order: Order,
-        out: &mut Vec<u8>,
-    ) -> Self {
-        let total: usize = histogram.0.iter().map(|&count| count as usize).sum();
+    pub(crate) fn new(histogram: Histogram, order: Order, out: &mut Vec<u8>) -> Self {
+        let histogram = histogram.counts();
+        let total: usize = histogram.iter().map(|&count| count as usize).sum();
         let log = counts::log_for(total);
+        let contexts = histogram.len() / SYMBOLS;
         let mut description = BitWriter::default();
         description.put(log - 8, 2);
         let mut this = Self {
             log,
-            shed: boxed(),
-            next: boxed(),
+            shed: vec![(0, 0); histogram.len()],
+            next: vec![0; contexts << log],
         };
-        for context in 0..contexts {
-            let keys = context * SYMBOLS..(context + 1) * SYMBOLS;
-            let counts = counts::normalise(&histogram.0[keys], log);
+        for (context, histogram) in histogram.chunks_exact(SYMBOLS).enumerate() {
+            let counts = counts::normalise(histogram, log);
             counts::write(&counts, order, log, &mut description);
             this.fill(context, &counts);
         }
@@ -119,8 +118,10 @@ impl Encoder {
 
     /// Encodes lanes of equal length, each to its own output.
     pub(crate) fn encode<const N: usize>(&self, lanes: [&[u16]; N]) -> [Vec<u8>; N] {
+        /// Four symbols shed at most 44 bits, which 64 hold beside the seven left over.
+        const BATCH: usize = 4;
         let length = lanes[0].len();
-        let lanes = lanes.map(|lane| &lane[..length]);
+        let (shed, next) = (&self.shed[..], &self.next[..]);
         let mut state = [1u32 << self.log; N];
         let mut pending = [0u64; N];
         let mut count = [0u32; N];
@@ -128,19 +129,36 @@ impl Encoder {
         let mut out: [Vec<u8>; N] = std::array::from_fn(|_| vec![0; length / 2 + 64]);
         let mut left = length;
         while left > 0 {
-            // Four symbols shed at most 44 bits, which the 64 hold beside the 7 left over.
-            let batch = left.min(4);
-            for index in (left - batch..left).rev() {
-                for lane in 0..N {
-                    let (adder, start) = self.shed[usize::from(lanes[lane][index]) & (KEYS - 1)];
-                    let bits = state[lane].wrapping_add(adder) >> 16;
-                    pending[lane] |= u64::from(state[lane] & !(u32::MAX << bits)) << count[lane];
-                    count[lane] += bits;
-                    let position = ((state[lane] >> bits) as i32).wrapping_add(start) as usize;
-                    state[lane] = u32::from(self.next[position & (STATES - 1)]);
+            let first = left.saturating_sub(BATCH);
+            let batch: [&[u16]; N] = std::array::from_fn(|lane| &lanes[lane][first..left]);
+            if left - first == BATCH {
+                for index in (0..BATCH).rev() {
+                    for (lane, batch) in batch.iter().enumerate() {
+                        step(
+                            batch[index],
+                            shed,
+                            next,
+                            &mut state[lane],
+                            &mut pending[lane],
+                            &mut count[lane],
+                        );
+                    }
+                }
+            } else {
+                for (lane, batch) in batch.iter().enumerate() {
+                    for &key in batch.iter().rev() {
+                        step(
+                            key,
+                            shed,
+                            next,
+                            &mut state[lane],
+                            &mut pending[lane],
+                            &mut count[lane],
+                        );
+                    }
                 }
             }
-            left -= batch;
+            left = first;
             for lane in 0..N {
                 if written[lane] + 8 > out[lane].len() {
                     grow(&mut out[lane]);
@@ -163,17 +181,33 @@ impl Encoder {
     }
 }
 
+/// Takes one symbol into a state, shedding bits.
+#[inline(always)]
+fn step(
+    key: u16,
+    shed: &[(u32, i32)],
+    next: &[u16],
+    state: &mut u32,
+    pending: &mut u64,
+    count: &mut u32,
+) {
+    let (adder, start) = shed[usize::from(key)];
+    let bits = state.wrapping_add(adder) >> 16;
+    *pending |= u64::from(*state & !(u32::MAX << bits)) << *count;
+    *count += bits;
+    *state = u32::from(next[((*state >> bits) as i32).wrapping_add(start) as usize]);
+}
+
 #[cold]
 fn grow(out: &mut Vec<u8>) {
     let length = out.len();
     out.resize(length + length / 2 + 64, 0);
 }
 
-/// The decoder's tables. An entry holds `next state << 12 | bits << 8 | symbol`.
+/// The decoder's tables. An entry holds `next state << 16 | symbol << 8 | bits`.
 pub(crate) struct Decoder {
-    pub(crate) log: u32,
-    contexts: usize,
-    entries: Box<[u32; STATES]>,
+    log: u32,
+    entries: Vec<u32>,
 }
 
 impl Decoder {
@@ -187,8 +221,7 @@ impl Decoder {
         let log = input.take(2) + 8;
         let mut this = Self {
             log,
-            contexts,
-            entries: boxed(),
+            entries: vec![0; contexts << log],
         };
         for context in 0..contexts {
             let counts = counts::read(order, log, &mut input)?;
@@ -212,88 +245,119 @@ impl Decoder {
             let bits = self.log - rank.ilog2();
             let after = (*rank << bits) - (1 << self.log);
             *rank += 1;
-            self.entries[base + position] = after << 12 | bits << 8 | u32::from(symbol);
+            self.entries[base + position] = after << 16 | u32::from(symbol) << 8 | bits;
         }
     }
 
-    /// Where a context's entries begin, ready to be or-ed with a state.
+    /// Where a context's entries begin, to be or-ed with a state.
     pub(crate) fn base(&self, context: usize) -> u16 {
-        debug_assert!(context < self.contexts);
-        ((context << self.log) & (STATES - 1)) as u16
+        (context << self.log) as u16
     }
 
-    /// Decodes one symbol of `lane` in the context that begins at `base`.
+    /// A lane to be decoded with these tables.
+    pub(crate) fn lane<'a>(&self, bytes: &'a [u8]) -> Result<Lane<'a>, Error> {
+        Lane::new(bytes, self.log)
+    }
+
+    /// Decodes one symbol in the context that begins at `base`.
     #[inline(always)]
-    pub(crate) fn symbol(&self, base: u16, lane: &mut Lane<'_>) -> u8 {
-        let entry = self.entries[usize::from(base) | (lane.state as usize & ((1 << MAX_LOG) - 1))];
-        let bits = (entry >> 8) & 15;
-        lane.state = (entry >> 12) + lane.take(bits);
-        entry as u8
+    pub(crate) fn symbol(&self, base: u16, bits: &mut Window) -> u8 {
+        let entry = self.entries[usize::from(base) | bits.state as usize];
+        let count = entry & 0xff;
+        bits.state = (entry >> 16) + ((bits.bits >> 1) >> (63 - count)) as u32;
+        bits.bits <<= count;
+        (entry >> 8) as u8
     }
 }
 
-/// One lane's bits, read from the end, and its state.
+/// The part of a lane that inner loops hold in registers: the state, and the next bits.
+///
+/// The bits are the topmost ones; a one marks their end.
+#[derive(Clone, Copy)]
+pub(crate) struct Window {
+    state: u32,
+    bits: u64,
+}
+
+/// One lane's bits, read from the end.
 pub(crate) struct Lane<'a> {
     bytes: &'a [u8],
-    state: u32,
-    /// The next bits, top bit first.
-    window: u64,
-    /// How many bits of the window are left.
-    filled: u32,
     /// Where the window's lowest bit lies in `bytes`; negative when the window reaches beyond the front.
     below: isize,
+    window: Window,
 }
 
+/// How many symbols may be decoded between two [`Lane::refill`]s: 56 bits are enough for five of eleven.
+pub(crate) const BATCH: usize = 4;
+/// Bits in a window after a refill.
+const FILLED: isize = 56;
+
 impl<'a> Lane<'a> {
-    pub(crate) fn new(bytes: &'a [u8], log: u32) -> Result<Self, Error> {
+    fn new(bytes: &'a [u8], log: u32) -> Result<Self, Error> {
         let last = *bytes.last().ok_or(Error::Truncated)?;
         if last == 0 {
             return Err(Error::Corrupt("a lane without its end mark"));
         }
-        let below = ((bytes.len() - 1) * 8 + last.ilog2() as usize) as isize;
+        let end = ((bytes.len() - 1) * 8 + last.ilog2() as usize) as isize;
         let mut lane = Self {
             bytes,
-            state: 0,
-            window: 0,
-            filled: 0,
-            below,
+            below: end,
+            window: Window {
+                state: 0,
+                bits: 1 << 63,
+            },
         };
-        lane.state = lane.take(log);
+        let mut window = lane.refill(lane.window);
+        window.state = (window.bits >> (64 - log)) as u32;
+        window.bits <<= log;
+        lane.window = window;
         Ok(lane)
     }
 
-    #[inline(always)]
-    fn take(&mut self, bits: u32) -> u32 {
-        if self.filled < bits {
-            self.refill();
-        }
-        let value = ((self.window >> 1) >> (63 - bits)) as u32;
-        self.window <<= bits;
-        self.filled -= bits;
-        value
+    /// The window as it was left.
+    pub(crate) fn window(&self) -> Window {
+        self.window
     }
 
-    /// Loads the eight bytes that hold the highest unread bits.
-    #[inline]
-    fn refill(&mut self) {
-        let end = self.below + self.filled as isize;
+    /// Leaves the window for later.
+    pub(crate) fn leave(&mut self, window: Window) {
+        self.window = window;
+    }
+
+    /// Fills a window up: loads the eight bytes that hold the highest unread bits.
+    #[inline(always)]
+    pub(crate) fn refill(&mut self, window: Window) -> Window {
+        let end = self.below + 63 - window.bits.trailing_zeros() as isize;
         let last = (end + 7) >> 3;
+        let word = match usize::try_from(last - 8)
+            .ok()
+            .and_then(|first| self.bytes.get(first..)?.first_chunk())
+        {
+            Some(word) => u64::from_le_bytes(*word),
+            None => self.front(last),
+        };
+        self.below = end - FILLED;
+        let spare = (last * 8 - end) as u32;
+        Window {
+            state: window.state,
+            bits: (word << spare) & !0xff | 0x80,
+        }
+    }
+
+    /// Beyond the front there are zeros; [`Lane::finish`] tells whether they were used.
+    #[cold]
+    fn front(&self, last: isize) -> u64 {
         let mut word = [0u8; 8];
-        if last >= 8 {
-            word.copy_from_slice(&self.bytes[last as usize - 8..last as usize]);
-        } else if last > 0 {
-            // Beyond the front there are zeros; `finish` tells whether they were used.
+        if (1..8).contains(&last) {
             word[8 - last as usize..].copy_from_slice(&self.bytes[..last as usize]);
         }
-        let spare = (last * 8 - end) as u32;
-        self.window = u64::from_le_bytes(word) << spare;
-        self.filled = 64 - spare;
-        self.below = last * 8 - 64;
+        u64::from_le_bytes(word)
     }
 
     /// Whether the lane ended where its encoder began, every bit read and none invented.
     pub(crate) fn finish(&self) -> Result<(), Error> {
-        if self.state == 0 && self.below + self.filled as isize == 0 {
+        let end = self.below + 63 - self.window.bits.trailing_zeros() as isize;
+        if self.window.state == 0 && end == 0 {
             Ok(())
         } else {
             Err(Error::Corrupt("a lane that does not end well"))
@@ -303,25 +367,40 @@ impl<'a> Lane<'a> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::counts::CONTEXTS;
     use super::*;
 
-    fn round_trip(lanes: [&[u16]; 3], contexts: usize, order: Order) -> usize {
-        let mut histogram = Histogram::new();
+    fn histogram(lanes: &[&[u16]], contexts: usize) -> Histogram {
+        let mut histogram = Histogram::new(contexts);
         lanes.iter().for_each(|lane| histogram.add(lane));
+        histogram
+    }
+
+    fn decode(decoder: &Decoder, stream: &[u8], keys: &[u16]) -> Result<(), Error> {
+        let mut lane = decoder.lane(stream)?;
+        let mut window = lane.window();
+        let mut same = true;
+        for batch in keys.chunks(BATCH) {
+            window = lane.refill(window);
+            for &key in batch {
+                let symbol = decoder.symbol(decoder.base(usize::from(key >> 8)), &mut window);
+                same &= u16::from(symbol) == key & 0xff;
+            }
+        }
+        lane.leave(window);
+        lane.finish()?;
+        assert!(same);
+        Ok(())
+    }
+
+    fn round_trip(lanes: [&[u16]; 3], contexts: usize, order: Order) -> usize {
         let mut table = Vec::new();
-        let encoder = Encoder::new(&histogram, contexts, order, &mut table);
+        let encoder = Encoder::new(histogram(&lanes, contexts), order, &mut table);
         let streams = encoder.encode(lanes);
         let (decoder, used) = Decoder::read(&table, contexts, order).unwrap();
         assert_eq!(used, table.len());
-        for (symbols, stream) in lanes.iter().zip(&streams) {
-            let mut lane = Lane::new(stream, decoder.log).unwrap();
-            for &key in *symbols {
-                assert_eq!(
-                    u16::from(decoder.symbol(decoder.base(usize::from(key >> 8)), &mut lane)),
-                    key & 0xff
-                );
-            }
-            lane.finish().unwrap();
+        for (keys, stream) in lanes.iter().zip(&streams) {
+            decode(&decoder, stream, keys).unwrap();
         }
         table.len() + streams.iter().map(Vec::len).sum::<usize>()
     }
@@ -361,25 +440,20 @@ mod tests {
 
     #[test]
     fn all_symbols_of_all_contexts() {
-        let lane: Vec<u16> = (0..KEYS as u16).collect();
+        let lane: Vec<u16> = (0..(CONTEXTS * SYMBOLS) as u16).collect();
         round_trip([&lane, &lane, &lane], CONTEXTS, Order::Signed);
     }
 
     #[test]
     fn a_lane_cut_short_is_noticed() {
         let lane = skewed(1000, 4);
-        let mut histogram = Histogram::new();
-        histogram.add(&lane);
         let mut table = Vec::new();
-        let [stream] = Encoder::new(&histogram, 5, Order::Natural, &mut table).encode([&lane]);
+        let encoder = Encoder::new(histogram(&[&lane], 5), Order::Natural, &mut table);
+        let [stream] = encoder.encode([&lane]);
         let (decoder, _) = Decoder::read(&table, 5, Order::Natural).unwrap();
-        let mut reader = Lane::new(&stream[10..], decoder.log).unwrap();
-        for &key in &lane {
-            decoder.symbol(decoder.base(usize::from(key >> 8)), &mut reader);
-        }
-        assert!(reader.finish().is_err());
-        assert!(Lane::new(&[], 8).is_err());
-        assert!(Lane::new(&[1, 0], 8).is_err());
+        assert!(decode(&decoder, &stream[10..], &lane).is_err());
+        assert!(decoder.lane(&[]).is_err());
+        assert!(decoder.lane(&[1, 0]).is_err());
         assert!(Decoder::read(&table[..3], 5, Order::Natural).is_err());
     }
 }

@@ -1,0 +1,180 @@
+//! Pictures: colour, grey, Bayer, depth.
+
+use crate::contest::{Contest, find, print};
+use crate::messages::image;
+use crate::samples::{self, Noise, Picture};
+use anyhow::{Result, ensure};
+use bench_report::{Race, Report, Target};
+use codec::{Codec, Decoder, Encoder, Schema};
+use std::hint::black_box;
+
+const ROUNDS: usize = 15;
+
+fn contest(messages: &[Vec<u8>]) -> Contest<'_> {
+    Contest { schema: Schema::Image, messages, rounds: ROUNDS }
+}
+
+/// The four figures of a lossless picture codec.
+fn figures(report: &mut Report, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<f64> {
+    let outcomes = contest(messages).run(&[Codec::Image], &[1, 3, 19])?;
+    print(title, &outcomes);
+    let (ours, zstd, best) = (find(&outcomes, "image")?, find(&outcomes, "zstd 1")?, find(&outcomes, "zstd 19")?);
+    let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
+    figure.beside("zstd 19", best.saved).reach(saved.map_or(Target::AboveFloor, Target::AtLeast));
+    let figure = report.figure(format!("{title}: encoding"), "MB/s", ours.encode).beside("zstd 1", zstd.encode);
+    if saved.is_some() {
+        figure.reach(Target::RatioAtLeast(0.4));
+    }
+    report.figure(format!("{title}: decoding"), "MB/s", ours.decode).beside("zstd 1", zstd.decode);
+    Ok(ours.encode)
+}
+
+/// PNG of one picture, as `image_transport`'s `compressed` makes it.
+fn png(picture: &Picture) -> Result<Vec<u8>> {
+    let mut out = Vec::new();
+    let mut encoder = png::Encoder::new(&mut out, picture.width as u32, picture.height as u32);
+    encoder.set_color(if picture.depth == 3 { png::ColorType::Rgb } else { png::ColorType::Grayscale });
+    encoder.set_depth(if picture.depth == 2 { png::BitDepth::Sixteen } else { png::BitDepth::Eight });
+    encoder.set_compression(png::Compression::Balanced);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(&picture.data)?;
+    writer.finish()?;
+    Ok(out)
+}
+
+fn jpeg(picture: &Picture) -> Result<Vec<u8>> {
+    let mut out = Vec::new();
+    let (width, height) = (u16::try_from(picture.width)?, u16::try_from(picture.height)?);
+    jpeg_encoder::Encoder::new(&mut out, 95).encode(&picture.data, width, height, jpeg_encoder::ColorType::Rgb)?;
+    Ok(out)
+}
+
+pub fn colours(report: &mut Report) -> Result<()> {
+    let pictures = samples::colours()?;
+    let messages: Vec<_> = pictures.iter().map(|p| image("rgb8", p.width, p.height, &p.data)).collect();
+    figures(report, "colour", &messages, Some(63.0))?;
+    peers(report, &pictures, &messages)?;
+
+    let packaged: Vec<_> =
+        samples::packaged_colours()?.iter().map(|p| image("bgr8", p.width, p.height, &p.data)).collect();
+    figures(report, "colour, packaged photographs", &packaged, None)?;
+    let grey = |p: &Picture| -> Vec<u8> { p.data.chunks_exact(3).map(|pixel| pixel[1]).collect() };
+    let messages: Vec<_> = pictures.iter().map(|p| image("mono8", p.width, p.height, &grey(p))).collect();
+    figures(report, "grey", &messages, None)?;
+    let messages: Vec<_> = pictures.iter().map(|p| image("bayer_rggb8", p.width, p.height, &bayer(p))).collect();
+    figures(report, "Bayer", &messages, None)?;
+    Ok(())
+}
+
+/// What a camera with a colour filter array would have seen.
+fn bayer(picture: &Picture) -> Vec<u8> {
+    let channel = |x: usize, y: usize| [[0, 1], [1, 2]][y % 2][x % 2];
+    (0..picture.width * picture.height)
+        .map(|at| picture.data[at * 3 + channel(at % picture.width, at / picture.width)])
+        .collect()
+}
+
+/// PNG and JPEG, which need pictures rather than messages.
+fn peers(report: &mut Report, pictures: &[Picture], messages: &[Vec<u8>]) -> Result<()> {
+    let bytes: usize = messages.iter().map(Vec::len).sum();
+    let saved = |sizes: Vec<usize>| {
+        let saved = sizes.iter().zip(pictures).map(|(&size, p)| 1.0 - size as f64 / p.data.len() as f64);
+        100.0 * saved.sum::<f64>() / pictures.len() as f64
+    };
+    let sizes = |encode: fn(&Picture) -> Result<Vec<u8>>| -> Result<Vec<usize>> {
+        pictures.iter().map(|picture| Ok(encode(picture)?.len())).collect()
+    };
+    let (png_saved, jpeg_saved) = (saved(sizes(png)?), saved(sizes(jpeg)?));
+    let mut race = Race::new(5);
+    let mut encoder = Encoder::new(Schema::Image);
+    let mut out = Vec::new();
+    race.add("image", move || {
+        for message in messages {
+            out.clear();
+            encoder.encode(Codec::Image, message, &mut out);
+            black_box(&out);
+        }
+    });
+    race.add("PNG", || pictures.iter().for_each(|picture| drop(black_box(png(picture)))));
+    race.add("JPEG 95", || pictures.iter().for_each(|picture| drop(black_box(jpeg(picture)))));
+    let times = race.run();
+    let speed: Vec<f64> = times.iter().map(|times| times.megabytes_per_second(bytes)).collect();
+    println!("    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s", speed[1]);
+    println!("    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy", speed[2]);
+    let figure = report.figure("colour: encoding", "MB/s", speed[0]).beside("PNG", speed[1]);
+    figure.reach(Target::RatioAtLeast(5.0)).note(format!("PNG saves {png_saved:.1}%"));
+    let figure = report.figure("colour: encoding", "MB/s", speed[0]).beside("JPEG 95", speed[2]);
+    figure.note(format!("JPEG saves {jpeg_saved:.1}%, lossy"));
+    Ok(())
+}
+
+pub fn depths(report: &mut Report) -> Result<()> {
+    let pictures = samples::depths()?;
+    ensure!(!pictures.is_empty(), "no depth image at hand: neither recordings nor scikit-image's samples");
+    let messages: Vec<_> = pictures.iter().map(|p| image("16UC1", p.width, p.height, &p.data)).collect();
+    figures(report, "depth", &messages, Some(83.0))?;
+    let holes: Vec<_> = pictures.iter().map(|p| image("16UC1", p.width, p.height, &with_holes(p))).collect();
+    figures(report, "depth with holes", &holes, None)?;
+    let metres: Vec<_> = pictures.iter().map(|p| image("32FC1", p.width, p.height, &in_metres(p))).collect();
+    figures(report, "float depth", &metres, None)?;
+    if let Some(disparity) = samples::motorcycle() {
+        let data: Vec<u8> = disparity.values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let message = image("32FC1", disparity.width, disparity.height, &data);
+        figures(report, "float disparity", &[message], None)?;
+    }
+    Ok(())
+}
+
+/// Shadows beside edges, as structured light leaves them; the recordings were filled.
+fn with_holes(picture: &Picture) -> Vec<u8> {
+    let depth = |at: usize| u16::from_le_bytes([picture.data[at * 2], picture.data[at * 2 + 1]]);
+    let mut data = picture.data.clone();
+    let mut noise = Noise(5);
+    for at in 12..data.len() / 2 {
+        let step = depth(at).abs_diff(depth(at - 12));
+        if step > 400 || (step > 100 && noise.next() % 4 == 0) {
+            data[at * 2..at * 2 + 2].fill(0);
+        }
+    }
+    data
+}
+
+/// As `depth_image_proc/convert_metric` publishes, NaN where nothing was measured.
+fn in_metres(picture: &Picture) -> Vec<u8> {
+    let metres = |pair: &[u8]| match u16::from_le_bytes([pair[0], pair[1]]) {
+        0 => f32::NAN,
+        depth => f32::from(depth) * 0.001,
+    };
+    with_holes(picture).chunks_exact(2).map(metres).flat_map(f32::to_le_bytes).collect()
+}
+
+/// Synthetic corner cases: all come back, none grows.
+pub fn corners(report: &mut Report) -> Result<()> {
+    let mut noise = Noise(3);
+    let mut random = |count: usize| -> Vec<u8> { (0..count).map(|_| noise.next() as u8).collect() };
+    let cases = [
+        ("flat rgb8", image("rgb8", 640, 480, &[90; 640 * 480 * 3])),
+        ("noise rgb8", image("rgb8", 640, 480, &random(640 * 480 * 3))),
+        ("noise 16UC1", image("16UC1", 640, 480, &random(640 * 480 * 2))),
+        ("noise 32FC1", image("32FC1", 640, 480, &random(640 * 480 * 4))),
+        ("one pixel", image("rgb8", 1, 1, &[1, 2, 3])),
+        ("one row", image("mono8", 5000, 1, &random(5000))),
+        ("one column", image("bgra8", 1, 5000, &random(20_000))),
+        ("odd Bayer", image("bayer_grbg8", 641, 479, &random(641 * 479))),
+        ("padded rows", image("mono8", 639, 480, &random(641 * 480))),
+        ("unknown encoding", image("yuv422", 640, 480, &random(640 * 480 * 2))),
+    ];
+    let mut worst = f64::MIN;
+    for (name, message) in &cases {
+        let mut frame = Vec::new();
+        let encoded = Encoder::new(Schema::Image).encode(Codec::Image, message, &mut frame);
+        let mut back = Vec::new();
+        Decoder::new(message.len()).decode(&frame, &mut back)?;
+        ensure!(back == *message, "{name} changed");
+        let growth = frame.len() as f64 - message.len() as f64;
+        worst = worst.max(growth);
+        println!("    {name:<18} {:>8} → {:>8} bytes by {}", message.len(), frame.len(), encoded.codec);
+    }
+    report.figure("corner cases: growth at worst", "B", worst).reach(Target::AtMost(16.0));
+    Ok(())
+}

@@ -1,0 +1,134 @@
+//! Colour video beside x264.
+
+use crate::messages::image;
+use crate::samples;
+use anyhow::{Context, Result, ensure};
+use bench_report::{Report, Target};
+use codec::{Codec, Decoder, Encoder, Schema, VideoOptions};
+use std::io::Write;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+const FRAMES: usize = 200;
+
+/// Signal to noise of samples of eight bits, in dB.
+#[derive(Default)]
+struct Psnr {
+    squares: f64,
+    samples: f64,
+}
+
+impl Psnr {
+    fn add(&mut self, ours: &[u8], truth: &[u8]) {
+        let square = |(&a, &b): (&u8, &u8)| u64::from(a.abs_diff(b)).pow(2);
+        self.squares += ours.iter().zip(truth).map(square).sum::<u64>() as f64;
+        self.samples += truth.len() as f64;
+    }
+
+    fn decibels(&self) -> f64 {
+        10.0 * (255.0 * 255.0 * self.samples / self.squares.max(1e-9)).log10()
+    }
+}
+
+/// BT.601 luma of blue, green, red.
+fn luma(pixels: &[u8]) -> Vec<u8> {
+    let luma = |p: &[u8]| (29 * u32::from(p[0]) + 150 * u32::from(p[1]) + 77 * u32::from(p[2]) + 128) >> 8;
+    pixels.chunks_exact(3).map(|pixel| luma(pixel) as u8).collect()
+}
+
+pub fn videos(report: &mut Report) -> Result<()> {
+    let (width, height, pixels) = samples::video(FRAMES)?;
+    let frames: Vec<&[u8]> = pixels.chunks_exact(width * height * 3).collect();
+    let messages: Vec<Vec<u8>> = frames.iter().map(|frame| image("bgr8", width, height, frame)).collect();
+    let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
+    let mut decoder = Decoder::new(messages[0].len());
+    let (mut encoding, mut decoding) = (Duration::ZERO, Duration::ZERO);
+    let mut bytes = 0usize;
+    let (mut colour, mut grey) = (Psnr::default(), Psnr::default());
+    for (message, frame) in messages.iter().zip(&frames) {
+        let mut out = Vec::new();
+        let start = Instant::now();
+        let encoded = encoder.encode(Codec::Video, message, &mut out);
+        encoding += start.elapsed();
+        ensure!(encoded.codec == Codec::Video, "video fell back to {}", encoded.codec);
+        bytes += out.len();
+        let mut back = Vec::new();
+        let start = Instant::now();
+        decoder.decode(&out, &mut back)?;
+        decoding += start.elapsed();
+        let head = message.len() - frame.len();
+        ensure!(back[..head] == message[..head], "video changed more than the pixels");
+        colour.add(&back[head..], frame);
+        grey.add(&luma(&back[head..]), &luma(frame));
+    }
+    let count = frames.len() as f64;
+    let planar = width * height * 3 / 2;
+    let saved = 100.0 * (1.0 - bytes as f64 / count / planar as f64);
+    let saved_of_message = 100.0 * (1.0 - bytes as f64 / count / messages[0].len() as f64);
+    let peer = x264(width, height, &pixels, &frames)?;
+    let speed = count / encoding.as_secs_f64();
+    println!(
+        "video: saved {saved:.2}% of yuv420 ({saved_of_message:.2}% of the message), {:.1} dB colour, {:.1} dB luma, \
+         {speed:.0} frames/s, decoding {:.0}",
+        colour.decibels(),
+        grey.decibels(),
+        count / decoding.as_secs_f64()
+    );
+    println!("    x264: saved {:.2}%, {:.1} dB colour, {:.0} frames/s", peer.saved, peer.colour, peer.speed);
+    let note = "of the 4:2:0 planes; of the message even more";
+    report.figure("video: saved", "%", saved).beside("x264", peer.saved).reach(Target::AtLeast(98.5)).note(note);
+    report.figure("video: saved of the message", "%", saved_of_message);
+    let figure = report.figure("video: PSNR of the colours", "dB", colour.decibels()).beside("x264", peer.colour);
+    figure.reach(Target::AtLeast(36.0));
+    report.figure("video: PSNR of luma", "dB", grey.decibels());
+    let figure = report.figure("video: encoding", "frames/s", speed).beside("x264", peer.speed);
+    figure.reach(Target::AtLeast(100.0));
+    report.figure("video: decoding", "frames/s", count / decoding.as_secs_f64());
+    Ok(())
+}
+
+struct Peer {
+    saved: f64,
+    colour: f64,
+    speed: f64,
+}
+
+/// x264 by ffmpeg, as for a live link, on one thread. Its time includes ffmpeg's colour conversion, as ours does.
+fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<Peer> {
+    let size = format!("{width}x{height}");
+    let raw = ["-f", "rawvideo", "-pix_fmt", "bgr24"];
+    let start = Instant::now();
+    let stream = pipe(
+        Command::new("ffmpeg")
+            .args(["-v", "error", "-threads", "1"])
+            .args(raw)
+            .args(["-s", &size, "-i", "-", "-c:v", "libx264", "-preset", "veryfast", "-tune", "zerolatency"])
+            .args(["-crf", "23", "-threads", "1", "-pix_fmt", "yuv420p", "-f", "h264", "-"]),
+        pixels,
+    )?;
+    let took = start.elapsed();
+    let back = pipe(
+        Command::new("ffmpeg").args(["-v", "error", "-f", "h264", "-i", "-"]).args(raw).arg("-"),
+        &stream,
+    )?;
+    ensure!(back.len() == pixels.len(), "x264 lost frames");
+    let mut colour = Psnr::default();
+    for (back, frame) in back.chunks_exact(frames[0].len()).zip(frames) {
+        colour.add(back, frame);
+    }
+    let count = frames.len() as f64;
+    let saved = 100.0 * (1.0 - stream.len() as f64 / count / (width * height * 3 / 2) as f64);
+    Ok(Peer { saved, colour: colour.decibels(), speed: count / took.as_secs_f64() })
+}
+
+/// Runs a filter.
+fn pipe(command: &mut Command, input: &[u8]) -> Result<Vec<u8>> {
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().context("ffmpeg; install it")?;
+    let mut stdin = child.stdin.take().context("a pipe")?;
+    let output = std::thread::scope(|scope| {
+        scope.spawn(move || stdin.write_all(input));
+        child.wait_with_output()
+    })?;
+    ensure!(output.status.success(), "ffmpeg failed");
+    Ok(output.stdout)
+}

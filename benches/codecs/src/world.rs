@@ -1,0 +1,219 @@
+//! Lasers and cameras looked through: scans and clouds made from the recordings, as drivers make them.
+
+use crate::messages::{Number, cloud, scan};
+use crate::samples::{Noise, Picture};
+
+/// Metres per cell of the office floor.
+const CELL: f64 = 0.1;
+
+/// A place on the floor that is free, far from walls.
+pub struct Pose {
+    pub x: f64,
+    pub y: f64,
+    pub heading: f64,
+}
+
+/// Places spread over the map.
+pub fn poses(map: &Picture, count: usize) -> Vec<Pose> {
+    let free = |x: usize, y: usize| {
+        (0..9).all(|at| {
+            let (x, y) = (x + at % 3 * 4, y + at / 3 * 4);
+            x < map.width && y < map.height && map.data[y * map.width + x] == 0
+        })
+    };
+    let mut noise = Noise(42);
+    let mut poses = Vec::new();
+    while poses.len() < count {
+        let (x, y) = (noise.next() as usize % map.width, noise.next() as usize % map.height);
+        if free(x, y) {
+            let heading = noise.unit() * std::f64::consts::TAU;
+            poses.push(Pose { x: (x + 4) as f64 * CELL, y: (y + 4) as f64 * CELL, heading });
+        }
+    }
+    poses
+}
+
+/// How far a ray goes before a wall, at most 30 m; `None` when it meets none.
+pub fn ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
+    let (sin, cos) = (pose.heading + angle).sin_cos();
+    let mut distance = 0.0;
+    while distance < 30.0 {
+        distance += CELL / 10.0;
+        let (x, y) = ((pose.x + cos * distance) / CELL, (pose.y + sin * distance) / CELL);
+        if x < 0.0 || y < 0.0 || x as usize >= map.width || y as usize >= map.height {
+            return None;
+        }
+        if map.data[y as usize * map.width + x as usize] == 100 {
+            return Some(distance);
+        }
+    }
+    None
+}
+
+/// A scanner of 1081 beams over 270 degrees with 10 mm of noise; `float` turns a distance in metres (infinite where
+/// nothing was met) into what the driver publishes.
+pub fn scanner(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> Vec<Vec<u8>> {
+    let mut noise = Noise(7);
+    poses(map, 12)
+        .iter()
+        .map(|pose| {
+            let mut ranges = Vec::new();
+            let mut echoes = Vec::new();
+            for beam in 0..1081 {
+                let angle = (f64::from(beam) - 540.0) * 0.25_f64.to_radians();
+                let distance = ray(map, pose, angle).map(|distance| distance + 0.01 * noise.normal());
+                ranges.push(float(distance.unwrap_or(f64::INFINITY)));
+                let echo = distance.map_or(0.0, |distance| 3000.0 / (1.0 + distance) + 20.0 * noise.normal());
+                echoes.push(echo.round().max(0.0) as f32);
+            }
+            scan(&ranges, if intensities { &echoes } else { &[] })
+        })
+        .collect()
+}
+
+/// Scans cut out of depth frames, as `depthimage_to_laserscan` makes them.
+pub fn camera_scans(depths: &[Picture]) -> Vec<Vec<u8>> {
+    let mut scans = Vec::new();
+    for depth in depths {
+        for row in (60..depth.height - 60).step_by(90) {
+            let ranges: Vec<f32> = (0..depth.width)
+                .rev()
+                .map(|u| {
+                    let z = metres(depth, u, row);
+                    let x = (u as f32 - 319.5) * z / 525.0;
+                    if z > 0.0 { x.hypot(z) } else { f32::NAN }
+                })
+                .collect();
+            scans.push(scan(&ranges, &[]));
+        }
+    }
+    scans
+}
+
+fn metres(depth: &Picture, u: usize, v: usize) -> f32 {
+    let at = (v * depth.width + u) * 2;
+    f32::from(u16::from_le_bytes([depth.data[at], depth.data[at + 1]])) / 5000.0
+}
+
+/// Coloured clouds of a depth camera, as `depth_image_proc` makes them: `step` bytes per point, padded as PCL does.
+/// `organised` keeps the picture, with NaN where nothing was measured; otherwise those points are left out.
+pub fn camera_clouds(colours: &[Picture], depths: &[Picture], step: usize, organised: bool) -> Vec<Vec<u8>> {
+    let pairs = colours.iter().zip(depths).filter(|(colour, depth)| (colour.width, colour.height) == (depth.width, depth.height));
+    pairs
+        .enumerate()
+        .map(|(index, (colour, depth))| {
+            let rgb = if step >= 32 { 16 } else { 12 };
+            let mut data = Vec::new();
+            let mut noise = Noise(index as u64 + 1);
+            for v in 0..depth.height {
+                for u in 0..depth.width {
+                    let z = metres(depth, u, v);
+                    // Real cameras miss a few per cent; these recordings were filled.
+                    let missing = z == 0.0 || noise.next() % 40 == 0;
+                    if missing && !organised {
+                        continue;
+                    }
+                    let constant = 1.0f32 / 525.0;
+                    let (x, y) = ((u as f32 - 319.5) * z * constant, (v as f32 - 239.5) * z * constant);
+                    let point = if missing { [f32::NAN; 3] } else { [x, y, z] };
+                    let start = data.len();
+                    data.resize(start + step, 0);
+                    for (axis, value) in point.iter().enumerate() {
+                        data[start + axis * 4..][..4].copy_from_slice(&value.to_le_bytes());
+                    }
+                    let pixel = &colour.data[(v * colour.width + u) * 3..][..3];
+                    data[start + rgb..][..4].copy_from_slice(&[pixel[2], pixel[1], pixel[0], 0]);
+                }
+            }
+            let fields =
+                [("x", 0, Number::F32), ("y", 4, Number::F32), ("z", 8, Number::F32), ("rgb", rgb, Number::F32)];
+            let count = data.len() / step;
+            let (width, height) = if organised { (depth.width, depth.height) } else { (count, 1) };
+            cloud(width, height, step, &fields, &data)
+        })
+        .collect()
+}
+
+/// A laser of 16 rings spun once in the office, 2 mm resolution, 20 mm of noise; points without an echo are left out.
+/// The packed layout of 22 bytes is the driver's.
+pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
+    let mut noise = Noise(11);
+    poses(map, 4)
+        .iter()
+        .map(|pose| {
+            let mut data = Vec::new();
+            for shot in 0..1800u32 {
+                let azimuth = f64::from(shot) * 0.2_f64.to_radians();
+                let wall = ray(map, pose, -azimuth);
+                for laser in 0..16u32 {
+                    // Fired in the order -15, 1, -13, 3, …
+                    let degrees = if laser % 2 == 0 { f64::from(laser) - 15.0 } else { f64::from(laser) };
+                    let (sin, cos) = degrees.to_radians().sin_cos();
+                    let floor = if sin < 0.0 { -1.2 / sin } else { 1.8 / sin };
+                    let range = wall.map_or(f64::INFINITY, |wall| wall / cos).min(floor);
+                    if range > 100.0 || noise.next() % 50 == 0 {
+                        continue;
+                    }
+                    let range = ((range + 0.02 * noise.normal()) / 0.002).round() as f32 * 0.002;
+                    let turned = azimuth + f64::from(laser) * 2.304e-6 * std::f64::consts::TAU * 10.0;
+                    let (turn_sin, turn_cos) = (turned.sin() as f32, turned.cos() as f32);
+                    let flat = range * cos as f32;
+                    let point = [flat * turn_cos, -(flat * turn_sin), range * sin as f32];
+                    point.iter().for_each(|value| data.extend_from_slice(&value.to_le_bytes()));
+                    let intensity = (20.0 + 60.0 / (1.0 + f64::from(range)) + 4.0 * noise.normal()).clamp(0.0, 255.0);
+                    data.extend_from_slice(&(intensity.round() as f32).to_le_bytes());
+                    let ring = ((degrees + 15.0) / 2.0) as u16;
+                    data.extend_from_slice(&ring.to_le_bytes());
+                    let time = f64::from(shot) * 55.296e-6 + f64::from(laser) * 2.304e-6;
+                    data.extend_from_slice(&(time as f32).to_le_bytes());
+                }
+            }
+            let fields = [
+                ("x", 0, Number::F32),
+                ("y", 4, Number::F32),
+                ("z", 8, Number::F32),
+                ("intensity", 12, Number::F32),
+                ("ring", 16, Number::U16),
+                ("time", 18, Number::F32),
+            ];
+            cloud(data.len() / 22, 1, 22, &fields, &data)
+        })
+        .collect()
+}
+
+/// A map being made: what has been seen after each of `count` stops, inside a grid of `size`×`size`.
+pub fn mapping(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>> {
+    let mut cells = vec![255u8; size * size];
+    let (left, top) = ((size - map.width) / 2, (size - map.height) / 2);
+    let mut stops = poses(map, count);
+    // In the order of a robot that goes to the nearest next.
+    for index in 1..stops.len() {
+        let (x, y) = (stops[index - 1].x, stops[index - 1].y);
+        let distance = |pose: &Pose| (pose.x - x).powi(2) + (pose.y - y).powi(2);
+        let nearest = (index..stops.len()).min_by(|&a, &b| distance(&stops[a]).total_cmp(&distance(&stops[b])));
+        stops.swap(index, nearest.unwrap_or(index));
+    }
+    let mut grids = Vec::new();
+    for pose in &stops {
+        for beam in 0..2000 {
+            let angle = f64::from(beam) * std::f64::consts::TAU / 2000.0;
+            let end = ray(map, pose, angle);
+            let (sin, cos) = (pose.heading + angle).sin_cos();
+            let mut distance = 0.0;
+            while distance < end.unwrap_or(12.0).min(12.0) {
+                let (x, y) = ((pose.x + cos * distance) / CELL, (pose.y + sin * distance) / CELL);
+                if x < 0.0 || y < 0.0 || x as usize >= map.width || y as usize >= map.height {
+                    break;
+                }
+                cells[(top + y as usize) * size + left + x as usize] = 0;
+                distance += CELL / 3.0;
+            }
+            if let Some(end) = end.filter(|&end| end < 12.0) {
+                let (x, y) = ((pose.x + cos * end) / CELL, (pose.y + sin * end) / CELL);
+                cells[(top + y as usize) * size + left + x as usize] = 100;
+            }
+        }
+        grids.push(cells.clone());
+    }
+    grids
+}
