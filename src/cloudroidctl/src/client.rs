@@ -1,7 +1,8 @@
 //! HTTP to the daemon, over TCP or its Unix socket.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::os::fd::AsRawFd;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail};
 use api::Problem;
@@ -184,7 +185,7 @@ impl Client {
                 self.exchange(stream, authority, method, path, body).await
             }
             Server::Unix(socket) => {
-                let stream = UnixStream::connect(socket).await.map_err(unreachable)?;
+                let stream = connect(socket).await.map_err(unreachable)?;
                 self.exchange(stream, "localhost", method, path, body).await
             }
         }
@@ -222,6 +223,20 @@ impl Client {
             return Ok(response);
         }
         Err(refusal(response).await)
+    }
+}
+
+/// Through a descriptor of its directory, because the path itself may be longer than an address can be.
+async fn connect(socket: &Path) -> std::io::Result<UnixStream> {
+    let (Some(directory), Some(name)) = (socket.parent(), socket.file_name()) else {
+        return UnixStream::connect(socket).await;
+    };
+    match std::fs::File::open(directory) {
+        Ok(opened) => {
+            let descriptors = PathBuf::from(format!("/proc/self/fd/{}", opened.as_raw_fd()));
+            UnixStream::connect(descriptors.join(name)).await
+        }
+        Err(_) => UnixStream::connect(socket).await,
     }
 }
 

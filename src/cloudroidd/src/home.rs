@@ -4,17 +4,14 @@
 //! lock  cloudroid.db  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/
 //! ```
 
-use std::fs::{DirBuilder, File, OpenOptions};
+use std::fs::{DirBuilder, File, OpenOptions, Permissions};
 use std::io::{Read, Seek, Write};
-use std::os::unix::fs::DirBuilderExt;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::{Flock, FlockArg};
-
-/// The kernel takes socket paths up to this long (`sun_path`, with its closing zero).
-const SOCKET_PATH: usize = 107;
-/// The longest socket path below the home: `servants/` and an id of 48 characters and `shim.sock`.
-const LONGEST_SOCKET: usize = "/servants//shim.sock".len() + 48;
+use tokio::net::UnixListener;
 
 /// Why a directory cannot be the home.
 #[derive(Debug, thiserror::Error)]
@@ -30,19 +27,6 @@ pub enum HomeError {
         pid: String,
         /// ` N`, where known.
         pid_bare: String,
-    },
-    /// Sockets below it could not be made.
-    #[error(
-        "the path {home} is {length} bytes long, and the kernel allows Unix sockets only in paths that are \
-         at most {allowed} long here; choose a shorter directory with --home"
-    )]
-    TooLong {
-        /// The directory.
-        home: PathBuf,
-        /// Bytes of its path.
-        length: usize,
-        /// Bytes that are allowed.
-        allowed: usize,
     },
     /// No default directory can be named.
     #[error(
@@ -87,7 +71,6 @@ impl Home {
     /// Makes what is missing of the directory and locks it; sweeps half-made builds of an earlier daemon.
     pub fn open(path: &Path) -> Result<Home, HomeError> {
         let path = std::path::absolute(path).map_err(io("resolve", path))?;
-        check_length(&path)?;
         // Servants run as unprivileged users: they pass through to their layers, and read nothing else.
         make_directory(&path, 0o711)?;
         let lock = lock(&path)?;
@@ -125,6 +108,21 @@ impl Home {
         self.path.join("cloudroid.db")
     }
 
+    /// Listens on the command line's socket, for root and this user alone.
+    pub fn listen(&self) -> Result<UnixListener, HomeError> {
+        let path = self.socket();
+        // Nobody else can be listening: the home is locked.
+        let _ = std::fs::remove_file(&path);
+        let directory = self.path.join("run");
+        let opened = File::open(&directory).map_err(io("open", &directory))?;
+        // Through a descriptor of its directory, because the path itself may be longer than an address can be.
+        let address = format!("/proc/self/fd/{}/daemon.sock", opened.as_raw_fd());
+        let listener = UnixListener::bind(address).map_err(io("listen on", &path))?;
+        std::fs::set_permissions(&path, Permissions::from_mode(0o600))
+            .map_err(io("protect", &path))?;
+        Ok(listener)
+    }
+
     /// The command line's socket.
     pub fn socket(&self) -> PathBuf {
         self.path.join("run/daemon.sock")
@@ -139,19 +137,6 @@ impl Home {
         }
         Ok(())
     }
-}
-
-fn check_length(home: &Path) -> Result<(), HomeError> {
-    let length = home.as_os_str().len();
-    let allowed = SOCKET_PATH - LONGEST_SOCKET;
-    if length > allowed {
-        return Err(HomeError::TooLong {
-            home: home.to_owned(),
-            length,
-            allowed,
-        });
-    }
-    Ok(())
 }
 
 fn make_directory(path: &Path, mode: u32) -> Result<(), HomeError> {
@@ -269,14 +254,13 @@ mod tests {
         assert!(!home.path().join("build/p1").exists());
     }
 
-    #[test]
-    fn a_path_too_long_for_sockets_is_refused() {
-        let long = Path::new("/tmp").join("x".repeat(100));
-        let refused = Home::open(&long).expect_err("too long").to_string();
-        assert!(
-            refused.contains("105 bytes") && refused.contains("--home"),
-            "{refused}"
-        );
-        assert!(!long.exists());
+    #[tokio::test]
+    async fn a_long_path_has_its_socket_all_the_same() {
+        let parent = tempfile::tempdir().expect("a directory");
+        let home = Home::open(&parent.path().join("x".repeat(200))).expect("free");
+        let listener = home.listen().expect("longer than an address can be");
+        assert!(home.socket().exists());
+        drop(listener);
+        home.listen().expect("the old one is taken away");
     }
 }

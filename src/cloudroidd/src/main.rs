@@ -40,7 +40,7 @@ use anyhow::{Context, bail};
 use clap::{Parser, Subcommand};
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
-use tokio::net::{TcpListener, UnixListener};
+use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing_subscriber::EnvFilter;
@@ -152,13 +152,7 @@ fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, doctor::Machin
     config.listen = arguments.listen.unwrap_or(config.listen);
     config.check()?;
     let path = home_of(&arguments)?;
-    if !nix::unistd::geteuid().is_root() {
-        bail!(
-            "servants are made by root, and this is user {}; run:\n    {}",
-            nix::unistd::geteuid(),
-            as_root()
-        );
-    }
+    require_root(nix::unistd::geteuid())?;
     let home = Home::open(&path)?;
     let (machine, missing) = doctor::look(home.path());
     if !missing.is_empty() {
@@ -175,6 +169,16 @@ fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, doctor::Machin
         );
     }
     Ok((config, home, machine))
+}
+
+fn require_root(user: nix::unistd::Uid) -> anyhow::Result<()> {
+    if !user.is_root() {
+        bail!(
+            "servants are made by root, and this is user {user}; run:\n    {}",
+            as_root()
+        );
+    }
+    Ok(())
 }
 
 /// This very command, by sudo.
@@ -198,7 +202,7 @@ fn as_root() -> String {
 async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Result<()> {
     let mut signals = supervision::Signals::new()?;
     let listener = listen(config.listen).await?;
-    let socket = listen_on_socket(&home)?;
+    let socket = home.listen()?;
     let app = build(config, &home, machine, listener.local_addr()?)?;
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
@@ -320,18 +324,6 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
         })
 }
 
-fn listen_on_socket(home: &Home) -> anyhow::Result<UnixListener> {
-    use std::os::unix::fs::PermissionsExt;
-    let path = home.socket();
-    // Nobody else can be listening: the home is locked.
-    let _ = std::fs::remove_file(&path);
-    let listener = UnixListener::bind(&path)
-        .with_context(|| format!("cannot listen on {}", path.display()))?;
-    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600))
-        .with_context(|| format!("cannot protect {}", path.display()))?;
-    Ok(listener)
-}
-
 /// Lets pushes, sessions and, unless they are to be kept, servants end.
 async fn drain(app: &App) {
     app.choreographer.close();
@@ -367,6 +359,19 @@ mod tests {
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
         Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn without_root_the_command_that_has_it_is_named() {
+        let refused = require_root(nix::unistd::Uid::from_raw(1000))
+            .expect_err("not root")
+            .to_string();
+        let this = std::env::args().next().expect("this program");
+        assert!(
+            refused.contains("user 1000") && refused.contains(&format!("sudo {this}")),
+            "{refused}"
+        );
+        require_root(nix::unistd::Uid::from_raw(0)).expect("root");
     }
 
     #[tokio::test]

@@ -15,7 +15,7 @@ mod receive;
 mod supplement;
 
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
@@ -122,9 +122,11 @@ pub async fn handle(
     let guard = cancel.clone().drop_guard();
     let tracker = app.pusher.tasks.clone();
     tracker.spawn(async move {
-        app.pusher
-            .run(&app, options, body, Tell(sender), cancel)
-            .await
+        let pusher = Arc::clone(&app.pusher);
+        if !pusher.run(&app, options, body, Tell(sender), cancel).await {
+            // What the failed push had made is of no use any more.
+            pusher.collect_garbage().await;
+        }
     });
     crate::portal::lines(ReceiverStream::new(receiver).map(move |event| {
         let _ = &guard;
@@ -210,6 +212,7 @@ impl Pusher {
         self.choreographer.check_limits(&options.limits)
     }
 
+    /// Pushes from beginning to end; whether it was published.
     async fn run(
         &self,
         app: &App,
@@ -217,7 +220,7 @@ impl Pusher {
         body: Body,
         tell: Tell,
         cancel: CancellationToken,
-    ) {
+    ) -> bool {
         let began = Instant::now();
         let id = format!("push-{}", names::random(8));
         let outcome = tokio::select! {
@@ -243,6 +246,7 @@ impl Pusher {
                     took,
                 })
                 .await;
+                true
             }
             Err(error) => {
                 self.failed.fetch_add(1, Ordering::Relaxed);
@@ -265,7 +269,7 @@ impl Pusher {
                     problem: error.problem(),
                 })
                 .await;
-                self.collect_garbage().await;
+                false
             }
         }
     }
@@ -393,7 +397,7 @@ impl Pusher {
             }
         };
         let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);
-        built.map_err(|error| push_error(&error))
+        built.map_err(|error| push_error(&error, &self.home))
     }
 
     async fn turn(&self, service: &str) -> OwnedMutexGuard<()> {
@@ -454,12 +458,28 @@ fn push_event(event: BuildEvent) -> PushEvent {
     }
 }
 
-fn push_error(error: &rootfs_builder::Error) -> Error {
+fn push_error(error: &rootfs_builder::Error, home: &Path) -> Error {
     Error::Push {
-        message: error.to_string(),
+        message: without_build_paths(&error.to_string(), home),
         next: None,
         log: Vec::new(),
     }
+}
+
+/// The pusher's own paths mean something to him, those of the build do not.
+fn without_build_paths(text: &str, home: &Path) -> String {
+    let builds = format!("{}/", home.join("build").display());
+    let mut parts = text.split(builds.as_str());
+    let mut mended = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let inside = part.split_once('/').map_or(part, |(_, inside)| inside);
+        mended.push_str(
+            inside
+                .strip_prefix(PUSHED)
+                .map_or(inside, |below| below.trim_start_matches('/')),
+        );
+    }
+    mended
 }
 
 /// Shared between daemons: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; below the home where neither is known.
@@ -492,5 +512,18 @@ mod tests {
             .problem();
         assert_eq!(refused.status, 400);
         assert!(refused.detail.contains("nope"), "{refused:?}");
+    }
+
+    #[test]
+    fn paths_of_the_build_are_told_as_the_pusher_knows_them() {
+        let text = "/home/build/push-1/pushed/src/a/package.xml, line 4: malformed; see /home/build/push-1/log";
+        assert_eq!(
+            without_build_paths(text, Path::new("/home")),
+            "src/a/package.xml, line 4: malformed; see log"
+        );
+        assert_eq!(
+            without_build_paths("nothing to mend", Path::new("/home")),
+            "nothing to mend"
+        );
     }
 }

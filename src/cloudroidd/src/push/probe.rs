@@ -1,12 +1,13 @@
 //! Finds the interface of a new image: it is started once, as a servant, and looked at.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use api::PushOptions;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use rootfs_builder::BuildOutcome;
-use rootfs_builder::probe::{Found, ProbeOptions};
+use rootfs_builder::probe::{Found, ProbeOptions, Work};
 use ros::bus::Bus;
 use ros::ros1::Ros1Bus;
 use ros::schema::Registry;
@@ -66,8 +67,10 @@ async fn look(
     };
     let registry = Registry::from_definitions(&built.definitions)
         .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
+    let working = Arc::clone(servant);
     let options = ProbeOptions {
         patience: pusher.config.push.probe.0,
+        work: Some(Work::new(move || cpu_time(Arc::clone(&working)))),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),
             NODE,
@@ -95,6 +98,11 @@ async fn look(
         found = looking => found,
     };
     outcome.map_err(|error| explained(error, servant))
+}
+
+async fn cpu_time(servant: Arc<dyn Servant>) -> Option<Duration> {
+    let usage = servant.usage().await.ok()?;
+    Some(Duration::from_micros(usage.cpu_usec))
 }
 
 /// Comes back when a node ends that should not, or the container does, with what is to be said about it.

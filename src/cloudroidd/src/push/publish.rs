@@ -126,12 +126,13 @@ impl Pusher {
     }
 
     pub(super) async fn collect_garbage(&self) {
-        let keep: BTreeSet<image::Digest> = self
-            .choreographer
-            .images_in_use()
-            .iter()
-            .filter_map(|image| image.parse().ok())
-            .collect();
+        let mut keep = self.builder.keep();
+        let in_use = self.choreographer.images_in_use();
+        keep.extend(
+            in_use
+                .iter()
+                .filter_map(|image| image.parse::<image::Digest>().ok()),
+        );
         let store = Arc::clone(&self.store);
         match blocking("collecting garbage", move || Ok(store.gc(&keep)?)).await {
             Ok(swept) if swept.blobs + swept.trees + swept.leftovers > 0 => {
