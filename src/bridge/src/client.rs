@@ -18,9 +18,9 @@ use rosbridge::{
 use tokio_util::sync::CancellationToken;
 
 use crate::SessionOptions;
-use crate::bridge::Shared;
 use crate::outbox::{Control, Outbox};
 use crate::sample::Frame;
+use crate::shared::Shared;
 
 /// Messages packed in pictures in fragments in pictures: nobody needs more.
 const MAX_WRAPPING: usize = 4;

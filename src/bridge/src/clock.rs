@@ -7,9 +7,9 @@ use ros::bus::ParamValue;
 use ros::codec::Time;
 use tokio::sync::mpsc;
 
-use crate::bridge::Shared;
 use crate::hub::Listener;
 use crate::sample::Sample;
+use crate::shared::Shared;
 
 /// How long a simulation may keep silent before the wall's time must do.
 const PATIENCE: Duration = Duration::from_secs(1);

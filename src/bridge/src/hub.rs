@@ -8,8 +8,8 @@ use ros::bus::{Message, SubscribeOptions, Subscription, WireType};
 use ros::schema::MessageType;
 use tokio::task::AbortHandle;
 
-use crate::bridge::Shared;
 use crate::sample::{Sample, TopicTypes};
+use crate::shared::Shared;
 
 /// Who listens to a topic: a client's queue, a goal waiting for its result.
 pub(crate) trait Listener: Send + Sync {

@@ -41,8 +41,10 @@ mod presence;
 mod registrations;
 mod rosapi;
 mod sample;
+mod seat;
 mod service_types;
 mod session;
+mod shared;
 mod topic_queue;
 mod ws;
 

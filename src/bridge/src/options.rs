@@ -56,8 +56,8 @@ pub struct BridgeOptions {
 impl Default for BridgeOptions {
     fn default() -> Self {
         Self {
-            max_frame: 64 << 20,
-            max_message: 64 << 20,
+            max_frame: 32 << 20,
+            max_message: 32 << 20,
             ping_interval: Duration::from_secs(15),
             idle_timeout: Duration::from_secs(90),
             close_timeout: Duration::from_secs(3),
@@ -74,8 +74,11 @@ impl Default for BridgeOptions {
             action_timeout: Duration::from_secs(10),
             warm_up: Duration::from_secs(1),
             resume_grace: Duration::from_secs(30),
-            fragments: FragmentLimits::default(),
-            max_png: 64 << 20,
+            fragments: FragmentLimits {
+                bytes: 32 << 20,
+                ..FragmentLimits::default()
+            },
+            max_png: 32 << 20,
             non_finite: NonFinite::Null,
         }
     }

@@ -11,7 +11,7 @@ use ros::schema::MessageType;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
-use crate::bridge::Shared;
+use crate::shared::Shared;
 
 /// Messages kept while the topic is being advertised, and their bytes.
 const WARM_MESSAGES: usize = 256;

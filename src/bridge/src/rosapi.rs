@@ -13,8 +13,8 @@ use ros::schema::{Registry, ServiceDef};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::bridge::Shared;
 use crate::clock;
+use crate::shared::Shared;
 
 /// The node that seems to serve these services.
 const NODE: &str = "/rosapi";

@@ -13,9 +13,9 @@ use ros::schema::{ActionDef, MessageType};
 use rosbridge::Id;
 
 use super::Client;
-use crate::bridge::Shared;
 use crate::names::plain_type;
 use crate::outlet::Outlet;
+use crate::shared::Shared;
 use goals::ActionClient;
 use server::ActionServer;
 

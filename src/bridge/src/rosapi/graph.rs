@@ -10,8 +10,8 @@ use ros::schema::Registry;
 use serde_json::{Value, json};
 
 use super::{NODE, Service, with_own};
-use crate::bridge::Shared;
 use crate::names::plain_type;
+use crate::shared::Shared;
 
 /// Services asked for their type at once.
 const ASKED_AT_ONCE: usize = 16;

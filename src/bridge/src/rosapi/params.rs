@@ -6,8 +6,8 @@ use ros::bus::{BusError, ParamValue};
 use serde_json::{Value, json};
 
 use super::Args;
-use crate::bridge::Shared;
 use crate::names::resolve;
+use crate::shared::Shared;
 
 fn key(args: &Args) -> Result<String, String> {
     match args.name.as_str() {
