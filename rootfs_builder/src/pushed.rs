@@ -170,11 +170,11 @@ mod tests {
         let (_root, pushed) = workspace(&[
             (
                 "app",
-                "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>",
+                "<depend>aa_msgs</depend><exec_depend>python3-numpy</exec_depend>",
             ),
-            ("app_msgs", "<depend>std_msgs</depend>"),
+            ("aa_msgs", "<depend>std_msgs</depend>"),
         ]);
-        assert_eq!(by_importance(pushed.packages()), ["app", "app_msgs"]);
+        assert_eq!(by_importance(pushed.packages()), ["app", "aa_msgs"]);
         assert_eq!(version(pushed.packages()), "1.2.3");
     }
 

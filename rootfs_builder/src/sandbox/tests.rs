@@ -120,6 +120,10 @@ impl Servant for Container {
     }
 
     async fn stop(&self) -> Result<(), servant::Error> {
+        // Ending a container takes its time.
+        for _ in 0..50 {
+            tokio::task::yield_now().await;
+        }
         let mut saw = self.saw.lock().expect("not poisoned");
         if let Some((directory, there)) = saw.as_mut() {
             *there = directory.exists();
