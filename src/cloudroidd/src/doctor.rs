@@ -297,7 +297,7 @@ fn room(home: &Path) -> Check {
             format!("df -h {}", existing.display()),
         );
     };
-    let free = found.blocks_available() as u64 * found.fragment_size() as u64;
+    let free = found.blocks_available() * found.fragment_size();
     let text = format!("{} free at {}", Size(free), existing.display());
     let mend = "make room, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {

@@ -12,38 +12,35 @@
 mod probe;
 mod publish;
 mod receive;
+mod request;
 mod supplement;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Instant;
 
 use anyhow::Context;
 use api::{PushEvent, PushOptions};
 use axum::body::Body;
-use axum::extract::{OriginalUri, State as Extracted};
-use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt;
 use image::Store;
 use parking_lot::Mutex;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
 use tokio::sync::{OwnedMutexGuard, mpsc};
-use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use request::Tell;
+pub use request::handle;
+
 use crate::choreographer::Choreographer;
-use crate::config::{self, Config};
+use crate::config::Config;
 use crate::errors::Error;
 use crate::home::Home;
 use crate::journal::Journal;
 use crate::names;
-use crate::portal::App;
 use crate::state::{self, NewEvent, Plan, RevisionRecord, State};
-use crate::views;
 
 /// Events that may wait for a slow client before the build waits for it.
 const EVENTS_AHEAD: usize = 256;
@@ -69,81 +66,10 @@ pub struct Pusher {
     tasks: TaskTracker,
 }
 
-/// Tells the client what is being done. It may have gone away: that cancels the push by itself.
-#[derive(Clone)]
-struct Tell(mpsc::Sender<PushEvent>);
-
-impl Tell {
-    async fn step(&self, title: &str) {
-        self.event(PushEvent::Step {
-            title: title.to_owned(),
-        })
-        .await;
-    }
-
-    async fn warning(&self, message: String) {
-        self.event(PushEvent::Warning { message }).await;
-    }
-
-    async fn event(&self, event: PushEvent) {
-        let _ = self.0.send(event).await;
-    }
-}
-
 /// What a push came to.
 struct Published {
     service: String,
     layers: Vec<api::push::Layer>,
-}
-
-/// Answers a push.
-pub async fn handle(
-    Extracted(app): Extracted<Arc<App>>,
-    OriginalUri(uri): OriginalUri,
-    body: Body,
-) -> Response {
-    let options = match read_options(uri.query())
-        .and_then(|options| app.pusher.check(&options).map(|()| options))
-    {
-        Ok(options) => options,
-        Err(error) => {
-            // The client is still sending. Were it cut off, it might not see why.
-            app.pusher.tasks.spawn(receive::discard(
-                body,
-                app.config.push.archive,
-                app.ending.clone(),
-            ));
-            return error.into_response();
-        }
-    };
-    let (sender, receiver) = mpsc::channel(EVENTS_AHEAD);
-    let cancel = app.pusher.cancel.child_token();
-    // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
-    let guard = cancel.clone().drop_guard();
-    let tracker = app.pusher.tasks.clone();
-    tracker.spawn(async move {
-        let pusher = Arc::clone(&app.pusher);
-        if !pusher.run(&app, options, body, Tell(sender), cancel).await {
-            // What the failed push had made is of no use any more.
-            pusher.collect_garbage().await;
-        }
-    });
-    crate::portal::lines(ReceiverStream::new(receiver).map(move |event| {
-        let _ = &guard;
-        event
-    }))
-}
-
-fn read_options(query: Option<&str>) -> Result<PushOptions, Error> {
-    let uri: axum::http::Uri = format!("/?{}", query.unwrap_or_default())
-        .parse()
-        .map_err(|_| Error::BadRequest("the push options cannot be read".to_owned()))?;
-    match crate::portal::query(&uri, "options") {
-        Some(text) => serde_json::from_str(&text).map_err(|error| {
-            Error::BadRequest(format!("the push options cannot be read: {error}"))
-        }),
-        None => Ok(PushOptions::default()),
-    }
 }
 
 impl Pusher {
@@ -197,81 +123,6 @@ impl Pusher {
         self.cancel.cancel();
         self.tasks.close();
         self.tasks.wait().await;
-    }
-
-    /// Refuses what can be refused before anything is received.
-    fn check(&self, options: &PushOptions) -> Result<(), Error> {
-        if self.cancel.is_cancelled() {
-            return Err(Error::Ending);
-        }
-        if let Some(name) = &options.name {
-            names::service(name)?;
-        }
-        config::check_limits(&options.limits)
-            .map_err(|error| Error::BadRequest(error.to_string()))?;
-        self.choreographer.check_limits(&options.limits)
-    }
-
-    /// Pushes from beginning to end; whether it was published.
-    async fn run(
-        &self,
-        app: &App,
-        options: PushOptions,
-        body: Body,
-        tell: Tell,
-        cancel: CancellationToken,
-    ) -> bool {
-        let began = Instant::now();
-        let id = format!("push-{}", names::random(8));
-        let outcome = tokio::select! {
-            outcome = self.push(&id, &options, body, &tell) => outcome,
-            () = cancel.cancelled() => Err(Error::Ending),
-        };
-        let build = self.home.join("build").join(&id);
-        let _ = tokio::task::spawn_blocking(move || {
-            std::fs::remove_dir_all(build.join(PUSHED))?;
-            // What the builder still has in there goes when its containers have ended.
-            std::fs::remove_dir(build)
-        })
-        .await;
-        let finished = outcome
-            .and_then(|published| Ok((views::service(app, &published.service)?, published.layers)));
-        match finished {
-            Ok((service, layers)) => {
-                self.published.fetch_add(1, Ordering::Relaxed);
-                let took = began.elapsed().as_millis() as u64;
-                tell.event(PushEvent::Done {
-                    service: Box::new(service),
-                    layers,
-                    took,
-                })
-                .await;
-                true
-            }
-            Err(error) => {
-                self.failed.fetch_add(1, Ordering::Relaxed);
-                let name = options.name.as_deref().or(options.apt.as_deref());
-                let what = if cancel.is_cancelled() {
-                    "was cancelled".to_owned()
-                } else {
-                    format!("failed: {error}")
-                };
-                let message = format!("the push of {} {what}", name.unwrap_or(&options.source));
-                self.journal.warning(
-                    "push-failed",
-                    &message,
-                    &NewEvent {
-                        service: name,
-                        ..NewEvent::default()
-                    },
-                );
-                tell.event(PushEvent::Error {
-                    problem: error.problem(),
-                })
-                .await;
-                false
-            }
-        }
     }
 
     async fn push(
@@ -500,19 +351,6 @@ fn cache_directory(home: &Home) -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn options_come_in_the_query() {
-        let options =
-            read_options(Some("options=%7B%22apt%22%3A%22opencv_apps%22%7D")).expect("valid");
-        assert_eq!(options.apt.as_deref(), Some("opencv_apps"));
-        assert_eq!(read_options(None).expect("none"), PushOptions::default());
-        let refused = read_options(Some("options=%7B%22nope%22%3A1%7D"))
-            .expect_err("unknown")
-            .problem();
-        assert_eq!(refused.status, 400);
-        assert!(refused.detail.contains("nope"), "{refused:?}");
-    }
 
     #[test]
     fn paths_of_the_build_are_told_as_the_pusher_knows_them() {

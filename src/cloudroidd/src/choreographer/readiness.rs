@@ -35,7 +35,7 @@ pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
     }
     for action in &interface.actions {
         let goal = graph.topics.get(&format!("{}/goal", action.name));
-        if !goal.is_some_and(|ends| !ends.subscribers.is_empty()) {
+        if goal.is_none_or(|ends| ends.subscribers.is_empty()) {
             missing.push(format!("the action {}", action.name));
         }
     }

@@ -12,7 +12,7 @@ use futures_util::{StreamExt, TryStreamExt};
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
-use super::Tell;
+use super::request::Tell;
 use crate::config::Push;
 use crate::errors::Error;
 

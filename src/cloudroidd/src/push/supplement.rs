@@ -14,7 +14,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use package::interface::{Interface, Service, Topic};
+use package::interface::Interface;
 use ros::schema::{Base, MessageType, Registry, SchemaError};
 
 /// Why a supplement is refused.
@@ -23,6 +23,9 @@ pub(super) enum SupplementError {
     /// Neither TOML nor JSON of this form.
     #[error("{0}")]
     Unreadable(String),
+    /// What was found says otherwise.
+    #[error("{0}")]
+    Contradiction(String),
     /// Not an absolute name.
     #[error("{0:?} is not an absolute name; begin it with /")]
     Relative(String),
@@ -42,34 +45,21 @@ pub(super) fn add(
     text: &str,
     definitions: &BTreeMap<String, String>,
 ) -> Result<(), SupplementError> {
-    let supplement = read(text)?;
-    let registry =
-        Registry::from_definitions(definitions).map_err(|source| SupplementError::Type {
-            name: "the image".to_owned(),
-            source,
-        })?;
+    let mut stated = read(text)?;
+    let registry = Registry::from_definitions(definitions).map_err(unknown("the image"))?;
     let mut texts = Texts {
         definitions,
-        used: &mut interface.definitions,
+        used: BTreeMap::new(),
     };
-    for topic in supplement.topics {
+    for topic in &mut stated.topics {
         absolute(&topic.name)?;
         let message = registry
             .message(&topic.type_name)
             .map_err(unknown(&topic.name))?;
         texts.message(&message);
-        let known = interface
-            .topics
-            .iter()
-            .any(|found| found.name == topic.name && found.direction == topic.direction);
-        if !known {
-            interface.topics.push(Topic {
-                md5: message.md5().to_owned(),
-                ..topic
-            });
-        }
+        topic.md5 = message.md5().to_owned();
     }
-    for service in supplement.services {
+    for service in &mut stated.services {
         absolute(&service.name)?;
         let definition = registry
             .service(&service.type_name)
@@ -77,18 +67,9 @@ pub(super) fn add(
         texts.own(&service.type_name, "srv");
         texts.message(&definition.request);
         texts.message(&definition.response);
-        if interface
-            .services
-            .iter()
-            .all(|found| found.name != service.name)
-        {
-            interface.services.push(Service {
-                md5: definition.md5.clone(),
-                ..service
-            });
-        }
+        service.md5.clone_from(&definition.md5);
     }
-    for action in supplement.actions {
+    for action in &stated.actions {
         absolute(&action.name)?;
         let definition = registry
             .action(&action.type_name)
@@ -97,37 +78,14 @@ pub(super) fn add(
         for message in [&definition.goal, &definition.result, &definition.feedback] {
             texts.message(message);
         }
-        if interface
-            .actions
-            .iter()
-            .all(|found| found.name != action.name)
-        {
-            interface.actions.push(action);
-        }
     }
-    for parameter in supplement.parameters {
+    for parameter in &stated.parameters {
         absolute(&parameter.name)?;
-        if interface
-            .parameters
-            .iter()
-            .all(|found| found.name != parameter.name)
-        {
-            interface.parameters.push(parameter);
-        }
     }
+    stated.definitions = texts.used;
     interface
-        .topics
-        .sort_by(|one, other| one.name.cmp(&other.name));
-    interface
-        .services
-        .sort_by(|one, other| one.name.cmp(&other.name));
-    interface
-        .actions
-        .sort_by(|one, other| one.name.cmp(&other.name));
-    interface
-        .parameters
-        .sort_by(|one, other| one.name.cmp(&other.name));
-    Ok(())
+        .supplement(&stated)
+        .map_err(|error| SupplementError::Contradiction(error.to_string()))
 }
 
 fn read(text: &str) -> Result<Interface, SupplementError> {
@@ -155,7 +113,7 @@ fn unknown(name: &str) -> impl FnOnce(SchemaError) -> SupplementError {
 /// The definitions that are used, with all that they refer to.
 struct Texts<'a> {
     definitions: &'a BTreeMap<String, String>,
-    used: &'a mut BTreeMap<String, String>,
+    used: BTreeMap<String, String>,
 }
 
 impl Texts<'_> {

@@ -127,7 +127,9 @@ fn a_robot_stays_with_whom_it_came_first() {
     );
     assert_eq!(state.robot_owner("r2", None).expect("readable"), None);
     assert_eq!(
-        state.release_robots(&[theirs.clone()]).expect("readable"),
+        state
+            .release_robots(std::slice::from_ref(&theirs))
+            .expect("readable"),
         1
     );
     assert_eq!(
