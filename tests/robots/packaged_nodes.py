@@ -54,8 +54,8 @@ def pixels(message, dtype=numpy.uint8):
     return rows[:, : message["width"] * channels].reshape(message["height"], message["width"], channels).squeeze()
 
 
-def ask(address, service, inputs, output, output_type, messages):
-    """Publishes `messages(sequence)` on `inputs` until something comes on `output`."""
+def ask(address, service, inputs, output, output_type, messages, wanted=lambda answer: True):
+    """Publishes `messages(sequence)` on `inputs` until something wanted comes on `output`."""
     client = roslibpy.Ros(f"ws://{address}/{service}?robot=tester")
     client.run(timeout=60)
     answers = queue.Queue()
@@ -76,9 +76,11 @@ def ask(address, service, inputs, output, output_type, messages):
                 topic.publish(message)
             sequence += 1
             try:
-                return answers.get(timeout=5)
+                answer = answers.get(timeout=5)
             except queue.Empty:
                 continue
+            if wanted(answer):
+                return answer
         sys.exit(f"{service}: no answer on {output} within {PATIENCE:.0f} s")
     finally:
         client.close()  # not terminate: the other services share the reactor
@@ -123,7 +125,9 @@ def main():
     push("--apt", "opencv_apps", "--name", "flow", "--node", "fback_flow", "--param", "debug_view=false")
     answer = ask(address, "flow", [("/image", "sensor_msgs/Image")], "/fback_flow/flows",
                  "opencv_apps/FlowArrayStamped",
-                 lambda n: [image(street if n % 2 == 0 else next_street, "bgr8", n)])
+                 lambda n: [image(street if n % 2 == 0 else next_street, "bgr8", n)],
+                 # The first picture has none before it to flow from.
+                 wanted=lambda answer: answer["flow"])
     check("fback_flow", len(answer["flow"]) > 0, answer)
 
     push("--apt", "image_proc", "--node", "image_proc")

@@ -61,7 +61,7 @@ pub fn the_interface_is_found_lazy_inputs_included() -> Told {
         .as_array()
         .context("services")?;
     for (name, kind) in [
-        ("/people_detect/get_loggers", "roscpp/GetLoggers"),
+        ("/people_detect/list", "nodelet/NodeletList"),
         (
             "/people_detect/set_parameters",
             "dynamic_reconfigure/Reconfigure",
