@@ -4,10 +4,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::{Message, SubscribeOptions, Subscription, WireType};
+use ros::bus::{Bus, Message, SubscribeOptions, Subscription, WireType};
 use ros::schema::MessageType;
 use tokio::task::AbortHandle;
 
+use crate::Metrics;
 use crate::sample::{Sample, TopicTypes};
 use crate::shared::Shared;
 
@@ -90,7 +91,8 @@ impl Hub {
         };
         let pump = tokio::spawn(pump(
             Arc::downgrade(&hub),
-            shared.clone(),
+            shared.bus.clone(),
+            shared.metrics.clone(),
             topic.to_owned(),
             options,
         ));
@@ -211,9 +213,15 @@ impl Drop for Hub {
     }
 }
 
-/// Moves messages from the bus to the hub until either is gone.
-async fn pump(hub: Weak<Hub>, shared: Arc<Shared>, topic: String, options: SubscribeOptions) {
-    let mut subscription: Subscription = match shared.bus.subscribe(&topic, options).await {
+/// Moves messages from the bus to the hub until either is gone. Owns nothing of the bridge, which may end meanwhile.
+async fn pump(
+    hub: Weak<Hub>,
+    bus: Arc<dyn Bus>,
+    metrics: Arc<Metrics>,
+    topic: String,
+    options: SubscribeOptions,
+) {
+    let mut subscription: Subscription = match bus.subscribe(&topic, options).await {
         Ok(subscription) => subscription,
         Err(error) => {
             if let Some(hub) = hub.upgrade() {
@@ -222,14 +230,15 @@ async fn pump(hub: Weak<Hub>, shared: Arc<Shared>, topic: String, options: Subsc
             return;
         }
     };
+    drop(bus);
     let mut dropped = 0;
     while let Some(message) = subscription.messages.recv().await {
         let Some(hub) = hub.upgrade() else { return };
-        shared.metrics.received.add(1);
+        metrics.received.add(1);
         hub.deliver(message, false);
         let now_dropped = subscription.dropped.load(Ordering::Relaxed);
         if now_dropped > dropped {
-            shared.metrics.bus_dropped.add(now_dropped - dropped);
+            metrics.bus_dropped.add(now_dropped - dropped);
             dropped = now_dropped;
         }
     }

@@ -45,6 +45,7 @@ mod seat;
 mod service_types;
 mod session;
 mod shared;
+mod tf;
 mod topic_queue;
 mod ws;
 

@@ -16,6 +16,7 @@ use crate::outlet::Outlet;
 use crate::presence::{self, Presence};
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
+use crate::tf::{self, Republisher};
 use crate::{BridgeOptions, Metrics, SessionOptions};
 
 /// What the bridge's parts need of it.
@@ -27,6 +28,7 @@ pub(crate) struct Shared {
     pub(crate) service_types: ServiceTypes,
     pub(crate) registrations: Registrations,
     pub(crate) presence: Presence,
+    pub(crate) republisher: Republisher,
     hubs: Mutex<HashMap<String, Weak<Hub>>>,
     /// What clients publish on, by topic.
     outlets: Mutex<HashMap<String, Vec<Weak<Outlet>>>>,
@@ -50,6 +52,7 @@ impl Shared {
         options: BridgeOptions,
     ) -> Arc<Self> {
         presence::define(&registry);
+        tf::define(&registry);
         Arc::new(Self {
             bus,
             registry,
@@ -58,6 +61,7 @@ impl Shared {
             service_types: ServiceTypes::default(),
             registrations: Registrations::default(),
             presence: Presence::default(),
+            republisher: Republisher::default(),
             hubs: Mutex::default(),
             outlets: Mutex::default(),
             clients: Mutex::default(),
@@ -125,13 +129,12 @@ impl Shared {
         if let Some(hub) = hubs.get(topic).and_then(Weak::upgrade) {
             return hub;
         }
-        let own = presence::type_name(topic)
-            .filter(|_| !self.bus.graph().borrow().topics.contains_key(topic));
-        let own = own.and_then(|name| self.registry.message(name).ok());
-        let hub = match &own {
+        let hub = match self.own_topic(topic) {
             Some(own) => {
                 let hub = Hub::internal(self, topic);
-                hub.deliver(self.presence.message(topic, own), true);
+                if presence::type_name(topic).is_some() {
+                    hub.deliver(self.presence.message(topic, &own), true);
+                }
                 hub
             }
             None => Hub::start(self, topic, message_type),
@@ -144,6 +147,13 @@ impl Shared {
         // The last owner of an outlet must not drop it under the lock.
         drop(hubs);
         hub
+    }
+
+    /// The type of a topic that the bridge itself publishes, unless a node of the servant has one of this name.
+    fn own_topic(&self, topic: &str) -> Option<Arc<MessageType>> {
+        let name = presence::type_name(topic).or_else(|| self.republisher.type_name(topic))?;
+        let taken = self.bus.graph().borrow().topics.contains_key(topic);
+        self.registry.message(name).ok().filter(|_| !taken)
     }
 
     /// Tells who listens that somebody has come or gone.
@@ -165,6 +175,13 @@ impl Shared {
             .flatten()
             .filter_map(Weak::upgrade)
             .collect()
+    }
+
+    /// Whether the client that published under this name still does.
+    pub(crate) fn has_outlet(&self, topic: &str, name: &str) -> bool {
+        self.outlets_of(topic)
+            .iter()
+            .any(|outlet| *outlet.name == *name)
     }
 
     pub(crate) fn add_outlet(&self, outlet: &Arc<Outlet>) {
@@ -196,7 +213,10 @@ impl Shared {
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
         let outlets = self.outlets_of(topic);
         let known = outlets.first().map(|outlet| outlet.message_type.name());
-        known.or(presence::type_name(topic)).map(str::to_owned)
+        known
+            .or(presence::type_name(topic))
+            .or_else(|| self.republisher.type_name(topic))
+            .map(str::to_owned)
     }
 
     /// The topic's hub, if anybody listens.

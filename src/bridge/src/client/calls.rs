@@ -13,6 +13,7 @@ use super::{Client, Reply, print_format};
 use crate::names::resolve;
 use crate::rosapi;
 use crate::sample::Frame;
+use crate::tf;
 
 /// A call, free of the frame it came in.
 struct Call {
@@ -95,8 +96,8 @@ impl Client {
             .borrow()
             .services
             .contains_key(&call.service);
-        if !served && let Some(api) = rosapi::Service::find(&call.service) {
-            return self.answer_rosapi(call, api).await;
+        if !served && let Some(answer) = self.answer_ourselves(call).await {
+            return answer;
         }
         let service_type = self
             .shared
@@ -139,37 +140,62 @@ impl Client {
         self.response_frame(call, def.as_deref().ok(), &response)
     }
 
-    async fn answer_rosapi(&self, call: &Call, api: rosapi::Service) -> Result<Frame, String> {
-        let def = api.definition()?;
-        let args = match call.args() {
-            None => Bytes::from_static(b"{}"),
+    /// Answers for the bridge itself, where the call is for it.
+    async fn answer_ourselves(&self, call: &Call) -> Option<Result<Frame, String>> {
+        if let Some(api) = rosapi::Service::find(&call.service) {
+            let answer = async {
+                let def = api.definition()?;
+                let args = self.own_args(call, &def)?;
+                self.own_frame(call, &def, &api.answer(&self.shared, &args).await?)
+            };
+            return Some(answer.await);
+        }
+        if call.service == tf::SERVICE {
+            let answer = || {
+                let def = tf::definition(&self.shared.registry)?;
+                let args = self.own_args(call, &def)?;
+                let values = self.shared.republisher.call(&self.shared, &args)?;
+                self.own_frame(call, &def, &values)
+            };
+            return Some(answer());
+        }
+        None
+    }
+
+    /// The arguments of a call that the bridge answers, as a JSON object.
+    fn own_args(&self, call: &Call, def: &ServiceDef) -> Result<Bytes, String> {
+        match call.args() {
+            None => Ok(Bytes::from_static(b"{}")),
             Some(args)
                 if args.format == Format::Json
                     && args.is_object()
                     && call.compression != Compression::CborRaw =>
             {
-                Bytes::copy_from_slice(args.bytes)
+                Ok(Bytes::copy_from_slice(args.bytes))
             }
             args => {
                 let request = decode_args(&def.request, args, call.compression)?;
                 let mut json = Vec::new();
                 self.print_payload(&def.request, &request, Format::Json, &mut json)?;
-                Bytes::from(json)
+                Ok(Bytes::from(json))
             }
-        };
-        let values = api.answer(&self.shared, &args).await?;
+        }
+    }
+
+    /// The answer to such a call, from JSON.
+    fn own_frame(&self, call: &Call, def: &ServiceDef, values: &[u8]) -> Result<Frame, String> {
         if matches!(call.compression, Compression::None | Compression::Png) {
             return answer_frame(call, Format::Json, |out| {
-                out.extend_from_slice(&values);
-                Ok::<_, String>(())
+                out.extend_from_slice(values);
+                Ok(())
             });
         }
         let values = Payload {
             format: Format::Json,
-            bytes: &values,
+            bytes: values,
         };
         let response = decode_args(&def.response, Some(values), Compression::None)?;
-        self.response_frame(call, Some(&def), &response)
+        self.response_frame(call, Some(def), &response)
     }
 
     fn response_frame(

@@ -11,6 +11,7 @@ use rosbridge::{Advertise, Compression, Format, Payload, Publish, Unadvertise};
 use super::{Client, Reply};
 use crate::names::{plain_type, resolve};
 use crate::outlet::Outlet;
+use crate::tf;
 
 /// Messages on one topic that wait until its type is known.
 const MAX_UNTYPED: usize = 64;
@@ -129,6 +130,9 @@ impl Client {
                 client.error(&reply, &format!("advertise: topic {name}: {reason}"));
             }
         };
+        if topic == tf::GOAL_TOPIC {
+            self.shared.republisher.listen(&self.shared);
+        }
         let outlet = Outlet::open(&self.shared, topic, message_type, latch, queue, failed);
         let replaced = outlets.open.insert(topic.to_owned(), outlet.clone());
         drop(outlets);

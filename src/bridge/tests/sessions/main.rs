@@ -10,3 +10,4 @@ mod resuming;
 mod rosapi;
 mod services;
 mod subscribing;
+mod transforms;

@@ -1,0 +1,102 @@
+//! What roslibjs's and roslibpy's TF clients need: the interface of tf2_web_republisher, which sends only the
+//! transforms asked for, only when they have changed enough. In a plain ROS a node does this; here the bridge does,
+//! unless the servant has such a node.
+//!
+//! * the service `/republish_tfs`, which names a topic of `tf2_web_republisher/TFArray` made for the caller;
+//! * the action `/tf2_web_republisher`, whose feedback carries the transforms for as long as the goal is active.
+
+mod buffer;
+mod republish;
+mod transform;
+
+use std::sync::{Arc, Weak};
+
+use parking_lot::Mutex;
+use ros::schema::Registry;
+
+use buffer::Buffer;
+pub(crate) use republish::{GOAL_TOPIC, Republisher, SERVICE, definition};
+use transform::Transform;
+
+const DEFINITIONS: &[(&str, &str)] = &[
+    (
+        "geometry_msgs/msg/Vector3",
+        "float64 x\nfloat64 y\nfloat64 z\n",
+    ),
+    (
+        "geometry_msgs/msg/Quaternion",
+        "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    ),
+    (
+        "geometry_msgs/msg/Transform",
+        "Vector3 translation\nQuaternion rotation\n",
+    ),
+    (
+        "geometry_msgs/msg/TransformStamped",
+        "Header header\nstring child_frame_id\nTransform transform\n",
+    ),
+    (
+        "tf2_web_republisher/msg/TFArray",
+        "geometry_msgs/TransformStamped[] transforms\n",
+    ),
+    (
+        "tf2_web_republisher/srv/RepublishTFs",
+        "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n\
+         duration timeout\n---\nstring topic_name\n",
+    ),
+    (
+        "tf2_web_republisher/action/TFSubscription",
+        "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n\
+         ---\n---\ngeometry_msgs/TransformStamped[] transforms\n",
+    ),
+];
+
+/// Adds the types that are needed and that the servant does not have.
+pub(crate) fn define(registry: &Registry) {
+    let known = registry.keys();
+    for (key, text) in DEFINITIONS {
+        if known.iter().all(|other| other != key)
+            && let Err(error) = registry.insert(key, text)
+        {
+            tracing::warn!(%error, "{key} cannot be defined");
+        }
+    }
+}
+
+/// The one buffer of a bridge, for as long as anybody needs it.
+#[derive(Default)]
+struct SharedBuffer(Mutex<Weak<Buffer>>);
+
+impl SharedBuffer {
+    fn get(&self, make: impl FnOnce() -> Buffer) -> Arc<Buffer> {
+        let mut buffer = self.0.lock();
+        buffer.upgrade().unwrap_or_else(|| {
+            let made = Arc::new(make());
+            *buffer = Arc::downgrade(&made);
+            made
+        })
+    }
+}
+
+/// Serialized `geometry_msgs/TransformStamped[]` without stamps: parent, child, transform.
+fn write_transforms<'t>(
+    transforms: impl IntoIterator<Item = (&'t str, &'t str, Transform)>,
+) -> Vec<u8> {
+    let now = ros::codec::Time::now();
+    let (mut out, mut count) = (vec![0; 4], 0u32);
+    for (parent, child, transform) in transforms {
+        count += 1;
+        for word in [0, now.secs, now.nsecs] {
+            out.extend_from_slice(&word.to_le_bytes());
+        }
+        for name in [parent, child] {
+            out.extend_from_slice(&(name.len() as u32).to_le_bytes());
+            out.extend_from_slice(name.as_bytes());
+        }
+        for number in transform.translation.iter().chain(&transform.rotation) {
+            out.extend_from_slice(&number.to_le_bytes());
+        }
+    }
+    out[..4].copy_from_slice(&count.to_le_bytes());
+    out
+}

@@ -1,0 +1,365 @@
+//! Who asked for which transforms, and their sending.
+
+use std::collections::HashMap;
+use std::sync::{Arc, OnceLock, Weak};
+use std::time::Duration;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{Message, WireType};
+use ros::codec::{self, JsonOptions, Time};
+use ros::schema::{MessageType, Registry, ServiceDef};
+use serde::Deserialize;
+use tokio::time::Instant;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+use super::transform::Transform;
+use super::{Buffer, SharedBuffer, buffer, write_transforms};
+use crate::actionlib::{self, GoalId, GoalState, Status};
+use crate::hub::{Listener, Listening};
+use crate::sample::Sample;
+use crate::shared::Shared;
+
+/// The service.
+pub(crate) const SERVICE: &str = "/republish_tfs";
+/// Where goals of the action come from.
+pub(crate) const GOAL_TOPIC: &str = "/tf2_web_republisher/goal";
+const CANCEL_TOPIC: &str = "/tf2_web_republisher/cancel";
+const FEEDBACK_TOPIC: &str = "/tf2_web_republisher/feedback";
+const RESULT_TOPIC: &str = "/tf2_web_republisher/result";
+/// Beginning of the names of topics made for callers of the service.
+const TOPIC_PREFIX: &str = "/tf_repub_";
+/// The node that seems to publish.
+const NODE: &str = "/tf2_web_republisher";
+
+/// Requests served at once.
+const MAX_REQUESTS: usize = 1000;
+const MAX_SOURCES: usize = 1000;
+
+/// What a caller or goal asks for.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(default)]
+pub(super) struct Wanted {
+    source_frames: Vec<String>,
+    target_frame: String,
+    angular_thres: f64,
+    trans_thres: f64,
+    rate: f64,
+    timeout: Timeout,
+}
+
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(default)]
+struct Timeout {
+    secs: i32,
+    nsecs: i32,
+}
+
+impl Default for Wanted {
+    fn default() -> Self {
+        Self {
+            source_frames: Vec::new(),
+            target_frame: String::new(),
+            angular_thres: 0.0,
+            trans_thres: 0.0,
+            rate: 10.0,
+            timeout: Timeout::default(),
+        }
+    }
+}
+
+/// One bridge's republisher.
+#[derive(Default)]
+pub(crate) struct Republisher {
+    buffer: SharedBuffer,
+    topics: Mutex<HashMap<String, DropGuard>>,
+    goals: Mutex<HashMap<String, DropGuard>>,
+    /// Set when a client first uses the action.
+    listening: OnceLock<[Listening; 2]>,
+}
+
+/// The service's definition.
+pub(crate) fn definition(registry: &Registry) -> Result<Arc<ServiceDef>, String> {
+    registry
+        .service("tf2_web_republisher/RepublishTFs")
+        .map_err(|error| error.to_string())
+}
+
+impl Republisher {
+    /// The type of a topic that was made for a caller.
+    pub(crate) fn type_name(&self, topic: &str) -> Option<&'static str> {
+        (topic.starts_with(TOPIC_PREFIX) && self.topics.lock().contains_key(topic))
+            .then_some("tf2_web_republisher/TFArray")
+    }
+
+    /// Answers a call of the service; request and response in JSON.
+    pub(crate) fn call(&self, shared: &Arc<Shared>, request: &[u8]) -> Result<Vec<u8>, String> {
+        let wanted: Wanted =
+            serde_json::from_slice(request).map_err(|error| format!("args: {error}"))?;
+        check(&wanted, self.topics.lock().len())?;
+        let topic = format!("{TOPIC_PREFIX}{}", shared.next_number());
+        let stop = CancellationToken::new();
+        self.topics
+            .lock()
+            .insert(topic.clone(), stop.clone().drop_guard());
+        let patience = Duration::new(
+            wanted.timeout.secs.max(0) as u64,
+            wanted.timeout.nsecs.clamp(0, 999_999_999) as u32,
+        );
+        let patience = patience.clamp(Duration::from_secs(1), Duration::from_secs(3600));
+        let (name, message_type) = (
+            topic.clone(),
+            shared.registry.message("tf2_web_republisher/TFArray"),
+        );
+        let message_type = message_type.map_err(|error| error.to_string())?;
+        let mut heard = Instant::now();
+        let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
+            if let Some(hub) = shared.live_hub(&name) {
+                heard = Instant::now();
+                if let Some(transforms) = transforms {
+                    hub.deliver(message(&message_type, transforms.into()), true);
+                }
+            }
+            // Nobody has listened for as long as the caller said: it is gone.
+            let gone = heard.elapsed() > patience;
+            if gone {
+                shared.republisher.topics.lock().remove(&name);
+            }
+            !gone
+        };
+        tokio::spawn(send(
+            Arc::downgrade(shared),
+            self.buffer(shared),
+            wanted,
+            stop,
+            deliver,
+        ));
+        Ok(serde_json::json!({ "topic_name": topic })
+            .to_string()
+            .into_bytes())
+    }
+
+    /// A client is about to send goals: listens to them, if nobody else does.
+    pub(crate) fn listen(&self, shared: &Arc<Shared>) {
+        let graph = shared.bus.graph().borrow().clone();
+        let served = graph
+            .topics
+            .get(FEEDBACK_TOPIC)
+            .is_some_and(|nodes| !nodes.publishers.is_empty());
+        if served || self.listening.get().is_some() {
+            return;
+        }
+        let registry = &shared.registry;
+        let (Ok(action), Ok(cancel)) = (
+            registry.action("tf2_web_republisher/TFSubscription"),
+            registry.message("actionlib_msgs/GoalID"),
+        ) else {
+            return;
+        };
+        let listener = |cancels| {
+            Arc::new(Goals {
+                shared: Arc::downgrade(shared),
+                cancels,
+            })
+        };
+        let goals = shared
+            .hub(GOAL_TOPIC, Some(&action.action_goal))
+            .listen(listener(false));
+        let cancels = shared
+            .hub(CANCEL_TOPIC, Some(&cancel))
+            .listen(listener(true));
+        // Whoever comes second has listened in vain, and stops.
+        let _ = self.listening.set([goals, cancels]);
+    }
+
+    fn buffer(&self, shared: &Arc<Shared>) -> Arc<Buffer> {
+        self.buffer.get(|| Buffer::new(shared))
+    }
+
+    fn begin(
+        &self,
+        shared: &Arc<Shared>,
+        goal: GoalId,
+        body: &[u8],
+        publisher: Arc<str>,
+    ) -> Result<(), String> {
+        let action = shared
+            .registry
+            .action("tf2_web_republisher/TFSubscription")
+            .map_err(|error| error.to_string())?;
+        let mut json = Vec::new();
+        codec::to_json(&action.goal, body, &mut json, &JsonOptions::default())
+            .map_err(|error| error.to_string())?;
+        let wanted: Wanted = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+        check(&wanted, self.goals.lock().len())?;
+        let stop = CancellationToken::new();
+        self.goals
+            .lock()
+            .insert(goal.id.clone(), stop.clone().drop_guard());
+        let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
+            if let (Some(hub), Some(transforms)) = (shared.live_hub(FEEDBACK_TOPIC), transforms) {
+                let bytes =
+                    actionlib::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
+                hub.deliver(message(&action.action_feedback, bytes), true);
+            }
+            // The goal of a client that is gone is given up.
+            let alive = shared.has_outlet(GOAL_TOPIC, &publisher);
+            if !alive {
+                shared.republisher.goals.lock().remove(&goal.id);
+            }
+            alive
+        };
+        tokio::spawn(send(
+            Arc::downgrade(shared),
+            self.buffer(shared),
+            wanted,
+            stop,
+            deliver,
+        ));
+        Ok(())
+    }
+
+    /// Ends a goal, or with an empty id all of them.
+    fn cancel(&self, shared: &Arc<Shared>, goal: &GoalId) {
+        let mut goals = self.goals.lock();
+        let ended: Vec<String> = match goal.id.as_str() {
+            "" => goals.drain().map(|(id, _)| id).collect(),
+            id => goals
+                .remove(id)
+                .map(|_| id.to_owned())
+                .into_iter()
+                .collect(),
+        };
+        drop(goals);
+        let action = shared.registry.action("tf2_web_republisher/TFSubscription");
+        let (Some(hub), Ok(action)) = (shared.live_hub(RESULT_TOPIC), action) else {
+            return;
+        };
+        for id in ended {
+            let goal = GoalId {
+                id,
+                ..GoalId::default()
+            };
+            let bytes = actionlib::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
+            hub.deliver(message(&action.action_result, bytes), true);
+        }
+    }
+}
+
+fn state(goal: &GoalId, status: Status) -> GoalState {
+    GoalState {
+        goal: goal.clone(),
+        status,
+        text: String::new(),
+    }
+}
+
+fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
+    if wanted.source_frames.len() > MAX_SOURCES {
+        return Err(format!(
+            "source_frames has {} entries, at most {MAX_SOURCES} are allowed",
+            wanted.source_frames.len()
+        ));
+    }
+    if requests >= MAX_REQUESTS {
+        return Err(format!(
+            "{MAX_REQUESTS} requests for transforms are served already; cancel some"
+        ));
+    }
+    Ok(())
+}
+
+fn message(message_type: &MessageType, bytes: Bytes) -> Message {
+    let wire_type = WireType {
+        name: message_type.name().to_owned(),
+        md5: message_type.md5().to_owned(),
+        definition: message_type.full_text().to_owned(),
+    };
+    Message {
+        bytes,
+        wire_type: Arc::new(wire_type),
+        publisher: NODE.into(),
+        latching: false,
+    }
+}
+
+/// Hears goals, or their cancelling.
+struct Goals {
+    shared: Weak<Shared>,
+    cancels: bool,
+}
+
+impl Listener for Goals {
+    fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
+        // Nodes have a republisher of their own, or none.
+        let Some(shared) = self.shared.upgrade().filter(|_| sample.local) else {
+            return;
+        };
+        if self.cancels {
+            if let Some(goal) = actionlib::read_cancel(&sample.bytes) {
+                shared.republisher.cancel(&shared, &goal);
+            }
+        } else if let Some((goal, body)) = actionlib::read_goal(&sample.bytes)
+            && let Err(reason) =
+                shared
+                    .republisher
+                    .begin(&shared, goal, &body, sample.publisher.clone())
+        {
+            tracing::debug!("a request for transforms is refused: {reason}");
+        }
+    }
+
+    fn failed(&self, reason: &str) {
+        tracing::debug!("goals for transforms cannot be heard: {reason}");
+    }
+}
+
+/// Gives `deliver` what has changed, at the rate asked for, until that says no or `stop` is cancelled.
+async fn send(
+    shared: Weak<Shared>,
+    buffer: Arc<Buffer>,
+    wanted: Wanted,
+    stop: CancellationToken,
+    mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
+) {
+    let rate = if wanted.rate > 0.0 {
+        wanted.rate.clamp(0.01, 1000.0)
+    } else {
+        10.0
+    };
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / rate));
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let target = buffer::plain(&wanted.target_frame);
+    let mut sent: HashMap<&str, Transform> = HashMap::new();
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => return,
+            _ = ticks.tick() => {}
+        }
+        let Some(shared) = shared.upgrade() else {
+            return;
+        };
+        let mut changed = Vec::new();
+        for source in wanted
+            .source_frames
+            .iter()
+            .map(|source| buffer::plain(source))
+        {
+            let Some(now) = buffer.find(target, source) else {
+                continue;
+            };
+            let moved = sent.get(source).is_none_or(|before| {
+                let (metres, radians) = now.distance(before);
+                metres > wanted.trans_thres || radians > wanted.angular_thres
+            });
+            if moved {
+                sent.insert(source, now);
+                changed.push((target, source, now));
+            }
+        }
+        let transforms = (!changed.is_empty()).then(|| write_transforms(changed));
+        if !deliver(&shared, transforms) {
+            return;
+        }
+    }
+}
