@@ -8,7 +8,7 @@
 //! ```
 //!
 //! On a hybrid host the controllers are on v1, and the empty v2 hierarchy beside them is still of use: it has
-//! `cgroup.kill`.
+//! `cgroup.kill`, and counts processor time.
 
 use std::fs;
 use std::io;

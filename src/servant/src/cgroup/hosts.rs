@@ -15,7 +15,10 @@ const NAME: &str = "cloudroid";
 /// The unit whose cgroup is delegated to us.
 const UNIT: &str = "cloudroid-servants.service";
 /// Controllers that limits or the end of a servant need.
-const WANTED_V1: [&str; 5] = ["cpu", "cpuacct", "memory", "pids", "freezer"];
+const WANTED_V1: [&str; 3] = ["cpu", "memory", "pids"];
+/// Needed besides where no v2 hierarchy, which can do both, is mounted beside v1. Every hierarchy costs each start a
+/// grace period of the kernel (its `cgroup.procs` is written).
+const WITHOUT_V2: [&str; 2] = ["cpuacct", "freezer"];
 const WANTED_V2: [&str; 5] = ["cpu", "memory", "pids", "io", "cpuset"];
 
 /// Below which directories servants' cgroups are made; found once per engine and handed to each shim.
@@ -92,8 +95,10 @@ impl Parent {
     }
 
     fn v1(mounted: &[Mounted], choice: &CgroupParent) -> Result<Self, Error> {
+        let lacks_v2 = !has_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
         let wanted = |hierarchy: &&Mounted| {
-            hierarchy.unified || WANTED_V1.iter().any(|name| hierarchy.has(name))
+            let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has(name));
+            hierarchy.unified || has_any(&WANTED_V1) || lacks_v2 && has_any(&WITHOUT_V2)
         };
         let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
             controllers: hierarchy.controllers.clone(),
@@ -227,6 +232,15 @@ fn enable(place: &Path, ours: bool) -> io::Result<()> {
         Some(error) if ours => Err(error),
         _ => Ok(()),
     }
+}
+
+/// Whether this kernel has `cgroup.kill`, which came with 5.14 and which no root directory shows.
+fn has_kill() -> bool {
+    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let mut numbers = release
+        .split(['.', '-'])
+        .map_while(|part| part.trim().parse::<u32>().ok());
+    (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0)) >= (5, 14)
 }
 
 /// Removes the directory above a servant's when it is one that we chose and no servant is left in it.

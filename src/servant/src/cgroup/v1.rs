@@ -3,7 +3,7 @@
 use std::fs;
 
 use super::Cgroup;
-use super::files::read_number;
+use super::files::{read_field, read_number};
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
@@ -60,8 +60,13 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
 /// Microseconds of CPU and bytes of memory.
 pub(super) fn usage(cgroup: &Cgroup) -> (u64, u64) {
     let number = |controller, name| read_number(&cgroup.file(controller, name)?);
-    let cpu = number("cpuacct", "cpuacct.usage").unwrap_or(0) / 1000;
-    (cpu, number("memory", "memory.usage_in_bytes").unwrap_or(0))
+    let beside = || {
+        let unified = cgroup.leaves.iter().find(|leaf| leaf.unified)?;
+        read_field(&unified.directory.join("cpu.stat"), "usage_usec")
+    };
+    let cpu = number("cpuacct", "cpuacct.usage").map(|nanoseconds| nanoseconds / 1000);
+    let memory = number("memory", "memory.usage_in_bytes");
+    (cpu.or_else(beside).unwrap_or(0), memory.unwrap_or(0))
 }
 
 /// A v2 weight (1..10000, 100 by default) as v1 shares (1024 by default).

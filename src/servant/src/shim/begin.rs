@@ -60,20 +60,14 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
         uid_range: launch.uid_range,
     };
     launch::write(&directory.join(launch::RUNTIME), &runtime)?;
-    let begun = prepare(&launch, &cgroup, &network).and_then(|enforced| {
-        let (ours, theirs) = socketpair(
-            AddressFamily::Unix,
-            SockType::SeqPacket,
-            None,
-            SockFlag::SOCK_CLOEXEC,
-        )
-        .map_err(Error::nix("socketpair for init"))?;
-        let listener = listen(directory)?;
-        let creator = create::fork(directory, &launch, &cgroup, theirs)?;
-        Ok((enforced, ours, listener, creator))
-    });
+    let begun = prepare(directory, &launch, &cgroup, &network);
     match begun {
-        Ok((enforced, init, listener, creator)) => Ok(Begun {
+        Ok(Prepared {
+            enforced,
+            init,
+            listener,
+            creator,
+        }) => Ok(Begun {
             directory: directory.into(),
             launch,
             identity,
@@ -130,8 +124,31 @@ fn receive_descriptors(control: &UnixStream) -> Result<(NetNs, OwnedFd), Error> 
     Ok((NetNs::from_fd(network)?, lock))
 }
 
-/// Cgroup, limits, network namespace.
-fn prepare(launch: &Launch, cgroup: &Cgroup, network: &NetNs) -> Result<Enforced, Error> {
+struct Prepared {
+    enforced: Enforced,
+    init: OwnedFd,
+    listener: UnixListener,
+    creator: Creator,
+}
+
+/// Network namespace, creator, and, while that works, the cgroup with its limits. Processes are moved between cgroups only
+/// after a grace period of the kernel, for each hierarchy: that is what a start waits for longest.
+fn prepare(
+    directory: &Path,
+    launch: &Launch,
+    cgroup: &Cgroup,
+    network: &NetNs,
+) -> Result<Prepared, Error> {
+    network.enter()?;
+    let (ours, theirs) = socketpair(
+        AddressFamily::Unix,
+        SockType::SeqPacket,
+        None,
+        SockFlag::SOCK_CLOEXEC,
+    )
+    .map_err(Error::nix("socketpair for init"))?;
+    let listener = listen(directory)?;
+    let creator = create::fork(directory, launch, theirs)?;
     if let Some(shims) = launch.parent.shims() {
         std::fs::create_dir_all(&shims).map_err(Error::file("make the cgroup", &shims))?;
         let file = shims.join("cgroup.procs");
@@ -151,8 +168,15 @@ fn prepare(launch: &Launch, cgroup: &Cgroup, network: &NetNs) -> Result<Enforced
             reason,
         });
     }
-    network.enter()?;
-    Ok(enforced)
+    // The container stays where it was made.
+    cgroup.enter(creator.pid)?;
+    let creator = creator.go_on()?;
+    Ok(Prepared {
+        enforced,
+        init: ours,
+        listener,
+        creator,
+    })
 }
 
 /// Binds `shim.sock` through a descriptor of its directory: the path itself may be longer than an address can be.

@@ -4,6 +4,14 @@
 //! uses memory that would otherwise stay for the servant's whole life. So the shim forks, the child creates the container as
 //! its own *sibling* (init's parent is the shim), and ends. The mount namespace in which the layers were put together ends
 //! with it too; the container has its own copy.
+//!
+//! Moving a process into a cgroup can take the kernel as long as all the rest of ours (it waits for an RCU grace period
+//! before the first move in a while), so the shim moves the creator while that puts the layers together:
+//!
+//! ```text
+//!   shim      fork ── move the creator ──▶ gate ── event loop
+//!   creator     └──── layers, config ───▶ gate ── libcontainer, in the cgroup ── end
+//! ```
 
 use std::collections::HashMap;
 use std::ffi::CString;
@@ -23,7 +31,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::bundle;
-use crate::cgroup::Cgroup;
 use crate::launch::Launch;
 use crate::rootfs::{Rootfs, make_skeleton};
 
@@ -47,24 +54,44 @@ pub(super) struct Creator {
     pub(super) report: OwnedFd,
 }
 
+/// The creating process, before it has made any process: that waits until it is in its cgroup.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    pub(super) pid: u32,
+    report: OwnedFd,
+    /// Closed without a word it ends.
+    go: OwnedFd,
+}
+
+impl Waiting {
+    /// Lets it go on.
+    pub(super) fn go_on(self) -> Result<Creator, Error> {
+        nix::unistd::write(&self.go, b".").map_err(Error::nix("writing to the creator"))?;
+        Ok(Creator {
+            report: self.report,
+        })
+    }
+}
+
 /// Forks it. The calling process must have one thread.
-pub(super) fn fork(
-    directory: &Path,
-    launch: &Launch,
-    cgroup: &Cgroup,
-    socket: OwnedFd,
-) -> Result<Creator, Error> {
-    let (report, write) =
-        nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
+pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result<Waiting, Error> {
+    let pipe = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
+    let ((report, write), (wait, go)) = (pipe()?, pipe()?);
     // SAFETY: one thread, so that the child may do whatever its parent might.
     match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork of the creator"))? {
-        ForkResult::Parent { .. } => Ok(Creator { report }),
+        ForkResult::Parent { child } => Ok(Waiting {
+            pid: child.as_raw() as u32,
+            report,
+            go,
+        }),
         ForkResult::Child => {
-            drop(report);
+            drop((report, go));
             let write = Arc::new(File::from(write));
             // Errors that libcontainer meets in its own children are only logged.
             let _ = tracing::subscriber::set_global_default(Complaints(write.clone()));
-            let outcome = match create(directory, launch, cgroup, socket) {
+            let outcome = match stage(directory, launch)
+                .and_then(|init| create(directory, launch, init, socket, wait))
+            {
                 Ok(init) => Report::Created { init },
                 Err(reason) => Report::Failed(reason),
             };
@@ -75,20 +102,12 @@ pub(super) fn fork(
     }
 }
 
-fn create(
-    directory: &Path,
-    launch: &Launch,
-    cgroup: &Cgroup,
-    socket: OwnedFd,
-) -> Result<i32, String> {
+/// Everything that libcontainer is to find: root, volumes, configuration. Gives the open init.
+fn stage(directory: &Path, launch: &Launch) -> Result<File, String> {
     let text = |error: &dyn std::error::Error| chain(error);
     // Opened before anything of the servant is mounted.
     let init = File::open(&launch.init)
         .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
-    // The container stays where it was made, and everything that it is made by is counted already.
-    cgroup
-        .enter(std::process::id())
-        .map_err(|error| text(&error))?;
     let skeleton = directory.join("skeleton");
     make_skeleton(
         &skeleton,
@@ -115,6 +134,21 @@ fn create(
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
     std::fs::write(&file, json)
         .map_err(|error| format!("could not write {}: {error}", file.display()))?;
+    Ok(init)
+}
+
+/// Creates and starts the container; init's pid on the host.
+fn create(
+    directory: &Path,
+    launch: &Launch,
+    init: File,
+    socket: OwnedFd,
+    wait: OwnedFd,
+) -> Result<i32, String> {
+    let text = |error: &dyn std::error::Error| chain(error);
+    if nix::unistd::read(&wait, &mut [0]) != Ok(1) {
+        return Err("the shim did not move its creator into the cgroup".into());
+    }
     let null = || {
         File::options()
             .read(true)
@@ -237,6 +271,14 @@ impl tracing::Subscriber for Complaints {
 }
 
 impl Creator {
+    /// Whether the report, as far as it was read, says that init runs.
+    pub(super) fn has_succeeded(text: &[u8]) -> bool {
+        let last = text
+            .strip_suffix(b"\n")
+            .and_then(|whole| whole.rsplit(|byte| *byte == b'\n').next());
+        last.is_some_and(|line| matches!(serde_json::from_slice(line), Ok(Report::Created { .. })))
+    }
+
     /// Reads what is left of the report and tells the outcome. `text` is the whole report.
     pub(super) fn outcome(text: &str) -> Result<i32, String> {
         let mut complaints: Vec<String> = Vec::new();

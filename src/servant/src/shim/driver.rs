@@ -218,16 +218,22 @@ impl Driver {
         let mut report =
             pipe::Receiver::from_owned_fd(report).map_err(|error| error.to_string())?;
         let mut text = Vec::new();
-        // To its end: that comes when the creator has exited and init has executed.
-        let read = tokio::time::timeout(CREATION, report.read_to_end(&mut text)).await;
-        let outcome = Creator::outcome(&String::from_utf8_lossy(&text));
-        match (read, outcome) {
-            (Ok(_), outcome) => outcome,
-            (Err(_), Err(reason)) => Err(reason),
-            (Err(_), Ok(_)) => Err(format!(
-                "init was not executed within {} s",
+        let read = async {
+            // A complaint may be followed by others, up to its end; success is said once.
+            while !Creator::has_succeeded(&text)
+                && report
+                    .read_buf(&mut text)
+                    .await
+                    .is_ok_and(|length| length > 0)
+            {}
+        };
+        let in_time = tokio::time::timeout(CREATION, read).await.is_ok();
+        match Creator::outcome(&String::from_utf8_lossy(&text)) {
+            Err(_) if !in_time && text.is_empty() => Err(format!(
+                "it was not created within {} s",
                 CREATION.as_secs()
             )),
+            outcome => outcome,
         }
     }
 

@@ -161,7 +161,9 @@ async fn a_pid_that_now_belongs_to_another_is_left_alone() {
     let servant = world.start(spec).await;
     let mut runtime = world.runtime(&id);
     world.stop(servant).await;
-    runtime.shim.pid = bystander.id() as i32;
+    runtime.shim = servant::process::Identity::of(bystander.id() as i32).unwrap();
+    // The same number, given to a process that started at another moment.
+    runtime.shim.start -= 1;
     std::fs::create_dir(world.servant_directory(&id)).unwrap();
     servant::launch::write(
         &world.servant_directory(&id).join(servant::launch::RUNTIME),
