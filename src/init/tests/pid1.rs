@@ -19,10 +19,8 @@ impl Init {
         let mut pair = [-1; 2];
         let kind = libc::SOCK_SEQPACKET | libc::SOCK_CLOEXEC;
         // SAFETY: two places for two descriptors.
-        assert_eq!(
-            unsafe { libc::socketpair(libc::AF_UNIX, kind, 0, pair.as_mut_ptr()) },
-            0
-        );
+        let made = unsafe { libc::socketpair(libc::AF_UNIX, kind, 0, pair.as_mut_ptr()) };
+        assert_eq!(made, 0);
         // SAFETY: made just now, owned by nobody else.
         let [ours, theirs] = pair.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
         // What never comes must fail, not hang.
@@ -85,10 +83,8 @@ impl Init {
         };
         let mut pipe = [-1; 2];
         // SAFETY: two places for two descriptors.
-        assert_eq!(
-            unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) },
-            0
-        );
+        let made = unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) };
+        assert_eq!(made, 0);
         // SAFETY: made just now, owned by nobody else.
         let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
         socket::send(
