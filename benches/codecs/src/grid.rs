@@ -12,29 +12,57 @@ const SIZE: usize = 4000;
 pub fn grids(report: &mut Report) -> Result<()> {
     let office = samples::office()?;
     let small = [messages::grid(office.width, office.height, &office.data)];
-    let outcomes =
-        Contest { schema: Schema::OccupancyGrid, messages: &small, rounds: 15 }.run(&[Codec::Grid], &[1, 3, 19])?;
+    let outcomes = Contest {
+        schema: Schema::OccupancyGrid,
+        messages: &small,
+        rounds: 15,
+    }
+    .run(&[Codec::Grid], &[1, 3, 19])?;
     print("grid, 566×608", &outcomes);
     let (ours, zstd) = (find(&outcomes, "grid")?, find(&outcomes, "zstd 19")?);
-    report.figure("grid 566×608: saved", "%", ours.saved).beside("zstd 19", zstd.saved).reach(Target::AboveFloor);
+    report
+        .figure("grid 566×608: saved", "%", ours.saved)
+        .beside("zstd 19", zstd.saved)
+        .reach(Target::AboveFloor);
 
-    let large = [messages::grid(SIZE, SIZE, &samples::in_the_middle(&office, SIZE))];
-    let outcomes =
-        Contest { schema: Schema::OccupancyGrid, messages: &large, rounds: 15 }.run(&[Codec::Grid], &[1, 3])?;
+    let large = [messages::grid(
+        SIZE,
+        SIZE,
+        &samples::in_the_middle(&office, SIZE),
+    )];
+    let outcomes = Contest {
+        schema: Schema::OccupancyGrid,
+        messages: &large,
+        rounds: 15,
+    }
+    .run(&[Codec::Grid], &[1, 3])?;
     print("grid, 4000×4000", &outcomes);
-    let (ours, zstd, copy) = (find(&outcomes, "grid")?, find(&outcomes, "zstd 1")?, find(&outcomes, "memcpy")?);
-    let figure = report.figure("grid 4000×4000: saved", "%", ours.saved).beside("zstd 1", zstd.saved);
+    let (ours, zstd, copy) = (
+        find(&outcomes, "grid")?,
+        find(&outcomes, "zstd 1")?,
+        find(&outcomes, "memcpy")?,
+    );
+    let figure = report
+        .figure("grid 4000×4000: saved", "%", ours.saved)
+        .beside("zstd 1", zstd.saved);
     figure.reach(Target::AtLeast(99.9));
-    let figure = report.figure("grid 4000×4000: encoding", "MB/s", ours.encode).beside("memcpy", copy.encode);
+    let figure = report
+        .figure("grid 4000×4000: encoding", "MB/s", ours.encode)
+        .beside("memcpy", copy.encode);
     figure.reach(Target::RatioAtLeast(0.3));
-    report.figure("grid 4000×4000: decoding", "MB/s", ours.decode).beside("memcpy", copy.decode);
+    report
+        .figure("grid 4000×4000: decoding", "MB/s", ours.decode)
+        .beside("memcpy", copy.decode);
     successors(report, &office)
 }
 
 /// A map being made, every grid acknowledged before the next.
 fn successors(report: &mut Report, office: &samples::Picture) -> Result<()> {
     let grids = world::mapping(office, SIZE, 24);
-    let messages: Vec<_> = grids.iter().map(|cells| messages::grid(SIZE, SIZE, cells)).collect();
+    let messages: Vec<_> = grids
+        .iter()
+        .map(|cells| messages::grid(SIZE, SIZE, cells))
+        .collect();
     let head = messages[0].len() - SIZE * SIZE;
     let mut encoder = Encoder::new(Schema::OccupancyGrid);
     let mut decoder = Decoder::new(messages[0].len());
@@ -48,8 +76,9 @@ fn successors(report: &mut Report, office: &samples::Picture) -> Result<()> {
         ensure!(back == *message, "a successor changed");
         encoder.acknowledge(encoded.sequence);
         if index > 0 {
-            let changed: Vec<usize> =
-                (0..SIZE * SIZE).filter(|&at| grids[index][at] != grids[index - 1][at]).collect();
+            let changed: Vec<usize> = (0..SIZE * SIZE)
+                .filter(|&at| grids[index][at] != grids[index - 1][at])
+                .collect();
             let values: Vec<u8> = changed.iter().map(|&at| grids[index][at]).collect();
             // Where they are, as distances from one to the next.
             let mut places = Vec::new();
@@ -78,9 +107,17 @@ fn successors(report: &mut Report, office: &samples::Picture) -> Result<()> {
         placed as f64 / count
     );
     let figure = report.figure("grid successor: size", "B", ours as f64 / count);
-    figure.beside("zstd 3 of the changed cells' values", values_only as f64 / count).reach(Target::RatioAtMost(1.2));
+    figure
+        .beside(
+            "zstd 3 of the changed cells' values",
+            values_only as f64 / count,
+        )
+        .reach(Target::RatioAtMost(1.2));
     let figure = report.figure("grid successor: size", "B", ours as f64 / count);
-    figure.beside("zstd 3 of the changed cells, values and places", placed as f64 / count);
+    figure.beside(
+        "zstd 3 of the changed cells, values and places",
+        placed as f64 / count,
+    );
     figure.reach(Target::RatioAtMost(1.2));
 
     let (first, second) = (&messages[10], &messages[11]);
@@ -90,14 +127,22 @@ fn successors(report: &mut Report, office: &samples::Picture) -> Result<()> {
     let encoded = encoder.encode(Codec::Grid, first, &mut frame);
     encoder.acknowledge(encoded.sequence);
     let mut race = Race::new(15);
-    race.add("memcpy", || black_box(&mut buffer[..]).copy_from_slice(second));
+    race.add("memcpy", || {
+        black_box(&mut buffer[..]).copy_from_slice(second)
+    });
     race.add("grid", || {
         frame.clear();
         encoder.encode(Codec::Grid, second, &mut frame);
         black_box(&frame);
     });
     let times = race.run();
-    let figure = report.figure("grid successor: encoding", "MB/s", times[1].megabytes_per_second(second.len()));
-    figure.beside("memcpy", times[0].megabytes_per_second(second.len())).reach(Target::RatioAtLeast(0.3));
+    let figure = report.figure(
+        "grid successor: encoding",
+        "MB/s",
+        times[1].megabytes_per_second(second.len()),
+    );
+    figure
+        .beside("memcpy", times[0].megabytes_per_second(second.len()))
+        .reach(Target::RatioAtLeast(0.3));
     Ok(())
 }

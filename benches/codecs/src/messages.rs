@@ -7,7 +7,11 @@ pub struct Message(Vec<u8>);
 impl Message {
     /// Begins with `std_msgs/Header`.
     fn stamped(sequence: u32, frame: &str) -> Self {
-        Self::default().u32(sequence).u32(1_700_000_000).u32(123_456_789).text(frame)
+        Self::default()
+            .u32(sequence)
+            .u32(1_700_000_000)
+            .u32(123_456_789)
+            .text(frame)
     }
 
     fn u8(mut self, value: u8) -> Self {
@@ -40,20 +44,29 @@ impl Message {
     }
 
     fn floats(self, values: &[f32]) -> Self {
-        values.iter().fold(self.u32(values.len() as u32), |message, &value| message.f32(value))
+        values
+            .iter()
+            .fold(self.u32(values.len() as u32), |message, &value| {
+                message.f32(value)
+            })
     }
 }
 
 /// `sensor_msgs/Image`; `step` is the data's length per row.
 pub fn image(encoding: &str, width: usize, height: usize, data: &[u8]) -> Vec<u8> {
     let step = (data.len() / height) as u32;
-    let message = Message::stamped(7, "camera_rgb_optical_frame").u32(height as u32).u32(width as u32);
+    let message = Message::stamped(7, "camera_rgb_optical_frame")
+        .u32(height as u32)
+        .u32(width as u32);
     message.text(encoding).u8(0).u32(step).bytes(data).0
 }
 
 /// `nav_msgs/OccupancyGrid` of 0.05 m cells around the origin.
 pub fn grid(width: usize, height: usize, cells: &[u8]) -> Vec<u8> {
-    let message = Message::stamped(1, "map").u32(1_700_000_000).u32(0).f32(0.05);
+    let message = Message::stamped(1, "map")
+        .u32(1_700_000_000)
+        .u32(0)
+        .f32(0.05);
     let message = message.u32(width as u32).u32(height as u32);
     let pose = [-100.0, -100.0, 0.0, 0.0, 0.0, 0.0, 1.0];
     pose.into_iter().fold(message, Message::f64).bytes(cells).0
@@ -62,8 +75,18 @@ pub fn grid(width: usize, height: usize, cells: &[u8]) -> Vec<u8> {
 /// `sensor_msgs/LaserScan` over 270 degrees.
 pub fn scan(ranges: &[f32], intensities: &[f32]) -> Vec<u8> {
     let increment = 1.5 * std::f32::consts::PI / ranges.len() as f32;
-    let limits = [-0.75 * std::f32::consts::PI, 0.75 * std::f32::consts::PI, increment, 0.0, 0.025, 0.05, 30.0];
-    let message = limits.into_iter().fold(Message::stamped(3, "laser"), Message::f32);
+    let limits = [
+        -0.75 * std::f32::consts::PI,
+        0.75 * std::f32::consts::PI,
+        increment,
+        0.0,
+        0.025,
+        0.05,
+        30.0,
+    ];
+    let message = limits
+        .into_iter()
+        .fold(Message::stamped(3, "laser"), Message::f32);
     message.floats(ranges).floats(intensities).0
 }
 
@@ -77,11 +100,29 @@ pub enum Number {
 }
 
 /// `sensor_msgs/PointCloud2` without row padding.
-pub fn cloud(width: usize, height: usize, step: usize, fields: &[(&str, usize, Number)], data: &[u8]) -> Vec<u8> {
-    let mut message = Message::stamped(9, "camera_depth_optical_frame").u32(height as u32).u32(width as u32);
+pub fn cloud(
+    width: usize,
+    height: usize,
+    step: usize,
+    fields: &[(&str, usize, Number)],
+    data: &[u8],
+) -> Vec<u8> {
+    let mut message = Message::stamped(9, "camera_depth_optical_frame")
+        .u32(height as u32)
+        .u32(width as u32);
     message = message.u32(fields.len() as u32);
     for &(name, offset, number) in fields {
-        message = message.text(name).u32(offset as u32).u8(number as u8).u32(1);
+        message = message
+            .text(name)
+            .u32(offset as u32)
+            .u8(number as u8)
+            .u32(1);
     }
-    message.u8(0).u32(step as u32).u32((step * width) as u32).bytes(data).u8(0).0
+    message
+        .u8(0)
+        .u32(step as u32)
+        .u32((step * width) as u32)
+        .bytes(data)
+        .u8(0)
+        .0
 }

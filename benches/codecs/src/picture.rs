@@ -11,21 +11,40 @@ use std::hint::black_box;
 const ROUNDS: usize = 15;
 
 fn contest(messages: &[Vec<u8>]) -> Contest<'_> {
-    Contest { schema: Schema::Image, messages, rounds: ROUNDS }
+    Contest {
+        schema: Schema::Image,
+        messages,
+        rounds: ROUNDS,
+    }
 }
 
 /// The four figures of a lossless picture codec.
-fn figures(report: &mut Report, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<f64> {
+fn figures(
+    report: &mut Report,
+    title: &str,
+    messages: &[Vec<u8>],
+    saved: Option<f64>,
+) -> Result<f64> {
     let outcomes = contest(messages).run(&[Codec::Image], &[1, 3, 19])?;
     print(title, &outcomes);
-    let (ours, zstd, best) = (find(&outcomes, "image")?, find(&outcomes, "zstd 1")?, find(&outcomes, "zstd 19")?);
+    let (ours, zstd, best) = (
+        find(&outcomes, "image")?,
+        find(&outcomes, "zstd 1")?,
+        find(&outcomes, "zstd 19")?,
+    );
     let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
-    figure.beside("zstd 19", best.saved).reach(saved.map_or(Target::AboveFloor, Target::AtLeast));
-    let figure = report.figure(format!("{title}: encoding"), "MB/s", ours.encode).beside("zstd 1", zstd.encode);
+    figure
+        .beside("zstd 19", best.saved)
+        .reach(saved.map_or(Target::AboveFloor, Target::AtLeast));
+    let figure = report
+        .figure(format!("{title}: encoding"), "MB/s", ours.encode)
+        .beside("zstd 1", zstd.encode);
     if saved.is_some() {
         figure.reach(Target::RatioAtLeast(0.4));
     }
-    report.figure(format!("{title}: decoding"), "MB/s", ours.decode).beside("zstd 1", zstd.decode);
+    report
+        .figure(format!("{title}: decoding"), "MB/s", ours.decode)
+        .beside("zstd 1", zstd.decode);
     Ok(ours.encode)
 }
 
@@ -33,8 +52,16 @@ fn figures(report: &mut Report, title: &str, messages: &[Vec<u8>], saved: Option
 fn png(picture: &Picture) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = png::Encoder::new(&mut out, picture.width as u32, picture.height as u32);
-    encoder.set_color(if picture.depth == 3 { png::ColorType::Rgb } else { png::ColorType::Grayscale });
-    encoder.set_depth(if picture.depth == 2 { png::BitDepth::Sixteen } else { png::BitDepth::Eight });
+    encoder.set_color(if picture.depth == 3 {
+        png::ColorType::Rgb
+    } else {
+        png::ColorType::Grayscale
+    });
+    encoder.set_depth(if picture.depth == 2 {
+        png::BitDepth::Sixteen
+    } else {
+        png::BitDepth::Eight
+    });
     encoder.set_compression(png::Compression::Balanced);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(&picture.data)?;
@@ -44,24 +71,43 @@ fn png(picture: &Picture) -> Result<Vec<u8>> {
 
 fn jpeg(picture: &Picture) -> Result<Vec<u8>> {
     let mut out = Vec::new();
-    let (width, height) = (u16::try_from(picture.width)?, u16::try_from(picture.height)?);
-    jpeg_encoder::Encoder::new(&mut out, 95).encode(&picture.data, width, height, jpeg_encoder::ColorType::Rgb)?;
+    let (width, height) = (
+        u16::try_from(picture.width)?,
+        u16::try_from(picture.height)?,
+    );
+    jpeg_encoder::Encoder::new(&mut out, 95).encode(
+        &picture.data,
+        width,
+        height,
+        jpeg_encoder::ColorType::Rgb,
+    )?;
     Ok(out)
 }
 
 pub fn colours(report: &mut Report) -> Result<()> {
     let pictures = samples::colours()?;
-    let messages: Vec<_> = pictures.iter().map(|p| image("rgb8", p.width, p.height, &p.data)).collect();
+    let messages: Vec<_> = pictures
+        .iter()
+        .map(|p| image("rgb8", p.width, p.height, &p.data))
+        .collect();
     figures(report, "colour", &messages, Some(63.0))?;
     peers(report, &pictures, &messages)?;
 
-    let packaged: Vec<_> =
-        samples::packaged_colours()?.iter().map(|p| image("bgr8", p.width, p.height, &p.data)).collect();
+    let packaged: Vec<_> = samples::packaged_colours()?
+        .iter()
+        .map(|p| image("bgr8", p.width, p.height, &p.data))
+        .collect();
     figures(report, "colour, packaged photographs", &packaged, None)?;
     let grey = |p: &Picture| -> Vec<u8> { p.data.chunks_exact(3).map(|pixel| pixel[1]).collect() };
-    let messages: Vec<_> = pictures.iter().map(|p| image("mono8", p.width, p.height, &grey(p))).collect();
+    let messages: Vec<_> = pictures
+        .iter()
+        .map(|p| image("mono8", p.width, p.height, &grey(p)))
+        .collect();
     figures(report, "grey", &messages, None)?;
-    let messages: Vec<_> = pictures.iter().map(|p| image("bayer_rggb8", p.width, p.height, &bayer(p))).collect();
+    let messages: Vec<_> = pictures
+        .iter()
+        .map(|p| image("bayer_rggb8", p.width, p.height, &bayer(p)))
+        .collect();
     figures(report, "Bayer", &messages, None)?;
     Ok(())
 }
@@ -78,11 +124,17 @@ fn bayer(picture: &Picture) -> Vec<u8> {
 fn peers(report: &mut Report, pictures: &[Picture], messages: &[Vec<u8>]) -> Result<()> {
     let bytes: usize = messages.iter().map(Vec::len).sum();
     let saved = |sizes: Vec<usize>| {
-        let saved = sizes.iter().zip(pictures).map(|(&size, p)| 1.0 - size as f64 / p.data.len() as f64);
+        let saved = sizes
+            .iter()
+            .zip(pictures)
+            .map(|(&size, p)| 1.0 - size as f64 / p.data.len() as f64);
         100.0 * saved.sum::<f64>() / pictures.len() as f64
     };
     let sizes = |encode: fn(&Picture) -> Result<Vec<u8>>| -> Result<Vec<usize>> {
-        pictures.iter().map(|picture| Ok(encode(picture)?.len())).collect()
+        pictures
+            .iter()
+            .map(|picture| Ok(encode(picture)?.len()))
+            .collect()
     };
     let (png_saved, jpeg_saved) = (saved(sizes(png)?), saved(sizes(jpeg)?));
     let mut race = Race::new(5);
@@ -95,30 +147,69 @@ fn peers(report: &mut Report, pictures: &[Picture], messages: &[Vec<u8>]) -> Res
             black_box(&out);
         }
     });
-    race.add("PNG", || pictures.iter().for_each(|picture| drop(black_box(png(picture)))));
-    race.add("JPEG 95", || pictures.iter().for_each(|picture| drop(black_box(jpeg(picture)))));
+    race.add("PNG", || {
+        pictures
+            .iter()
+            .for_each(|picture| drop(black_box(png(picture))))
+    });
+    race.add("JPEG 95", || {
+        pictures
+            .iter()
+            .for_each(|picture| drop(black_box(jpeg(picture))))
+    });
     let times = race.run();
-    let speed: Vec<f64> = times.iter().map(|times| times.megabytes_per_second(bytes)).collect();
-    println!("    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s", speed[1]);
-    println!("    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy", speed[2]);
-    let figure = report.figure("colour: encoding", "MB/s", speed[0]).beside("PNG", speed[1]);
-    figure.reach(Target::RatioAtLeast(5.0)).note(format!("PNG saves {png_saved:.1}%"));
-    let figure = report.figure("colour: encoding", "MB/s", speed[0]).beside("JPEG 95", speed[2]);
+    let speed: Vec<f64> = times
+        .iter()
+        .map(|times| times.megabytes_per_second(bytes))
+        .collect();
+    println!(
+        "    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s",
+        speed[1]
+    );
+    println!(
+        "    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy",
+        speed[2]
+    );
+    let figure = report
+        .figure("colour: encoding", "MB/s", speed[0])
+        .beside("PNG", speed[1]);
+    figure
+        .reach(Target::RatioAtLeast(5.0))
+        .note(format!("PNG saves {png_saved:.1}%"));
+    let figure = report
+        .figure("colour: encoding", "MB/s", speed[0])
+        .beside("JPEG 95", speed[2]);
     figure.note(format!("JPEG saves {jpeg_saved:.1}%, lossy"));
     Ok(())
 }
 
 pub fn depths(report: &mut Report) -> Result<()> {
     let pictures = samples::depths()?;
-    ensure!(!pictures.is_empty(), "no depth image at hand: neither recordings nor scikit-image's samples");
-    let messages: Vec<_> = pictures.iter().map(|p| image("16UC1", p.width, p.height, &p.data)).collect();
+    ensure!(
+        !pictures.is_empty(),
+        "no depth image at hand: neither recordings nor scikit-image's samples"
+    );
+    let messages: Vec<_> = pictures
+        .iter()
+        .map(|p| image("16UC1", p.width, p.height, &p.data))
+        .collect();
     figures(report, "depth", &messages, Some(83.0))?;
-    let holes: Vec<_> = pictures.iter().map(|p| image("16UC1", p.width, p.height, &with_holes(p))).collect();
+    let holes: Vec<_> = pictures
+        .iter()
+        .map(|p| image("16UC1", p.width, p.height, &with_holes(p)))
+        .collect();
     figures(report, "depth with holes", &holes, None)?;
-    let metres: Vec<_> = pictures.iter().map(|p| image("32FC1", p.width, p.height, &in_metres(p))).collect();
+    let metres: Vec<_> = pictures
+        .iter()
+        .map(|p| image("32FC1", p.width, p.height, &in_metres(p)))
+        .collect();
     figures(report, "float depth", &metres, None)?;
     if let Some(disparity) = samples::motorcycle() {
-        let data: Vec<u8> = disparity.values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let data: Vec<u8> = disparity
+            .values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect();
         let message = image("32FC1", disparity.width, disparity.height, &data);
         figures(report, "float disparity", &[message], None)?;
     }
@@ -145,7 +236,11 @@ fn in_metres(picture: &Picture) -> Vec<u8> {
         0 => f32::NAN,
         depth => f32::from(depth) * 0.001,
     };
-    with_holes(picture).chunks_exact(2).map(metres).flat_map(f32::to_le_bytes).collect()
+    with_holes(picture)
+        .chunks_exact(2)
+        .map(metres)
+        .flat_map(f32::to_le_bytes)
+        .collect()
 }
 
 /// Synthetic corner cases: all come back, none grows.
@@ -154,15 +249,30 @@ pub fn corners(report: &mut Report) -> Result<()> {
     let mut random = |count: usize| -> Vec<u8> { (0..count).map(|_| noise.next() as u8).collect() };
     let cases = [
         ("flat rgb8", image("rgb8", 640, 480, &[90; 640 * 480 * 3])),
-        ("noise rgb8", image("rgb8", 640, 480, &random(640 * 480 * 3))),
-        ("noise 16UC1", image("16UC1", 640, 480, &random(640 * 480 * 2))),
-        ("noise 32FC1", image("32FC1", 640, 480, &random(640 * 480 * 4))),
+        (
+            "noise rgb8",
+            image("rgb8", 640, 480, &random(640 * 480 * 3)),
+        ),
+        (
+            "noise 16UC1",
+            image("16UC1", 640, 480, &random(640 * 480 * 2)),
+        ),
+        (
+            "noise 32FC1",
+            image("32FC1", 640, 480, &random(640 * 480 * 4)),
+        ),
         ("one pixel", image("rgb8", 1, 1, &[1, 2, 3])),
         ("one row", image("mono8", 5000, 1, &random(5000))),
         ("one column", image("bgra8", 1, 5000, &random(20_000))),
-        ("odd Bayer", image("bayer_grbg8", 641, 479, &random(641 * 479))),
+        (
+            "odd Bayer",
+            image("bayer_grbg8", 641, 479, &random(641 * 479)),
+        ),
         ("padded rows", image("mono8", 639, 480, &random(641 * 480))),
-        ("unknown encoding", image("yuv422", 640, 480, &random(640 * 480 * 2))),
+        (
+            "unknown encoding",
+            image("yuv422", 640, 480, &random(640 * 480 * 2)),
+        ),
     ];
     let mut worst = f64::MIN;
     for (name, message) in &cases {
@@ -173,8 +283,15 @@ pub fn corners(report: &mut Report) -> Result<()> {
         ensure!(back == *message, "{name} changed");
         let growth = frame.len() as f64 - message.len() as f64;
         worst = worst.max(growth);
-        println!("    {name:<18} {:>8} → {:>8} bytes by {}", message.len(), frame.len(), encoded.codec);
+        println!(
+            "    {name:<18} {:>8} → {:>8} bytes by {}",
+            message.len(),
+            frame.len(),
+            encoded.codec
+        );
     }
-    report.figure("corner cases: growth at worst", "B", worst).reach(Target::AtMost(16.0));
+    report
+        .figure("corner cases: growth at worst", "B", worst)
+        .reach(Target::AtMost(16.0));
     Ok(())
 }

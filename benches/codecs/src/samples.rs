@@ -29,10 +29,21 @@ pub fn packaged() -> PathBuf {
 }
 
 fn picture(path: &Path) -> Result<Picture> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let decoder = png::Decoder::new(BufReader::new(File::open(path).with_context(|| path.display().to_string())?));
+    let name = path
+        .file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
+    let decoder = png::Decoder::new(BufReader::new(
+        File::open(path).with_context(|| path.display().to_string())?,
+    ));
     let mut reader = decoder.read_info()?;
-    let mut data = vec![0; reader.output_buffer_size().context("picture is too large")?];
+    let mut data = vec![
+        0;
+        reader
+            .output_buffer_size()
+            .context("picture is too large")?
+    ];
     let info = reader.next_frame(&mut data)?;
     data.truncate(info.buffer_size());
     let depth = match (info.color_type, info.bit_depth) {
@@ -44,16 +55,29 @@ fn picture(path: &Path) -> Result<Picture> {
         }
         (png::ColorType::Rgb, png::BitDepth::Eight) => 3,
         (png::ColorType::Rgba, png::BitDepth::Eight) => {
-            data = data.chunks_exact(4).flat_map(|pixel| &pixel[..3]).copied().collect();
+            data = data
+                .chunks_exact(4)
+                .flat_map(|pixel| &pixel[..3])
+                .copied()
+                .collect();
             3
         }
         other => bail!("{name} holds {other:?}, which is not measured"),
     };
-    Ok(Picture { name, width: info.width as usize, height: info.height as usize, depth, data })
+    Ok(Picture {
+        name,
+        width: info.width as usize,
+        height: info.height as usize,
+        depth,
+        data,
+    })
 }
 
 fn pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
-    names.iter().map(|name| picture(&directory.join(name))).collect()
+    names
+        .iter()
+        .map(|name| picture(&directory.join(name)))
+        .collect()
 }
 
 /// Colour frames of a camera.
@@ -68,7 +92,12 @@ pub fn colours() -> Result<Vec<Picture>> {
 pub fn packaged_colours() -> Result<Vec<Picture>> {
     let mut pictures = pictures(&packaged(), &["graf1.png", "graf3.png"])?;
     if let Some(directory) = fetched() {
-        let names = ["astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png"];
+        let names = [
+            "astronaut.png",
+            "chelsea.png",
+            "coffee.png",
+            "motorcycle_left.png",
+        ];
         pictures.extend(self::pictures(&directory, &names)?);
     }
     pictures.retain(|picture| picture.depth == 3);
@@ -109,10 +138,25 @@ impl Disparity {
     fn depth(&self) -> Picture {
         let millimetre = |&disparity: &f32| {
             let depth = 193.001 * 994.978 / (disparity + 32.778);
-            if depth.is_finite() && disparity.is_finite() { depth as u16 } else { 0 }
+            if depth.is_finite() && disparity.is_finite() {
+                depth as u16
+            } else {
+                0
+            }
         };
-        let data = self.values.iter().map(millimetre).flat_map(u16::to_le_bytes).collect();
-        Picture { name: "motorcycle".to_owned(), width: self.width, height: self.height, depth: 2, data }
+        let data = self
+            .values
+            .iter()
+            .map(millimetre)
+            .flat_map(u16::to_le_bytes)
+            .collect();
+        Picture {
+            name: "motorcycle".to_owned(),
+            width: self.width,
+            height: self.height,
+            depth: 2,
+            data,
+        }
     }
 }
 
@@ -120,15 +164,25 @@ impl Disparity {
 pub fn motorcycle() -> Option<Disparity> {
     let path = fetched()?.join("motorcycle_disp.f32");
     let bytes = std::fs::read(path).ok()?;
-    let size = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
+    let size =
+        |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     let (height, width) = (size(0)?, size(4)?);
-    let values: Vec<f32> = bytes[8..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-    (values.len() == width * height).then_some(Disparity { width, height, values })
+    let values: Vec<f32> = bytes[8..]
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+        .collect();
+    (values.len() == width * height).then_some(Disparity {
+        width,
+        height,
+        values,
+    })
 }
 
 /// An office floor of 566×608 cells as an occupancy grid: unknown, free, occupied.
 pub fn office() -> Result<Picture> {
-    let Some(path) = recordings() else { return Ok(rooms()) };
+    let Some(path) = recordings() else {
+        return Ok(rooms());
+    };
     let mut pgm = Vec::new();
     flate2::read::GzDecoder::new(File::open(path.join("willow.pgm.gz"))?).read_to_end(&mut pgm)?;
     let mut numbers = Vec::new();
@@ -141,7 +195,11 @@ pub fn office() -> Result<Picture> {
             }
             at += 1;
         }
-        let end = at + pgm[at..].iter().position(u8::is_ascii_whitespace).context("a header without end")?;
+        let end = at
+            + pgm[at..]
+                .iter()
+                .position(u8::is_ascii_whitespace)
+                .context("a header without end")?;
         numbers.push(std::str::from_utf8(&pgm[at..end])?.parse::<usize>()?);
         at = end;
     }
@@ -154,8 +212,19 @@ pub fn office() -> Result<Picture> {
         _ => 255,
     };
     // A map begins at the bottom, a picture at the top.
-    let data = pixels.chunks_exact(width).rev().flatten().map(cell).collect();
-    Ok(Picture { name: "willow".to_owned(), width, height, depth: 1, data })
+    let data = pixels
+        .chunks_exact(width)
+        .rev()
+        .flatten()
+        .map(cell)
+        .collect();
+    Ok(Picture {
+        name: "willow".to_owned(),
+        width,
+        height,
+        depth: 1,
+        data,
+    })
 }
 
 /// Rooms and corridors, where there is no recording.
@@ -165,11 +234,17 @@ fn rooms() -> Picture {
     for y in 20..height - 20 {
         for x in 20..width - 20 {
             let wall = (x % 90 < 2 && y % 70 > 12) || (y % 110 < 2 && x % 80 > 10);
-            let noise = (x * 2_654_435_761 ^ y * 40_503) % 97 == 0;
+            let noise = ((x * 2_654_435_761) ^ (y * 40_503)) % 97 == 0;
             data[y * width + x] = if wall || noise { 100 } else { 0 };
         }
     }
-    Picture { name: "rooms".to_owned(), width, height, depth: 1, data }
+    Picture {
+        name: "rooms".to_owned(),
+        width,
+        height,
+        depth: 1,
+        data,
+    }
 }
 
 /// A grid of `size`×`size` cells with `map` in its middle, as gmapping publishes.
@@ -188,11 +263,22 @@ pub fn video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
     let output = Command::new("ffmpeg")
         .args(["-v", "error", "-i"])
         .arg(packaged().join("vtest.avi"))
-        .args(["-frames:v", &frames.to_string(), "-f", "rawvideo", "-pix_fmt", "bgr24", "-"])
+        .args([
+            "-frames:v",
+            &frames.to_string(),
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "bgr24",
+            "-",
+        ])
         .output()
         .context("ffmpeg decodes the video; install it")?;
     if !output.status.success() {
-        bail!("ffmpeg: {}; install opencv-doc for vtest.avi", String::from_utf8_lossy(&output.stderr));
+        bail!(
+            "ffmpeg: {}; install opencv-doc for vtest.avi",
+            String::from_utf8_lossy(&output.stderr)
+        );
     }
     Ok((768, 576, output.stdout))
 }

@@ -26,7 +26,7 @@ mod race;
 mod table;
 
 pub use machine::Machine;
-pub use race::{Race, Times};
+pub use race::{Race, Times, children_time, thread_time};
 
 use serde::Serialize;
 use std::io;
@@ -134,7 +134,11 @@ pub struct Report {
 impl Report {
     /// A report that will be written to `target/bench/NAME.json`.
     pub fn new(name: &str) -> Self {
-        Self { bench: name.to_owned(), machine: Machine::describe(), figures: Vec::new() }
+        Self {
+            bench: name.to_owned(),
+            machine: Machine::describe(),
+            figures: Vec::new(),
+        }
     }
 
     /// Adds a figure.
@@ -176,7 +180,10 @@ impl Report {
 /// The repository: the nearest directory upwards that holds a `Cargo.lock`, else the current one.
 pub fn root() -> PathBuf {
     let here = std::env::current_dir().unwrap_or_default();
-    here.ancestors().find(|path| path.join("Cargo.lock").exists()).unwrap_or(&here).to_owned()
+    here.ancestors()
+        .find(|path| path.join("Cargo.lock").exists())
+        .unwrap_or(&here)
+        .to_owned()
 }
 
 #[cfg(test)]
@@ -186,10 +193,25 @@ mod tests {
     #[test]
     fn a_figure_knows_whether_it_was_met() {
         let mut report = Report::new("test");
-        report.figure("speed", "MB/s", 30.0).beside("peer", 100.0).reach(Target::RatioAtLeast(0.3));
-        report.figure("size", "B", 120.0).beside("peer", 100.0).reach(Target::RatioAtMost(1.2));
-        report.figure("saved", "%", 50.0).reach(Target::AtMost(40.0));
-        assert_eq!(report.figures.iter().map(|figure| figure.met).collect::<Vec<_>>(), [Some(true), Some(true), Some(false)]);
+        report
+            .figure("speed", "MB/s", 30.0)
+            .beside("peer", 100.0)
+            .reach(Target::RatioAtLeast(0.3));
+        report
+            .figure("size", "B", 120.0)
+            .beside("peer", 100.0)
+            .reach(Target::RatioAtMost(1.2));
+        report
+            .figure("saved", "%", 50.0)
+            .reach(Target::AtMost(40.0));
+        assert_eq!(
+            report
+                .figures
+                .iter()
+                .map(|figure| figure.met)
+                .collect::<Vec<_>>(),
+            [Some(true), Some(true), Some(false)]
+        );
         assert_eq!(report.figures[0].ratio, Some(0.3));
         assert!(!report.all_met());
     }
@@ -197,15 +219,24 @@ mod tests {
     #[test]
     fn a_target_without_its_floor_is_not_met() {
         let mut report = Report::new("test");
-        report.figure("speed", "MB/s", 30.0).reach(Target::RatioAtLeast(0.3));
+        report
+            .figure("speed", "MB/s", 30.0)
+            .reach(Target::RatioAtLeast(0.3));
         assert!(!report.all_met());
     }
 
     #[test]
     fn the_table_shows_every_figure() {
         let mut report = Report::new("test");
-        report.figure("speed", "MB/s", 30.0).beside("peer", 100.0).reach(Target::AboveFloor).note("cold");
+        report
+            .figure("speed", "MB/s", 30.0)
+            .beside("peer", 100.0)
+            .reach(Target::AboveFloor)
+            .note("cold");
         let table = table::render(&report);
-        assert!(table.contains("speed") && table.contains("NOT MET") && table.contains("cold"), "{table}");
+        assert!(
+            table.contains("speed") && table.contains("NOT MET") && table.contains("cold"),
+            "{table}"
+        );
     }
 }

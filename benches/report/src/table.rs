@@ -14,7 +14,11 @@ fn number(value: f64) -> String {
 
 /// Percentages near a hundred differ in their decimals.
 fn value(figure: &Figure) -> String {
-    if figure.unit == "%" { format!("{:.2}", figure.value) } else { number(figure.value) }
+    if figure.unit == "%" {
+        format!("{:.2}", figure.value)
+    } else {
+        number(figure.value)
+    }
 }
 
 fn verdict(figure: &Figure) -> &'static str {
@@ -49,7 +53,10 @@ pub(crate) fn render(report: &Report) -> String {
                 figure.figure.clone(),
                 format!("{} {}", value(figure), figure.unit),
                 floor,
-                figure.ratio.map(|ratio| format!("{ratio:.2}x")).unwrap_or_default(),
+                figure
+                    .ratio
+                    .map(|ratio| format!("{ratio:.2}x"))
+                    .unwrap_or_default(),
                 figure.to_reach.clone().unwrap_or_default(),
                 verdict(figure).to_owned(),
                 figure.note.clone().unwrap_or_default(),
@@ -58,7 +65,11 @@ pub(crate) fn render(report: &Report) -> String {
         .collect();
     let titles = ["figure", "value", "beside", "ratio", "to reach", "", ""].map(str::to_owned);
     let width = |column: usize| {
-        rows.iter().chain([&titles]).map(|row| row[column].chars().count()).max().unwrap_or(0)
+        rows.iter()
+            .chain([&titles])
+            .map(|row| row[column].chars().count())
+            .max()
+            .unwrap_or(0)
     };
     let widths: [usize; 7] = std::array::from_fn(width);
     for row in [&titles].into_iter().chain(&rows) {

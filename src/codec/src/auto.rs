@@ -130,7 +130,7 @@ impl Auto {
     }
 
     /// The codec for the next message: the current one, or one to be tried.
-    pub fn next(&mut self) -> Codec {
+    pub fn choose(&mut self) -> Codec {
         self.messages += 1;
         let untried = self
             .candidates
@@ -198,7 +198,7 @@ impl Auto {
         clock: impl Fn() -> Duration,
         out: &mut Vec<u8>,
     ) -> Encoded {
-        let codec = self.next();
+        let codec = self.choose();
         let start = clock();
         let encoded = encoder.encode(codec, message, out);
         let cpu = clock().saturating_sub(start);
@@ -322,7 +322,7 @@ mod tests {
     fn run(auto: &mut Auto, messages: usize, link: f64, from: &mut u32) {
         for _ in 0..messages {
             *from += 1;
-            let codec = auto.next();
+            let codec = auto.choose();
             let (ratio, milliseconds) = match codec {
                 Codec::Raw => (1.0, 0.1),
                 Codec::Zstd(_) => (0.6, 3.0),

@@ -96,7 +96,7 @@ impl Scale {
     pub(crate) fn find(bits: &[u32]) -> Option<Self> {
         // Few are enough to tell: a chance multiple of a coarse scale is one in thousands.
         // An odd step, lest all of a pattern's even values be taken.
-        let step = bits.len() / 96 | 1;
+        let step = (bits.len() / 96) | 1;
         let sample: Vec<u32> = bits
             .iter()
             .step_by(step)

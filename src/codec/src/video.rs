@@ -20,14 +20,14 @@ use crate::wire::Cursor;
 /// How much may be lost.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct VideoOptions {
-    /// H.264's quantiser, 0 (best) to 51 (smallest). Six more halve the detail kept; 24 is hard to tell from the
+    /// H.264's quantiser, 0 (best) to 51 (smallest). Six more halve the detail kept; 22 is hard to tell from the
     /// original.
     pub quantiser: u8,
 }
 
 impl Default for VideoOptions {
     fn default() -> Self {
-        Self { quantiser: 24 }
+        Self { quantiser: 22 }
     }
 }
 

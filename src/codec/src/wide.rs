@@ -70,7 +70,8 @@ fn token(residual: u32) -> u8 {
 fn merge(samples: usize) -> u32 {
     match samples {
         0..0x200 => 5,
-        0x200..0x1000 => 3,
+        0x200..0x800 => 4,
+        0x800..0x1000 => 3,
         0x1000..0x2000 => 2,
         0x2000..0x8000 => 1,
         _ => 0,

@@ -4,9 +4,9 @@ mod bus;
 pub mod master;
 pub mod names;
 mod reply;
+pub mod tcpros;
 #[cfg(test)]
 mod testing;
-pub mod tcpros;
 pub mod xmlrpc;
 
 pub use bus::{Ros1Bus, Ros1Options};

@@ -33,10 +33,12 @@ impl BitWriter {
 
     /// Rice code: `value >> k` in unary, then the low `k` bits.
     pub(crate) fn put_rice(&mut self, value: u32, k: u32) {
-        for _ in 0..value >> k {
-            self.put(0, 1);
+        let mut unary = value >> k;
+        while unary > 30 {
+            self.put(0, 31);
+            unary -= 31;
         }
-        self.put(1, 1);
+        self.put(1 << unary, unary + 1);
         self.put(value & ((1 << k) - 1), k);
     }
 

@@ -34,8 +34,8 @@ pub(crate) type Counts = [u16; SYMBOLS];
 /// The table size worth its header for that many symbols.
 pub(crate) fn log_for(symbols: usize) -> u32 {
     match symbols {
-        0..0x400 => 8,
-        0x400..0x1000 => 9,
+        0..0x800 => 8,
+        0x800..0x1000 => 9,
         0x1000..0x4000 => 10,
         _ => MAX_LOG,
     }
@@ -63,19 +63,35 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
             largest = symbol;
         }
     }
-    if left > 0 {
-        counts[largest] += left as u16;
+    if left < 0 {
+        left = give_back(&mut counts, left);
     }
-    // Rounding up rare symbols took too much: give it back where a single state matters least.
+    counts[largest] += left as u16;
+    counts
+}
+
+/// Rounding up rare symbols took too much: takes it back where a single state matters least. Returns what is over.
+#[cold]
+fn give_back(counts: &mut Counts, mut left: i32) -> i32 {
+    // Symbols in proportion to what they have above one.
+    let above: i32 = counts
+        .iter()
+        .map(|&count| i32::from(count.saturating_sub(1)))
+        .sum();
+    let owed = -left;
+    for count in counts.iter_mut().filter(|count| **count > 1) {
+        let share = ((i32::from(*count) - 1) * owed / above.max(1)).min(-left.min(0));
+        *count -= share as u16;
+        left += share;
+    }
     while left < 0 {
         let richest = (0..SYMBOLS)
             .max_by_key(|&symbol| counts[symbol])
             .unwrap_or(0);
-        let step = (counts[richest] / 16).clamp(1, (-left) as u16);
-        counts[richest] -= step;
-        left += i32::from(step);
+        counts[richest] -= 1;
+        left += 1;
     }
-    counts
+    left
 }
 
 /// Writes the counts of one context: Rice codes whose parameter follows the counts before, runs of zeros apart.
