@@ -148,7 +148,24 @@ fn prepare(
     )
     .map_err(Error::nix("socketpair for init"))?;
     let listener = listen(directory)?;
-    let creator = create::fork(directory, launch, theirs)?;
+    let waiting = create::fork(directory, launch, theirs)?;
+    let enforced = match confine(launch, cgroup, waiting.pid) {
+        Ok(enforced) => enforced,
+        Err(error) => {
+            waiting.end();
+            return Err(error);
+        }
+    };
+    Ok(Prepared {
+        enforced,
+        init: ours,
+        listener,
+        creator: waiting.go_on()?,
+    })
+}
+
+/// Makes the cgroup, sets its limits, and moves the creator into it.
+fn confine(launch: &Launch, cgroup: &Cgroup, creator: u32) -> Result<Enforced, Error> {
     if let Some(shims) = launch.parent.shims() {
         std::fs::create_dir_all(&shims).map_err(Error::file("make the cgroup", &shims))?;
         let file = shims.join("cgroup.procs");
@@ -169,14 +186,8 @@ fn prepare(
         });
     }
     // The container stays where it was made.
-    cgroup.enter(creator.pid)?;
-    let creator = creator.go_on()?;
-    Ok(Prepared {
-        enforced,
-        init: ours,
-        listener,
-        creator,
-    })
+    cgroup.enter(creator)?;
+    Ok(enforced)
 }
 
 /// Binds `shim.sock` through a descriptor of its directory: the path itself may be longer than an address can be.

@@ -64,6 +64,14 @@ pub(super) struct Waiting {
 }
 
 impl Waiting {
+    /// Ends it. Once this returns it writes nothing any more, so that the servant's directory can be removed.
+    pub(super) fn end(self) {
+        let pid = nix::unistd::Pid::from_raw(self.pid as i32);
+        // Our own child, not reaped yet: the number is surely its own.
+        let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGKILL);
+        let _ = nix::sys::wait::waitpid(pid, None);
+    }
+
     /// Lets it go on.
     pub(super) fn go_on(self) -> Result<Creator, Error> {
         nix::unistd::write(&self.go, b".").map_err(Error::nix("writing to the creator"))?;
