@@ -93,9 +93,7 @@ pub fn scan(ranges: &[f32], intensities: &[f32]) -> Vec<u8> {
 /// A point field's type, as `sensor_msgs/PointField` numbers it.
 #[derive(Clone, Copy)]
 pub enum Number {
-    U8 = 2,
     U16 = 4,
-    U32 = 6,
     F32 = 7,
 }
 

@@ -9,7 +9,6 @@ use std::process::Command;
 
 /// A picture as decoded.
 pub struct Picture {
-    pub name: String,
     pub width: usize,
     pub height: usize,
     /// Bytes per pixel: 1 grey, 2 depth (little endian), 3 red, green, blue.
@@ -65,7 +64,6 @@ fn picture(path: &Path) -> Result<Picture> {
         other => bail!("{name} holds {other:?}, which is not measured"),
     };
     Ok(Picture {
-        name,
         width: info.width as usize,
         height: info.height as usize,
         depth,
@@ -151,7 +149,6 @@ impl Disparity {
             .flat_map(u16::to_le_bytes)
             .collect();
         Picture {
-            name: "motorcycle".to_owned(),
             width: self.width,
             height: self.height,
             depth: 2,
@@ -219,7 +216,6 @@ pub fn office() -> Result<Picture> {
         .map(cell)
         .collect();
     Ok(Picture {
-        name: "willow".to_owned(),
         width,
         height,
         depth: 1,
@@ -239,7 +235,6 @@ fn rooms() -> Picture {
         }
     }
     Picture {
-        name: "rooms".to_owned(),
         width,
         height,
         depth: 1,

@@ -102,7 +102,7 @@ mod tests {
     fn set() -> Vec<u8> {
         let mut text = String::from("01000010" /* 66 */);
         text.push_str("0000000000011110");
-        text.push_str("1"); // set 0
+        text.push('1'); // set 0
         text.push_str("011"); // 2: frame number
         text.push_str("011"); // 2: order
         text.push_str("010"); // 1 reference
