@@ -16,7 +16,7 @@ use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
 use crate::definitions;
 use crate::errors::Error;
-use crate::state::{self, NewEvent, ServantRecord};
+use crate::state::{self, ServantRecord};
 use crate::works::Works;
 
 /// Lines of the log that explain a failure.
@@ -34,62 +34,66 @@ pub(super) enum Beginning {
 
 /// Runs the servant's life to its end and cleans up after it.
 pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, beginning: Beginning) {
-    let about = NewEvent {
-        service: Some(handle.service()),
-        servant: Some(&handle.id),
-        robot: Some(&handle.robot),
-    };
     let mut permit = None;
     let outcome = live(&inner, &handle, beginning, &mut permit).await;
     inner.retire(&handle);
     let outcome = outcome.map_err(|failure| with_log(failure, &handle));
     handle.set_over(&outcome);
-    let who = format!(
-        "servant {} of {} for {}",
-        handle.id,
-        handle.service(),
-        handle.robot
-    );
-    let (last, ended) = match &outcome {
-        Ok(reason) => {
-            inner.journal.info(
-                "servant-stopped",
-                &format!("{who} was ended: {reason}"),
-                &about,
-            );
-            (Phase::Stopped, reason.clone())
-        }
-        Err(failure) => {
-            let reason = handle.life().reason().unwrap_or_default();
-            let kind = if matches!(failure, Failure::Full(_)) {
-                "servant-refused"
-            } else {
-                "servant-failed"
-            };
-            inner
-                .journal
-                .error(kind, &format!("{who} {reason}"), &about);
-            (Phase::Failed, format!("the servant {reason}"))
-        }
-    };
+    let farewell = tell_end(&inner, &handle, &outcome);
     if let Some(works) = handle.take_works() {
-        works.bridge.close(&ended);
+        works.bridge.close(&farewell);
     }
     if let Some(container) = handle.container()
         && let Err(error) = container.stop().await
     {
-        inner.journal.error(
-            "servant-leftover",
-            &format!("{who} could not be cleaned up: {error}"),
-            &about,
-        );
+        let message = format!("servant {} could not be cleaned up: {error}", handle.id);
+        inner
+            .journal
+            .error("servant-leftover", &message, &handle.about());
     }
     if let Err(error) = inner.state.remove_servant(&handle.id) {
         tracing::error!("servant {} could not be forgotten: {error}", handle.id);
     }
     drop(permit);
     inner.forget(&handle);
-    handle.set_phase(last);
+    handle.set_phase(if outcome.is_ok() {
+        Phase::Stopped
+    } else {
+        Phase::Failed
+    });
+}
+
+/// Writes why the servant ended into the journal; gives the words for its robots.
+fn tell_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -> String {
+    let who = format!(
+        "servant {} of {} for {}",
+        handle.id,
+        handle.service(),
+        handle.robot
+    );
+    let (journal, about) = (&inner.journal, handle.about());
+    match outcome {
+        Ok(reason) => {
+            journal.info(
+                "servant-stopped",
+                &format!("{who} was ended: {reason}"),
+                &about,
+            );
+            reason.clone()
+        }
+        Err(Failure::Full(refused)) => {
+            journal.warning(
+                "servant-refused",
+                &format!("{who} was refused: {refused}"),
+                &about,
+            );
+            refused.to_string()
+        }
+        Err(Failure::Broken { reason, .. }) => {
+            journal.error("servant-failed", &format!("{who} {reason}"), &about);
+            format!("the servant {reason}")
+        }
+    }
 }
 
 /// From asked for to why it ended as it should, or why it failed.
@@ -168,11 +172,7 @@ async fn run(
             handle.robot
         )
     };
-    let about = NewEvent {
-        service: Some(handle.service()),
-        servant: Some(&handle.id),
-        robot: Some(&handle.robot),
-    };
+    let about = handle.about();
     inner.journal.info(
         if fresh {
             "servant-ready"
@@ -297,11 +297,7 @@ async fn interface_there(
                     handle.id,
                     missing.join(", ")
                 );
-                let about = NewEvent {
-                    service: Some(handle.service()),
-                    servant: Some(&handle.id),
-                    robot: Some(&handle.robot),
-                };
+                let about = handle.about();
                 inner
                     .journal
                     .warning("interface-incomplete", &message, &about);
@@ -336,7 +332,10 @@ async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
             .is_ok();
         handle.set_idle_until(None);
         if !returned && inner.retire_if_idle(handle) {
-            return format!("no robot was connected for {} s", grace.as_secs());
+            return match grace.as_secs() {
+                0 => "its robot left".to_owned(),
+                seconds => format!("no robot was connected for {seconds} s"),
+            };
         }
     }
 }

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::admission::Refused;
 use crate::errors::Error;
-use crate::state::RevisionRecord;
+use crate::state::{NewEvent, RevisionRecord};
 use crate::works::Works;
 
 /// Why a servant failed.
@@ -121,6 +121,15 @@ impl Handle {
     /// Its service.
     pub fn service(&self) -> &str {
         &self.revision.service
+    }
+
+    /// What its events are about.
+    pub fn about(&self) -> NewEvent<'_> {
+        NewEvent {
+            service: Some(self.service()),
+            servant: Some(&self.id),
+            robot: Some(&self.robot),
+        }
     }
 
     /// Where it is now.

@@ -15,7 +15,6 @@ use tokio::time::Instant;
 use super::handle::{Failure, Handle};
 use super::restart::Backoff;
 use super::{Inner, tail};
-use crate::state::NewEvent;
 
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
@@ -164,11 +163,7 @@ impl<'a> Nodes<'a> {
     }
 
     fn tell(&self, kind: &str, message: &str) {
-        let about = NewEvent {
-            service: Some(self.handle.service()),
-            servant: Some(&self.handle.id),
-            robot: Some(&self.handle.robot),
-        };
+        let about = self.handle.about();
         self.inner.journal.warning(
             kind,
             &format!("servant {}: {message}", self.handle.id),

@@ -193,7 +193,9 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
         let (robot, anonymous) = nameless(asked.resume.as_deref());
         return app.choreographer.ensure(&asked.service, &robot, anonymous);
     };
-    let owner = app.state.robot_owner(robot, caller.token.as_ref())?;
+    // Where tokens are configured, a name used before there were any goes to the first who has one.
+    let claim = !app.tokens.is_empty();
+    let owner = app.state.robot_owner(robot, caller.token.as_ref(), claim)?;
     if owner.is_some() && owner != caller.token {
         return Err(Error::RobotTaken(robot.clone()));
     }

@@ -24,19 +24,22 @@ pub struct ServantRecord {
 }
 
 impl State {
-    /// Binds `robot` to `owner` when it is new; then says to whom it is bound.
+    /// Binds `robot` to `owner` when it is new, and with `claim` also when nobody owns it yet; then says to whom it
+    /// is bound.
     pub fn robot_owner(
         &self,
         robot: &str,
         owner: Option<&TokenHash>,
+        claim: bool,
     ) -> Result<Option<TokenHash>, StateError> {
         self.run(|connection| {
-            connection.query_row(
-                "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
-                 ON CONFLICT (name) DO UPDATE SET last_seen = ?3 RETURNING owner",
-                params![robot, owner, now() as i64],
-                |row| row.get(0),
-            )
+            connection
+                .prepare_cached(
+                    "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
+                     ON CONFLICT (name) DO UPDATE SET last_seen = ?3,
+                     owner = CASE WHEN ?4 THEN COALESCE(owner, ?2) ELSE owner END RETURNING owner",
+                )?
+                .query_row(params![robot, owner, now() as i64, claim], |row| row.get(0))
         })
     }
 

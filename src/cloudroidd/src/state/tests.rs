@@ -113,29 +113,26 @@ fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
 fn a_robot_stays_with_whom_it_came_first() {
     let (_directory, state) = state();
     let (mine, theirs) = ("m".repeat(64), "t".repeat(64));
+    let owner = |robot: &str, token: Option<&String>, claim| {
+        state.robot_owner(robot, token, claim).expect("readable")
+    };
+    assert_eq!(owner("r1", Some(&mine), false), Some(mine.clone()));
+    assert_eq!(owner("r1", Some(&theirs), true), Some(mine.clone()));
+    assert_eq!(owner("r1", None, false), Some(mine));
+    assert_eq!(owner("r2", None, false), None);
     assert_eq!(
-        state.robot_owner("r1", Some(&mine)).expect("readable"),
-        Some(mine.clone())
+        owner("r2", Some(&theirs), false),
+        None,
+        "who uses it without a token is not locked out"
     );
-    assert_eq!(
-        state.robot_owner("r1", Some(&theirs)).expect("readable"),
-        Some(mine.clone())
-    );
-    assert_eq!(
-        state.robot_owner("r1", None).expect("readable"),
-        Some(mine.clone())
-    );
-    assert_eq!(state.robot_owner("r2", None).expect("readable"), None);
+    assert_eq!(owner("r2", Some(&theirs), true), Some(theirs.clone()));
     assert_eq!(
         state
             .release_robots(std::slice::from_ref(&theirs))
             .expect("readable"),
         1
     );
-    assert_eq!(
-        state.robot_owner("r1", Some(&theirs)).expect("readable"),
-        Some(theirs)
-    );
+    assert_eq!(owner("r1", Some(&theirs), false), Some(theirs));
 }
 
 #[test]
