@@ -68,7 +68,7 @@ pub fn default_path(
 }
 
 impl Home {
-    /// Makes what is missing of the directory and locks it; sweeps half-made builds of an earlier daemon.
+    /// Makes what is missing of the directory and locks it.
     pub fn open(path: &Path) -> Result<Home, HomeError> {
         let path = std::path::absolute(path).map_err(io("resolve", path))?;
         // Servants run as unprivileged users: they pass through to their layers, and read nothing else.
@@ -84,7 +84,6 @@ impl Home {
         ] {
             make_directory(&home.path.join(name), mode)?;
         }
-        home.sweep_builds()?;
         Ok(home)
     }
 
@@ -128,14 +127,21 @@ impl Home {
         self.path.join("run/daemon.sock")
     }
 
-    fn sweep_builds(&self) -> Result<(), HomeError> {
-        let builds = self.path.join("build");
-        for entry in std::fs::read_dir(&builds).map_err(io("read", &builds))? {
-            let half_made = entry.map_err(io("read", &builds))?.path();
-            std::fs::remove_dir_all(&half_made).map_err(io("sweep", &half_made))?;
-            tracing::info!("swept the half-made build {}", half_made.display());
+    /// Removes what an earlier daemon's builds left half-made, once their containers have ended. What cannot be
+    /// removed is told and is no reason not to start.
+    pub fn sweep_builds(&self) {
+        let entries = std::fs::read_dir(self.path.join("build"));
+        for half_made in entries
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.path())
+        {
+            match std::fs::remove_dir_all(&half_made) {
+                Ok(()) => tracing::info!("swept the half-made build {}", half_made.display()),
+                Err(error) => tracing::error!("cannot sweep {}: {error}", half_made.display()),
+            }
         }
-        Ok(())
     }
 }
 
@@ -251,6 +257,7 @@ mod tests {
         std::fs::create_dir_all(home.path().join("build/p1/deep")).expect("a build");
         drop(home);
         let home = Home::open(parent.path()).expect("free");
+        home.sweep_builds();
         assert!(!home.path().join("build/p1").exists());
     }
 

@@ -216,6 +216,7 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
         .adopt()
         .await
         .context("cannot take over the servants of an earlier daemon")?;
+    home.sweep_builds();
     let router = portal::router(Arc::clone(&app));
     let tcp = tokio::spawn(portal::serve_tcp(
         Arc::clone(&app),
