@@ -276,6 +276,17 @@ impl Choreographer {
         self.inner.ending.store(true, Ordering::SeqCst);
     }
 
+    /// Reads the definitions of everything published, so that no robot waits for that.
+    pub async fn read_definitions(&self) -> Result<(), Error> {
+        let inner = &self.inner;
+        for service in inner.state.service_names()? {
+            if let Some(revision) = inner.state.current(&service)? {
+                inner.definitions.read(&inner.store, &revision.image).await;
+            }
+        }
+        Ok(())
+    }
+
     /// Forgets the definitions of all images but those.
     pub fn keep_definitions(&self, images: &BTreeSet<String>) {
         self.inner.definitions.keep_only(images);

@@ -40,6 +40,11 @@ impl Definitions {
         Arc::new(registry)
     }
 
+    /// Reads those of an image before they are needed.
+    pub async fn read(&self, store: &Arc<image::Store>, image: &str) {
+        self.of_image(store, image).await;
+    }
+
     async fn of_image(&self, store: &Arc<image::Store>, image: &str) -> Texts {
         if let Some(known) = self.images.lock().get(image) {
             return Arc::clone(known);

@@ -130,6 +130,26 @@ pub enum Error {
     Internal(&'static str),
 }
 
+impl Error {
+    /// What happened and, where a log explains it, its last line: for a status message.
+    pub fn in_a_line(&self) -> String {
+        match self {
+            Error::Servant { log, .. } | Error::Push { log, .. } => {
+                with_last_words(&self.to_string(), log)
+            }
+            _ => self.to_string(),
+        }
+    }
+}
+
+/// `text` and the last line of a log that says something.
+pub fn with_last_words(text: &str, log: &[String]) -> String {
+    match log.iter().rev().find(|line| !line.trim().is_empty()) {
+        Some(line) => format!("{text}; its log ends with: {line}"),
+        None => text.to_owned(),
+    }
+}
+
 /// Seconds after which a full machine may be asked again.
 const RETRY_AFTER: u64 = 10;
 
@@ -298,5 +318,19 @@ mod tests {
         let response = Error::Unauthorised("a token is needed").into_response();
         assert_eq!(response.status(), 401);
         assert_eq!(response.headers()[header::WWW_AUTHENTICATE], "Bearer");
+    }
+
+    #[test]
+    fn the_last_line_that_says_something_is_told() {
+        let log = [
+            "loading".to_owned(),
+            "no map file".to_owned(),
+            " ".to_owned(),
+        ];
+        assert_eq!(
+            with_last_words("it ended", &log),
+            "it ended; its log ends with: no map file"
+        );
+        assert_eq!(with_last_words("it ended", &[]), "it ended");
     }
 }

@@ -231,6 +231,7 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
         home.path().display()
     );
     supervision::ready();
+    app.choreographer.read_definitions().await?;
     signals.end_asked().await;
     supervision::stopping();
     tokio::select! {

@@ -189,6 +189,7 @@ impl Pusher {
         };
         tell.step("publishing").await;
         let number = self.publish(record).await?;
+        self.choreographer.read_definitions().await?;
         let about = NewEvent {
             service: Some(&name),
             ..NewEvent::default()

@@ -32,11 +32,11 @@ impl Works {
         container: &Arc<dyn servant::engine::Servant>,
     ) -> Result<Arc<Works>, BusError> {
         let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
-        let bus: Arc<dyn Bus> = Ros1Bus::connect(sockets, MASTER, NODE).await?;
-        let registry = inner
-            .definitions
-            .registry(&inner.store, &handle.revision)
-            .await;
+        let (bus, registry) = tokio::join!(
+            Ros1Bus::connect(sockets, MASTER, NODE),
+            inner.definitions.registry(&inner.store, &handle.revision),
+        );
+        let bus: Arc<dyn Bus> = bus?;
         let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));
         Ok(Arc::new(Works { bus, bridge }))
     }

@@ -15,7 +15,7 @@ use super::nodes::Nodes;
 use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
 use crate::definitions;
-use crate::errors::Error;
+use crate::errors::{Error, with_last_words};
 use crate::state::{self, ServantRecord};
 use crate::works::Works;
 
@@ -79,7 +79,7 @@ fn tell_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -
                 &format!("{who} was ended: {reason}"),
                 &about,
             );
-            reason.clone()
+            format!("the servant was ended: {reason}")
         }
         Err(Failure::Full(refused)) => {
             journal.warning(
@@ -89,7 +89,8 @@ fn tell_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -
             );
             refused.to_string()
         }
-        Err(Failure::Broken { reason, .. }) => {
+        Err(Failure::Broken { reason, log }) => {
+            let reason = with_last_words(reason, log);
             journal.error("servant-failed", &format!("{who} {reason}"), &about);
             format!("the servant {reason}")
         }

@@ -227,3 +227,62 @@ pub async fn openapi(OriginalUri(_): OriginalUri) -> Response {
     )
         .into_response()
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::Value;
+
+    /// Every `$ref` in the document.
+    fn references(value: &Value, found: &mut Vec<String>) {
+        match value {
+            Value::Object(members) => {
+                for (name, member) in members {
+                    match member.as_str() {
+                        Some(target) if name == "$ref" => found.push(target.to_owned()),
+                        _ => references(member, found),
+                    }
+                }
+            }
+            Value::Array(elements) => elements
+                .iter()
+                .for_each(|element| references(element, found)),
+            _ => {}
+        }
+    }
+
+    #[test]
+    fn the_description_is_whole() {
+        let document: Value = serde_json::from_str(include_str!("openapi.json")).expect("JSON");
+        let mut found = Vec::new();
+        references(&document, &mut found);
+        assert!(!found.is_empty());
+        for target in found {
+            let pointer = target.strip_prefix('#').expect("within the document");
+            assert!(
+                document.pointer(pointer).is_some(),
+                "{target} leads nowhere"
+            );
+        }
+    }
+
+    #[test]
+    fn every_route_is_described() {
+        let document: Value = serde_json::from_str(include_str!("openapi.json")).expect("JSON");
+        let routes = include_str!("../portal.rs");
+        let (_, v1) = routes.split_once("let v1 = ").expect("the routes");
+        let (v1, _) = v1.split_once(".fallback").expect("their end");
+        let paths: Vec<&str> = v1
+            .split('"')
+            .skip(1)
+            .step_by(2)
+            .filter(|path| *path != "/openapi.json")
+            .collect();
+        assert!(paths.contains(&"/push"));
+        for path in paths {
+            assert!(
+                document["paths"].get(path).is_some(),
+                "{path} is not described"
+            );
+        }
+    }
+}

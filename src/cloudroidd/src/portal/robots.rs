@@ -296,7 +296,7 @@ async fn session<S>(
     let (lease, works) = match (lease, ready) {
         (Ok(lease), Ok(works)) => (lease, works),
         (Err(error), _) | (_, Err(error)) => {
-            return bridge::refuse(io, TRY_AGAIN_LATER, &error.to_string()).await;
+            return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
         }
     };
     let client = match (&asked.robot, caller.peer) {
