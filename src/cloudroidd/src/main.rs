@@ -253,9 +253,8 @@ fn build(
     let config = Arc::new(config);
     let tokens = Tokens::new(&config.tokens)?;
     let state = Arc::new(State::open(&home.database())?);
-    if !tokens.is_empty() {
-        state.release_robots(tokens.hashes())?;
-    }
+    // Names bound to a token that is not known any more would be nobody's for ever.
+    state.release_robots(tokens.hashes())?;
     let store = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(&config, home)?)?);
     let room = &config.room;

@@ -97,20 +97,27 @@ fn explain(app: &App, service: &str, method: &Method) -> Result<Response, Error>
 struct Asked {
     service: String,
     robot: Option<String>,
+    /// The configured default robot, which is everybody's.
+    shared: bool,
     resume: Option<String>,
 }
 
 impl Asked {
     fn read(app: &App, service: String, uri: &Uri) -> Result<Asked, Error> {
-        let plain = uri.path() == "/";
-        let robot = guard::query(uri, "robot")
-            .or_else(|| app.config.default_robot.clone().filter(|_| plain));
+        let named = guard::query(uri, "robot");
+        let shared = named.is_none() && uri.path() == "/" && app.config.default_robot.is_some();
+        let robot = if shared {
+            app.config.default_robot.clone()
+        } else {
+            named
+        };
         if let Some(robot) = &robot {
             names::robot(robot)?;
         }
         Ok(Asked {
             service,
             robot,
+            shared,
             resume: guard::query(uri, "resume").filter(|token| !token.is_empty()),
         })
     }
@@ -193,13 +200,21 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
         let (robot, anonymous) = nameless(asked.resume.as_deref());
         return app.choreographer.ensure(&asked.service, &robot, anonymous);
     };
+    if !asked.shared {
+        check_owner(app, robot, caller)?;
+    }
+    app.choreographer.ensure(&asked.service, robot, false)
+}
+
+/// Nobody takes over another's robot.
+fn check_owner(app: &App, robot: &str, caller: &Caller) -> Result<(), Error> {
     // Where tokens are configured, a name used before there were any goes to the first who has one.
     let claim = !app.tokens.is_empty();
     let owner = app.state.robot_owner(robot, caller.token.as_ref(), claim)?;
     if owner.is_some() && owner != caller.token {
-        return Err(Error::RobotTaken(robot.clone()));
+        return Err(Error::RobotTaken(robot.to_owned()));
     }
-    app.choreographer.ensure(&asked.service, robot, false)
+    Ok(())
 }
 
 /// A name for a robot that gave none (one that no robot can give, so nobody takes it over), and whether nobody can come back under it: who holds the resume token can.
