@@ -27,6 +27,7 @@ mod clients;
 mod create;
 mod driver;
 mod link;
+mod memory;
 mod nodes;
 mod privileges;
 mod streams;

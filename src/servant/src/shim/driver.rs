@@ -20,7 +20,7 @@ use super::create::Creator;
 use super::link::Link;
 use super::nodes::{self, Consequence, Nodes};
 use super::streams::Streams;
-use super::{Resident, ResidentContext, privileges};
+use super::{Resident, ResidentContext, memory, privileges};
 use crate::engine::{ContainerState, Enforced, NodeEvent, NodeExit};
 use crate::launch::{self, Exit};
 use crate::protocol::{Command, FromShim, Request};
@@ -201,7 +201,7 @@ impl Driver {
         self.begun.launch.spec.layers = Vec::new();
         self.begun.launch.spec.nodes = Vec::new();
         self.begun.launch.spec.resident = serde_json::Value::Null;
-        sys::give_back_memory();
+        memory::give_back();
         Ok(())
     }
 
