@@ -26,6 +26,9 @@ const SOCKET_FULL: usize = 64 * 1024;
 const READ_BATCH: usize = 64;
 /// Rounds before other tasks have their turn.
 const ROUNDS: usize = 16;
+/// Bytes moved before other tasks have their turn. What a big message sets off (a node's connection that writes it)
+/// often waits for this very thread; to read the next one first would stall both.
+const MOVED: usize = 128 * 1024;
 /// While so many answers wait nothing more is read from the client.
 const CONTROL_HIGH: usize = 256;
 
@@ -42,6 +45,8 @@ pub(crate) struct Session<S> {
     acks: Acks,
     /// Reading was put off because answers wait.
     held_back: bool,
+    /// Bytes read and written since other tasks had their turn.
+    moved: usize,
     timer: Pin<Box<Sleep>>,
     timer_at: Option<Instant>,
 }
@@ -73,6 +78,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             ping_at: (!options.ping_interval.is_zero()).then(|| now + options.ping_interval),
             acks: Acks::default(),
             held_back: false,
+            moved: 0,
             timer: Box::pin(tokio::time::sleep_until(now.into())),
             timer_at: None,
             client,
@@ -82,13 +88,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     /// Moves what waits into the socket. Ready when there is nothing left, pending when the socket takes no more.
     fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<std::io::Result<()>> {
         loop {
-            while self.socket.queued() < SOCKET_FULL {
+            while self.socket.queued() < SOCKET_FULL && self.moved < MOVED {
                 let Some((opcode, bytes)) = self.next_frame(now) else {
                     break;
                 };
                 let metrics = &self.client.shared.metrics;
                 metrics.frames_out.add(1);
                 metrics.bytes_out.add(bytes.len() as u64);
+                self.moved += bytes.len();
                 self.socket.queue(opcode, bytes);
             }
             if self.socket.queued() == 0 {
@@ -191,6 +198,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     /// Takes frames from the client. Ready when a batch was taken, pending when none is there.
     fn read(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), Stop>> {
         for _ in 0..READ_BATCH {
+            if self.moved >= MOVED {
+                break;
+            }
             // Who does not read what we answer has nothing more to say.
             if self.client.outbox.control_waiting() >= CONTROL_HIGH {
                 self.held_back = true;
@@ -225,6 +235,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             Message::Text(bytes) => {
                 metrics.frames_in.add(1);
                 metrics.bytes_in.add(bytes.len() as u64);
+                self.moved += bytes.len();
                 match std::str::from_utf8(&bytes) {
                     Ok(text) => self.client.text(&mut self.inbox, text),
                     Err(_) => {
@@ -240,6 +251,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             Message::Binary(bytes) => {
                 metrics.frames_in.add(1);
                 metrics.bytes_in.add(bytes.len() as u64);
+                self.moved += bytes.len();
                 self.client.binary(&mut self.inbox, &bytes);
             }
             // Pongs that a client does not read pile up no higher than this.
@@ -311,6 +323,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 readable: true,
             });
         }
+        self.moved = 0;
         for _ in 0..ROUNDS {
             if let Some(Goodbye { code, reason }) = self.client.outbox.goodbye() {
                 return Poll::Ready(Stop::Close {
@@ -339,6 +352,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             };
             let more =
                 read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
+            if self.moved >= MOVED {
+                break;
+            }
             if !more && self.arm(cx, at).is_pending() {
                 return Poll::Pending;
             }

@@ -1,164 +1,26 @@
-//! How fast messages pass the bridge, beside a relay that only moves bytes over the same hops:
-//! `cargo run --release -p bridge --example speed [PART OF A TITLE]`.
-//!
-//! Node, bridge and client have a runtime each, all on loopback. Sender and receiver keep a window of messages under
-//! way, so nothing is dropped and the slowest hop decides.
+//! How many messages pass in a second.
 
 use std::future::Future;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use bridge::{Bridge, BridgeOptions, SessionOptions};
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, SubscribeOptions, WireType};
+use ros::bus::{AdvertiseOptions, Bus, SubscribeOptions};
 use ros::codec::{self, CborOptions, JsonOptions};
-use ros::net::HostSockets;
-use ros::ros1::Ros1Bus;
-use ros::ros1::master::{Master, MasterOptions};
-use ros::schema::Registry;
 use rosbridge::{Format, Publish, Writer};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::runtime::{Builder, Runtime};
+use tokio::net::TcpStream;
 use tokio::sync::Notify;
 
-const ROUND: Duration = Duration::from_secs(2);
+use crate::Failure;
+use crate::world::{World, frame, wire_type};
 
-type Failure = Box<dyn std::error::Error + Send + Sync>;
-
-struct World {
-    node: Arc<Ros1Bus>,
-    portal: SocketAddr,
-    relay: SocketAddr,
-    registry: Arc<Registry>,
-    ours: Runtime,
-    theirs: Runtime,
-    _bridge: Runtime,
-}
-
-fn main() -> Result<(), Failure> {
-    let only = std::env::args().nth(1).unwrap_or_default();
-    let world = world()?;
-    for (title, type_name, size, window) in [
-        ("string", "std_msgs/String", 20, 64),
-        ("image", "sensor_msgs/Image", 921_600, 8),
-    ] {
-        let message = message(&world, type_name, size)?;
-        let floor = world
-            .theirs
-            .block_on(relayed(&world, message.len(), window))?;
-        println!(
-            "\n{title}, {} bytes of ROS; byte relay {floor:.0}/s",
-            message.len()
-        );
-        let show = |what: &str, rate: f64| {
-            println!("  {what:<24}{rate:>10.0}/s {:>6.1} %", rate / floor * 100.0)
-        };
-        for encoding in ["none", "cbor", "cbor-raw"] {
-            let what = format!("{title} out {encoding}");
-            if what.contains(&only) {
-                show(&what, out(&world, type_name, &message, encoding, window)?);
-            }
-        }
-        for encoding in ["none", "cbor", "cbor-raw"] {
-            let what = format!("{title} in {encoding}");
-            if what.contains(&only) {
-                show(
-                    &what,
-                    inward(&world, type_name, &message, encoding, window)?,
-                );
-            }
-        }
-    }
-    Ok(())
-}
-
-fn world() -> Result<World, Failure> {
-    let runtime = |workers| {
-        Builder::new_multi_thread()
-            .worker_threads(workers)
-            .enable_all()
-            .build()
-    };
-    let (ours, theirs, bridge) = (runtime(1)?, runtime(1)?, runtime(2)?);
-    let registry = Arc::new(Registry::new());
-    registry.insert("std_msgs/String", "string data\n")?;
-    let image = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n";
-    registry.insert("sensor_msgs/Image", image)?;
-    let master = bridge.block_on(async {
-        let listener = TcpListener::bind("127.0.0.1:0").await?;
-        let address = listener.local_addr()?;
-        let master = Master::new(MasterOptions {
-            uri: format!("http://{address}/"),
-            ..MasterOptions::default()
-        });
-        tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
-        Ok::<_, Failure>(address)
-    })?;
-    let node = theirs.block_on(Ros1Bus::connect(Arc::new(HostSockets), master, "/node"))?;
-    let definitions = registry.clone();
-    let (portal, relay) = bridge.block_on(async {
-        let bus = Ros1Bus::connect(Arc::new(HostSockets), master, "/cloudroid_bridge").await?;
-        let bridge = Bridge::new(bus, definitions, BridgeOptions::default());
-        let portal = TcpListener::bind("127.0.0.1:0").await?;
-        let relay = TcpListener::bind("127.0.0.1:0").await?;
-        let addresses = (portal.local_addr()?, relay.local_addr()?);
-        tokio::spawn(async move {
-            while let Ok((stream, _)) = portal.accept().await {
-                let bridge = bridge.clone();
-                let _ = stream.set_nodelay(true);
-                tokio::spawn(async move { bridge.serve(stream, SessionOptions::default()).await });
-            }
-        });
-        tokio::spawn(async move {
-            while let (Ok((mut from, _)), Ok((mut to, _))) =
-                (relay.accept().await, relay.accept().await)
-            {
-                let _ = to.set_nodelay(true);
-                tokio::spawn(async move {
-                    let mut buffer = vec![0; 256 * 1024];
-                    while let Ok(count @ 1..) = from.read(&mut buffer).await {
-                        if to.write_all(&buffer[..count]).await.is_err() {
-                            return;
-                        }
-                    }
-                });
-            }
-        });
-        Ok::<_, Failure>(addresses)
-    })?;
-    Ok(World {
-        node,
-        portal,
-        relay,
-        registry,
-        ours,
-        theirs,
-        _bridge: bridge,
-    })
-}
-
-fn message(world: &World, type_name: &str, size: usize) -> Result<Bytes, Failure> {
-    let mut bytes = Vec::new();
-    if type_name == "sensor_msgs/Image" {
-        bytes.extend_from_slice(&[0; 12]);
-        bytes.extend_from_slice(b"\x03\0\0\0cam");
-        bytes.extend_from_slice(&480u32.to_le_bytes());
-        bytes.extend_from_slice(&640u32.to_le_bytes());
-        bytes.extend_from_slice(b"\x04\0\0\0rgb8\0");
-        bytes.extend_from_slice(&1920u32.to_le_bytes());
-    }
-    bytes.extend_from_slice(&(size as u32).to_le_bytes());
-    bytes.extend((0..size).map(|at| b'a' + (at * 7 % 26) as u8));
-    codec::validate(&*world.registry.message(type_name)?, &bytes)?;
-    Ok(bytes.into())
-}
+pub const ROUND: Duration = Duration::from_secs(2);
 
 /// What the receiver tells the sender.
 #[derive(Default)]
-struct Progress {
+pub struct Progress {
     received: AtomicU64,
     changed: Notify,
 }
@@ -177,7 +39,7 @@ impl Progress {
 }
 
 /// Messages per second that `send` manages while `received` follows within the window.
-async fn rate<F: Future<Output = Result<(), Failure>>>(
+pub async fn rate<F: Future<Output = Result<(), Failure>>>(
     progress: &Progress,
     window: u64,
     mut send: impl FnMut() -> F,
@@ -204,7 +66,7 @@ async fn rate<F: Future<Output = Result<(), Failure>>>(
     }
 }
 
-async fn relayed(world: &World, size: usize, window: u64) -> Result<f64, Failure> {
+pub async fn relayed(world: &World, size: usize, window: u64) -> Result<f64, Failure> {
     let mut from = TcpStream::connect(world.relay).await?;
     let mut to = TcpStream::connect(world.relay).await?;
     from.set_nodelay(true)?;
@@ -231,26 +93,8 @@ async fn relayed(world: &World, size: usize, window: u64) -> Result<f64, Failure
     found
 }
 
-fn wire_type(world: &World, type_name: &str) -> Result<WireType, Failure> {
-    let found = world.registry.message(type_name)?;
-    Ok(WireType {
-        name: type_name.to_owned(),
-        md5: found.md5().to_owned(),
-        definition: found.full_text().to_owned(),
-    })
-}
-
-/// A masked text or binary frame; the mask is zero, which costs the server the same.
-fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
-    let mut out = vec![0x80 | opcode, 0x80 | 127];
-    out.extend_from_slice(&(payload.len() as u64).to_be_bytes());
-    out.extend_from_slice(&[0; 4]);
-    out.extend_from_slice(payload);
-    out
-}
-
 /// Node to client.
-fn out(
+pub fn out(
     world: &World,
     type_name: &str,
     message: &Bytes,
@@ -292,7 +136,7 @@ fn out(
     found
 }
 
-async fn count_frames(mut stream: TcpStream, count: &Progress) -> Result<(), Failure> {
+pub async fn count_frames(mut stream: TcpStream, count: &Progress) -> Result<(), Failure> {
     let mut buffer = vec![0; 1 << 20];
     let (mut header, mut left) = (Vec::new(), 0usize);
     loop {
@@ -329,7 +173,7 @@ async fn count_frames(mut stream: TcpStream, count: &Progress) -> Result<(), Fai
 }
 
 /// Client to node.
-fn inward(
+pub fn inward(
     world: &World,
     type_name: &str,
     message: &Bytes,

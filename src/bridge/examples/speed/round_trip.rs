@@ -1,0 +1,129 @@
+//! How long a message or a call is under way.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use ros::bus::{AdvertiseOptions, Bus, ServiceHandler, ServiceType, SubscribeOptions};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::Failure;
+use crate::world::{World, frame, wire_type};
+
+pub const TRIPS: usize = 5000;
+
+/// Half and 99 of a hundred are not slower.
+pub fn percentiles(mut times: Vec<Duration>) -> [Duration; 2] {
+    times.sort();
+    [times[times.len() / 2], times[times.len() * 99 / 100]]
+}
+
+/// Client, relay, echo, relay, client: as many hops as through bridge and node.
+pub async fn relay_round_trip(world: &World) -> Result<[Duration; 2], Failure> {
+    let mut there = [
+        TcpStream::connect(world.relay).await?,
+        TcpStream::connect(world.relay).await?,
+    ];
+    let mut back = [
+        TcpStream::connect(world.relay).await?,
+        TcpStream::connect(world.relay).await?,
+    ];
+    for stream in there.iter_mut().chain(&mut back) {
+        stream.set_nodelay(true)?;
+    }
+    let ([mut to, mut from], [mut echo_to, mut echo_from]) = (there, back);
+    let echo = world.theirs.spawn(async move {
+        let mut message = [0; 60];
+        while from.read_exact(&mut message).await.is_ok()
+            && echo_to.write_all(&message).await.is_ok()
+        {}
+    });
+    let (mut message, mut times) = ([7; 60], Vec::with_capacity(TRIPS));
+    for _ in 0..TRIPS {
+        let begun = Instant::now();
+        to.write_all(&message).await?;
+        echo_from.read_exact(&mut message).await?;
+        times.push(begun.elapsed());
+    }
+    echo.abort();
+    Ok(percentiles(times))
+}
+
+/// Through the bridge: a String to a node that sends it back, or a call of a service.
+pub fn round_trip(world: &World, service: bool) -> Result<[Duration; 2], Failure> {
+    let wire_type = wire_type(world, "std_msgs/String")?;
+    let options = AdvertiseOptions {
+        wire_type: wire_type.clone(),
+        latch: false,
+        queue: 100,
+    };
+    let publisher = world
+        .theirs
+        .block_on(world.node.advertise("/trip/back", options))?;
+    let subscribe = SubscribeOptions {
+        wire_type: Some(wire_type),
+        queue: 100,
+    };
+    let mut subscription = world
+        .theirs
+        .block_on(world.node.subscribe("/trip/there", subscribe))?;
+    let mut subscribers = publisher.subscribers();
+    let echo = world.theirs.spawn(async move {
+        while let Some(message) = subscription.messages.recv().await {
+            publisher.publish(message.bytes);
+        }
+    });
+    let def = world.registry.service("x/Echo")?;
+    let service_type = ServiceType {
+        name: def.name.clone(),
+        md5: def.md5.clone(),
+    };
+    let _served =
+        world
+            .theirs
+            .block_on(world.node.serve("/trip/call", service_type, Arc::new(Echo)))?;
+    let found = world.ours.block_on(async {
+        let mut stream = TcpStream::connect(world.portal).await?;
+        stream.set_nodelay(true)?;
+        let begin = if service {
+            frame(1, br#"{"op":"set_level","level":"none"}"#)
+        } else {
+            let subscribe = frame(1, br#"{"op":"subscribe","topic":"/trip/back","type":"std_msgs/String"}"#);
+            let advertise = frame(1, br#"{"op":"advertise","topic":"/trip/there","type":"std_msgs/String"}"#);
+            [subscribe, advertise].concat()
+        };
+        stream.write_all(&begin).await?;
+        if !service {
+            subscribers.wait_for(|count| *count > 0).await?;
+        }
+        let ask = if service {
+            frame(1, br#"{"op":"call_service","id":"1","service":"/trip/call","args":{"data":"hello there"}}"#)
+        } else {
+            frame(1, br#"{"op":"publish","topic":"/trip/there","msg":{"data":"hello there"}}"#)
+        };
+        let (mut times, mut buffer) = (Vec::with_capacity(TRIPS), vec![0; 4096]);
+        for _ in 0..TRIPS {
+            let begun = Instant::now();
+            stream.write_all(&ask).await?;
+            // One short frame: its length is in the second byte.
+            let mut got = stream.read(&mut buffer).await?;
+            while got < 2 + usize::from(buffer[1]) {
+                got += stream.read(&mut buffer[got..]).await?;
+            }
+            times.push(begun.elapsed());
+        }
+        Ok::<_, Failure>(percentiles(times))
+    });
+    echo.abort();
+    found
+}
+
+pub struct Echo;
+
+#[async_trait::async_trait]
+impl ServiceHandler for Echo {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        Ok(request)
+    }
+}
