@@ -162,8 +162,11 @@ fn programs_begin_with_ordinary_signals_and_a_session_of_their_own() {
     init.shell(1, "kill -PIPE $$; exit 0");
     let pid = init.started(1);
     assert_eq!(init.exited(pid), libc::SIGPIPE);
-    init.shell(2, "trap '' INT; sleep 60 & wait");
+    let mut printed = init.shell(2, "trap '' INT; sleep 60 & echo up; wait");
     let pid = init.started(2);
+    // Its child must be there before the group is killed.
+    let mut line = [0; 3];
+    printed.read_exact(&mut line).unwrap();
     socket::send(
         init.fd(),
         &Request::signal(pid, libc::SIGKILL, Scope::Group),
