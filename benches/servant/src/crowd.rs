@@ -20,7 +20,7 @@ const IDLE: f64 = 0.1;
 
 /// From one servant to many and back.
 pub(crate) fn measure(report: &mut Report, daemon: &Daemon, image: &Image) -> Result<()> {
-    let (crowd, watch) = if full() { (100, 60) } else { (30, 20) };
+    let (crowd, watch) = if full() { (100, 60) } else { (30, 35) };
     let starts = |what: &str| -> Result<Vec<Duration>> {
         eprintln!("{STARTS} starts {what}");
         (0..STARTS).map(|_| robot(daemon, image)).collect()
