@@ -160,7 +160,7 @@ fn prepare(
         enforced,
         init: ours,
         listener,
-        creator: waiting.go_on()?,
+        creator: waiting.go_on(),
     })
 }
 

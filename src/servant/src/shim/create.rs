@@ -17,8 +17,8 @@ use std::collections::HashMap;
 use std::ffi::CString;
 use std::fs::File;
 use std::io::Write;
-use std::os::fd::OwnedFd;
-use std::path::Path;
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use libcontainer::container::builder::ContainerBuilder;
@@ -26,6 +26,7 @@ use libcontainer::syscall::syscall::SyscallType;
 use libcontainer::workload::{
     Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError,
 };
+use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, send, socketpair};
 use nix::unistd::ForkResult;
 use serde::{Deserialize, Serialize};
 
@@ -73,18 +74,26 @@ impl Waiting {
     }
 
     /// Lets it go on.
-    pub(super) fn go_on(self) -> Result<Creator, Error> {
-        nix::unistd::write(&self.go, b".").map_err(Error::nix("writing to the creator"))?;
-        Ok(Creator {
+    pub(super) fn go_on(self) -> Creator {
+        // Where nobody listens it has failed and ended, and says so in its report. That must not end us too (SIGPIPE).
+        let _ = send(self.go.as_raw_fd(), b".", MsgFlags::MSG_NOSIGNAL);
+        Creator {
             report: self.report,
-        })
+        }
     }
 }
 
 /// Forks it. The calling process must have one thread.
 pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result<Waiting, Error> {
-    let pipe = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
-    let ((report, write), (wait, go)) = (pipe()?, pipe()?);
+    let (report, write) =
+        nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
+    let (wait, go) = socketpair(
+        AddressFamily::Unix,
+        SockType::Stream,
+        None,
+        SockFlag::SOCK_CLOEXEC,
+    )
+    .map_err(Error::nix("socketpair for the creator"))?;
     // SAFETY: one thread, so that the child may do whatever its parent might.
     match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork of the creator"))? {
         ForkResult::Parent { child } => Ok(Waiting {
@@ -98,7 +107,7 @@ pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result
             // Errors that libcontainer meets in its own children are only logged.
             let _ = tracing::subscriber::set_global_default(Complaints(write.clone()));
             let outcome = match stage(directory, launch)
-                .and_then(|init| create(directory, launch, init, socket, wait))
+                .and_then(|staged| create(directory, launch, staged, socket, wait))
             {
                 Ok(init) => Report::Created { init },
                 Err(reason) => Report::Failed(reason),
@@ -110,10 +119,18 @@ pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result
     }
 }
 
-/// Everything that libcontainer is to find: root, volumes, configuration. Gives the open init.
-fn stage(directory: &Path, launch: &Launch) -> Result<File, String> {
+/// What the creator has prepared.
+struct Ready {
+    /// The static init, opened before anything of the servant was mounted.
+    init: File,
+    /// Where libcontainer keeps its records. Nobody needs them later, and on a disk their writing took as long as a
+    /// fifth of the creation: this is in memory, and goes with the creator's mount namespace.
+    records: PathBuf,
+}
+
+/// Everything that libcontainer is to find: root, volumes, configuration.
+fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
     let text = |error: &dyn std::error::Error| chain(error);
-    // Opened before anything of the servant is mounted.
     let init = File::open(&launch.init)
         .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
     let skeleton = directory.join("skeleton");
@@ -142,14 +159,17 @@ fn stage(directory: &Path, launch: &Launch) -> Result<File, String> {
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
     std::fs::write(&file, json)
         .map_err(|error| format!("could not write {}: {error}", file.display()))?;
-    Ok(init)
+    Ok(Ready {
+        init,
+        records: staged.root.with_file_name("records"),
+    })
 }
 
 /// Creates and starts the container; init's pid on the host.
 fn create(
     directory: &Path,
     launch: &Launch,
-    init: File,
+    staged: Ready,
     socket: OwnedFd,
     wait: OwnedFd,
 ) -> Result<i32, String> {
@@ -165,10 +185,10 @@ fn create(
             .map_err(|error| text(&error))
     };
     let mut container = ContainerBuilder::new(launch.spec.id.clone(), SyscallType::default())
-        .with_root_path(directory.join("container"))
+        .with_root_path(&staged.records)
         .map_err(|error| text(&error))?
         .with_executor(RunInit {
-            init: Arc::new(init),
+            init: Arc::new(staged.init),
         })
         .with_stdin(socket)
         .with_stdout(null()?)
