@@ -78,9 +78,16 @@ pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Told {
     caller.says(
         json!({"op": "call_service", "id": "q", "service": "/lamp", "args": {"data": true}}),
     )?;
-    let request = server.hears("the call", |value| {
+    let heard = server.hears("the call", |value| {
         value["op"] == "call_service" && value["service"] == "/lamp"
-    })?;
+    });
+    let request = match heard {
+        Ok(request) => request,
+        Err(error) => {
+            let answer = caller.hears("its answer", |value| value["id"] == "q");
+            return Err(error.context(format!("the caller heard {answer:?}")));
+        }
+    };
     ensure!(request["args"]["data"] == true, "{request}");
     server.says(json!({
         "op": "service_response", "id": request["id"], "service": "/lamp", "result": true,

@@ -9,6 +9,7 @@ use parking_lot::Mutex;
 use tokio::time::timeout;
 
 use super::link::broken;
+use super::registrar::Kind;
 use super::{HANDSHAKE, Inner};
 use crate::bus::{BusError, Graph, ServiceType};
 use crate::ros1::names::PeerUri;
@@ -107,7 +108,10 @@ pub(super) async fn call(
 
 /// Asks a server for its type.
 pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceType, BusError> {
-    if let Some(served) = bus.services.lock().get(service) {
+    let own = bus.services.lock().get(service).cloned();
+    if let Some(served) = own {
+        // Who is told the type may call: the Master must know the server by then.
+        bus.registrar.sync(Kind::Service, service, false).await?;
         return Ok(served.service_type.clone());
     }
     let connection = open(bus, service, ("probe", "1")).await?;
