@@ -223,9 +223,10 @@ async fn wait_for_end(pidfd: &OwnedFd, patience: Duration) -> std::io::Result<()
     if process::has_ended(pidfd) {
         return Ok(());
     }
-    // SAFETY: the descriptor is borrowed for as long as it is watched.
-    let watched =
-        unsafe { AsyncFd::register_with_interest(pidfd.as_fd(), tokio::io::Interest::READABLE) }?;
+    // A descriptor of its own: several wait for the same end, and one descriptor can be watched only once.
+    let own = pidfd.try_clone()?;
+    // SAFETY: owned by what watches it, and so open for as long as it is watched.
+    let watched = unsafe { AsyncFd::register_with_interest(own, tokio::io::Interest::READABLE) }?;
     let _ready = tokio::time::timeout(patience, watched.readable()).await??;
     Ok(())
 }
