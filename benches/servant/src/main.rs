@@ -1,9 +1,11 @@
 //! `make bench ONLY=servant`: what a servant costs, beside the same node started alone, libcontainer called from a bare
-//! program, and runc. Needs root. The program calls itself for the bare container (`bare DIRECTORY`).
+//! program, and runc. Needs root. The program calls itself for the bare container (`bare HOW DIRECTORY`).
 
 #![deny(unsafe_code)]
 
 mod bare;
+mod bundle;
+mod cgroups;
 mod cost;
 mod crowd;
 mod engine;
@@ -37,7 +39,7 @@ fn main() -> Result<()> {
         .as_slice()
     {
         [] => measure(),
-        ["bare", directory] => bare::run(Path::new(directory)),
+        ["bare", how, directory] => bare::run(how, Path::new(directory)),
         _ => bail!("it takes no arguments; CLOUDROID_BENCH_FULL=1 measures longer"),
     }
 }

@@ -46,6 +46,45 @@ pub(crate) fn median(times: &Times) -> f64 {
     times.median().as_secs_f64() * 1e3
 }
 
+/// Between two contestants, for what the one before left running in the kernel.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// Starts something once, and ends it.
+type Start<'a> = Box<dyn Fn(&Spec) -> Result<Duration> + 'a>;
+
+/// One way to start something.
+struct Contestant<'a> {
+    name: &'static str,
+    /// One that does not work on this host is told and left out; ours must.
+    optional: bool,
+    start: Start<'a>,
+    times: Vec<Duration>,
+}
+
+impl<'a> Contestant<'a> {
+    fn ours(name: &'static str, start: impl Fn(&Spec) -> Result<Duration> + 'a) -> Self {
+        Self {
+            name,
+            optional: false,
+            start: Box::new(start),
+            times: Vec::new(),
+        }
+    }
+
+    fn peer(name: &'static str, start: impl Fn(&Spec) -> Result<Duration> + 'a) -> Self {
+        Self {
+            optional: true,
+            ..Self::ours(name, start)
+        }
+    }
+}
+
+const ROBOT: &str = "robot";
+const NODE: &str = "node alone";
+const ENGINE: &str = "engine";
+const LIMITED: &str = "libcontainer alone, the same spec";
+const UNLIMITED: &str = "libcontainer alone, without cgroups";
+
 /// All starts in turns, so that what disturbs one disturbs all.
 pub(crate) fn measure(
     report: &mut Report,
@@ -58,57 +97,66 @@ pub(crate) fn measure(
     std::fs::create_dir_all(&place)?;
     let native = Native::prepare(&place, image, runtime)?;
     let ours = Ours::prepare(&place, runtime)?;
-    let mut peers: Vec<(Peer, Vec<Duration>)> = Peer::installed()?
-        .into_iter()
-        .map(|peer| (peer, Vec::new()))
-        .collect();
-    let (mut robots, mut nodes, mut engine, mut bares) = (vec![], vec![], vec![], vec![]);
+    let bundle = place.join("bundle");
+    let mut contestants = vec![
+        Contestant::ours(ROBOT, |_| robot(daemon, image)),
+        Contestant::ours(NODE, |_| native.time()),
+        Contestant::ours(ENGINE, |spec| ours.time(spec.clone())),
+        Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),
+        Contestant::ours(UNLIMITED, |spec| bare::unlimited(&bundle, spec)),
+    ];
+    for peer in Peer::installed() {
+        let bundle = place.join(peer.name);
+        contestants.push(Contestant::peer(peer.name, move |spec| {
+            peer.time(&bundle, spec)
+        }));
+    }
     // The first round warms up.
     for round in 0..=rounds {
         eprintln!("starts: round {round} of {rounds}");
-        let spec = |name: &str| Spec {
-            id: format!("bench-{name}-{}-{round}", std::process::id()),
-            nodes: Vec::new(),
-            ..image.spec.clone()
-        };
-        let robot = robot(daemon, image).context("a robot's start")?;
-        let node = native.time().context("the node alone")?;
-        let engines = ours.time(spec("engine")).context("the engine alone")?;
-        let bare = bare::time(&place.join("bare"), &spec("bare")).context("libcontainer alone")?;
-        // One that does not work on this host is told and left out.
-        peers.retain_mut(|(peer, times)| {
-            match peer.time(&place.join(peer.name), &spec(peer.name)) {
-                Ok(time) => {
-                    times.extend((round > 0).then_some(time));
-                    true
+        for index in (0..contestants.len()).rev() {
+            let one = &mut contestants[index];
+            let spec = Spec {
+                id: format!("bench-{}-{round}-{index}", std::process::id()),
+                nodes: Vec::new(),
+                ..image.spec.clone()
+            };
+            std::thread::sleep(PAUSE);
+            match (one.start)(&spec) {
+                Ok(time) => one.times.extend((round > 0).then_some(time)),
+                Err(error) if one.optional => {
+                    eprintln!("{} is left out: {error:#}", one.name);
+                    contestants.remove(index);
                 }
-                Err(error) => {
-                    eprintln!("{} is left out: {error:#}", peer.name);
-                    false
-                }
+                Err(error) => return Err(error.context(one.name)),
             }
-        });
-        if round > 0 {
-            robots.push(robot);
-            nodes.push(node);
-            engine.push(engines);
-            bares.push(bare);
         }
     }
-    let robots = times("robot", robots);
-    let (nodes, engine, bares) = (
-        times("node", nodes),
-        times("engine", engine),
-        times("bare", bares),
-    );
-    let (node, bare) = (median(&nodes), median(&bares));
+    let all: Vec<Times> = contestants
+        .into_iter()
+        .map(|one| times(one.name, one.times))
+        .collect();
+    tell(report, &all, rounds)
+}
+
+fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
+    let of = |name: &str| all.iter().find(|times| times.name == name);
+    let needed = |name: &str| of(name).with_context(|| name.to_owned());
+    let (robots, node) = (needed(ROBOT)?, median(needed(NODE)?));
+    let engine = median(needed(ENGINE)?);
+    let unlimited = needed(UNLIMITED)?;
+    // Where libcontainer cannot set limits the container without them stands for it.
+    let bare = of(LIMITED).unwrap_or(unlimited);
     report
         .figure(
             "robot connects → node registered, bridged",
             "ms",
-            median(&robots),
+            median(robots),
         )
-        .beside("node alone + 1.5 × libcontainer alone", node + 1.5 * bare)
+        .beside(
+            "node alone + 1.5 × libcontainer alone",
+            node + 1.5 * median(bare),
+        )
         .reach(Target::RatioAtMost(1.0))
         .note(format!(
             "medians of {rounds}, in turns; best {:.1} ms",
@@ -118,19 +166,19 @@ pub(crate) fn measure(
         .figure("node alone: exec → registered", "ms", node)
         .note("in a chroot of the same layers, namespaces ready, the same Master");
     report
-        .figure("create → running", "ms", median(&engine))
-        .beside("libcontainer alone, bare program, same spec", bare)
+        .figure("create → running", "ms", engine)
+        .beside(bare.name.clone(), median(bare))
         .reach(Target::RatioAtMost(1.5))
-        .note("ours with cgroup, limits, shim, Master and init; the bare one without");
-    for (peer, list) in peers {
-        let name = peer.name;
-        report
-            .figure(
-                format!("create → running, beside {name}"),
-                "ms",
-                median(&engine),
-            )
-            .beside(name, median(&times(name, list)));
+        .note("ours with limits read back, shim, Master and init");
+    for other in all
+        .iter()
+        .filter(|times| ![ROBOT, NODE, ENGINE].contains(&times.name.as_str()))
+    {
+        if other.name != bare.name {
+            report
+                .figure("create → running", "ms", engine)
+                .beside(other.name.clone(), median(other));
+        }
     }
     Ok(())
 }
