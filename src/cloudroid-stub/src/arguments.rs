@@ -1,0 +1,72 @@
+//! The command line. Launchers write it, people only type `doctor`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+/// Runs a robot's node in the cloud, under its own name.
+#[derive(Debug, Parser)]
+#[command(name = "cloudroid-stub", version, arg_required_else_help = true)]
+pub struct Arguments {
+    /// What to do.
+    #[command(subcommand)]
+    pub verb: Verb,
+}
+
+/// What can be done.
+#[derive(Debug, Subcommand)]
+pub enum Verb {
+    /// Be the node: register under its name, have the real one run in the cloud.
+    Run(Run),
+    /// Become the next executable of this name in libexec order: one that is not outsourced.
+    ExecOriginal(ExecOriginal),
+    /// Say of each thing the stub needs whether it is there.
+    Doctor(Doctor),
+}
+
+/// Which executable is meant.
+#[derive(Debug, Clone, Args)]
+pub struct Node {
+    /// The ROS package.
+    #[arg(long, value_name = "PKG")]
+    pub package: String,
+    /// The executable below lib/PKG.
+    #[arg(long, value_name = "EXE")]
+    pub node: String,
+    /// The stub's share/PKG, where interface.toml and stub.toml are.
+    #[arg(long, value_name = "DIR")]
+    pub share: PathBuf,
+}
+
+/// Be the node.
+#[derive(Debug, Args)]
+pub struct Run {
+    #[command(flatten)]
+    /// Which.
+    pub node: Node,
+    /// As roslaunch or rosrun gave it: arguments, remaps, __name:=, __log:=.
+    #[arg(last = true, allow_hyphen_values = true)]
+    pub argv: Vec<String>,
+}
+
+/// Become the original.
+#[derive(Debug, Args)]
+pub struct ExecOriginal {
+    #[command(flatten)]
+    /// Which.
+    pub node: Node,
+    /// Passed on as it is.
+    #[arg(last = true, allow_hyphen_values = true)]
+    pub argv: Vec<String>,
+}
+
+/// Check.
+#[derive(Debug, Args)]
+pub struct Doctor {
+    /// The stub's share/PKG, where interface.toml and stub.toml are.
+    #[arg(long, value_name = "DIR")]
+    pub share: PathBuf,
+    /// The ROS package; by default the share directory's name.
+    #[arg(long, value_name = "PKG")]
+    pub package: Option<String>,
+}

@@ -1,0 +1,246 @@
+//! `stub.toml`, which stands beside `interface.toml` in the stub's share directory, and what overrides it.
+//!
+//! ```toml
+//! server = "ws://cloud.example:9090"   # the portal
+//! service = "opencv_apps"              # what was published
+//! token_file = "~/.config/cloudroid/token"   # holds the bearer token; none is needed where the portal asks for none
+//! robot = "rover1"                     # this robot's id; by default its host name
+//!
+//! desire = 0.10        # T_desire, seconds: the response time that is wished for
+//! max = 0.30           # T_max, seconds: the longest that is acceptable
+//! threshold = 10       # Q_t: below it the local original is started
+//! initial = 10         # Q at the beginning; Q_t where absent
+//! frames_per_second = 5.0   # instead, or as well: least rate of an output
+//! age = 0.5            # instead, or as well, seconds: greatest age of an output
+//! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
+//!
+//! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed, "none"
+//! stateful = false     # the local original takes over only while the link is down
+//! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time
+//! codec = "auto"       # "none", "auto" (lossless), or "video" (lossy pictures allowed)
+//! ```
+//!
+//! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by the node's
+//! private parameter `~cloudroid/KEY`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use serde::Deserialize;
+use toml::{Table, Value};
+
+/// The file's name in the share directory.
+pub const FILE: &str = "stub.toml";
+
+/// How the stub is to behave.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The portal: `ws://host:port`.
+    pub server: String,
+    /// The service's name.
+    pub service: String,
+    /// The bearer token itself. Better in a file, which fewer can read.
+    #[serde(default)]
+    pub token: Option<String>,
+    /// A file that holds it.
+    #[serde(default)]
+    pub token_file: Option<PathBuf>,
+    /// This robot's id; its host name where absent.
+    #[serde(default)]
+    pub robot: Option<String>,
+    /// T_desire in seconds.
+    #[serde(default)]
+    pub desire: Option<f64>,
+    /// T_max in seconds.
+    #[serde(default)]
+    pub max: Option<f64>,
+    /// Q_t.
+    #[serde(default)]
+    pub threshold: Option<f64>,
+    /// Q at the beginning.
+    #[serde(default)]
+    pub initial: Option<f64>,
+    /// Least rate of an output.
+    #[serde(default)]
+    pub frames_per_second: Option<f64>,
+    /// Greatest age of an output in seconds.
+    #[serde(default)]
+    pub age: Option<f64>,
+    /// `auto`, or `INPUT -> OUTPUT`.
+    #[serde(default)]
+    pub request: Option<String>,
+    /// When the local original runs.
+    #[serde(default)]
+    pub local: Local,
+    /// The local original takes over only while the link is down.
+    #[serde(default)]
+    pub stateful: bool,
+    /// An output on which a message of zeros is published when neither side answers in time.
+    #[serde(default)]
+    pub safe_stop: Option<String>,
+    /// How messages are made smaller on the link.
+    #[serde(default)]
+    pub codec: Codec,
+}
+
+/// When the local original runs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Local {
+    /// Started when it is needed.
+    #[default]
+    Cold,
+    /// Started at once, given requests when it is needed.
+    Warm,
+    /// Never.
+    None,
+}
+
+/// How messages are made smaller.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Codec {
+    /// Not at all.
+    None,
+    /// As it pays, without loss.
+    #[default]
+    Auto,
+    /// As it pays; pictures may lose detail.
+    Video,
+}
+
+/// Reads `stub.toml` in `share` with what the environment says instead.
+pub fn read(
+    share: &Path,
+    environment: impl Iterator<Item = (String, String)>,
+) -> anyhow::Result<Config> {
+    let path = share.join(FILE);
+    let text = std::fs::read_to_string(&path).with_context(|| {
+        format!(
+            "cannot read {}: the stub's package is not complete; install it again",
+            path.display()
+        )
+    })?;
+    let table: Table = toml::from_str(&text).with_context(|| format!("{}", path.display()))?;
+    with(
+        table,
+        environment.filter_map(|(name, value)| Some((key_of(&name)?, value))),
+    )
+    .with_context(|| format!("{} with CLOUDROID_* of the environment", path.display()))
+}
+
+/// The key that an environment variable stands for.
+fn key_of(variable: &str) -> Option<String> {
+    let key = variable.strip_prefix("CLOUDROID_")?.to_ascii_lowercase();
+    KEYS.contains(&key.as_str()).then_some(key)
+}
+
+/// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
+pub const KEYS: [&str; 16] = [
+    "server",
+    "service",
+    "token",
+    "token_file",
+    "robot",
+    "desire",
+    "max",
+    "threshold",
+    "initial",
+    "frames_per_second",
+    "age",
+    "request",
+    "local",
+    "stateful",
+    "safe_stop",
+    "codec",
+];
+
+/// The file's table with some keys given otherwise, as text.
+fn with(
+    mut table: Table,
+    instead: impl Iterator<Item = (String, String)>,
+) -> anyhow::Result<Config> {
+    for (key, text) in instead {
+        table.insert(key, value_of(&text));
+    }
+    let mut config: Config = table.try_into()?;
+    // The parts that share them write them as whole numbers too.
+    while config.server.ends_with('/') {
+        config.server.pop();
+    }
+    if !["ws://", "wss://"]
+        .iter()
+        .any(|scheme| config.server.starts_with(scheme))
+    {
+        bail!(
+            "server is {:?}; it should look like ws://host:9090",
+            config.server
+        );
+    }
+    if let (Some(desire), Some(max)) = (config.desire, config.max)
+        && desire > max
+    {
+        bail!("desire ({desire} s) is greater than max ({max} s)");
+    }
+    Ok(config)
+}
+
+/// A value as TOML would read it, or else as text.
+fn value_of(text: &str) -> Value {
+    match text.trim() {
+        "true" => Value::Boolean(true),
+        "false" => Value::Boolean(false),
+        other => other.parse().map_or_else(
+            |_| Value::String(text.to_owned()),
+            |number: f64| Value::Float(number),
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FILE: &str =
+        "server = 'ws://cloud:9090/'\nservice = 'opencv_apps'\ndesire = 0.1\nmax = 1\n";
+
+    fn config(instead: &[(&str, &str)]) -> anyhow::Result<Config> {
+        let instead = instead
+            .iter()
+            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        with(toml::from_str(FILE)?, instead)
+    }
+
+    #[test]
+    fn the_file_is_enough() {
+        let config = config(&[]).unwrap();
+        assert_eq!(config.server, "ws://cloud:9090");
+        assert_eq!((config.desire, config.max), (Some(0.1), Some(1.0)));
+        assert_eq!((config.local, config.codec), (Local::Cold, Codec::Auto));
+    }
+
+    #[test]
+    fn the_environment_says_otherwise() {
+        assert_eq!(key_of("CLOUDROID_LOCAL").as_deref(), Some("local"));
+        assert_eq!(key_of("CLOUDROID_HOME"), None);
+        let config = config(&[("local", "warm"), ("max", "0.5"), ("stateful", "true")]).unwrap();
+        assert_eq!(
+            (config.local, config.max, config.stateful),
+            (Local::Warm, Some(0.5), true)
+        );
+    }
+
+    #[test]
+    fn nonsense_is_named() {
+        for (key, value, named) in [
+            ("server", "cloud:9090", "server"),
+            ("desire", "2", "desire"),
+            ("local", "hot", "hot"),
+            ("max", "soon", "max"),
+        ] {
+            let error = format!("{:#}", config(&[(key, value)]).unwrap_err());
+            assert!(error.contains(named), "{error}");
+        }
+    }
+}
