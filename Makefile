@@ -77,6 +77,11 @@ stories: build-dev ## the whole system, told as stories; ONLY=name runs those wh
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
 	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
 
+.PHONY: fuzz
+fuzz: ## a minute of fuzzing for every decoder; ONLY=name for one, FUZZ_SECONDS=n for another time
+	@scripts/deps build fuzz
+	@scripts/fuzz "$(CACHE)" $(ONLY)
+
 .PHONY: install
 install: build ## install binaries, units and the example configuration below PREFIX
 	@scripts/install "$(CARGO_TARGET_DIR)/release" "$(DESTDIR)" "$(PREFIX)"

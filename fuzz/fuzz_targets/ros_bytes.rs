@@ -1,0 +1,3 @@
+//! A serialized message.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(ros, bytes);

@@ -1,0 +1,3 @@
+//! CBOR for a message.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(ros, cbor);

@@ -1,0 +1,3 @@
+//! A binary frame.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(rosbridge, cbor);

@@ -1,0 +1,42 @@
+//! One function per kind of bytes that strangers send. Each reads or refuses what it is given and then checks what
+//! must be true of what was read; a wrong answer is a panic, as a crash would be.
+//!
+//! The fuzzer calls them from `fuzz_targets/` (`make fuzz ONLY=ros_json`), the tests from `tests/replay.rs`, with the
+//! kept corpus and some damage done to it. A new target is a function here, an entry in [`TARGETS`], a program in
+//! `fuzz_targets/` with its `[[bin]]`, and a few seeds in `corpus/`.
+
+#![forbid(unsafe_code)]
+
+pub mod ros;
+pub mod rosbridge;
+
+/// What takes the fuzzer's bytes.
+pub type Target = fn(&[u8]);
+
+/// Every target, by the name of its program and of its folder in `corpus/`.
+pub const TARGETS: &[(&str, Target)] = &[
+    ("rosbridge_json", rosbridge::json),
+    ("rosbridge_cbor", rosbridge::cbor),
+    ("rosbridge_fragments", rosbridge::fragments),
+    ("rosbridge_png", rosbridge::png),
+    ("ros_json", ros::json),
+    ("ros_cbor", ros::cbor),
+    ("ros_bytes", ros::bytes),
+    ("ros_definition", ros::definition),
+    ("ros_tcpros", ros::tcpros),
+    ("ros_xmlrpc", ros::xmlrpc),
+];
+
+/// The program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzer's build it does nothing.
+#[macro_export]
+macro_rules! target {
+    ($module:ident, $function:ident) => {
+        #[cfg(fuzzing)]
+        libfuzzer_sys::fuzz_target!(|data: &[u8]| $crate::$module::$function(data));
+
+        #[cfg(not(fuzzing))]
+        fn main() {
+            eprintln!("this is a fuzzer's program; run it by make fuzz");
+        }
+    };
+}

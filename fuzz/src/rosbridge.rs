@@ -1,0 +1,107 @@
+//! rosbridge: frames, fragments, pictures.
+
+use std::time::{Duration, Instant};
+
+use base64::prelude::{BASE64_STANDARD, Engine as _};
+use rosbridge::{
+    Format, Fragment, FragmentLimits, Fragments, Frame, Id, Op, Payload, decode_png, encode_png,
+    unknown_fields,
+};
+
+/// A text frame.
+pub fn json(data: &[u8]) {
+    if let Ok(text) = std::str::from_utf8(data) {
+        frame(Frame::Text(text));
+    }
+}
+
+/// A binary frame.
+pub fn cbor(data: &[u8]) {
+    frame(Frame::Binary(data));
+}
+
+fn frame(frame: Frame<'_>) {
+    let Ok(op) = Op::parse(frame) else {
+        return;
+    };
+    unknown_fields(frame);
+    if let Some(payload) = payload(&op) {
+        let _ = (payload.raw(), payload.text(), payload.named(["a", "data"]));
+    }
+    let mut printed = Vec::new();
+    op.print(&mut printed, frame.format());
+    let again = match frame.format() {
+        Format::Json => Frame::Text(std::str::from_utf8(&printed).expect("JSON is UTF-8")),
+        Format::Cbor => Frame::Binary(&printed),
+    };
+    assert_eq!(Op::parse(again).as_ref(), Ok(&op), "{printed:?}");
+}
+
+fn payload<'a>(op: &Op<'a>) -> Option<Payload<'a>> {
+    match op {
+        Op::Publish(op) => Some(op.msg),
+        Op::CallService(op) => op.args,
+        Op::ServiceResponse(op) => op.values,
+        Op::SendActionGoal(op) => op.args,
+        Op::ActionFeedback(op) => Some(op.values),
+        Op::ActionResult(op) => op.values,
+        _ => None,
+    }
+}
+
+/// Fragments of several messages, in any order: five bytes each say message, index, total, time since the last one and
+/// length; the text follows.
+pub fn fragments(mut data: &[u8]) {
+    let limits = FragmentLimits {
+        messages: 4,
+        parts: 64,
+        bytes: 2048,
+        age: Duration::from_secs(100),
+    };
+    let mut fragments = Fragments::new(limits);
+    let mut now = Instant::now();
+    while let [id, num, total, wait, length, rest @ ..] = data {
+        let (text, rest) = rest.split_at(usize::from(*length).min(rest.len()));
+        data = rest;
+        now += Duration::from_secs((*wait).into());
+        let fragment = Fragment {
+            id: Id::Integer(i64::from(*id % 8)),
+            data: String::from_utf8_lossy(text),
+            num: (*num).into(),
+            total: (*total).into(),
+        };
+        let before = fragments.bytes();
+        match fragments.add(&fragment, now) {
+            Ok(Some(whole)) => {
+                assert!(whole.ends_with(&*fragment.data) || fragment.num + 1 < fragment.total);
+                assert!(fragments.bytes() <= before);
+            }
+            Ok(None) => assert!(fragment.num < fragment.total),
+            Err(_) => {}
+        }
+        // One message's empty slots may come on top.
+        assert!(fragments.bytes() <= limits.bytes + limits.parts * size_of::<Option<Box<str>>>());
+    }
+    fragments.forget_old(now + Duration::from_secs(1000));
+    assert_eq!(fragments.bytes(), 0);
+}
+
+/// A message packed into a picture: the bytes as a PNG file, and as a text to be packed.
+pub fn png(data: &[u8]) {
+    const LIMIT: usize = 100_000;
+    let text = BASE64_STANDARD.encode(data);
+    if let Ok(message) = decode_png(&text, LIMIT) {
+        assert!(message.len() <= LIMIT);
+    }
+    if let Ok(text) = std::str::from_utf8(data) {
+        let _ = decode_png(text, LIMIT);
+        if let Ok(packed) = encode_png(data)
+            && text.len() < LIMIT / 2
+        {
+            // Pictures are padded with these.
+            let text = text.trim_end_matches(['\n', '\0']);
+            let unpacked = decode_png(&packed, LIMIT).expect("its own picture");
+            assert_eq!(unpacked, text);
+        }
+    }
+}
