@@ -16,10 +16,11 @@ pub struct Picture {
     pub data: Vec<u8>,
 }
 
-/// Where the recordings are, if they are.
+/// Where the recordings are, if they are: in `CLOUDROID_RECORDINGS`, else in `../shared/data` beside the repository.
 pub fn recordings() -> Option<PathBuf> {
-    let path = bench_report::root().join("../shared/data");
-    path.is_dir().then_some(path)
+    let beside = || bench_report::root().join("../shared/data");
+    let path = std::env::var_os("CLOUDROID_RECORDINGS").map_or_else(beside, PathBuf::from);
+    path.join("color1.png").exists().then_some(path)
 }
 
 /// Debian's `opencv-doc`.

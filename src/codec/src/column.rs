@@ -63,20 +63,6 @@ impl Shape {
     }
 }
 
-/// Fills lanes of one plane from samples in order, each mapped.
-fn fill<S: Copy, T: Copy + Default>(lanes: &mut Lanes<T>, samples: &[S], map: impl Fn(S) -> T) {
-    let mut rest = samples;
-    for lane in &mut lanes.lanes {
-        for y in 0..lane.height {
-            let (row, after) = rest.split_at(lane.width);
-            for (slot, &sample) in lane.row_mut(y).iter_mut().zip(row) {
-                *slot = map(sample);
-            }
-            rest = after;
-        }
-    }
-}
-
 /// The order of floats as an order of integers.
 #[inline]
 pub(crate) fn ordered(bits: u32) -> u32 {
@@ -106,7 +92,7 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     }
     let missing = (zeros > 0 && smallest >= 15).then(|| {
         let mut lanes = shape.lanes();
-        fill(&mut lanes, samples, |sample| u8::from(sample == 0));
+        lanes.fill(samples, |sample| u8::from(sample == 0));
         lanes
     });
     let flags = if missing.is_some() { MISSING } else { 0 };
@@ -165,12 +151,12 @@ fn encode_plane16(
             }
             put_varint(out, values.len() as u64);
             put_packed(&steps, out);
-            fill(&mut lanes, samples, |sample| rank[usize::from(sample)]);
+            lanes.fill(samples, |sample| rank[usize::from(sample)]);
         }
         None => {
             out.push(flags);
             out.extend_from_slice(preamble);
-            fill(&mut lanes, samples, |sample| sample);
+            lanes.fill(samples, |sample| sample);
         }
     }
     Wide {
@@ -196,7 +182,7 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
         out.push(WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        fill(&mut lanes, samples, |sample| sample - smallest);
+        lanes.fill(samples, |sample| sample - smallest);
         Wide {
             samples: lanes,
             missing: None,
@@ -208,7 +194,7 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
 /// Encodes differences that are small numbers already.
 pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut lanes = shape.lanes();
-    fill(&mut lanes, samples, |sample| sample);
+    lanes.fill(samples, |sample| sample);
     Wide {
         samples: lanes,
         missing: None,
@@ -230,77 +216,85 @@ pub(crate) fn encode_floats(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
 }
 
 fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
-    let mut multiples: Vec<i32> = bits.iter().map(|&bits| scale.multiple(bits)).collect();
-    let fits = |multiple: i32| multiple != Scale::NONE;
+    let mut multiples = scale.multiples(bits);
     // Zero is taken for "nothing measured" when all others are far from it.
-    if multiples.contains(&0)
-        && multiples
-            .iter()
-            .all(|&multiple| multiple == 0 || multiple.unsigned_abs() >= 16)
-    {
-        multiples
-            .iter_mut()
-            .filter(|multiple| **multiple == 0)
-            .for_each(|multiple| *multiple = Scale::NONE);
+    let (mut zeros, mut nearest) = (0u32, u32::MAX);
+    for &multiple in &multiples {
+        zeros += u32::from(multiple == 0);
+        nearest = nearest.min(multiple.unsigned_abs().wrapping_sub(1));
     }
-    let unfit = multiples
-        .iter()
-        .filter(|&&multiple| !fits(multiple))
-        .count();
-    let odd = bits
-        .iter()
-        .zip(&multiples)
-        .filter(|&(&bits, &multiple)| !fits(multiple) && measured(bits))
-        .count();
-    if odd * 16 > bits.len() {
-        return encode_ordered(bits, shape, out);
+    if zeros > 0 && nearest >= 15 {
+        for multiple in &mut multiples {
+            *multiple = if *multiple == 0 {
+                Scale::NONE
+            } else {
+                *multiple
+            };
+        }
     }
-    let smallest = multiples
-        .iter()
-        .copied()
-        .filter(|&multiple| fits(multiple))
-        .min()
-        .unwrap_or(0);
-    let largest = multiples.iter().copied().max().unwrap_or(0).max(smallest);
+    let fits = |multiple: i32| multiple != Scale::NONE;
+    let (mut unfit, mut smallest, mut largest) = (0usize, i32::MAX, i32::MIN);
+    for &multiple in &multiples {
+        unfit += usize::from(!fits(multiple));
+        smallest = smallest.min(if fits(multiple) { multiple } else { i32::MAX });
+        largest = largest.max(multiple);
+    }
+    if unfit == multiples.len() {
+        (smallest, largest) = (0, 0);
+    }
     let mut flags = SCALED;
     let mut preamble = vec![scale.name()];
-    let missing = (unfit > 0).then(|| {
+    let mut missing = None;
+    if unfit > 0 {
         flags |= MISSING;
-        let apart = bits
-            .iter()
-            .zip(&multiples)
-            .filter(|&(_, &multiple)| !fits(multiple))
-            .map(|(&bits, _)| bits);
-        put_apart(apart, &mut preamble);
-        let mut lanes = shape.lanes();
-        fill(&mut lanes, &multiples, |multiple| u8::from(!fits(multiple)));
-        lanes
-    });
-    put_varint(&mut preamble, zigzag(i64::from(smallest)));
-    let above = |multiple: i32| {
-        if fits(multiple) {
-            multiple.wrapping_sub(smallest) as u32
-        } else {
-            0
+        if !put_unfit(bits, &multiples, unfit, &mut preamble) {
+            return encode_ordered(bits, shape, out);
         }
-    };
-    if (i64::from(largest) - i64::from(smallest)) < 1 << 16 {
-        let samples: Vec<u16> = multiples
-            .iter()
-            .map(|&multiple| above(multiple) as u16)
-            .collect();
+        let mut lanes = shape.lanes();
+        lanes.fill(&multiples, |multiple| u8::from(!fits(multiple)));
+        missing = Some(lanes);
+    }
+    put_varint(&mut preamble, zigzag(i64::from(smallest)));
+    // What is missing gets any value: its place is bridged.
+    if i64::from(largest) - i64::from(smallest) < 1 << 16 {
+        let above = |multiple: i32| multiple.wrapping_sub(smallest) as u16;
+        let samples: Vec<u16> = multiples.iter().map(|&multiple| above(multiple)).collect();
         encode_plane16(&samples, missing, flags, &preamble, shape, out);
     } else {
         out.push(flags | WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        fill(&mut lanes, &multiples, above);
+        lanes.fill(&multiples, |multiple| {
+            multiple.wrapping_sub(smallest) as u32
+        });
         Wide {
             samples: lanes,
             missing,
         }
         .encode(shape.kinds(), out);
     }
+}
+
+/// Lists the `unfit` floats that are no multiple. False when too many of them were measured for a scale to be worth it.
+fn put_unfit(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -> bool {
+    let pairs = || bits.iter().zip(multiples);
+    let first = pairs()
+        .find(|&(_, &multiple)| multiple == Scale::NONE)
+        .map_or(0, |(&bits, _)| bits);
+    let same =
+        |(&bits, &multiple): (&u32, &i32)| usize::from((multiple == Scale::NONE) & (bits == first));
+    if pairs().map(same).sum::<usize>() == unfit {
+        // One mark for "nothing", as most drivers have it.
+        put_apart(std::iter::repeat_n(first, unfit), out);
+        return !measured(first) || unfit * 16 <= bits.len();
+    }
+    let apart = || {
+        pairs()
+            .filter(|&(_, &multiple)| multiple == Scale::NONE)
+            .map(|(&bits, _)| bits)
+    };
+    put_apart(apart(), out);
+    apart().filter(|&bits| measured(bits)).count() * 16 <= bits.len()
 }
 
 /// Whether a float is one that a sensor measured rather than a mark for "nothing".
@@ -319,14 +313,14 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
             &mut preamble,
         );
         let mut lanes = shape.lanes();
-        fill(&mut lanes, bits, |bits| u8::from(!measured(bits)));
+        lanes.fill(bits, |bits| u8::from(!measured(bits)));
         lanes
     });
     put_varint(&mut preamble, 0);
     out.push(flags);
     out.extend_from_slice(&preamble);
     let mut lanes = shape.lanes();
-    fill(&mut lanes, bits, ordered);
+    lanes.fill(bits, ordered);
     Wide {
         samples: lanes,
         missing,
@@ -405,6 +399,7 @@ fn decode_plane<T: Sample>(
     wide.samples
         .rows()
         .for_each(|row| samples.extend_from_slice(row));
+    samples.truncate(shape.count());
     Ok((samples, wide.missing))
 }
 

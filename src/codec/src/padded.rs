@@ -150,15 +150,12 @@ impl<T: Copy + Default> Lanes<T> {
                 stripes: 1,
             };
         }
-        let stripe = length / STRIPES;
-        let mut lanes: Vec<_> = (0..STRIPES).map(|_| Padded::sequence(stripe)).collect();
-        if length % STRIPES > 0 {
-            lanes.push(Padded::sequence(length % STRIPES));
-        }
+        // What does not divide by four is filled up rather than coded apart.
+        let stripe = length.div_ceil(STRIPES);
         Self {
-            stripes: lanes.len(),
-            lanes,
+            lanes: (0..STRIPES).map(|_| Padded::sequence(stripe)).collect(),
             stripe,
+            stripes: STRIPES,
         }
     }
 
@@ -195,6 +192,25 @@ impl<T: Copy + Default> Lanes<T> {
         for lane in &mut self.lanes {
             for y in 0..lane.height {
                 lane.close_row(y);
+            }
+        }
+    }
+
+    /// Fills a single plane or sequence from samples in order, each mapped; what is over gets the last one.
+    pub(crate) fn fill<S: Copy>(&mut self, samples: &[S], map: impl Fn(S) -> T) {
+        let mut rest = samples;
+        let mut last = T::default();
+        for lane in &mut self.lanes {
+            for y in 0..lane.height {
+                let row = lane.row_mut(y);
+                let (front, back) = rest.split_at(row.len().min(rest.len()));
+                let (filled, over) = row.split_at_mut(front.len());
+                for (slot, &sample) in filled.iter_mut().zip(front) {
+                    *slot = map(sample);
+                }
+                last = filled.last().copied().unwrap_or(last);
+                over.fill(last);
+                rest = back;
             }
         }
     }
@@ -256,11 +272,15 @@ mod tests {
         for length in [0, 1, 1023, 1024, 1027] {
             let samples: Vec<u32> = (0..length).collect();
             let mut lanes = Lanes::sequence(samples.len());
-            let mut rest = samples.iter().copied();
-            for lane in &mut lanes.lanes {
-                (0..lane.height).for_each(|y| lane.row_mut(y).fill_with(|| rest.next().unwrap()));
-            }
-            assert_eq!(lanes.rows().flatten().copied().collect::<Vec<_>>(), samples);
+            lanes.fill(&samples, |sample| sample);
+            let back: Vec<u32> = lanes
+                .rows()
+                .flatten()
+                .copied()
+                .take(samples.len())
+                .collect();
+            assert_eq!(back, samples);
+            assert!(lanes.count() < samples.len() + 4);
         }
     }
 }

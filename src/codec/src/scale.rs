@@ -46,8 +46,10 @@ const SCALES: [(f32, f32); 26] = [
 impl Scale {
     /// The multiple of what is none.
     pub(crate) const NONE: i32 = i32::MIN;
-    /// Whole numbers up to here are exact in a float.
-    const LARGEST: f64 = 16_777_215.0;
+    /// Beyond this the product below is no longer good to half a multiple.
+    const LARGEST: f32 = 4_000_000.0;
+    /// Adding and taking away this rounds to a whole number.
+    const ROUND: f32 = 12_582_912.0;
 
     pub(crate) fn named(name: u8) -> Result<Self, Error> {
         let &(divisor, factor) = SCALES
@@ -76,20 +78,40 @@ impl Scale {
         value.to_bits()
     }
 
-    /// The multiple whose float has these very bits, or [`Scale::NONE`].
-    #[inline]
+    /// The multiple whose float has these very bits, or [`Scale::NONE`]. Without a branch, for the vectoriser.
+    #[inline(always)]
     pub(crate) fn multiple(self, bits: u32) -> i32 {
-        let scaled = f64::from(f32::from_bits(bits)) * f64::from(self.divisor);
-        // NaN fails the comparison too.
-        if !(-Self::LARGEST..=Self::LARGEST).contains(&scaled) {
-            return Self::NONE;
-        }
-        let multiple = (scaled + 0.5f64.copysign(scaled)) as i32;
-        if self.value(multiple) == bits {
+        let scaled = f32::from_bits(bits) * self.divisor;
+        // Not a number fails the comparison too.
+        let near = scaled.abs() <= Self::LARGEST;
+        let multiple = ((scaled + Self::ROUND) - Self::ROUND) as i32;
+        if near & (self.value(multiple) == bits) {
             multiple
         } else {
             Self::NONE
         }
+    }
+
+    /// [`Scale::multiple`] of many.
+    pub(crate) fn multiples(self, bits: &[u32]) -> Vec<i32> {
+        let mut multiples = vec![0; bits.len()];
+        // Whether to divide or multiply is decided once.
+        if self.factor == 0.0 {
+            let scale = Self {
+                factor: 0.0,
+                ..self
+            };
+            multiples
+                .iter_mut()
+                .zip(bits)
+                .for_each(|(multiple, &bits)| *multiple = scale.multiple(bits));
+        } else {
+            multiples
+                .iter_mut()
+                .zip(bits)
+                .for_each(|(multiple, &bits)| *multiple = self.multiple(bits));
+        }
+        multiples
     }
 
     /// The coarsest scale that nearly all of the floats measured are multiples of.

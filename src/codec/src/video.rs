@@ -48,7 +48,7 @@ impl VideoEncoder {
     }
 
     /// Appends the body of `message`; `None` when it is no colour picture or the library refuses it.
-    #[cfg_attr(not(feature = "video"), allow(unused_variables))]
+    #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
     pub(crate) fn encode(
         &mut self,
         message: &[u8],
@@ -77,7 +77,7 @@ pub(crate) struct VideoDecoder {
 
 impl VideoDecoder {
     /// Appends a message of `total` bytes to `out`.
-    #[cfg_attr(not(feature = "video"), allow(unused_variables))]
+    #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
     pub(crate) fn decode(
         &mut self,
         input: &mut Cursor<'_>,

@@ -16,7 +16,7 @@ use crate::predict::{EASE, Kind, Predictor, Sample, with_predictor};
 use crate::wire::put_block;
 
 /// The token of a missing sample.
-const MISSING: u8 = 200;
+const MISSING: u8 = LAST_TOKEN as u8 + 1;
 /// Differences below this are their own token; above it there are four tokens per octave.
 const EXACT: u32 = 16;
 /// The token of the largest difference.
@@ -147,20 +147,17 @@ impl<T: Sample> Wide<T> {
     /// The predictor whose differences take the fewest bits on some rows of a picture, or the beginning of a sequence.
     fn choose(&self, kinds: &[Kind]) -> Kind {
         /// Samples of a row that are looked at.
-        const SOME: usize = 128;
+        const SOME: usize = 64;
         if let [only] = kinds {
             return *only;
         }
         let rows: usize = self.samples.lanes.iter().map(|plane| plane.height).sum();
         let step = (rows / 32).clamp(1, 16);
+        let sequence = self.samples.lanes.first().is_some_and(Padded::is_sequence);
+        let some = if sequence { SOME } else { usize::MAX };
         let cost = |kind: Kind| -> u64 {
             let mut cost = 0;
             for plane in &self.samples.lanes {
-                let some = if plane.is_sequence() {
-                    SOME
-                } else {
-                    usize::MAX
-                };
                 for y in (usize::from(plane.height > 1)..plane.height).step_by(step) {
                     cost += with_predictor!(kind, row_cost::<T>(plane, y, some));
                 }
@@ -236,18 +233,20 @@ fn row_keys<P: Predictor, T: Sample>(
             }
             Some(gaps) => {
                 let [left, above, _, _, here] = gaps.map(|row| &row[range.clone()]);
+                // Where gaps begin and end nobody can foresee, so there is no branch on them.
                 for (x, key) in keys.iter_mut().enumerate() {
-                    let context = match left[x] | above[x] {
-                        0 => T::context(uneases[x & (CHUNK - 1)]),
-                        _ => gap_context(left[x], above[x]),
+                    let (near, gap) = (left[x] | above[x] != 0, here[x] != 0);
+                    let unease = T::context(uneases[x & (CHUNK - 1)]);
+                    let context = if near {
+                        gap_context(left[x], above[x])
+                    } else {
+                        unease
                     };
-                    let mut symbol = MISSING;
-                    if here[x] == 0 {
-                        let residual = residuals[x & (CHUNK - 1)];
-                        symbol = token(residual);
-                        let (smallest, bits) = RESIDUALS[usize::from(symbol)];
-                        plain.put(residual - smallest, bits);
-                    }
+                    let residual = if gap { 0 } else { residuals[x & (CHUNK - 1)] };
+                    let token = token(residual);
+                    let (smallest, bits) = RESIDUALS[usize::from(token)];
+                    plain.put(residual - smallest, bits);
+                    let symbol = if gap { MISSING } else { token };
                     *key = (context >> shift) << 8 | u16::from(symbol);
                 }
             }

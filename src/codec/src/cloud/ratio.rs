@@ -26,6 +26,9 @@ enum Reference {
     Both,
 }
 
+/// Lasers told apart; more of them than any scanner has share quotients.
+const RINGS: usize = 1024;
+
 /// Which points share a quotient.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Sharing {
@@ -142,7 +145,7 @@ impl<'a> Tracker<'a> {
             Sharing::All => 1,
             Sharing::Column => width,
             Sharing::Row => height,
-            Sharing::Ring => 1 << 16,
+            Sharing::Ring => RINGS,
         };
         let memory = match (guess.reference, guess.sharing) {
             (Reference::Last, _) | (_, Sharing::All) => 1,
@@ -168,7 +171,7 @@ impl<'a> Tracker<'a> {
                 .known
                 .ring
                 .as_ref()
-                .map_or(0, |ring| usize::from(ring[index])),
+                .map_or(0, |ring| usize::from(ring[index]) % RINGS),
         }
     }
 
@@ -224,18 +227,27 @@ pub(super) fn restore(differences: &[u32], guess: Guess, known: &Known, shape: S
     bits
 }
 
-/// Points looked at to choose.
-const SAMPLE: usize = 8192;
+/// How many points are looked at to choose: four rows of a picture, within bounds.
+fn some(bits: &[u32], shape: Shape) -> usize {
+    let rows = match shape {
+        Shape::Picture { width, .. } => 4 * width,
+        Shape::Sequence(_) => 0,
+    };
+    rows.clamp(2048, 8192).min(bits.len())
+}
 
-/// The guess that leaves clearly less than the column's own neighbours do; `None` when none does.
+/// The guess that leaves less than the column's own neighbours do; `None` when none does.
 pub(super) fn choose(bits: &[u32], known: &Known, shape: Shape) -> Option<Guess> {
-    let mut best = (plain_cost(bits, shape), None);
+    let some = some(bits, shape);
+    let mut best = (plain_cost(&bits[..some], shape), None);
     for guess in Guess::all().filter(|guess| guess.applies(known, shape)) {
         let mut tracker = Tracker::new(guess, known, shape);
         let mut cost = 0u64;
-        for (index, &bits) in bits.iter().enumerate().take(SAMPLE) {
+        for (index, &bits) in bits[..some].iter().enumerate() {
             tracker.next(index, |guessed| {
-                cost += size(ordered(bits).wrapping_sub(ordered(guessed)));
+                // The first half is for learning.
+                let counts = u64::from(index >= some / 2);
+                cost += counts * size(ordered(bits).wrapping_sub(ordered(guessed)));
                 bits
             });
         }
@@ -250,21 +262,24 @@ fn size(difference: u32) -> u64 {
     u64::from(32 - zigzag(difference as i32).leading_zeros())
 }
 
-/// What the column costs when guessed from its neighbours.
-fn plain_cost(bits: &[u32], shape: Shape) -> u64 {
-    let sample = &bits[..bits.len().min(SAMPLE)];
+/// What the second half of a column costs when guessed from its neighbours.
+fn plain_cost(sample: &[u32], shape: Shape) -> u64 {
+    let half = (sample.len() / 2).max(1);
     if let Some(scale) = crate::scale::Scale::find(sample) {
-        let multiples = sample
-            .windows(2)
-            .map(|pair| (scale.multiple(pair[0]), scale.multiple(pair[1])));
-        return multiples.map(|(a, b)| size(b.wrapping_sub(a) as u32)).sum();
+        let multiples = sample.windows(2).skip(half - 1);
+        let step = |pair: &[u32]| {
+            scale
+                .multiple(pair[1])
+                .wrapping_sub(scale.multiple(pair[0]))
+        };
+        return multiples.map(|pair| size(step(pair) as u32)).sum();
     }
     let above = match shape {
         Shape::Picture { width, .. } => width,
         Shape::Sequence(_) => 1,
     };
+    let order = |index: usize| ordered(sample[index]);
     let cost = |index: usize| {
-        let order = |index: usize| ordered(sample[index]);
         let west = size(order(index).wrapping_sub(order(index - 1)));
         if index <= above {
             return west;
@@ -274,5 +289,5 @@ fn plain_cost(bits: &[u32], shape: Shape) -> u64 {
             .wrapping_sub(order(index - above - 1));
         west.min(size(order(index).wrapping_sub(plane)))
     };
-    (1..sample.len()).map(cost).sum()
+    (half..sample.len()).map(cost).sum()
 }

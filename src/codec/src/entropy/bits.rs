@@ -10,7 +10,7 @@ pub(crate) struct BitWriter {
 
 impl BitWriter {
     /// Appends the low `count` bits of `value`; at most 32, the rest of `value` zero.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn put(&mut self, value: u32, count: u32) {
         debug_assert!(count <= 32 && (count == 32 || value >> count == 0));
         self.pending |= u64::from(value) << self.count;

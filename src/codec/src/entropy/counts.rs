@@ -49,30 +49,38 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
         return counts;
     }
     let size = 1i32 << log;
+    let last = histogram.iter().rposition(|&count| count > 0).unwrap_or(0);
+    let histogram = &histogram[..=last];
+    // Symbols too rare for a state get one all the same; the others share what is left.
+    let rare = (total >> (log + 1)) as u32;
+    let (mut few, mut few_total) = (0i32, 0u64);
+    for &count in histogram {
+        let is_rare = count > 0 && count <= rare;
+        few += i32::from(is_rare);
+        few_total += if is_rare { u64::from(count) } else { 0 };
+    }
+    let scale = f64::from(size - few) / (total - few_total).max(1) as f64;
     let mut left = size;
-    let mut largest = 0;
-    for (symbol, &count) in histogram
-        .iter()
-        .enumerate()
-        .filter(|&(_, &count)| count > 0)
-    {
-        let scaled = ((u64::from(count) << log) + total / 2) / total;
-        counts[symbol] = scaled.max(1) as u16;
-        left -= i32::from(counts[symbol]);
-        if count > histogram[largest] {
-            largest = symbol;
+    let (mut largest, mut most) = (0, 0);
+    for (symbol, &count) in histogram.iter().enumerate() {
+        let scaled = ((f64::from(count) * scale + 0.5) as u16).max(u16::from(count > 0));
+        counts[symbol] = scaled;
+        left -= i32::from(scaled);
+        if count > most {
+            (largest, most) = (symbol, count);
         }
     }
-    if left < 0 {
-        left = give_back(&mut counts, left);
+    if left + i32::from(counts[largest]) > i32::from(counts[largest]) / 2 {
+        counts[largest] = (i32::from(counts[largest]) + left) as u16;
+    } else {
+        give_back(&mut counts, left);
     }
-    counts[largest] += left as u16;
     counts
 }
 
-/// Rounding up rare symbols took too much: takes it back where a single state matters least. Returns what is over.
+/// Rounding up took too much: takes it back where a single state matters least.
 #[cold]
-fn give_back(counts: &mut Counts, mut left: i32) -> i32 {
+fn give_back(counts: &mut Counts, mut left: i32) {
     // Symbols in proportion to what they have above one.
     let above: i32 = counts
         .iter()
@@ -91,7 +99,6 @@ fn give_back(counts: &mut Counts, mut left: i32) -> i32 {
         counts[richest] -= 1;
         left += 1;
     }
-    left
 }
 
 /// Writes the counts of one context: Rice codes whose parameter follows the counts before, runs of zeros apart.
