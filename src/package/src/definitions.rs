@@ -1,16 +1,10 @@
 //! Definitions of messages, services and actions in extracted layers.
-//!
-//! The layers are other people's: each is a tree whose links, device nodes and sizes mean nothing good. So the
-//! stack is walked by directory descriptors, as an overlay mount would merge it, without following any link.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::os::fd::{AsFd, OwnedFd};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use rustix::fs::{Dir, Mode, OFlags};
-use rustix::io::Errno;
-
-use crate::{Error, names, read};
+use crate::merged::{self, Level, Merged};
+use crate::{Error, names};
 
 /// Texts by `package/msg/Type`, `package/srv/Type` and `package/action/Type`.
 pub type Definitions = BTreeMap<String, String>;
@@ -24,15 +18,6 @@ const MAX_FILES: usize = 20_000;
 /// Directories of a package and the files in them.
 const KINDS: [(&str, &str); 3] = [("msg", ".msg"), ("srv", ".srv"), ("action", ".action")];
 
-const DIRECTORY: OFlags = OFlags::RDONLY
-    .union(OFlags::DIRECTORY)
-    .union(OFlags::NOFOLLOW)
-    .union(OFlags::CLOEXEC);
-const FILE: OFlags = OFlags::RDONLY
-    .union(OFlags::NOFOLLOW)
-    .union(OFlags::NONBLOCK)
-    .union(OFlags::CLOEXEC);
-
 /// Reads all definitions below the share directories of a stack of layers.
 ///
 /// `layers` are extracted trees, lowest first. `shares` are paths in them such as `usr/share` and
@@ -42,114 +27,16 @@ pub fn read<L: AsRef<Path>, S: AsRef<str>>(
     layers: &[L],
     shares: &[S],
 ) -> Result<Definitions, Error> {
-    let mut stack = Vec::new();
-    for layer in layers.iter().rev() {
-        let path = layer.as_ref().to_owned();
-        // The layers' own paths are ours, and may lead through links.
-        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
-        let directory = rustix::fs::open(&path, flags, Mode::empty())
-            .map_err(|error| read::failed("open", &path, error))?;
-        stack.push(Level { directory, path });
-    }
+    let stack = merged::open(layers)?;
     let mut reader = Reader {
         definitions: Definitions::new(),
         packages: BTreeSet::new(),
         total: 0,
     };
     for share in shares {
-        let parts = share
-            .as_ref()
-            .split('/')
-            .filter(|part| !part.is_empty() && *part != ".");
-        let mut merged = Merged::top(&stack)?;
-        for part in parts {
-            merged = merged.below(part.as_bytes())?;
-        }
-        reader.share(&merged)?;
+        reader.share(&Merged::at(&stack, share.as_ref())?)?;
     }
     Ok(reader.definitions)
-}
-
-/// One layer's part of a directory.
-struct Level {
-    directory: OwnedFd,
-    path: PathBuf,
-}
-
-/// A directory as an overlay mount shows it: its parts, the uppermost first.
-struct Merged {
-    levels: Vec<Level>,
-}
-
-impl Merged {
-    fn top(stack: &[Level]) -> Result<Self, Error> {
-        let levels = stack.iter().map(|level| {
-            let directory = level
-                .directory
-                .try_clone()
-                .map_err(|error| read::failed("open", &level.path, error))?;
-            Ok(Level {
-                directory,
-                path: level.path.clone(),
-            })
-        });
-        Ok(Self {
-            levels: levels.collect::<Result<_, Error>>()?,
-        })
-    }
-
-    /// A directory in this one; one without parts if there is none.
-    fn below(&self, name: &[u8]) -> Result<Self, Error> {
-        let mut levels = Vec::new();
-        for level in &self.levels {
-            let path = level.path.join(shown(name));
-            match rustix::fs::openat(&level.directory, name, DIRECTORY, Mode::empty()) {
-                Ok(directory) => {
-                    let opaque = is_opaque(&directory);
-                    levels.push(Level { directory, path });
-                    if opaque {
-                        break;
-                    }
-                }
-                Err(Errno::NOENT) => {}
-                // A file, a link or a deletion: it hides what the layers below have.
-                Err(Errno::NOTDIR | Errno::LOOP | Errno::NXIO) => break,
-                Err(error) => return Err(read::failed("open", &path, error)),
-            }
-        }
-        Ok(Self { levels })
-    }
-
-    /// All names in it, each with the uppermost level that has it.
-    fn names(&self) -> Result<BTreeMap<Vec<u8>, &Level>, Error> {
-        let mut names = BTreeMap::new();
-        for level in &self.levels {
-            let failed = |error| read::failed("list", &level.path, error);
-            for entry in Dir::read_from(level.directory.as_fd()).map_err(failed)? {
-                let name = entry.map_err(failed)?.file_name().to_bytes().to_vec();
-                names.entry(name).or_insert(level);
-            }
-            if names.len() > MAX_FILES {
-                return Err(Error::TooMany {
-                    path: level.path.clone(),
-                    what: "files",
-                    limit: MAX_FILES,
-                });
-            }
-        }
-        Ok(names)
-    }
-}
-
-/// Whether a directory hides those of its name in the layers below.
-fn is_opaque(directory: &OwnedFd) -> bool {
-    ["trusted.overlay.opaque", "user.overlay.opaque"]
-        .iter()
-        .any(|name| {
-            let mut value = [0; 4];
-            rustix::fs::fgetxattr(directory, *name, &mut value[..])
-                .is_ok_and(|length| &value[..length] == b"y")
-        })
 }
 
 struct Reader {
@@ -203,18 +90,10 @@ impl Reader {
 
     /// The text of a file; none for a link, a deletion or anything else that is no file.
     fn file(&mut self, level: &Level, name: &str) -> Result<Option<String>, Error> {
-        let path = level.path.join(name);
-        let file = match rustix::fs::openat(&level.directory, name, FILE, Mode::empty()) {
-            Ok(file) => file,
-            Err(Errno::LOOP | Errno::NXIO | Errno::NODEV | Errno::NOENT) => return Ok(None),
-            Err(error) => return Err(read::failed("open", &path, error)),
-        };
-        let stat =
-            rustix::fs::fstat(&file).map_err(|error| read::failed("look at", &path, error))?;
-        if rustix::fs::FileType::from_raw_mode(stat.st_mode) != rustix::fs::FileType::RegularFile {
+        let Some(file) = level.file(name.as_bytes(), MAX_BYTES)? else {
             return Ok(None);
-        }
-        let bytes = read::bytes(file, &path, MAX_BYTES)?;
+        };
+        let (path, bytes) = (level.path.join(name), file.bytes);
         self.total += bytes.len();
         if self.total > MAX_TOTAL || self.definitions.len() >= MAX_FILES {
             return Err(Error::TooMany {
@@ -227,14 +106,13 @@ impl Reader {
     }
 }
 
-fn shown(name: &[u8]) -> PathBuf {
-    PathBuf::from(String::from_utf8_lossy(name).into_owned())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::os::unix::fs::symlink;
+    use std::path::PathBuf;
+
+    use rustix::fs::Mode;
 
     struct Layers(tempfile::TempDir);
 

@@ -116,4 +116,12 @@ pub enum Error {
         /// Why not.
         problem: String,
     },
+    /// A stub cannot be put together.
+    #[error(
+        "the image holds no package.xml of {package}, so robots could not install a stub of it; push it with its share directory"
+    )]
+    NoManifest {
+        /// The ROS package.
+        package: String,
+    },
 }

@@ -5,6 +5,7 @@
 //!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
 //!   layers ──definitions::read──▶ "pkg/msg/Type" → text
 //!   running package, supplement ──interface──▶ Interface, compared by difference
+//!   layers, interface ──stub──▶ the files that a robot installs in the package's place
 //! ```
 //!
 //! Everything here comes from strangers: names are checked before anyone puts them into a path or a command, sizes
@@ -19,9 +20,11 @@ mod error;
 pub mod interface;
 mod interface_toml;
 pub mod manifest;
+mod merged;
 pub mod names;
 mod order;
 mod read;
+pub mod stub;
 mod supplement;
 pub mod workspace;
 

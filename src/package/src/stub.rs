@@ -1,0 +1,204 @@
+//! The stub: the package as a robot installs it, under the original's name, with launchers in place of programs.
+//!
+//! ```text
+//!  image ──contents──▶ Contents ─┐
+//!  service, interface ─▶ About ──┴─compose─▶ files of a catkin install space ──(caller)──▶ NAME.tar.gz
+//! ```
+//!
+//! Workspaces are searched only up to the first that holds a package. So the stub has a launcher for every
+//! executable, not only for those that run in the cloud, and everything that the package shares. The same input
+//! gives the same files. The robot's program, `lib/PACKAGE/cloudroid-stub`, is added by the caller, who has it.
+
+mod contents;
+mod nodelets;
+mod settings;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+pub use contents::{Content, Contents};
+
+use crate::Error;
+use crate::interface::Interface;
+
+/// The robot's program, in `lib/PACKAGE`.
+pub const PROGRAM: &str = "cloudroid-stub";
+
+const RUN: &str = include_str!("stub/inside/run.sh");
+const ORIGINAL: &str = include_str!("stub/inside/original.sh");
+const SETUP_SH: &str = include_str!("stub/inside/setup.sh");
+const SETUP_BASH: &str = include_str!("stub/inside/setup.bash");
+const SETUP_ZSH: &str = include_str!("stub/inside/setup.zsh");
+const INSTALL: &str = include_str!("stub/inside/install.sh");
+const README: &str = include_str!("stub/inside/README.md");
+
+/// What a stub stands for.
+#[derive(Debug, Clone)]
+pub struct About<'a> {
+    /// The service.
+    pub service: &'a str,
+    /// The ROS package.
+    pub package: &'a str,
+    /// The service's revision.
+    pub revision: u64,
+    /// Digest of its image.
+    pub image: &'a str,
+    /// Where robots reach the portal, such as `ws://server:9090`.
+    pub server: &'a str,
+    /// Architecture of the robot's program, as `uname -m` says it.
+    pub architecture: &'a str,
+    /// Executables that run in the cloud.
+    pub outsourced: &'a BTreeSet<String>,
+    /// What the package shows.
+    pub interface: &'a Interface,
+}
+
+/// The files of a stub, by path in the install space.
+pub type Files = BTreeMap<String, Content>;
+
+/// Puts a stub together.
+pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
+    let package = about.package;
+    if !contents.share.contains_key("package.xml") {
+        return Err(Error::NoManifest {
+            package: package.to_owned(),
+        });
+    }
+    let mut files = Files::new();
+    for (name, text) in [
+        (".catkin", ""),
+        ("setup.sh", SETUP_SH),
+        ("setup.bash", SETUP_BASH),
+        ("setup.zsh", SETUP_ZSH),
+    ] {
+        files.insert(name.to_owned(), plain(text));
+    }
+    let names = executables(about, &contents);
+    files.insert("install.sh".to_owned(), plain(&filled(INSTALL, about)));
+    files.insert("README.md".to_owned(), plain(&manual(about, &names)));
+    for name in &names {
+        let launcher = launcher(about, name, "/../..");
+        files.insert(format!("lib/{package}/{name}"), launcher);
+    }
+    let refused = nodelets::plugin_lists(&contents.share);
+    for (path, content) in contents.share {
+        let content = if refused.contains(&path) {
+            nodelets::refusing(about, content)
+        } else {
+            shared(about, &path, content)
+        };
+        files.insert(format!("share/{package}/{path}"), content);
+    }
+    for (key, text) in &about.interface.definitions {
+        // Where an image has definitions without their files.
+        if let Some(path) = definition_path(package, key) {
+            files.entry(path).or_insert_with(|| plain(text));
+        }
+    }
+    for (name, text) in [
+        ("interface.toml", about.interface.to_toml()),
+        ("stub.toml", settings::stub(about)),
+        ("revision.toml", settings::revision(about, &names)),
+    ] {
+        files.insert(format!("share/{package}/{name}"), plain(&text));
+    }
+    Ok(files)
+}
+
+/// Every name that has a launcher in `lib/PACKAGE`: those of the image, and those outsourced.
+fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
+    let in_share = |name: &String| {
+        contents
+            .share
+            .keys()
+            .any(|path| path.rsplit('/').next() == Some(name.as_str()))
+    };
+    let mut names = contents.executables.clone();
+    // One that is a shared script has its launcher in the script's place.
+    names.extend(
+        about
+            .outsourced
+            .iter()
+            .filter(|name| !in_share(name))
+            .cloned(),
+    );
+    names.remove(PROGRAM);
+    names
+}
+
+/// A shared file as the stub has it: programs give way to launchers.
+fn shared(about: &About<'_>, path: &str, content: Content) -> Content {
+    let Content::File {
+        bytes,
+        executable: true,
+    } = &content
+    else {
+        return content;
+    };
+    let name = path.rsplit('/').next().unwrap_or(path);
+    let machine_code = bytes.starts_with(b"\x7fELF");
+    if !about.outsourced.contains(name) && !machine_code {
+        return content;
+    }
+    // From the file's directory up to the install space: below share/PACKAGE, so two more than in the path.
+    let up = "/..".repeat(2 + path.matches('/').count());
+    launcher(about, name, &up)
+}
+
+fn launcher(about: &About<'_>, node: &str, up: &str) -> Content {
+    let template = if about.outsourced.contains(node) {
+        RUN
+    } else {
+        ORIGINAL
+    };
+    let text = template
+        .replace("@PACKAGE@", about.package)
+        .replace("@NODE@", node)
+        .replace("@UP@", up);
+    Content::File {
+        bytes: text.into_bytes(),
+        executable: true,
+    }
+}
+
+fn plain(text: &str) -> Content {
+    Content::File {
+        bytes: text.as_bytes().to_vec(),
+        executable: false,
+    }
+}
+
+fn filled(template: &str, about: &About<'_>) -> String {
+    template
+        .replace("@PACKAGE@", about.package)
+        .replace("@SERVICE@", about.service)
+        .replace("@REVISION@", &about.revision.to_string())
+}
+
+fn manual(about: &About<'_>, names: &BTreeSet<String>) -> String {
+    let list = |names: Vec<&str>| match names.len() {
+        0 => "none".to_owned(),
+        _ => names.join(", "),
+    };
+    let original = names.difference(about.outsourced).map(String::as_str);
+    let example = about.outsourced.first().or(names.first());
+    filled(README, about)
+        .replace(
+            "@OUTSOURCED@",
+            &list(about.outsourced.iter().map(String::as_str).collect()),
+        )
+        .replace("@ORIGINAL@", &list(original.collect()))
+        .replace("@EXAMPLE@", example.map_or("NODE", String::as_str))
+}
+
+/// `pkg/msg/Type` of this package as a path in the install space.
+fn definition_path(package: &str, key: &str) -> Option<String> {
+    let (kind, name) = key
+        .strip_prefix(package)?
+        .strip_prefix('/')?
+        .split_once('/')?;
+    let known = matches!(kind, "msg" | "srv" | "action") && crate::names::is_type(name);
+    known.then(|| format!("share/{package}/{kind}/{name}.{kind}"))
+}
+
+#[cfg(test)]
+mod tests;
