@@ -35,17 +35,29 @@ INIT_FLAGS := --locked -p init --profile init --target $(HOST)
 init:
 	@RUSTFLAGS="-C target-feature=+crt-static" cargo build -q $(INIT_FLAGS)
 
+# The robot's program is static, too: it runs on whatever a robot has. It stands where the daemon looks for it.
+STUB := cargo build -q --locked -p cloudroid-stub --target $(HOST)
+.PHONY: stub
+stub:
+	@RUSTFLAGS="-C target-feature=+crt-static" $(STUB) --profile stub
+	@install -D -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/stub/cloudroid-stub" "$(CARGO_TARGET_DIR)/release/stubs/x86_64/cloudroid-stub"
+
+.PHONY: stub-dev
+stub-dev:
+	@RUSTFLAGS="-C target-feature=+crt-static -C strip=debuginfo" $(STUB)
+	@install -D -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/debug/cloudroid-stub" "$(CARGO_TARGET_DIR)/debug/stubs/x86_64/cloudroid-stub"
+
 .PHONY: build
 build: ## build the daemon, the command line tool and the servants' init, optimised
 	@scripts/deps build
 	@echo "== building cloudroidd and cloudroidctl (release; the first time takes some minutes)"
-	@$(MAKE) init
+	@$(MAKE) init stub
 	@cargo build --locked --release -p cloudroidd -p cloudroidctl
 	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
 .PHONY: build-dev
 build-dev:
-	@$(MAKE) init
+	@$(MAKE) init stub-dev
 	@cargo build --locked -p cloudroidd -p cloudroidctl
 	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/debug/cloudroid-init"
 

@@ -14,6 +14,7 @@ pub mod servant;
 pub mod service;
 pub mod size;
 pub mod status;
+pub mod stub;
 
 pub use doctor::{Check, CheckStatus, Doctor};
 pub use event::{Event, Level};
@@ -25,6 +26,7 @@ pub use servant::{LogLine, Phase, Servant, Stopped};
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use size::Size;
 pub use status::{Capacity, Isolation, Status};
+pub use stub::Stubs;
 
 /// Media type of streams: one JSON value per line.
 pub const NDJSON: &str = "application/x-ndjson";

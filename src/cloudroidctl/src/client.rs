@@ -240,7 +240,8 @@ async fn connect(socket: &Path) -> std::io::Result<UnixStream> {
     }
 }
 
-fn empty() -> Body {
+/// No body.
+pub fn empty() -> Body {
     Full::default()
         .map_err(|never| match never {})
         .boxed_unsync()

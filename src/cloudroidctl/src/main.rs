@@ -15,6 +15,7 @@ mod servants;
 mod services;
 mod status;
 mod stop;
+mod stub;
 
 use std::process::ExitCode;
 
@@ -63,6 +64,7 @@ enum Verb {
     Stop(stop::Stop),
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
+    Stub(stub::Stub),
     Status(status::Status),
     Doctor(doctor::Doctor),
 }
@@ -104,6 +106,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
+        Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
     }

@@ -44,6 +44,22 @@ pub enum Error {
         /// Asked for.
         what: String,
     },
+    /// No stub can be made of it.
+    #[error("there is no stub of {service}: {reason}")]
+    NoStub {
+        /// The service.
+        service: String,
+        /// Why not.
+        reason: String,
+    },
+    /// The robot's program is not held for an architecture.
+    #[error("this server holds no cloudroid-stub for {asked:?}")]
+    UnknownArchitecture {
+        /// Asked for.
+        asked: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
     /// Nothing is served there.
     #[error("nothing is served at {path}")]
     UnknownPath {
@@ -168,7 +184,8 @@ impl Error {
         match self {
             Error::UnknownService { exists, .. }
             | Error::UnknownServant { exists, .. }
-            | Error::UnknownRevision { exists, .. } => problem.exists = exists.clone(),
+            | Error::UnknownRevision { exists, .. }
+            | Error::UnknownArchitecture { exists, .. } => problem.exists = exists.clone(),
             Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
             Error::Full(admission::Refused::TooBig { .. }) => {}
             Error::Full(_) | Error::Ending => problem.retry_after = Some(RETRY_AFTER),
@@ -184,6 +201,10 @@ impl Error {
             Error::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
             Error::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
             Error::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
+            Error::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
+            Error::UnknownArchitecture { .. } => {
+                (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
+            }
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
             Error::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
             Error::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
@@ -213,6 +234,10 @@ impl Error {
             Error::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
             Error::UnknownRevision { service, .. } => {
                 format!("see those that exist with: cloudroidctl services {service}")
+            }
+            Error::NoStub { service, .. } => format!("mend the package and push {service} again"),
+            Error::UnknownArchitecture { .. } => {
+                "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".into()
             }
             Error::NameTaken { name, .. } => {
                 format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")

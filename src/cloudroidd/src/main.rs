@@ -24,6 +24,7 @@ mod push;
 mod shim;
 mod sockets;
 mod state;
+mod stubs;
 mod supervision;
 mod tokens;
 mod views;

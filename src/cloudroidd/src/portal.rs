@@ -5,6 +5,7 @@
 //!                                                        ├─▶ /healthz /metrics /assets
 //!                                                        ├─▶ /api/v1      what cloudroidctl does
 //!                                                        ├─▶ /v2          images, read-only (OCI distribution)
+//!                                                        ├─▶ /stubs       what robots install in a package's place
 //!                                                        └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
 
@@ -15,6 +16,7 @@ mod metrics;
 mod oci;
 mod page;
 mod robots;
+mod stubs;
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -144,7 +146,8 @@ pub fn router(app: Arc<App>) -> Router {
         .route("/v2/", get(oci::version))
         .nest("/v2", images)
         .route("/api", any(nothing))
-        .route("/stubs", any(nothing))
+        .route("/stubs", get(stubs::list))
+        .route("/stubs/{file}", get(stubs::archive))
         .route("/assets", any(nothing))
         .route("/{service}", any(robots::service))
         .fallback(nothing)

@@ -1,0 +1,375 @@
+//! Stubs of published services: composed from the image and the interface, packed with the robot's program.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use api::stub::{ARCHITECTURES, architecture};
+use flate2::{Compression, GzBuilder};
+use package::stub::{About, Content, Contents, Files, PROGRAM, compose};
+use tar::{EntryType, Header};
+
+use crate::definitions;
+use crate::errors::Error;
+use crate::state::RevisionRecord;
+
+/// The time of every file: the same input gives the same archive.
+const MTIME: u64 = 1_700_000_000;
+
+/// The robot's program, for each architecture that there is one for: `stubs/ARCHITECTURE/cloudroid-stub` beside
+/// this program or where it is installed.
+pub struct Programs {
+    found: Vec<Program>,
+}
+
+/// One of them.
+pub struct Program {
+    /// As in [`ARCHITECTURES`].
+    pub architecture: &'static str,
+    path: PathBuf,
+}
+
+impl Programs {
+    /// Looks for them. They may be added while the daemon runs.
+    pub fn look() -> Programs {
+        let beside = std::env::current_exe()
+            .ok()
+            .and_then(|path| Some(path.parent()?.to_owned()));
+        let installed = ["/usr/local/lib/cloudroid", "/usr/lib/cloudroid"].map(PathBuf::from);
+        let places: Vec<PathBuf> = beside.into_iter().chain(installed).collect();
+        Self::below(&places)
+    }
+
+    fn below(places: &[PathBuf]) -> Programs {
+        let find = |architecture: &'static str| {
+            let of = |place: &PathBuf| place.join("stubs").join(architecture).join(PROGRAM);
+            let path = places.iter().map(of).find(|path| path.is_file())?;
+            Some(Program { architecture, path })
+        };
+        Programs {
+            found: ARCHITECTURES.into_iter().filter_map(find).collect(),
+        }
+    }
+
+    /// For which there is one.
+    pub fn held(&self) -> Vec<String> {
+        self.found
+            .iter()
+            .map(|program| program.architecture.to_owned())
+            .collect()
+    }
+
+    /// For which there is none.
+    pub fn lacking(&self) -> Vec<String> {
+        let held = self.held();
+        ARCHITECTURES
+            .into_iter()
+            .map(str::to_owned)
+            .filter(|architecture| !held.contains(architecture))
+            .collect()
+    }
+
+    /// The one for an architecture; none: this machine's.
+    pub fn of(self, asked: Option<&str>) -> Result<Program, Error> {
+        let asked = asked.unwrap_or(std::env::consts::ARCH);
+        let exists = self.held();
+        let wanted = architecture(asked);
+        self.found
+            .into_iter()
+            .find(|program| Some(program.architecture) == wanted)
+            .ok_or_else(|| Error::UnknownArchitecture {
+                asked: asked.to_owned(),
+                exists,
+            })
+    }
+}
+
+/// `HOST` or `HOST:PORT`, nothing that a file or script could misunderstand.
+pub fn is_authority(text: &str) -> bool {
+    !text.is_empty()
+        && text
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
+}
+
+/// Executables of the package that run in the cloud: those that a revision's servants run.
+pub fn outsourced(revision: &RevisionRecord) -> BTreeSet<String> {
+    let package = &revision.package;
+    let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
+    let of_package = |argument: &String| {
+        let inside = below
+            .iter()
+            .any(|below| argument.starts_with('/') && argument.contains(below));
+        inside.then(|| argument.rsplit('/').next().unwrap_or_default().to_owned())
+    };
+    let nodes = revision.plan.nodes.iter();
+    nodes
+        .filter_map(|node| node.argv.iter().find_map(of_package))
+        .collect()
+}
+
+/// The files of a revision's stub, but for the robot's program.
+pub fn files(
+    store: &image::Store,
+    revision: &RevisionRecord,
+    architecture: &str,
+    server: &str,
+) -> Result<Files, Error> {
+    let no_stub = |error: package::Error| Error::NoStub {
+        service: revision.service.clone(),
+        reason: error.to_string(),
+    };
+    let layers = definitions::layers(store, &revision.image)?;
+    let contents = Contents::read(&layers, &prefixes(revision), &revision.package);
+    let about = About {
+        service: &revision.service,
+        package: &revision.package,
+        revision: revision.number,
+        image: &revision.image,
+        server,
+        architecture,
+        outsourced: &outsourced(revision),
+        interface: &revision.interface,
+    };
+    compose(&about, contents.map_err(no_stub)?).map_err(no_stub)
+}
+
+/// Install spaces of an image in the order in which its nodes search them, without the leading slash.
+fn prefixes(revision: &RevisionRecord) -> Vec<String> {
+    let variable = |name: &str| {
+        let value = revision.plan.environment.get(name);
+        value
+            .map(String::as_str)
+            .unwrap_or_default()
+            .split(':')
+            .map(str::to_owned)
+            .collect::<Vec<_>>()
+    };
+    let mut prefixes = variable("CMAKE_PREFIX_PATH");
+    let shares = variable("ROS_PACKAGE_PATH");
+    prefixes.extend(
+        shares
+            .iter()
+            .filter_map(|share| share.strip_suffix("/share"))
+            .map(str::to_owned),
+    );
+    prefixes.push("/usr".to_owned());
+    let mut seen = BTreeSet::new();
+    prefixes
+        .iter()
+        .map(|prefix| prefix.trim_matches('/').to_owned())
+        .filter(|prefix| !prefix.is_empty() && seen.insert(prefix.clone()))
+        .collect()
+}
+
+/// The archive of a revision's stub, in a file that is gone when it is closed.
+pub fn archive(
+    store: &image::Store,
+    revision: &RevisionRecord,
+    program: &Program,
+    server: &str,
+) -> Result<File, Error> {
+    let files = files(store, revision, program.architecture, server)?;
+    let failed = |error: std::io::Error| Error::NoStub {
+        service: revision.service.clone(),
+        reason: format!("it could not be packed: {error}"),
+    };
+    let mut binary = File::open(&program.path).map_err(failed)?;
+    let packed = pack(&revision.service, &revision.package, &files, &mut binary);
+    packed.map_err(failed)
+}
+
+fn pack(service: &str, package: &str, files: &Files, binary: &mut File) -> std::io::Result<File> {
+    let file = tempfile::tempfile()?;
+    let gzip = GzBuilder::new()
+        .mtime(0)
+        .write(file, Compression::default());
+    let mut archive = tar::Builder::new(gzip);
+    let top = format!("{service}-stub");
+    let program = format!("lib/{package}/{PROGRAM}");
+    for directory in directories(files.keys().chain([&program])) {
+        let mut header = header(EntryType::Directory, true, 0);
+        archive.append_data(&mut header, format!("{top}/{directory}"), std::io::empty())?;
+    }
+    for (path, content) in files {
+        let at = format!("{top}/{path}");
+        match content {
+            Content::File { bytes, executable } => {
+                let mut header = header(EntryType::Regular, *executable, bytes.len() as u64);
+                archive.append_data(&mut header, at, bytes.as_slice())?;
+            }
+            Content::Link(target) => {
+                let mut header = header(EntryType::Symlink, true, 0);
+                archive.append_link(&mut header, at, Path::new(target))?;
+            }
+        }
+    }
+    let mut header = header(EntryType::Regular, true, binary.metadata()?.len());
+    archive.append_data(&mut header, format!("{top}/{program}"), binary)?;
+    let mut file = archive.into_inner()?.finish()?;
+    file.flush()?;
+    file.seek(SeekFrom::Start(0))?;
+    Ok(file)
+}
+
+/// Every directory that these paths are in, each after its parent.
+fn directories<'a>(paths: impl Iterator<Item = &'a String>) -> BTreeSet<String> {
+    let mut directories = BTreeSet::from([String::new()]);
+    for path in paths {
+        let mut path = path.as_str();
+        while let Some((parent, _)) = path.rsplit_once('/') {
+            directories.insert(format!("{parent}/"));
+            path = parent;
+        }
+    }
+    directories
+}
+
+fn header(kind: EntryType, executable: bool, size: u64) -> Header {
+    let mut header = Header::new_gnu();
+    header.set_entry_type(kind);
+    header.set_mode(if executable { 0o755 } else { 0o644 });
+    header.set_size(size);
+    header.set_mtime(MTIME);
+    header.set_uid(0);
+    header.set_gid(0);
+    header
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use super::*;
+    use crate::state::Plan;
+
+    fn revision(argv: &[&[&str]]) -> RevisionRecord {
+        RevisionRecord {
+            service: "serves".into(),
+            number: 1,
+            image: String::new(),
+            published: 0,
+            package: "p".into(),
+            source: String::new(),
+            plan: Plan {
+                environment: [
+                    ("CMAKE_PREFIX_PATH", "/opt/mine:/usr"),
+                    ("ROS_PACKAGE_PATH", "/opt/mine/share:/opt/other/share"),
+                ]
+                .map(|(key, value)| (key.to_owned(), value.to_owned()))
+                .into(),
+                nodes: argv
+                    .iter()
+                    .map(|argv| servant::spec::NodeSpec {
+                        name: "/n".into(),
+                        argv: argv.iter().map(|word| (*word).to_owned()).collect(),
+                        environment: Default::default(),
+                        directory: "/root".into(),
+                        respawn: false,
+                        respawn_delay: 0.0,
+                        required: false,
+                    })
+                    .collect(),
+                ..Plan::default()
+            },
+            interface: Default::default(),
+        }
+    }
+
+    #[test]
+    fn what_servants_run_of_the_package_is_outsourced() {
+        let revision = revision(&[
+            &["/usr/bin/nice", "-n", "5", "/usr/lib/p/node", "__name:=n"],
+            &["/opt/mine/share/p/scripts/tool.py", "x:=/lib/p/y"],
+            &["/usr/lib/q/other"],
+        ]);
+        let names: Vec<String> = super::outsourced(&revision).into_iter().collect();
+        assert_eq!(names, ["node", "tool.py"]);
+        assert_eq!(prefixes(&revision), ["opt/mine", "usr", "opt/other"]);
+    }
+
+    #[test]
+    fn the_same_files_make_the_same_archive() {
+        let place = tempfile::tempdir().expect("a directory");
+        let path = place.path().join("program");
+        std::fs::write(&path, "ELF").expect("written");
+        let files: Files = [
+            (
+                "lib/p/node".to_owned(),
+                Content::File {
+                    bytes: b"#!/bin/sh".to_vec(),
+                    executable: true,
+                },
+            ),
+            ("share/p/a/b".to_owned(), Content::Link("c".into())),
+        ]
+        .into();
+        let pack = || {
+            let mut binary = File::open(&path).expect("opened");
+            let mut bytes = Vec::new();
+            super::pack("serves", "p", &files, &mut binary)
+                .expect("packed")
+                .read_to_end(&mut bytes)
+                .expect("read");
+            bytes
+        };
+        let bytes = pack();
+        assert_eq!(bytes, pack());
+        let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&bytes[..]));
+        let names: Vec<String> = archive
+            .entries()
+            .expect("an archive")
+            .map(|entry| {
+                let entry = entry.expect("an entry");
+                entry.path().expect("a path").display().to_string()
+            })
+            .collect();
+        assert_eq!(
+            names,
+            [
+                "serves-stub/",
+                "serves-stub/lib/",
+                "serves-stub/lib/p/",
+                "serves-stub/share/",
+                "serves-stub/share/p/",
+                "serves-stub/share/p/a/",
+                "serves-stub/lib/p/node",
+                "serves-stub/share/p/a/b",
+                "serves-stub/lib/p/cloudroid-stub",
+            ]
+        );
+    }
+
+    #[test]
+    fn architectures_are_held_or_lacking() {
+        let place = tempfile::tempdir().expect("a directory");
+        let directory = place.path().join("stubs/aarch64");
+        std::fs::create_dir_all(&directory).expect("made");
+        std::fs::write(directory.join(PROGRAM), "").expect("written");
+        let look = || Programs::below(&[place.path().to_owned()]);
+        assert_eq!(look().held(), ["aarch64"]);
+        assert_eq!(look().lacking(), ["x86_64", "armv7"]);
+        assert_eq!(
+            look()
+                .of(Some("arm64"))
+                .ok()
+                .map(|program| program.architecture),
+            Some("aarch64")
+        );
+        let refused = look()
+            .of(Some("riscv64"))
+            .err()
+            .map(|error| error.problem());
+        assert_eq!(
+            refused.map(|problem| (problem.status, problem.exists)),
+            Some((404, vec!["aarch64".to_owned()]))
+        );
+    }
+
+    #[test]
+    fn an_address_holds_nothing_that_could_be_misunderstood() {
+        assert!(is_authority("server.local:9090") && is_authority("[::1]:9090"));
+        assert!(!is_authority("a\"b") && !is_authority("") && !is_authority("a/b"));
+    }
+}
