@@ -18,7 +18,7 @@ help: ## what can be asked for
 
 .PHONY: deps
 deps: ## install the Debian packages that building, running and testing need (as root)
-	@scripts/deps build run demo test
+	@scripts/deps build run demo test vm
 
 .PHONY: demo-deps
 demo-deps:
@@ -66,7 +66,7 @@ demo: demo-deps build ## push Debian's people_detect and find people in real pic
 	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/release" demo/demo
 
 .PHONY: test
-test: test-deps lint unit stories ## format, lints, unit tests, stories
+test: test-deps lint unit stories test-vm ## format, lints, unit tests, stories, stories in a virtual machine
 
 .PHONY: lint
 lint:
@@ -83,7 +83,14 @@ unit: build-dev
 .PHONY: stories
 stories: build-dev ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
-	@cargo test --locked -p stories -- $(ONLY)
+	@cargo test --locked -p stories --test stories -- $(ONLY)
+
+.PHONY: test-vm
+test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
+	@scripts/deps build run vm
+	@echo "== stories in a virtual machine"
+	@cargo test --locked -q -p stories --test vm --no-run
+	@tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
 
 .PHONY: bench
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
@@ -93,6 +100,10 @@ bench: test-deps build ## every measurement with its peer in the same run; ONLY=
 fuzz: ## a minute of fuzzing for every decoder; ONLY=name for one, FUZZ_SECONDS=n for another time
 	@scripts/deps build fuzz
 	@scripts/fuzz "$(CACHE)" $(ONLY)
+
+.PHONY: deb
+deb: build ## make a Debian package below target/debian
+	@scripts/deb "$(CARGO_TARGET_DIR)/release" target/debian
 
 .PHONY: install
 install: build ## install binaries, units and the example configuration below PREFIX

@@ -1,9 +1,13 @@
-//! Where the programs under test are: beside this test binary, as cargo and make built them.
+//! Where the programs under test are: beside this test binary, as cargo and make built them, or where
+//! `CLOUDROID_BIN` says.
 
 use std::path::PathBuf;
 
 /// `name` in the directory that cargo builds into.
 pub fn path(name: &str) -> PathBuf {
+    if let Some(installed) = std::env::var_os("CLOUDROID_BIN") {
+        return PathBuf::from(installed).join(name);
+    }
     let test = std::env::current_exe().expect("the path of the running test");
     let directory = test
         .parent()

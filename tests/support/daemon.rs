@@ -22,7 +22,8 @@ pub struct Daemon {
     pub home: PathBuf,
     /// Where it listens, such as `127.0.0.1:40123`.
     pub address: String,
-    child: Child,
+    /// None where another has started it, such as systemd.
+    child: Option<Child>,
 }
 
 /// How to start one.
@@ -114,7 +115,7 @@ impl Setup {
                 return Ok(Daemon {
                     home: self.home.clone(),
                     address,
-                    child,
+                    child: Some(child),
                 });
             }
             if let Some(status) = child.try_wait()? {
@@ -185,6 +186,37 @@ fn read_log(home: &Path) -> String {
 }
 
 impl Daemon {
+    /// The one that another has started with its state in `home`, once it answers; not the one with the pid `not`.
+    pub fn of_another(home: &Path, not: Option<i32>) -> anyhow::Result<Daemon> {
+        let deployer = Deployer {
+            home: home.to_owned(),
+        };
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match deployer.asks(&["status"]) {
+                Ok(status) if not.is_none_or(|pid| status["pid"] != pid) => {
+                    let address = status["listen"]
+                        .as_str()
+                        .context("status says where it listens")?
+                        .to_owned();
+                    return Ok(Daemon {
+                        home: home.to_owned(),
+                        address,
+                        child: None,
+                    });
+                }
+                outcome if Instant::now() > deadline => {
+                    let why = outcome.err().map(|error| format!(": {error:#}"));
+                    bail!(
+                        "no daemon answered within {PATIENCE:?}{}",
+                        why.unwrap_or_default()
+                    );
+                }
+                _ => std::thread::sleep(Duration::from_millis(20)),
+            }
+        }
+    }
+
     /// A deployer at a shell of this machine.
     pub fn deployer(&self) -> Deployer {
         Deployer {
@@ -278,30 +310,34 @@ impl Daemon {
         lines[lines.len().saturating_sub(30)..].join("\n")
     }
 
-    /// Its process id.
+    /// Its process id; 0 where another has started it.
     pub fn pid(&self) -> i32 {
-        self.child.id() as i32
+        self.child.as_ref().map_or(0, |child| child.id() as i32)
     }
 
     /// Ends it as an operator would and waits.
     pub fn ends(mut self) -> anyhow::Result<ExitStatus> {
-        kill(Pid::from_raw(self.pid()), Signal::SIGTERM)?;
-        Ok(self.child.wait()?)
+        let mut child = self.child.take().context("started by another")?;
+        kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM)?;
+        Ok(child.wait()?)
     }
 
     /// Ends it as a crash would and waits.
     pub fn is_killed(mut self) -> anyhow::Result<()> {
-        self.child.kill()?;
-        self.child.wait()?;
+        let mut child = self.child.take().context("started by another")?;
+        child.kill()?;
+        child.wait()?;
         Ok(())
     }
 }
 
 impl Drop for Daemon {
     fn drop(&mut self) {
-        if let Ok(None) = self.child.try_wait() {
-            let _ = kill(Pid::from_raw(self.pid()), Signal::SIGTERM);
-            let _ = self.child.wait();
+        if let Some(child) = &mut self.child
+            && let Ok(None) = child.try_wait()
+        {
+            let _ = kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM);
+            let _ = child.wait();
         }
     }
 }

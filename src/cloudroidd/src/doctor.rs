@@ -91,18 +91,15 @@ pub fn look(home: &Path) -> (Machine, Vec<Check>) {
 /// The static init of servants: beside this program, where packages install it, or where `CLOUDROID_INIT` says.
 pub fn find_init() -> Option<PathBuf> {
     let named = std::env::var_os("CLOUDROID_INIT").map(PathBuf::from);
-    let beside = std::env::current_exe()
+    // As built, and as installed below any prefix.
+    let directory = std::env::current_exe()
         .ok()
-        .and_then(|path| Some(path.parent()?.join("cloudroid-init")));
-    let installed = [
-        "/usr/local/lib/cloudroid/cloudroid-init",
-        "/usr/lib/cloudroid/cloudroid-init",
-    ];
-    let candidates = named
-        .into_iter()
-        .chain(beside)
-        .chain(installed.into_iter().map(PathBuf::from));
-    candidates.into_iter().find(|path| path.is_file())
+        .and_then(|path| Some(path.parent()?.to_owned()));
+    let near = ["cloudroid-init", "../lib/cloudroid/cloudroid-init"]
+        .iter()
+        .filter_map(|name| Some(directory.as_ref()?.join(name)));
+    let found = named.into_iter().chain(near).find(|path| path.is_file());
+    found.map(|path| path.canonicalize().unwrap_or(path))
 }
 
 /// A list for people, for the daemon that cannot start.

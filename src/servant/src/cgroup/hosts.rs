@@ -16,6 +16,8 @@ const NAME: &str = "cloudroid";
 const UNIT: &str = "cloudroid-servants.service";
 /// Controllers that limits or the end of a servant need.
 const WANTED_V1: [&str; 3] = ["cpu", "memory", "pids"];
+/// Used only for servants whose limits ask for it.
+const IF_ASKED_V1: &str = "blkio";
 /// Needed besides where no v2 hierarchy, which can do both, is mounted beside v1. Every hierarchy costs each start a
 /// grace period of the kernel (its `cgroup.procs` is written).
 const WITHOUT_V2: [&str; 2] = ["cpuacct", "freezer"];
@@ -98,7 +100,10 @@ impl Parent {
         let lacks_v2 = !has_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
         let wanted = |hierarchy: &&Mounted| {
             let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has(name));
-            hierarchy.unified || has_any(&WANTED_V1) || lacks_v2 && has_any(&WITHOUT_V2)
+            hierarchy.unified
+                || has_any(&WANTED_V1)
+                || has_any(&[IF_ASKED_V1])
+                || lacks_v2 && has_any(&WITHOUT_V2)
         };
         let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
             controllers: hierarchy.controllers.clone(),
@@ -164,23 +169,26 @@ impl Parent {
     }
 }
 
+impl Below {
+    /// Whether a servant without a limit of input and output is better off without this hierarchy.
+    pub(super) fn only_if_asked(&self) -> bool {
+        !self.unified && self.controllers.iter().all(|name| name == IF_ASKED_V1)
+    }
+}
+
 impl Mounted {
     fn has(&self, controller: &str) -> bool {
         !self.unified && self.controllers.iter().any(|name| name == controller)
     }
 }
 
-/// The unit's cgroup when it is there or can be started; our own place in the root when no systemd manages it;
-/// otherwise a place beside us.
+/// The unit's cgroup when the unit runs or can be started; our own place in the root when no systemd manages it;
+/// otherwise a place beside us. A unit without a process has no directory until we make one.
 fn choose_v2(unified: &Mounted) -> PathBuf {
     let unit = unified.mount.join("system.slice").join(UNIT);
     let own_is_root = unified.own == unified.mount;
-    if unit.exists()
-        || (!own_is_root
-            && Path::new("/run/systemd/system").exists()
-            && start_unit()
-            && unit.exists())
-    {
+    let by_systemd = || Path::new("/run/systemd/system").exists() && (unit_runs() || start_unit());
+    if unit.exists() || !own_is_root && by_systemd() {
         return unit;
     }
     if own_is_root {
@@ -190,10 +198,18 @@ fn choose_v2(unified: &Mounted) -> PathBuf {
     }
 }
 
-/// Asks systemd for the delegated unit where it was not installed. The directory made in it keeps its cgroup alive.
+/// Whether systemd has the delegated unit.
+fn unit_runs() -> bool {
+    let mut command = Command::new("systemctl");
+    let status = command.args(["--quiet", "is-active", UNIT]).status();
+    status.is_ok_and(|status| status.success())
+}
+
+/// Asks systemd for the delegated unit where it was not installed.
 fn start_unit() -> bool {
-    let script = "mkdir -p /sys/fs/cgroup$(cut -d: -f3 /proc/self/cgroup)/shims";
     let mut command = Command::new("systemd-run");
+    // It would tell our own supervisor that it is ready.
+    command.env_remove("NOTIFY_SOCKET");
     command.args([
         "--quiet",
         "--unit",
@@ -209,7 +225,7 @@ fn start_unit() -> bool {
     ] {
         command.args(["--property", property]);
     }
-    command.args(["/bin/sh", "-c", script]);
+    command.arg("/bin/true");
     command.status().is_ok_and(|status| status.success())
 }
 

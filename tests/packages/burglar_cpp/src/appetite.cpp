@@ -1,0 +1,85 @@
+// Taking as much as there is: processor time, memory, processes.
+#include <signal.h>
+#include <unistd.h>
+
+#include <atomic>
+#include <chrono>
+#include <cstdlib>
+#include <cstring>
+#include <thread>
+#include <vector>
+
+#include "tries.h"
+
+namespace {
+
+std::atomic<bool> burning{false};
+
+// So many threads that never rest, until "rest".
+Outcome burn(const std::string& threads) {
+  burning = true;
+  for (int i = std::stoi(threads); i > 0; --i)
+    std::thread([] {
+      volatile unsigned long sum = 0;
+      while (burning) sum += 1;
+    }).detach();
+  return {true, threads + " threads"};
+}
+
+Outcome rest(const std::string&) {
+  burning = false;
+  return {true, "resting"};
+}
+
+// A fixed piece of work; how many microseconds it took.
+Outcome work(const std::string& rounds) {
+  auto begin = std::chrono::steady_clock::now();
+  volatile unsigned long sum = 0;
+  for (unsigned long i = std::stoul(rounds); i > 0; --i) sum += i;
+  auto took = std::chrono::steady_clock::now() - begin;
+  return {true, std::to_string(std::chrono::duration_cast<std::chrono::microseconds>(took).count())};
+}
+
+// So many megabytes, touched and kept.
+Outcome take(const std::string& megabytes) {
+  size_t size = std::stoul(megabytes) << 20;
+  char* memory = static_cast<char*>(malloc(size));
+  if (!memory) return outcome(-1);
+  std::memset(memory, 'x', size);
+  return {true, megabytes + " MB taken"};
+}
+
+// Processes that make processes, as many as can be.
+Outcome bomb(const std::string&) {
+  pid_t first = fork();
+  if (first < 0) return outcome(-1);
+  if (first == 0)
+    for (;;)
+      if (fork() < 0) usleep(1000);
+  return {true, "lit"};
+}
+
+// The program ends as it is told: "exit 3", "signal 11".
+Outcome end(const std::string& how) {
+  int number = std::stoi(how.substr(how.find(' ') + 1));
+  std::thread([how, number] {
+    usleep(50000);
+    if (how[0] == 'e') _exit(number);
+    kill(getpid(), number);
+  }).detach();
+  return {true, how};
+}
+
+// Answers after so many milliseconds.
+Outcome waitFor(const std::string& milliseconds) {
+  std::this_thread::sleep_for(std::chrono::milliseconds(std::stoi(milliseconds)));
+  return {true, "waited"};
+}
+
+}  // namespace
+
+const Tries& appetite() {
+  static const Tries all{{"burn", burn}, {"rest", rest}, {"work", work},    {"take", take},
+                         {"bomb", bomb}, {"end", end},   {"wait", waitFor}};
+  return all;
+}

@@ -1,0 +1,123 @@
+//! Stories that need a machine of their own: systemd, cgroup v2, a package to install and to remove, power that is cut.
+//! Told in the virtual machine that `make test-vm` starts (`tests/vm/run`), as root, over several boots:
+//!
+//! ```text
+//!   boot 1   install the package ─▶ stories ─▶ first cut's beginning ─▶ power off
+//!   boot 2   what is left of the first cut ─▶ second cut's beginning ─▶ power off
+//!   …
+//!   last     what is left of the last cut ─▶ remove the package
+//! ```
+
+use std::process::ExitCode;
+use std::time::Instant;
+
+use support::Told;
+
+#[path = "stories/cuts.rs"]
+mod cuts;
+#[path = "stories/installation.rs"]
+mod installation;
+#[path = "stories/limits.rs"]
+mod limits;
+mod machine;
+#[path = "stories/restarts.rs"]
+mod restarts;
+
+/// A story under its function's name.
+struct Story {
+    name: &'static str,
+    tell: fn() -> Told,
+}
+
+/// Something that a cut of the power comes into the middle of.
+struct Cut {
+    name: &'static str,
+    /// Comes back in the middle.
+    before: fn() -> Told,
+    /// At the next boot.
+    after: fn() -> Told,
+}
+
+macro_rules! stories {
+    ($module:ident: $($name:ident),+ $(,)?) => {
+        vec![$(Story { name: concat!(stringify!($module), "::", stringify!($name)), tell: $module::$name }),+]
+    };
+}
+
+macro_rules! cuts {
+    ($($name:ident),+ $(,)?) => {
+        vec![$(Cut { name: concat!("cuts::", stringify!($name)), before: cuts::$name::before, after: cuts::$name::after }),+]
+    };
+}
+
+fn main() -> ExitCode {
+    let Some(boot) = machine::boot() else {
+        println!("told in a virtual machine only: make test-vm");
+        return ExitCode::SUCCESS;
+    };
+    let wanted: Vec<String> = std::env::args().skip(1).collect();
+    let chosen = |name: &str| wanted.is_empty() || wanted.iter().any(|word| name.contains(word));
+    let stories: Vec<Story> = [
+        stories![limits:
+            limits_are_in_the_kernels_own_files,
+        ],
+        stories![restarts:
+            a_killed_daemon_is_started_again_and_finds_its_servants,
+            a_restart_loses_nothing,
+        ],
+    ]
+    .into_iter()
+    .flatten()
+    .filter(|story| chosen(story.name))
+    .collect();
+    let cuts: Vec<Cut> = cuts![in_the_middle_of_a_start]
+        .into_iter()
+        .filter(|cut| chosen(cut.name))
+        .collect();
+
+    if boot == 1 {
+        told(
+            "installation::a_package_leaves_a_running_service",
+            installation::installs,
+        );
+        if machine::daemon().is_err() {
+            return machine::verdict();
+        }
+        for story in stories {
+            told(story.name, story.tell);
+        }
+    } else {
+        let cut = &cuts[boot - 2];
+        told(cut.name, cut.after);
+    }
+    if let Some(cut) = cuts.get(boot - 1) {
+        match (cut.before)() {
+            Ok(()) => machine::cut_power(),
+            Err(error) => told(cut.name, move || Err(error)),
+        }
+    }
+    if chosen("installation::removal_leaves_the_state_alone") {
+        told(
+            "installation::removal_leaves_the_state_alone",
+            installation::removes,
+        );
+    }
+    machine::verdict()
+}
+
+/// Tells one and says how it went.
+fn told(name: &str, tell: impl FnOnce() -> Told) {
+    let began = Instant::now();
+    let outcome = tell();
+    let took = began.elapsed().as_secs_f64();
+    match outcome {
+        Ok(()) => println!("ok      {name} ({took:.1} s)"),
+        Err(error) => {
+            println!(
+                "FAILED  {name} ({took:.1} s)\n{error:#}\n{}",
+                machine::last_words()
+            );
+            machine::failed(name);
+        }
+    }
+}

@@ -1,0 +1,79 @@
+//! Installing the package, and removing it.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use serde_json::json;
+use support::{Told, leftovers, procfs};
+
+use crate::machine::{HOME, SERVANTS, daemon, main_pid, property, types};
+
+/// A clean machine, a package, a running service that has everything it needs.
+pub fn installs() -> Told {
+    let package = std::fs::read_dir("/stage")?
+        .flatten()
+        .map(|entry| entry.path())
+        .find(|path| path.extension().is_some_and(|end| end == "deb"))
+        .context("a package to install")?;
+    types("dpkg", &["-i", &package.to_string_lossy()])?;
+    ensure!(property("cloudroid.service", "ActiveState")? == "active");
+    ensure!(property("cloudroid.service", "Type")? == "notify");
+    ensure!(property("cloudroid.service", "WatchdogUSec")? != "0");
+    ensure!(property("cloudroid-servants.service", "ActiveState")? == "active");
+    let daemon = daemon()?;
+    let status = daemon.deployer().asks(&["status"])?;
+    ensure!(status["pid"] == main_pid()?, "{status:#}");
+    ensure!(
+        status["isolation"]["cgroup_version"] == 2 && status["isolation"]["missing"] == json!([]),
+        "{status:#}"
+    );
+    let doctor = daemon.deployer().asks(&["doctor"])?;
+    for check in doctor["checks"].as_array().context("checks")? {
+        ensure!(check["status"] != "missing", "{check:#}");
+    }
+    Ok(())
+}
+
+/// Every servant is ended, and only the state is left.
+pub fn removes() -> Told {
+    let daemon = daemon()?;
+    let _robot = daemon
+        .robot("greeter_cpp?robot=last")?
+        .calls("/greeter/count", json!({}))?;
+    let id = daemon.servant_of("greeter_cpp", "last")?["id"].clone();
+    let log = types("dpkg", &["--purge", "cloudroid"])?;
+    ensure!(!Path::new(SERVANTS).exists(), "its cgroup is there: {log}");
+    for pid in procfs::pids() {
+        let command = procfs::command_line(pid).unwrap_or_default();
+        ensure!(!command.contains("cloudroid"), "{pid}: {command}");
+    }
+    ensure!(
+        leftovers::cgroups(&[id.as_str().context("an id")?.to_owned()]).is_empty(),
+        "cgroups of servants are left"
+    );
+    let found = types(
+        "find",
+        &[
+            "/etc",
+            "/usr",
+            "/var",
+            "/run",
+            "/lib/",
+            "-xdev",
+            "-name",
+            "*cloudroid*",
+        ],
+    )?;
+    let left: Vec<&str> = found
+        .lines()
+        .filter(|path| {
+            *path != HOME && !path.starts_with("/var/lib/dpkg/") && !path.starts_with("/var/log/")
+        })
+        .collect();
+    ensure!(left.is_empty(), "{left:#?}");
+    ensure!(
+        Path::new(HOME).join("cloudroid.db").exists(),
+        "the state is gone"
+    );
+    Ok(())
+}
