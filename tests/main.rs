@@ -54,6 +54,7 @@ fn main() -> ExitCode {
             every_node_process_is_confined,
             nothing_of_ours_but_init_runs_inside,
             limits_are_set_and_read_back,
+            limits_are_changed_while_it_works,
             a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
             two_robots_see_nothing_of_each_other,
         ],

@@ -111,6 +111,9 @@ function showServants(servants) {
       seen.set(servant.id, { time: now, cpu: usage.cpu_usec });
       if (before && now > before.time) cpu = `${Math.round((usage.cpu_usec - before.cpu) / (now - before.time) / 10)} %`;
     }
+    if (usage?.throttled_usec) cpu += `, throttled ${(usage.throttled_usec / 1e6).toFixed(1)} s`;
+    const waits = Object.entries(usage?.pressure ?? {}).filter(([, percent]) => percent >= 1);
+    if (waits.length) cpu += `, waits for ${waits.map(([what, percent]) => `${what} ${Math.round(percent)} %`).join(", ")}`;
     const idle = servant.idle_until ? ` (idle, ends in ${Math.max(0, Math.round((servant.idle_until - Date.now()) / 1000))} s)` : "";
     const state = element("td", `${servant.phase}${idle}${servant.reason ? `: ${servant.reason}` : ""}`, servant.phase);
     return row(name(servant.id), `${servant.service}:${servant.revision}`, servant.robot, state, age(servant.created),

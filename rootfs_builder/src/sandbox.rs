@@ -220,9 +220,9 @@ fn limits() -> Limits {
     });
     Limits {
         cpus: None,
-        cpu_weight: None,
         memory: memory.map(|kib| kib * 1024 / 4 * 3),
         pids: Some(4096),
+        ..Limits::default()
     }
 }
 

@@ -153,6 +153,45 @@ pub fn limits_are_set_and_read_back() -> Told {
     Ok(())
 }
 
+pub fn limits_are_changed_while_it_works() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut robot = daemon.robot("greeter_cpp?robot=changed")?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    let before = daemon.servant_of("greeter_cpp", "changed")?;
+    let id = before["id"].as_str().context("an id")?;
+    let deployer = daemon.deployer();
+    let said = deployer
+        .types(&["set", id, "--cpus", "0.5", "--memory", "256M"])?
+        .succeeded()?;
+    ensure!(said.stdout.contains("0.5 cpus, 256M"), "{}", said.stdout);
+    let after = daemon.servant_of("greeter_cpp", "changed")?;
+    ensure!(
+        after["enforced"]["cpus"] == 0.5 && after["enforced"]["memory"] == 256 << 20,
+        "the kernel took them: {after:#}"
+    );
+    ensure!(
+        after["enforced"]["pids"] == before["enforced"]["pids"],
+        "what was not named stays: {after:#}"
+    );
+    let status = deployer.asks(&["status"])?;
+    ensure!(
+        status["capacity"]["cpus_reserved"].as_f64() >= Some(0.5),
+        "what it has is promised to it: {status:#}"
+    );
+    // The same nodes, still at work.
+    ensure!(after["pids"] == before["pids"]);
+    ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    deployer
+        .types(&["set", id, "--memory", "900T"])?
+        .failed_saying(&["no room", "left for it"])?;
+    deployer
+        .types(&["set", id, "--cpus", "5000"])?
+        .failed_saying(&["between 0.01 and 4096"])?;
+    deployer.types(&["set", id])?.failed_saying(&["--cpus"])?;
+    ensure!(daemon.servant_of("greeter_cpp", "changed")?["enforced"] == after["enforced"]);
+    Ok(())
+}
+
 const HOG: Service = Service {
     name: "hog_py",
     package: Some("hog_py"),

@@ -4,6 +4,7 @@
 //! A request is answered by one of these types as JSON, by a stream of them as JSON lines ([`NDJSON`]), or by
 //! a [`problem::Problem`] with the HTTP status that it names.
 
+pub mod cpuset;
 pub mod doctor;
 pub mod event;
 pub mod interface;
@@ -16,10 +17,11 @@ pub mod size;
 pub mod status;
 pub mod stub;
 
+pub use cpuset::CpuSet;
 pub use doctor::{Check, CheckStatus, Doctor};
 pub use event::{Event, Level};
 pub use interface::Interface;
-pub use limits::{Limits, Usage};
+pub use limits::{Limits, Pressure, Usage};
 pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
 pub use servant::{LogLine, Phase, Servant, Stopped};

@@ -142,6 +142,18 @@ impl Client {
         read(self.send(Method::GET, path, empty()).await?).await
     }
 
+    /// `PATCH path` with `body` as JSON.
+    pub async fn patch<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &impl Serialize,
+    ) -> anyhow::Result<T> {
+        let body = Full::new(Bytes::from(serde_json::to_vec(body)?))
+            .map_err(|never| match never {})
+            .boxed_unsync();
+        read(self.send(Method::PATCH, path, body).await?).await
+    }
+
     /// `DELETE path`.
     pub async fn delete<T: DeserializeOwned>(&self, path: &str) -> anyhow::Result<T> {
         read(self.send(Method::DELETE, path, empty()).await?).await

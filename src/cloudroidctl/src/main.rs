@@ -6,6 +6,7 @@
 mod client;
 mod doctor;
 mod events;
+mod limits;
 mod logs;
 mod output;
 mod push;
@@ -13,6 +14,7 @@ mod rm;
 mod rollback;
 mod servants;
 mod services;
+mod set;
 mod status;
 mod stop;
 mod stub;
@@ -61,6 +63,7 @@ enum Verb {
     Servants(servants::Servants),
     Logs(logs::Logs),
     Events(events::Events),
+    Set(set::Set),
     Stop(stop::Stop),
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
@@ -103,6 +106,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Servants(verb) => verb.run(&client, format).await,
         Verb::Logs(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
+        Verb::Set(verb) => verb.run(&client, format).await,
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,

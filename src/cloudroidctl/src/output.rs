@@ -141,7 +141,14 @@ pub fn limits(limits: &Limits) -> String {
     let cpus = limits.cpus.map(|cpus| format!("{cpus} cpus"));
     let memory = limits.memory.map(|memory| memory.to_string());
     let pids = limits.pids.map(|pids| format!("{pids} pids"));
-    let set: Vec<String> = [cpus, memory, pids].into_iter().flatten().collect();
+    let high = limits.memory_high.map(|high| format!("high {high}"));
+    let read = limits.io_read.map(|bytes| format!("read {bytes}/s"));
+    let write = limits.io_write.map(|bytes| format!("write {bytes}/s"));
+    let cores = limits.cpuset.map(|cores| format!("on cores {cores}"));
+    let set: Vec<String> = [cpus, cores, memory, high, pids, read, write]
+        .into_iter()
+        .flatten()
+        .collect();
     if set.is_empty() {
         "none".to_owned()
     } else {

@@ -6,11 +6,12 @@ mod progress;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use api::{Limits, PushEvent, PushOptions, Size};
+use api::{PushEvent, PushOptions};
 use futures_util::StreamExt;
 use hyper::Method;
 
 use crate::client::{self, Client, escaped};
+use crate::limits::LimitFlags;
 use crate::output::Format;
 use crate::services;
 use progress::Progress;
@@ -60,12 +61,8 @@ pub struct Push {
     /// Debian package to add; may be given several times.
     #[arg(long = "with", value_name = "DEB")]
     with: Vec<String>,
-    /// Cores that a servant may use, and is promised.
-    #[arg(long, value_name = "N", value_parser = cores)]
-    cpus: Option<f64>,
-    /// Memory that a servant may use, and is promised, such as 512M.
-    #[arg(long, value_name = "SIZE")]
-    memory: Option<Size>,
+    #[command(flatten)]
+    limits: LimitFlags,
 }
 
 fn parameter(text: &str) -> Result<(String, serde_json::Value), String> {
@@ -91,13 +88,6 @@ fn mapping(text: &str) -> Result<(String, String), String> {
             Ok((key.to_owned(), package.to_owned()))
         }
         _ => Err("write KEY=DEB".to_owned()),
-    }
-}
-
-fn cores(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(cores) if cores.is_finite() && cores > 0.0 => Ok(cores),
-        _ => Err("write a number of cores such as 1.5".to_owned()),
     }
 }
 
@@ -144,11 +134,7 @@ impl Push {
             interface,
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
-            limits: Limits {
-                cpus: self.cpus,
-                memory: self.memory,
-                ..Limits::default()
-            },
+            limits: self.limits.into(),
             source,
         })
     }

@@ -1,6 +1,6 @@
 //! `servants`: who works for which robot.
 
-use api::{Servant, Size};
+use api::{Pressure, Servant, Size};
 
 use crate::client::Client;
 use crate::output::{self, Format, Table};
@@ -36,6 +36,8 @@ impl Servants {
             "CONNECTIONS",
             "MEMORY",
             "CPU",
+            "THROTTLED",
+            "PRESSURE",
             "LIMITS",
         ]);
         for servant in &servants {
@@ -53,11 +55,31 @@ impl Servants {
                 usage
                     .map(|usage| format!("{:.1} s", usage.cpu_usec as f64 / 1e6))
                     .unwrap_or_default(),
+                usage
+                    .map(|usage| format!("{:.1} s", usage.throttled_usec as f64 / 1e6))
+                    .unwrap_or_default(),
+                usage
+                    .and_then(|usage| usage.pressure)
+                    .map(pressure)
+                    .unwrap_or_default(),
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
             ]);
         }
         table.print()
     }
+}
+
+/// What some of it waits for, if for anything.
+fn pressure(of: Pressure) -> String {
+    let waits: Vec<String> = [("cpu", of.cpu), ("memory", of.memory), ("io", of.io)]
+        .into_iter()
+        .filter(|(_, percent)| *percent >= 1.0)
+        .map(|(what, percent)| format!("{what} {percent:.0} %"))
+        .collect();
+    if waits.is_empty() {
+        return "none".to_owned();
+    }
+    waits.join(", ")
 }
 
 fn state(servant: &Servant) -> String {

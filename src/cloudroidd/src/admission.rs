@@ -64,6 +64,17 @@ pub enum Refused {
         /// What there is.
         capacity: Amount,
     },
+    /// A servant that runs cannot be promised more.
+    #[error(
+        "there is no room for a servant of {} cores and {} of memory: {} cores and {} are left for it",
+        wanted.cpus(), api::Size(wanted.memory), free.cpus(), api::Size(free.memory)
+    )]
+    NoMore {
+        /// Asked for.
+        wanted: Amount,
+        /// What it could have.
+        free: Amount,
+    },
     /// Too many wait already.
     #[error("this machine is full and {waiting} robots wait for room already")]
     QueueFull {
@@ -98,21 +109,71 @@ pub struct Admission {
 
 /// A promise kept until dropped.
 pub struct Permit {
-    amount: Amount,
+    promise: Promise,
+}
+
+/// How much is promised by a permit. Promises nothing once that is dropped.
+#[derive(Clone)]
+pub struct Promise {
+    /// Locked only while the book is.
+    amount: Arc<Mutex<Option<Amount>>>,
     book: Arc<Mutex<Book>>,
+}
+
+impl Permit {
+    fn new(amount: Amount, book: &Arc<Mutex<Book>>) -> Permit {
+        let promise = Promise {
+            amount: Arc::new(Mutex::new(Some(amount))),
+            book: Arc::clone(book),
+        };
+        Permit { promise }
+    }
+
+    /// How much it promises, to be changed.
+    pub fn promise(&self) -> Promise {
+        self.promise.clone()
+    }
+}
+
+impl Promise {
+    /// Promises `wanted` instead, if there is room for what is more. Who waits for room goes before.
+    pub fn change(&self, wanted: Amount) -> Result<(), Refused> {
+        let admitted = {
+            let mut book = self.book.lock();
+            let mut amount = self.amount.lock();
+            let Some(promised) = *amount else {
+                return Ok(());
+            };
+            let others = book.taken.minus(promised);
+            let free = book.capacity.minus(others);
+            let grows = !wanted.fits(promised);
+            if grows && !wanted.fits(free) {
+                return Err(Refused::NoMore { wanted, free });
+            }
+            *amount = Some(wanted);
+            drop(amount);
+            book.taken = others.plus(wanted);
+            book.admit_waiting(&self.book)
+        };
+        for (waiter, permit) in admitted {
+            let _ = waiter.send(permit);
+        }
+        Ok(())
+    }
 }
 
 impl std::fmt::Debug for Permit {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.debug_tuple("Permit").field(&self.amount).finish()
+        out.debug_tuple("Permit").finish_non_exhaustive()
     }
 }
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        let mut book = self.book.lock();
-        book.taken = book.taken.minus(self.amount);
-        let admitted = book.admit_waiting(&self.book);
+        let mut book = self.promise.book.lock();
+        let amount = self.promise.amount.lock().take().unwrap_or_default();
+        book.taken = book.taken.minus(amount);
+        let admitted = book.admit_waiting(&self.promise.book);
         drop(book);
         // Handing over may drop the permit at once (nobody waits any more), which locks the book again.
         for (waiter, permit) in admitted {
@@ -126,10 +187,7 @@ impl Book {
         let fits = wanted.fits(self.capacity.minus(self.taken));
         fits.then(|| {
             self.taken = self.taken.plus(wanted);
-            Permit {
-                amount: wanted,
-                book: Arc::clone(book),
-            }
+            Permit::new(wanted, book)
         })
     }
 
@@ -192,10 +250,7 @@ impl Admission {
     pub fn adopt(&self, wanted: Amount) -> Permit {
         let mut book = self.book.lock();
         book.taken = book.taken.plus(wanted);
-        Permit {
-            amount: wanted,
-            book: Arc::clone(&self.book),
-        }
+        Permit::new(wanted, &self.book)
     }
 
     /// Takes `wanted`, waiting at most `deadline`. Calls `on_wait` when there is no room at once.
@@ -360,5 +415,33 @@ mod tests {
             Refused::Deadline { waited: SECOND }
         );
         small.expect("fits once the big one has gone");
+    }
+
+    #[tokio::test]
+    async fn a_promise_is_changed_where_there_is_room() {
+        let admission = Admission::new(Amount::new(2.0, 100), 4);
+        let no_wait = Duration::ZERO;
+        let one = admission
+            .admit(Amount::new(1.0, 10), no_wait, || {})
+            .await
+            .expect("room");
+        let two = admission
+            .admit(Amount::new(0.5, 10), no_wait, || {})
+            .await
+            .expect("room");
+        let promise = one.promise();
+        promise.change(Amount::new(1.5, 90)).expect("just so");
+        assert_eq!(admission.look().1, Amount::new(2.0, 100));
+        let refused = promise
+            .change(Amount::new(1.6, 90))
+            .expect_err("more than is left")
+            .to_string();
+        assert!(refused.contains("1.5 cores"), "{refused}");
+        assert_eq!(admission.look().1, Amount::new(2.0, 100));
+        promise.change(Amount::new(0.1, 1)).expect("less");
+        drop(one);
+        promise.change(Amount::new(1.0, 1)).expect("nobody's");
+        drop(two);
+        assert_eq!(admission.look().1, Amount::default());
     }
 }

@@ -38,7 +38,7 @@ use crate::journal::Journal;
 use crate::names;
 use crate::state::{self, NewEvent, RevisionRecord, ServantRecord, State};
 
-pub use handle::{Handle, Lease};
+pub use handle::{Asked, Handle, Lease};
 pub(crate) use nodes::how_it_ended;
 pub use tail::{read as read_log, record as log_record};
 
@@ -126,7 +126,7 @@ impl Choreographer {
                 names::servant_id(service),
                 robot.to_owned(),
                 anonymous,
-                revision.plan.limits.or(inner.config.limits),
+                Asked::new(revision.plan.limits, inner.config.limits),
                 revision,
                 state::now(),
             ));
@@ -203,13 +203,13 @@ impl Choreographer {
         servant: Arc<dyn servant::engine::Servant>,
     ) {
         let inner = &self.inner;
-        let limits = revision.plan.limits.or(inner.config.limits);
+        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.config.limits);
         let key = (record.service, record.robot.clone());
         let handle = Arc::new(Handle::new(
             record.id.clone(),
             record.robot,
             record.anonymous,
-            limits,
+            asked,
             revision,
             record.created,
         ));
@@ -224,6 +224,40 @@ impl Choreographer {
             handle,
             Beginning::Adopted(servant, permit),
         ));
+    }
+
+    /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.
+    pub async fn set_limits(&self, id: &str, change: api::Limits) -> Result<(), Error> {
+        let handle = self.servant(id)?;
+        let unreached = || Error::Servant {
+            service: handle.service().to_owned(),
+            robot: handle.robot.clone(),
+            reason: "does not run, so that its limits cannot be changed".to_owned(),
+            log: Vec::new(),
+        };
+        let container = handle.container().ok_or_else(unreached)?;
+        // One change after the other: what is promised, in force and remembered must be of the same.
+        let _turn = handle.limits_turn().await;
+        let (before, wanted) = (handle.asked(), change.or(handle.asked()));
+        let promise = handle.promise().ok_or_else(unreached)?;
+        promise.change(self.inner.promised_for(&wanted))?;
+        if let Err(error) = container.set_limits(engine_limits(&change)).await {
+            // What the kernel took of it before it refused the rest is taken back.
+            let earlier = engine_limits(&before.or(handle.limits()));
+            let _ = container.set_limits(earlier).await;
+            let _ = promise.change(self.inner.promised_for(&before));
+            return Err(error.into());
+        }
+        handle.set_asked(wanted);
+        self.inner.state.set_servant_limits(id, &wanted)?;
+        let message = format!(
+            "servant {id}: limits changed to {}",
+            in_words(&handle.limits())
+        );
+        self.inner
+            .journal
+            .info("limits-changed", &message, &handle.about());
+        Ok(())
     }
 
     /// All servants that live, oldest first.
@@ -319,7 +353,7 @@ impl Choreographer {
 
 impl Inner {
     fn promised(&self, handle: &Handle) -> Amount {
-        self.promised_for(&handle.revision.plan.limits)
+        self.promised_for(&handle.asked())
     }
 
     /// Limits asked for at push are a promise; else the configured reserve is.
@@ -402,7 +436,7 @@ pub async fn describe(handle: &Handle) -> api::Servant {
         created: handle.created,
         connections: handle.connections(),
         idle_until: handle.idle_until(),
-        limits: handle.limits,
+        limits: handle.limits(),
         cgroup_version: enforced
             .as_ref()
             .map_or(0, |enforced| enforced.cgroup_version),
@@ -412,9 +446,27 @@ pub async fn describe(handle: &Handle) -> api::Servant {
             memory: usage.memory,
             pids: usage.pids,
             oom_kills: usage.oom_kills,
+            throttled_usec: usage.throttled_usec,
+            pressure: usage.pressure.map(|pressure| api::Pressure {
+                cpu: pressure.cpu,
+                memory: pressure.memory,
+                io: pressure.io,
+            }),
         }),
         pids,
         dropped: works.map_or(0, |works| works.dropped()),
+    }
+}
+
+/// Limits for people.
+fn in_words(limits: &api::Limits) -> String {
+    match serde_json::to_value(limits) {
+        Ok(serde_json::Value::Object(set)) => set
+            .iter()
+            .map(|(name, value)| format!("{name} {value}"))
+            .collect::<Vec<_>>()
+            .join(", "),
+        _ => String::new(),
     }
 }
 
@@ -423,7 +475,11 @@ fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
         cpus: limits.cpus,
         cpu_weight: limits.cpu_weight,
         memory: limits.memory.map(api::Size),
+        memory_high: limits.memory_high.map(api::Size),
         pids: limits.pids,
+        io_read: limits.io_read.map(api::Size),
+        io_write: limits.io_write.map(api::Size),
+        cpuset: limits.cpuset.map(api::CpuSet),
     }
 }
 
@@ -433,6 +489,10 @@ pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
         cpus: limits.cpus,
         cpu_weight: limits.cpu_weight,
         memory: limits.memory.map(|memory| memory.0),
+        memory_high: limits.memory_high.map(|memory| memory.0),
         pids: limits.pids,
+        io_read: limits.io_read.map(|bytes| bytes.0),
+        io_write: limits.io_write.map(|bytes| bytes.0),
+        cpuset: limits.cpuset.map(|set| set.0),
     }
 }

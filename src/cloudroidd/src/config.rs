@@ -142,6 +142,7 @@ impl Default for Config {
                 cpu_weight: Some(100),
                 memory: Some(Size(1 << 30)),
                 pids: Some(512),
+                ..Limits::default()
             },
             room: Room::default(),
             servant: Servant::default(),
@@ -312,6 +313,15 @@ pub fn check_limits(limits: &Limits) -> anyhow::Result<()> {
         && memory.0 < 4 << 20
     {
         bail!("memory = {memory} is too little for any node; at least 4M");
+    }
+    for (name, limit) in [
+        ("memory_high", limits.memory_high),
+        ("io_read", limits.io_read),
+        ("io_write", limits.io_write),
+    ] {
+        if limit == Some(Size(0)) {
+            bail!("{name} = 0 would stop the servant; leave it out for no limit");
+        }
     }
     if let Some(pids) = limits.pids
         && pids < 4

@@ -221,6 +221,9 @@ impl Error {
             Error::Ending => (S::SERVICE_UNAVAILABLE, "ending", "daemon ending"),
             Error::Push { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
             Error::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
+            Error::Engine(servant::Error::Refused { .. }) => {
+                (S::CONFLICT, "refused", "the servant refused")
+            }
             Error::State(_) | Error::Image(_) | Error::Engine(_) | Error::Internal(_) => {
                 (S::INTERNAL_SERVER_ERROR, "internal", "the daemon failed")
             }

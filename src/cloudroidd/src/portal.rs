@@ -120,7 +120,9 @@ pub fn router(app: Arc<App>) -> Router {
         )
         .route(
             "/servants/{id}",
-            get(api_v1::servant).delete(api_v1::stop_servant),
+            get(api_v1::servant)
+                .patch(api_v1::set_limits)
+                .delete(api_v1::stop_servant),
         )
         .route("/servants/{id}/logs", get(api_v1::logs))
         .route(

@@ -23,7 +23,10 @@ pub use lives::ServantRecord;
 pub use services::{Plan, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 1] = [include_str!("state/001-start.sql")];
+const MIGRATIONS: [&str; 2] = [
+    include_str!("state/001-start.sql"),
+    include_str!("state/002-limits.sql"),
+];
 
 /// What can go wrong.
 #[derive(Debug, thiserror::Error)]

@@ -19,8 +19,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::engine::{Enforced, Usage};
-use crate::spec::Limits;
+use crate::spec::{Limits, Spec};
 
+mod cores;
+mod disk;
 mod files;
 mod hosts;
 mod v1;
@@ -36,6 +38,9 @@ pub struct Cgroup {
     pub version: u8,
     /// One for each hierarchy in use.
     leaves: Vec<Leaf>,
+    /// `MAJOR:MINOR` of the disk that input and output are limited on.
+    #[serde(default)]
+    disk: Option<String>,
 }
 
 /// A directory in one hierarchy.
@@ -49,16 +54,25 @@ struct Leaf {
 }
 
 impl Cgroup {
-    /// Where the cgroup of servant `id` is, or would be.
-    pub fn planned(parent: &Parent, id: &str) -> Self {
-        let leaves = parent.hierarchies.iter().map(|hierarchy| Leaf {
-            controllers: hierarchy.controllers.clone(),
-            directory: hierarchy.directory.join(id),
-            unified: hierarchy.unified,
-        });
+    /// Where the cgroup of a servant is, or would be.
+    pub fn planned(parent: &Parent, spec: &Spec) -> Self {
+        let asked = |hierarchy: &&hosts::Below| {
+            let limits = &spec.limits;
+            !hierarchy.only_if_asked() || limits.io_read.or(limits.io_write).is_some()
+        };
+        let leaves = parent
+            .hierarchies
+            .iter()
+            .filter(asked)
+            .map(|hierarchy| Leaf {
+                controllers: hierarchy.controllers.clone(),
+                directory: hierarchy.directory.join(&spec.id),
+                unified: hierarchy.unified,
+            });
         Self {
             version: parent.version,
             leaves: leaves.collect(),
+            disk: spec.layers.first().and_then(|layer| disk::of(layer)),
         }
     }
 
@@ -105,7 +119,7 @@ impl Cgroup {
 
     /// What is used now.
     pub fn usage(&self) -> Usage {
-        let (cpu_usec, memory) = if self.version == 2 {
+        let counted = if self.version == 2 {
             v2::usage(self)
         } else {
             v1::usage(self)
@@ -115,10 +129,9 @@ impl Cgroup {
             .and_then(|file| read_number(&file))
             .unwrap_or(0);
         Usage {
-            cpu_usec,
-            memory,
             pids,
             oom_kills: self.oom_kills(),
+            ..counted
         }
     }
 
@@ -268,8 +281,22 @@ pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
     if !close(number(asked.memory), number(enforced.memory), 65536.0) {
         missing.push("memory");
     }
+    // Memory that is to be given back, like memory, comes in pages.
+    let high = (number(asked.memory_high), number(enforced.memory_high));
+    if !close(high.0, high.1, 65536.0) {
+        missing.push("memory_high");
+    }
     if !close(number(asked.pids), number(enforced.pids), 0.0) {
         missing.push("pids");
+    }
+    if !close(number(asked.io_read), number(enforced.io_read), 0.0) {
+        missing.push("io_read");
+    }
+    if !close(number(asked.io_write), number(enforced.io_write), 0.0) {
+        missing.push("io_write");
+    }
+    if asked.cpuset.is_some() && asked.cpuset != enforced.cpuset {
+        missing.push("cpuset");
     }
     missing
 }
@@ -282,9 +309,9 @@ mod tests {
     fn a_limit_that_is_not_in_force_is_named() {
         let asked = Limits {
             cpus: Some(1.5),
-            cpu_weight: None,
             memory: Some(100_000_000),
             pids: Some(10),
+            ..Limits::default()
         };
         let got = Limits {
             memory: Some(99_999_744),

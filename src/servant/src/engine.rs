@@ -103,6 +103,21 @@ pub struct Usage {
     pub pids: u64,
     /// Processes killed for want of memory so far.
     pub oom_kills: u64,
+    /// Microseconds so far in which it wanted to run and had used its cores up.
+    pub throttled_usec: u64,
+    /// How much of the last ten seconds some of it waited for what others used; none on cgroup v1.
+    pub pressure: Option<Pressure>,
+}
+
+/// Percent of the last ten seconds in which some thread waited (`some avg10` of pressure stall information).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Pressure {
+    /// For a core.
+    pub cpu: f64,
+    /// For memory.
+    pub memory: f64,
+    /// For a disk.
+    pub io: f64,
 }
 
 /// One line that a process printed.

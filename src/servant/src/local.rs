@@ -98,10 +98,9 @@ impl LocalEngineConfig {
             shim_command,
             init,
             default_limits: Limits {
-                cpus: None,
-                cpu_weight: None,
                 memory: Some(1 << 30),
                 pids: Some(512),
+                ..Limits::default()
             },
             uid_base: DEFAULT_UID_BASE,
             cgroup_parent: CgroupParent::Auto,

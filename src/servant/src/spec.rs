@@ -59,10 +59,34 @@ pub struct Limits {
     pub cpus: Option<f64>,
     /// Relative share when cores are scarce, 1..10000, 100 by default (`cpu.weight`).
     pub cpu_weight: Option<u64>,
-    /// Bytes of memory, swap not included.
+    /// Bytes of memory, swap not included (`memory.max`; there is no swap). A servant that needs more is killed, whole.
     pub memory: Option<u64>,
+    /// Bytes of memory above which it is slowed down and made to give back (`memory.high`; v2 only).
+    pub memory_high: Option<u64>,
     /// Processes and threads.
     pub pids: Option<u64>,
+    /// Bytes a second read from the disk that holds the layers (`io.max`).
+    pub io_read: Option<u64>,
+    /// Bytes a second written to it.
+    pub io_write: Option<u64>,
+    /// On which cores it may run, bit n of word n / 64 for core n (`cpuset.cpus`).
+    pub cpuset: Option<[u64; 4]>,
+}
+
+impl Limits {
+    /// These, with `default` where nothing is said.
+    pub fn or(self, default: &Self) -> Self {
+        Self {
+            cpus: self.cpus.or(default.cpus),
+            cpu_weight: self.cpu_weight.or(default.cpu_weight),
+            memory: self.memory.or(default.memory),
+            memory_high: self.memory_high.or(default.memory_high),
+            pids: self.pids.or(default.pids),
+            io_read: self.io_read.or(default.io_read),
+            io_write: self.io_write.or(default.io_write),
+            cpuset: self.cpuset.or(default.cpuset),
+        }
+    }
 }
 
 /// One process to run.

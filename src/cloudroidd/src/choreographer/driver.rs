@@ -111,11 +111,13 @@ async fn live(
                 reason = handle.end_asked() => return Ok(reason),
                 () = abandoned(handle) => return Ok("its robot left before there was room".to_owned()),
             };
+            handle.set_promise(permit.promise());
             *kept = Some(permit);
             handle.set_phase(Phase::Admitted);
             (start(inner, handle).await?, true)
         }
         Beginning::Adopted(container, permit) => {
+            handle.set_promise(permit.promise());
             *kept = Some(permit);
             (container, false)
         }
@@ -125,6 +127,8 @@ async fn live(
     let mut nodes = Nodes::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, &mut nodes, fresh));
     tokio::select! {
+        // A node's end says more than that of its container, and comes first where both come at once.
+        biased;
         outcome = &mut supervised => outcome,
         reason = handle.end_asked() => Ok(reason),
         failure = container_over(&container) => Err(failure),
@@ -218,6 +222,7 @@ async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Serva
         robot: handle.robot.clone(),
         anonymous: handle.anonymous,
         created: handle.created,
+        limits: api::Limits::default(),
     };
     inner
         .state
@@ -242,7 +247,7 @@ async fn spec(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Spec, Error> {
         layers,
         writable: None,
         profile: Profile::Servant,
-        limits: engine_limits(&handle.limits),
+        limits: engine_limits(&handle.limits()),
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         owned_directories: Vec::new(),

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::admission::Refused;
+use crate::admission::{Promise, Refused};
 use crate::errors::Error;
 use crate::state::{NewEvent, RevisionRecord};
 use crate::works::Works;
@@ -63,6 +63,22 @@ impl Life {
     }
 }
 
+/// Limits of a servant, and where they come from.
+#[derive(Debug, Clone, Copy)]
+pub struct Asked {
+    /// By whoever pushed the package, or changed the servant: a promise.
+    promised: Limits,
+    /// Where they said nothing.
+    default: Limits,
+}
+
+impl Asked {
+    /// Of a new servant.
+    pub fn new(promised: Limits, default: Limits) -> Asked {
+        Asked { promised, default }
+    }
+}
+
 /// A servant.
 pub struct Handle {
     /// Its id.
@@ -71,13 +87,14 @@ pub struct Handle {
     pub robot: String,
     /// The robot named no name; nobody can come back to this servant.
     pub anonymous: bool,
-    /// Limits asked for.
-    pub limits: Limits,
     /// What it is started from.
     pub revision: Arc<RevisionRecord>,
     /// When it was asked for.
     pub created: Millis,
     life: watch::Sender<Life>,
+    asked: Mutex<Asked>,
+    limits_turn: tokio::sync::Mutex<()>,
+    promise: OnceLock<Promise>,
     connections: watch::Sender<usize>,
     /// 0: not idle.
     idle_until: AtomicU64,
@@ -93,7 +110,7 @@ impl Handle {
         id: String,
         robot: String,
         anonymous: bool,
-        limits: Limits,
+        asked: Asked,
         revision: Arc<RevisionRecord>,
         created: Millis,
     ) -> Handle {
@@ -101,7 +118,6 @@ impl Handle {
             id,
             robot,
             anonymous,
-            limits,
             revision,
             created,
             life: watch::Sender::new(Life {
@@ -109,6 +125,9 @@ impl Handle {
                 failure: None,
                 ended: None,
             }),
+            asked: Mutex::new(asked),
+            limits_turn: tokio::sync::Mutex::default(),
+            promise: OnceLock::new(),
             connections: watch::Sender::new(0),
             idle_until: AtomicU64::new(0),
             end: CancellationToken::new(),
@@ -121,6 +140,35 @@ impl Handle {
     /// Its service.
     pub fn service(&self) -> &str {
         &self.revision.service
+    }
+
+    /// The limits that it is to have.
+    pub fn limits(&self) -> Limits {
+        let asked = self.asked.lock();
+        asked.promised.or(asked.default)
+    }
+
+    /// Those of them that somebody asked for, which are promised to it.
+    pub fn asked(&self) -> Limits {
+        self.asked.lock().promised
+    }
+
+    pub(super) fn set_asked(&self, limits: Limits) {
+        self.asked.lock().promised = limits;
+    }
+
+    /// Whoever changes its limits holds this.
+    pub(super) async fn limits_turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
+        self.limits_turn.lock().await
+    }
+
+    /// What it is promised, once it was admitted.
+    pub(super) fn promise(&self) -> Option<&Promise> {
+        self.promise.get()
+    }
+
+    pub(super) fn set_promise(&self, promise: Promise) {
+        let _ = self.promise.set(promise);
     }
 
     /// What its events are about.

@@ -102,9 +102,10 @@ impl<'a> Nodes<'a> {
     ) -> Result<(), Failure> {
         // The engine lost it: the container's own state says why.
         let Ok(exit) = exit else { return Ok(()) };
-        let how = how_it_ended(&exit, &self.handle.limits);
+        let how = how_it_ended(&exit, &self.handle.limits());
         if exit.out_of_memory {
             // What it knew is lost, and it would do the same again: its robot is told and begins anew.
+            self.tell("out-of-memory", &format!("{} {how}", node.name));
             return Err(self.failure(&node, format!("lost {}: it {how}", node.name)));
         }
         let failed = exit.code != Some(0);

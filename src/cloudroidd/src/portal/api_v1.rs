@@ -128,6 +128,19 @@ pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Ans
     Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
 }
 
+/// Changes limits of one servant while it runs.
+pub async fn set_limits(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    body: Bytes,
+) -> Answer<api::Servant> {
+    let change: api::Limits = serde_json::from_slice(&body)
+        .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
+    crate::config::check_limits(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
+    app.choreographer.set_limits(&id, change).await?;
+    Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
+}
+
 /// Ends one servant.
 pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<Stopped> {
     app.choreographer.servant(&id)?;

@@ -179,6 +179,15 @@ async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
         "Processor time of a servant.",
         cpu,
     );
+    let throttled = of(|usage| usage.throttled_usec as f64 / 1e6);
+    family(
+        out,
+        "cloudroid_servant_throttled_seconds_total",
+        "counter",
+        "Time in which a servant had used its cores up.",
+        throttled,
+    );
+    pressure(out, &rows);
     let kills = of(|usage| usage.oom_kills as f64);
     family(
         out,
@@ -186,6 +195,28 @@ async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
         "counter",
         "Processes killed for want of memory.",
         kills,
+    );
+}
+
+/// None on cgroup v1.
+fn pressure(out: &mut String, rows: &[(String, api::Usage)]) {
+    let waits = rows.iter().flat_map(|(labels, usage)| {
+        let each = usage.pressure.map(|pressure| {
+            [
+                ("cpu", pressure.cpu),
+                ("memory", pressure.memory),
+                ("io", pressure.io),
+            ]
+        });
+        each.into_iter()
+            .flatten()
+            .map(move |(what, percent)| (format!("{labels},resource=\"{what}\""), percent / 100.0))
+    });
+    gauge(
+        out,
+        "cloudroid_servant_pressure_ratio",
+        "Share of the last ten seconds in which some of a servant waited.",
+        waits,
     );
 }
 

@@ -1,13 +1,13 @@
 //! Who is who while servants live: robots' names and their owners, servants and their robots.
 
-use api::Millis;
+use api::{Limits, Millis};
 use rusqlite::params;
 
-use super::{State, StateError, now};
+use super::{State, StateError, now, to_json};
 use crate::tokens::TokenHash;
 
 /// Whose a servant is.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ServantRecord {
     /// Its id.
     pub id: String,
@@ -21,6 +21,8 @@ pub struct ServantRecord {
     pub anonymous: bool,
     /// When it was asked for.
     pub created: Millis,
+    /// Limits that were changed while it lived.
+    pub limits: Limits,
 }
 
 impl State {
@@ -73,6 +75,18 @@ impl State {
         .map(|_| ())
     }
 
+    /// Remembers the limits that a servant was given while it lived.
+    pub fn set_servant_limits(&self, id: &str, limits: &Limits) -> Result<(), StateError> {
+        let limits = to_json(limits, id)?;
+        self.run(|connection| {
+            connection.execute(
+                "UPDATE servants SET limits = ?2 WHERE id = ?1",
+                [id, limits.as_str()],
+            )
+        })
+        .map(|_| ())
+    }
+
     /// Forgets a servant that has ended.
     pub fn remove_servant(&self, id: &str) -> Result<(), StateError> {
         self.run(|connection| connection.execute("DELETE FROM servants WHERE id = ?1", [id]))
@@ -83,7 +97,7 @@ impl State {
     pub fn servants(&self) -> Result<Vec<ServantRecord>, StateError> {
         self.run(|connection| {
             connection
-                .prepare_cached("SELECT id, service, revision, robot, anonymous, created FROM servants ORDER BY created")?
+                .prepare_cached("SELECT id, service, revision, robot, anonymous, created, limits FROM servants ORDER BY created")?
                 .query_map([], |row| {
                     Ok(ServantRecord {
                         id: row.get(0)?,
@@ -92,6 +106,8 @@ impl State {
                         robot: row.get(3)?,
                         anonymous: row.get(4)?,
                         created: row.get::<_, i64>(5)? as Millis,
+                        // Written by a later version: then the push's own limits apply.
+                        limits: serde_json::from_str(&row.get::<_, String>(6)?).unwrap_or_default(),
                     })
                 })?
                 .collect()

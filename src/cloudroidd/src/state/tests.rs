@@ -145,6 +145,7 @@ fn servants_are_remembered_until_they_end() {
         robot: "r1".into(),
         anonymous: false,
         created: 5,
+        limits: api::Limits::default(),
     };
     state.add_servant(&record).expect("written");
     assert_eq!(state.servants().expect("readable"), [record]);

@@ -20,6 +20,24 @@ pub(super) fn read_field(file: &Path, name: &str) -> Option<u64> {
     })
 }
 
+/// The value of `key` in the line of `device`, in a file of `MAJOR:MINOR key=value …` lines; none for `max`.
+pub(super) fn read_of_device(file: &Path, device: &str, key: &str) -> Option<u64> {
+    let text = fs::read_to_string(file).ok()?;
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix(device)?.strip_prefix(' '))?;
+    line.split(' ')
+        .find_map(|pair| pair.strip_prefix(key)?.strip_prefix('=')?.parse().ok())
+}
+
+/// `some avg10` of a pressure file, in percent.
+pub(super) fn read_pressure(file: &Path) -> Option<f64> {
+    let text = fs::read_to_string(file).ok()?;
+    let some = text.lines().find_map(|line| line.strip_prefix("some "))?;
+    some.split(' ')
+        .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
+}
+
 /// The processes of a cgroup directory. Those of another pid namespace read as 0, which `kill` takes for our own process
 /// group: they are left out.
 pub(super) fn read_pids(directory: &Path) -> Vec<i32> {

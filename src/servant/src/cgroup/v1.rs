@@ -2,12 +2,16 @@
 
 use std::fs;
 
-use super::Cgroup;
 use super::files::{read_field, read_number};
+use super::{Cgroup, cores};
+use crate::engine::Usage;
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
+
+const READ: &str = "blkio.throttle.read_bps_device";
+const WRITE: &str = "blkio.throttle.write_bps_device";
 
 /// What `memory.limit_in_bytes` reads when there is no limit: the largest multiple of a page.
 const NO_LIMIT: u64 = 1 << 62;
@@ -40,6 +44,16 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     if let Some(pids) = limits.pids {
         write("pids", "pids.max", pids.to_string());
     }
+    if let Some(disk) = &cgroup.disk {
+        for (name, limit) in [(READ, limits.io_read), (WRITE, limits.io_write)] {
+            if let Some(limit) = limit {
+                write("blkio", name, format!("{disk} {limit}"));
+            }
+        }
+    }
+    if let Some(cpuset) = &limits.cpuset {
+        write("cpuset", "cpuset.cpus", cores::print(cpuset));
+    }
 }
 
 pub(super) fn limits(cgroup: &Cgroup) -> Limits {
@@ -47,18 +61,27 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     let period = number("cpu", "cpu.cfs_period_us");
     // -1, which is no limit, is no u64 and so reads as none.
     let quota = number("cpu", "cpu.cfs_quota_us");
+    let io = |name| read_field(&cgroup.file("blkio", name)?, cgroup.disk.as_deref()?);
+    let cpuset = cgroup
+        .file("cpuset", "cpuset.cpus")
+        .and_then(|file| cores::parse(&fs::read_to_string(file).ok()?));
     Limits {
         cpus: quota
             .zip(period)
             .map(|(quota, period)| quota as f64 / period as f64),
         cpu_weight: number("cpu", "cpu.shares").map(weight),
         memory: number("memory", "memory.limit_in_bytes").filter(|bytes| *bytes < NO_LIMIT),
+        // Its nearest likeness, soft_limit_in_bytes, slows nobody down.
+        memory_high: None,
         pids: number("pids", "pids.max"),
+        io_read: io(READ),
+        io_write: io(WRITE),
+        cpuset,
     }
 }
 
-/// Microseconds of CPU and bytes of memory.
-pub(super) fn usage(cgroup: &Cgroup) -> (u64, u64) {
+/// Processor time and memory.
+pub(super) fn usage(cgroup: &Cgroup) -> Usage {
     let number = |controller, name| read_number(&cgroup.file(controller, name)?);
     let beside = || {
         let unified = cgroup.leaves.iter().find(|leaf| leaf.unified)?;
@@ -66,7 +89,15 @@ pub(super) fn usage(cgroup: &Cgroup) -> (u64, u64) {
     };
     let cpu = number("cpuacct", "cpuacct.usage").map(|nanoseconds| nanoseconds / 1000);
     let memory = number("memory", "memory.usage_in_bytes");
-    (cpu.or_else(beside).unwrap_or(0), memory.unwrap_or(0))
+    let throttled = cgroup
+        .file("cpu", "cpu.stat")
+        .and_then(|file| read_field(&file, "throttled_time"));
+    Usage {
+        cpu_usec: cpu.or_else(beside).unwrap_or(0),
+        throttled_usec: throttled.unwrap_or(0) / 1000,
+        memory: memory.unwrap_or(0),
+        ..Usage::default()
+    }
 }
 
 /// A v2 weight (1..10000, 100 by default) as v1 shares (1024 by default).

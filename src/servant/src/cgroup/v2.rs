@@ -2,8 +2,9 @@
 
 use std::fs;
 
-use super::Cgroup;
-use super::files::{read_field, read_number};
+use super::files::{read_field, read_number, read_of_device, read_pressure};
+use super::{Cgroup, cores};
+use crate::engine::{Pressure, Usage};
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
@@ -29,9 +30,24 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     if let Some(memory) = limits.memory {
         write("memory", "memory.max", memory.to_string());
         write("memory", "memory.swap.max", "0".into());
+        // Half a servant is of no use: the nodes that were spared would wait for the one that was not.
+        write("memory", "memory.oom.group", "1".into());
+    }
+    if let Some(high) = limits.memory_high {
+        write("memory", "memory.high", high.to_string());
     }
     if let Some(pids) = limits.pids {
         write("pids", "pids.max", pids.to_string());
+    }
+    if let Some(disk) = &cgroup.disk {
+        for (key, limit) in [("rbps", limits.io_read), ("wbps", limits.io_write)] {
+            if let Some(limit) = limit {
+                write("io", "io.max", format!("{disk} {key}={limit}"));
+            }
+        }
+    }
+    if let Some(cpuset) = &limits.cpuset {
+        write("cpuset", "cpuset.cpus", cores::print(cpuset));
     }
 }
 
@@ -42,23 +58,44 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
         let (quota, period) = text.trim().split_once(' ')?;
         Some(quota.parse::<f64>().ok()? / period.parse::<f64>().ok()?)
     });
+    let io = |key| {
+        let disk = cgroup.disk.as_deref()?;
+        read_of_device(&cgroup.file("io", "io.max")?, disk, key)
+    };
+    let cpuset = cgroup
+        .file("cpuset", "cpuset.cpus")
+        .and_then(|file| cores::parse(&fs::read_to_string(file).ok()?));
     Limits {
         cpus,
         cpu_weight: number("cpu", "cpu.weight"),
         memory: number("memory", "memory.max"),
+        memory_high: number("memory", "memory.high"),
         pids: number("pids", "pids.max"),
+        io_read: io("rbps"),
+        io_write: io("wbps"),
+        cpuset,
     }
 }
 
-/// Microseconds of CPU and bytes of memory.
-pub(super) fn usage(cgroup: &Cgroup) -> (u64, u64) {
-    // cpu.stat has usage_usec even where the cpu controller is not enabled.
-    let cpu = cgroup
-        .leaves
-        .first()
-        .and_then(|leaf| read_field(&leaf.directory.join("cpu.stat"), "usage_usec"));
+/// Processor time, memory and pressure.
+pub(super) fn usage(cgroup: &Cgroup) -> Usage {
+    // cpu.stat and the pressure files are there even where a controller is not enabled.
+    let plain = |name: &str| Some(cgroup.leaves.first()?.directory.join(name));
+    let stat = |field| read_field(&plain("cpu.stat")?, field);
+    let pressure = |name| read_pressure(&plain(name)?);
     let memory = cgroup
         .file("memory", "memory.current")
         .and_then(|file| read_number(&file));
-    (cpu.unwrap_or(0), memory.unwrap_or(0))
+    Usage {
+        cpu_usec: stat("usage_usec").unwrap_or(0),
+        throttled_usec: stat("throttled_usec").unwrap_or(0),
+        memory: memory.unwrap_or(0),
+        // A kernel may be built or booted without.
+        pressure: pressure("cpu.pressure").map(|cpu| Pressure {
+            cpu,
+            memory: pressure("memory.pressure").unwrap_or(0.0),
+            io: pressure("io.pressure").unwrap_or(0.0),
+        }),
+        ..Usage::default()
+    }
 }

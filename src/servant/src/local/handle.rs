@@ -74,7 +74,7 @@ pub(super) async fn started(
         .ok_or_else(ended)?;
     let runtime = Runtime {
         shim,
-        cgroup: Cgroup::planned(&launch.parent, id),
+        cgroup: Cgroup::planned(&launch.parent, &launch.spec),
         uid_range: launch.uid_range,
     };
     let servant = connect(

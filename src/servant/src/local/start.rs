@@ -16,11 +16,11 @@ use super::{Shared, sweep, validate};
 use crate::launch::{self, Launch};
 use crate::netns::NetNs;
 use crate::process::Identity;
-use crate::spec::{Limits, Spec};
+use crate::spec::Spec;
 use crate::{Error, uids};
 
 pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalServant>, Error> {
-    spec.limits = with_defaults(spec.limits, &shared.config.default_limits);
+    spec.limits = spec.limits.or(&shared.config.default_limits);
     validate::validate(&spec)?;
     let id = spec.id.clone();
     let directory = shared.config.home_servants_dir.join(&id);
@@ -37,15 +37,6 @@ pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalSe
         }
     }
     started
-}
-
-fn with_defaults(limits: Limits, defaults: &Limits) -> Limits {
-    Limits {
-        cpus: limits.cpus.or(defaults.cpus),
-        cpu_weight: limits.cpu_weight.or(defaults.cpu_weight),
-        memory: limits.memory.or(defaults.memory),
-        pids: limits.pids.or(defaults.pids),
-    }
 }
 
 async fn start_in(

@@ -89,6 +89,12 @@ fn problem(spec: &Spec) -> Option<String> {
     if limits.pids == Some(0) || limits.memory.is_some_and(|bytes| bytes < 4 << 20) {
         return Some("a servant needs at least 4 MiB of memory and one process".into());
     }
+    if [limits.io_read, limits.io_write, limits.memory_high].contains(&Some(0)) {
+        return Some("a limit of 0 would stop the servant: leave it out for none".into());
+    }
+    if limits.cpuset == Some([0; 4]) {
+        return Some("a set of cores needs at least one".into());
+    }
     let mut names = BTreeSet::new();
     for node in &spec.nodes {
         if node.name.is_empty() || !names.insert(&node.name) {

@@ -53,7 +53,7 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     })?;
     let own = std::process::id() as i32;
     let identity = Identity::of(own).map_err(Error::call("reading our own start time"))?;
-    let cgroup = Cgroup::planned(&launch.parent, &launch.spec.id);
+    let cgroup = Cgroup::planned(&launch.parent, &launch.spec);
     let runtime = Runtime {
         shim: identity,
         cgroup: cgroup.clone(),

@@ -94,6 +94,7 @@ async fn limits_are_read_back_and_changed_while_it_runs() {
         cpu_weight: Some(200),
         memory: Some(64 << 20),
         pids: Some(50),
+        ..Limits::default()
     };
     let asked = spec.limits;
     let servant = world.start(spec).await;
