@@ -1,0 +1,406 @@
+//! For each request: who was asked, who answered first, what is a late duplicate.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crate::request::{Leg, RequestId, Side, Stamp};
+
+/// What is kept, and for how long.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// After its T_max a request is remembered for so long: late answers are recognised, and an input that nobody
+    /// answered is given up.
+    pub patience: Duration,
+    /// Requests remembered; beyond it the oldest inputs are forgotten. Calls and goals are not counted: each holds a
+    /// caller.
+    pub requests: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            patience: Duration::from_secs(30),
+            requests: 4096,
+        }
+    }
+}
+
+/// What to do with an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Hand it to the application.
+    Deliver,
+    /// The request was answered already, failed, or nobody knows it: drop it.
+    Drop,
+}
+
+/// What kind of request it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// A service call or an action's goal: exactly one result.
+    Call(Arc<str>),
+    /// An input of the pair with this index.
+    Input {
+        pair: usize,
+        stamp: Option<Stamp>,
+        /// Outputs that answer it; the first one is the answer.
+        outputs: usize,
+    },
+}
+
+/// The requests of one node that are open or were until lately. `P` is what was asked, cheap to clone.
+#[derive(Debug)]
+pub struct Arbiter<P> {
+    limits: Limits,
+    next: u64,
+    requests: BTreeMap<RequestId, Record<P>>,
+    /// One for each request that still awaits its T_max or its end.
+    timers: BTreeSet<(Instant, RequestId)>,
+}
+
+#[derive(Debug)]
+pub(crate) struct Record<P> {
+    pub(crate) kind: Kind,
+    /// Until it is answered, failed, or, for inputs, too old to be asked anew.
+    pub(crate) payload: Option<P>,
+    pub(crate) asked_at: Instant,
+    pub(crate) deadline: Instant,
+    pub(crate) cloud: Leg,
+    pub(crate) local: Leg,
+    /// Whose answer was taken, per output.
+    owners: Vec<Option<Side>>,
+    /// The application was told that there will be no answer.
+    pub(crate) failed: bool,
+    /// T_max has passed.
+    pub(crate) overdue: bool,
+    /// The cloud's time has counted, or that it had none.
+    judged: bool,
+}
+
+impl<P> Record<P> {
+    pub(crate) fn leg(&mut self, side: Side) -> &mut Leg {
+        match side {
+            Side::Cloud => &mut self.cloud,
+            Side::Local => &mut self.local,
+        }
+    }
+
+    pub(crate) fn answered(&self) -> Option<Side> {
+        self.owners[0]
+    }
+
+    /// Neither answered nor failed.
+    pub(crate) fn is_open(&self) -> bool {
+        self.answered().is_none() && !self.failed
+    }
+
+    pub(crate) fn is_call(&self) -> bool {
+        matches!(self.kind, Kind::Call(_))
+    }
+
+    fn awaits_nobody(&self) -> bool {
+        [&self.cloud, &self.local]
+            .iter()
+            .all(|leg| matches!(leg, Leg::NotAsked | Leg::Answered | Leg::Failed(_)))
+    }
+}
+
+impl<P: Clone> Arbiter<P> {
+    /// Knows no request yet.
+    pub fn new(limits: Limits) -> Self {
+        Self {
+            limits,
+            next: 0,
+            requests: BTreeMap::new(),
+            timers: BTreeSet::new(),
+        }
+    }
+
+    /// A service was called, or a goal was sent. Nobody is asked yet.
+    pub fn call(
+        &mut self,
+        now: Instant,
+        t_max: Duration,
+        name: &Arc<str>,
+        payload: P,
+    ) -> RequestId {
+        self.open(now, t_max, Kind::Call(name.clone()), payload)
+    }
+
+    pub(crate) fn open(
+        &mut self,
+        now: Instant,
+        t_max: Duration,
+        kind: Kind,
+        payload: P,
+    ) -> RequestId {
+        let id = RequestId(self.next);
+        self.next += 1;
+        let outputs = match &kind {
+            Kind::Call(_) => 1,
+            Kind::Input { outputs, .. } => *outputs,
+        };
+        let record = Record {
+            kind,
+            payload: Some(payload),
+            asked_at: now,
+            deadline: now + t_max,
+            cloud: Leg::NotAsked,
+            local: Leg::NotAsked,
+            owners: vec![None; outputs],
+            failed: false,
+            overdue: false,
+            judged: false,
+        };
+        // At T_max it is still in time.
+        let passed = record.deadline + Duration::from_nanos(1);
+        self.timers.insert((passed, id));
+        self.requests.insert(id, record);
+        id
+    }
+
+    /// Marks `side` as asked and gives what to ask, unless it was asked already or the request needs nobody.
+    pub fn ask(&mut self, id: RequestId, side: Side) -> Option<P> {
+        let record = self.requests.get_mut(&id)?;
+        if !record.is_open() || !matches!(record.leg(side), Leg::NotAsked) {
+            return None;
+        }
+        let payload = record.payload.clone()?;
+        *record.leg(side) = Leg::Asked;
+        Some(payload)
+    }
+
+    /// `side` gave the result of a call, or the answering output of an input.
+    pub fn answer(&mut self, id: RequestId, side: Side) -> Verdict {
+        self.answer_with(id, side, 0)
+    }
+
+    /// `side` gave output number `output`. The side that is first with it keeps it: a node that answers one input
+    /// with several messages on a topic is passed as it is.
+    pub(crate) fn answer_with(&mut self, id: RequestId, side: Side, output: usize) -> Verdict {
+        let Some(record) = self.requests.get_mut(&id) else {
+            return Verdict::Drop;
+        };
+        if output == 0 {
+            *record.leg(side) = Leg::Answered;
+        }
+        let call = record.is_call();
+        let failed = record.failed;
+        let owner = &mut record.owners[output];
+        let verdict = match *owner {
+            _ if failed => Verdict::Drop,
+            None => Verdict::Deliver,
+            Some(first) if first == side && !call => Verdict::Deliver,
+            Some(_) => Verdict::Drop,
+        };
+        if verdict == Verdict::Deliver {
+            *owner = Some(side);
+        }
+        if record.answered().is_some() {
+            record.payload = None;
+        }
+        self.close_call(id);
+        verdict
+    }
+
+    /// `side` cannot answer. Whether that fails the request is for the caller to say, who knows what else may come.
+    pub fn failed(&mut self, id: RequestId, side: Side, reason: &str) {
+        if let Some(record) = self.requests.get_mut(&id) {
+            if *record.leg(side) != Leg::Answered {
+                *record.leg(side) = Leg::Failed(reason.to_owned());
+            }
+        }
+        self.close_call(id);
+    }
+
+    /// Gives the request up. True for the first time, and only where it was not answered.
+    pub fn fail(&mut self, id: RequestId) -> bool {
+        let Some(record) = self.requests.get_mut(&id).filter(|record| record.is_open()) else {
+            return false;
+        };
+        record.failed = true;
+        record.payload = None;
+        self.close_call(id);
+        true
+    }
+
+    /// Nobody wants the answer any more; what comes is dropped.
+    pub fn cancel(&mut self, id: RequestId) {
+        self.requests.remove(&id);
+    }
+
+    /// A call is over when everybody who was asked has spoken; inputs stay until their patience ends, because
+    /// further outputs may come.
+    fn close_call(&mut self, id: RequestId) {
+        let over =
+            |record: &Record<P>| record.is_call() && !record.is_open() && record.awaits_nobody();
+        if self.requests.get(&id).is_some_and(over) {
+            self.requests.remove(&id);
+        }
+    }
+
+    /// Notes that the cloud's time counts now. True for the first time only.
+    pub(crate) fn judge(&mut self, id: RequestId) -> bool {
+        self.requests
+            .get_mut(&id)
+            .is_some_and(|record| !std::mem::replace(&mut record.judged, true))
+    }
+
+    pub(crate) fn get(&self, id: RequestId) -> Option<&Record<P>> {
+        self.requests.get(&id)
+    }
+
+    /// Requests in the order asked.
+    pub(crate) fn select(&self, wanted: impl Fn(&Record<P>) -> bool) -> Vec<RequestId> {
+        let wanted = self.requests.iter().filter(|(_, record)| wanted(record));
+        wanted.map(|(id, _)| *id).collect()
+    }
+
+    /// Changes the legs of `side` that are `from`, and names their requests.
+    pub(crate) fn turn(&mut self, side: Side, from: &Leg, to: &Leg) -> Vec<RequestId> {
+        let mut turned = Vec::new();
+        for (id, record) in &mut self.requests {
+            if record.leg(side) == from {
+                *record.leg(side) = to.clone();
+                turned.push(*id);
+            }
+        }
+        for id in &turned {
+            self.close_call(*id);
+        }
+        turned
+    }
+
+    /// When [`expire`](Self::expire) has something to say.
+    pub fn deadline(&self) -> Option<Instant> {
+        self.timers.first().map(|(at, _)| *at)
+    }
+
+    /// More is remembered than may be.
+    pub(crate) fn is_crowded(&self) -> bool {
+        self.requests.len() > self.limits.requests
+    }
+
+    /// Requests whose T_max has passed since the last call, and those that are forgotten now.
+    pub(crate) fn expire(&mut self, now: Instant) -> (Vec<RequestId>, Vec<(RequestId, Record<P>)>) {
+        let (mut overdue, mut forgotten) = (Vec::new(), Vec::new());
+        while let Some((at, id)) = self.timers.first().copied().filter(|(at, _)| *at <= now) {
+            self.timers.pop_first();
+            let Some(record) = self.requests.get_mut(&id) else {
+                continue;
+            };
+            if !record.overdue {
+                record.overdue = true;
+                if !record.is_call() {
+                    record.payload = None;
+                }
+                overdue.push(id);
+                self.timers.insert((at + self.limits.patience, id));
+            } else if record.is_call() && record.is_open() {
+                // Somebody waits for it, as long as it takes. Whether it can come at all is looked at again later.
+                overdue.push(id);
+                self.timers.insert((now + self.limits.patience, id));
+            } else if let Some(record) = self.requests.remove(&id) {
+                forgotten.push((id, record));
+            }
+        }
+        if self.is_crowded() {
+            let crowd = self.requests.len() - self.limits.requests;
+            let inputs = self.requests.iter().filter(|(_, record)| !record.is_call());
+            let oldest: Vec<RequestId> = inputs.map(|(id, _)| *id).take(crowd).collect();
+            for id in oldest {
+                forgotten.extend(self.requests.remove(&id).map(|record| (id, record)));
+            }
+            self.timers.retain(|(_, id)| self.requests.contains_key(id));
+        }
+        (overdue, forgotten)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn arbiter() -> (Arbiter<u8>, Arc<str>, Instant) {
+        (
+            Arbiter::new(Limits::default()),
+            "/add".into(),
+            Instant::now(),
+        )
+    }
+
+    const MAX: Duration = Duration::from_millis(100);
+
+    #[test]
+    fn the_first_result_wins_and_the_second_is_dropped() {
+        let (mut arbiter, name, now) = arbiter();
+        let id = arbiter.call(now, MAX, &name, 7);
+        assert_eq!(arbiter.ask(id, Side::Cloud), Some(7));
+        assert_eq!(arbiter.ask(id, Side::Cloud), None, "asked once");
+        assert_eq!(arbiter.ask(id, Side::Local), Some(7));
+        assert_eq!(arbiter.answer(id, Side::Local), Verdict::Deliver);
+        assert_eq!(arbiter.answer(id, Side::Local), Verdict::Drop);
+        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+        assert!(arbiter.get(id).is_none(), "both have spoken: it is over");
+        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+    }
+
+    #[test]
+    fn an_answer_after_the_failure_is_dropped() {
+        let (mut arbiter, name, now) = arbiter();
+        let id = arbiter.call(now, MAX, &name, 7);
+        arbiter.ask(id, Side::Cloud);
+        assert!(arbiter.fail(id));
+        assert!(!arbiter.fail(id));
+        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+        assert!(arbiter.requests.is_empty());
+    }
+
+    #[test]
+    fn one_input_may_have_several_messages_of_one_side() {
+        let (mut arbiter, _, now) = arbiter();
+        let kind = Kind::Input {
+            pair: 0,
+            stamp: None,
+            outputs: 2,
+        };
+        let id = arbiter.open(now, MAX, kind, 7);
+        arbiter.ask(id, Side::Cloud);
+        arbiter.ask(id, Side::Local);
+        assert_eq!(arbiter.answer_with(id, Side::Local, 1), Verdict::Deliver);
+        assert_eq!(arbiter.answer_with(id, Side::Cloud, 1), Verdict::Drop);
+        assert_eq!(arbiter.answer_with(id, Side::Cloud, 0), Verdict::Deliver);
+        assert_eq!(arbiter.answer_with(id, Side::Cloud, 0), Verdict::Deliver);
+        assert_eq!(arbiter.answer_with(id, Side::Local, 0), Verdict::Drop);
+    }
+
+    #[test]
+    fn memory_is_bounded_and_waiting_callers_are_not_forgotten() {
+        let (_, name, now) = arbiter();
+        let limits = Limits {
+            patience: Duration::from_secs(1),
+            requests: 10,
+        };
+        let mut arbiter = Arbiter::new(limits);
+        let call = arbiter.call(now, MAX, &name, 7);
+        for _ in 0..1000 {
+            let kind = Kind::Input {
+                pair: 0,
+                stamp: None,
+                outputs: 1,
+            };
+            arbiter.open(now, MAX, kind, 7);
+            arbiter.expire(now);
+            assert!(arbiter.requests.len() <= 10, "{}", arbiter.requests.len());
+            assert!(arbiter.timers.len() <= 11, "{}", arbiter.timers.len());
+        }
+        let (overdue, _) = arbiter.expire(now + MAX);
+        assert!(overdue.is_empty(), "at T_max it is still in time");
+        let (overdue, _) = arbiter.expire(now + MAX * 2);
+        assert!(overdue.contains(&call));
+        let (_, forgotten) = arbiter.expire(now + Duration::from_secs(60));
+        assert!(forgotten.iter().all(|(id, _)| *id != call));
+        assert_eq!(arbiter.requests.len(), 1);
+    }
+}

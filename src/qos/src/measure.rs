@@ -1,0 +1,201 @@
+//! Measures other than the response time: frames per second of an output, and its age.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use crate::sla::{Measure, Sla};
+
+/// Turns one side's outputs on one topic into times for the satisfaction algorithm.
+///
+/// - Frames per second: T is the mean interval of the last `over` frames.
+/// - Age: T is how old the newest output has become when the next one comes.
+///
+/// What does not come counts too, at the moment when T passes T_max, and again each T_max from then on. Outputs are
+/// awaited from [`start`](Self::start) on.
+#[derive(Debug, Clone)]
+pub struct Meter {
+    kind: Kind,
+    t_max: Duration,
+    /// When the next missing output counts; none before the start.
+    deadline: Option<Instant>,
+    /// What is awaited was counted as missing already; when it comes it must not count again.
+    counted: bool,
+}
+
+#[derive(Debug, Clone)]
+enum Kind {
+    /// Arrivals, the newest last; at most `over + 1`.
+    Rate {
+        over: usize,
+        arrivals: VecDeque<Instant>,
+    },
+    /// When the newest output was born.
+    Age { born: Option<Instant> },
+}
+
+impl Meter {
+    /// For an SLA's measure, with the topic it looks at; none where that is the response time.
+    pub fn new(sla: &Sla) -> Option<(&str, Self)> {
+        let (output, kind) = match &sla.measure {
+            Measure::Rrt => return None,
+            Measure::FramesPerSecond { output, over } => {
+                let arrivals = VecDeque::new();
+                (
+                    output,
+                    Kind::Rate {
+                        over: *over,
+                        arrivals,
+                    },
+                )
+            }
+            Measure::Age { output } => (output, Kind::Age { born: None }),
+        };
+        let meter = Self {
+            kind,
+            t_max: sla.t_max,
+            deadline: None,
+            counted: false,
+        };
+        Some((output, meter))
+    }
+
+    /// Outputs are to come from now on. Later calls change nothing.
+    pub fn start(&mut self, now: Instant) {
+        self.deadline.get_or_insert(now + self.t_max);
+    }
+
+    /// Nobody waits for outputs any more (no subscriber, say); what was seen is forgotten.
+    pub fn stop(&mut self) {
+        self.deadline = None;
+        self.counted = false;
+        match &mut self.kind {
+            Kind::Rate { arrivals, .. } => arrivals.clear(),
+            Kind::Age { born } => *born = None,
+        }
+    }
+
+    /// An output came, `age` after its stamp (zero where it has none); what was [`missed`](Self::missed) until `now`
+    /// was asked for before. Gives T, and none where there is nothing to compare with.
+    pub fn output(&mut self, now: Instant, age: Duration) -> Option<Duration> {
+        let counted = std::mem::take(&mut self.counted);
+        match &mut self.kind {
+            Kind::Rate { over, arrivals } => {
+                if counted {
+                    arrivals.clear();
+                }
+                arrivals.push_back(now);
+                if arrivals.len() > *over + 1 {
+                    arrivals.pop_front();
+                }
+                // With the next frame the mean is taken over one interval more, `over` at most; it will be too
+                // long once those have used up their time.
+                let next = arrivals.len().min(*over);
+                let used = next as u32 * self.t_max;
+                let due = arrivals[arrivals.len() - next] + used;
+                self.deadline = Some(due.max(now + self.t_max));
+                let intervals = arrivals.len() as u32 - 1;
+                (intervals > 0).then(|| (now - arrivals[0]) / intervals)
+            }
+            Kind::Age { born } => {
+                let this = now.checked_sub(age).unwrap_or(now);
+                let before = born.replace(this).filter(|_| !counted);
+                self.deadline = Some((this + self.t_max).max(now));
+                before.map(|before| now - before)
+            }
+        }
+    }
+
+    /// When [`missed`](Self::missed) is to be asked next.
+    pub fn deadline(&self) -> Option<Instant> {
+        self.deadline
+    }
+
+    /// How often an output has been missing since the last call.
+    pub fn missed(&mut self, now: Instant) -> u32 {
+        let mut missed = 0;
+        while let Some(deadline) = self.deadline.filter(|deadline| *deadline <= now) {
+            missed += 1;
+            self.counted = true;
+            self.deadline = Some(deadline + self.t_max);
+            // Q is as low as it gets long before.
+            if missed == 1000 {
+                self.deadline = Some(now + self.t_max);
+            }
+        }
+        missed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn meter(text: &str) -> Meter {
+        let sla = Sla::parse(toml::Deserializer::parse(text).unwrap()).unwrap();
+        Meter::new(&sla).unwrap().1
+    }
+
+    const MS: Duration = Duration::from_millis(1);
+
+    #[test]
+    fn frames_are_averaged_and_a_stall_counts_while_it_lasts() {
+        let mut meter =
+            meter("measure.frames_per_second = { output = '/m', desire = 10, min = 4, over = 2 }");
+        let start = Instant::now();
+        meter.start(start);
+        assert_eq!(meter.missed(start + 249 * MS), 0);
+        assert_eq!(meter.output(start + 249 * MS, Duration::ZERO), None);
+        assert_eq!(
+            meter.output(start + 329 * MS, Duration::ZERO),
+            Some(80 * MS)
+        );
+        assert_eq!(
+            meter.output(start + 449 * MS, Duration::ZERO),
+            Some(100 * MS)
+        );
+        // 329 and 449 are two arrivals; with one more their mean passes 250 ms at 329 + 500.
+        assert_eq!(meter.deadline(), Some(start + 829 * MS));
+        assert_eq!(meter.missed(start + 1100 * MS), 2);
+        // The gap was counted twice already; the frame that ends it begins a new mean.
+        assert_eq!(meter.output(start + 1100 * MS, Duration::ZERO), None);
+        assert_eq!(
+            meter.output(start + 1200 * MS, Duration::ZERO),
+            Some(100 * MS)
+        );
+    }
+
+    #[test]
+    fn an_output_is_as_old_as_it_was_when_the_next_came() {
+        let mut meter = meter("measure.age = { output = '/m', desire = 0.5, max = 1 }");
+        let start = Instant::now() + Duration::from_secs(100);
+        meter.start(start);
+        assert_eq!(meter.output(start + 500 * MS, 200 * MS), None);
+        assert_eq!(meter.output(start + 1200 * MS, 100 * MS), Some(900 * MS));
+        assert_eq!(meter.missed(start + 2099 * MS), 0);
+        assert_eq!(meter.missed(start + 2100 * MS), 1);
+        assert_eq!(meter.output(start + 2200 * MS, Duration::ZERO), None);
+        assert_eq!(
+            meter.output(start + 2300 * MS, Duration::ZERO),
+            Some(100 * MS)
+        );
+    }
+
+    #[test]
+    fn an_output_that_is_too_old_when_it_comes_counts_once() {
+        let mut meter = meter("measure.age = { output = '/m', desire = 0.5, max = 1 }");
+        let start = Instant::now() + Duration::from_secs(100);
+        assert_eq!(meter.output(start, 3000 * MS), None);
+        assert_eq!(meter.missed(start), 1);
+        assert_eq!(meter.output(start + 100 * MS, Duration::ZERO), None);
+    }
+
+    #[test]
+    fn nothing_is_missed_while_nobody_waits() {
+        let mut meter = meter("measure.age = { output = '/m', desire = 0.5, max = 1 }");
+        let start = Instant::now();
+        assert_eq!(meter.missed(start + Duration::from_secs(60)), 0);
+        meter.start(start);
+        meter.stop();
+        assert_eq!(meter.missed(start + Duration::from_secs(60)), 0);
+    }
+}

@@ -1,0 +1,124 @@
+//! Which input triggers which outputs, and how the answer is recognised.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// How an output finds the input it answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Correlation {
+    /// Both carry `header.stamp`, and the node copies it.
+    Stamp,
+    /// One outstanding request per side: the next output answers it; forgotten at T_max.
+    Arrival,
+}
+
+/// An input and the outputs it triggers. Written on one line: `/image -> /found, /marked by stamp`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Pair {
+    /// Absolute name of the input topic.
+    pub input: String,
+    /// Absolute names of the output topics; the first one is the answer whose time counts. Never empty.
+    pub outputs: Vec<String>,
+    /// How the answer is recognised; none where it is to be found from the types.
+    pub by: Option<Correlation>,
+}
+
+impl fmt::Display for Pair {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "{} -> {}", self.input, self.outputs.join(", "))?;
+        match self.by {
+            Some(Correlation::Stamp) => out.write_str(" by stamp"),
+            Some(Correlation::Arrival) => out.write_str(" by arrival"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl FromStr for Pair {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let example = "write it as \"/input -> /output\", \"/input -> /output, /other by stamp\" or \
+                       \"/input -> /output by arrival\"";
+        let refuse = |why: &str| format!("{text:?} {why}; {example}");
+        let (input, rest) = text
+            .split_once("->")
+            .ok_or_else(|| refuse("has no arrow"))?;
+        let (outputs, by) = match rest.rsplit_once(" by ") {
+            None => (rest, None),
+            Some((outputs, by)) => match by.trim() {
+                "stamp" => (outputs, Some(Correlation::Stamp)),
+                "arrival" => (outputs, Some(Correlation::Arrival)),
+                other => {
+                    return Err(refuse(&format!(
+                        "correlates by {other:?}, which is neither stamp nor arrival"
+                    )));
+                }
+            },
+        };
+        let topic = |name: &str| {
+            let name = name.trim();
+            let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '/';
+            if name.len() > 1 && name.starts_with('/') && name.chars().all(plain) {
+                Ok(name.to_owned())
+            } else {
+                Err(refuse(&format!(
+                    "names {name:?}, which is not an absolute topic name"
+                )))
+            }
+        };
+        Ok(Self {
+            input: topic(input)?,
+            outputs: outputs.split(',').map(topic).collect::<Result<_, _>>()?,
+            by,
+        })
+    }
+}
+
+impl TryFrom<String> for Pair {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Pair> for String {
+    fn from(pair: Pair) -> Self {
+        pair.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pair_is_one_line() {
+        let pair: Pair = "/image -> /found, /marked by stamp".parse().unwrap();
+        assert_eq!(pair.input, "/image");
+        assert_eq!(pair.outputs, ["/found", "/marked"]);
+        assert_eq!(pair.by, Some(Correlation::Stamp));
+        assert_eq!(pair.to_string(), "/image -> /found, /marked by stamp");
+        let pair: Pair = "/scan->/pose".parse().unwrap();
+        assert_eq!((pair.input.as_str(), pair.by), ("/scan", None));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        for (text, named) in [
+            ("/image /found", "no arrow"),
+            ("image -> /found", "\"image\""),
+            ("/image -> ", "\"\""),
+            ("/image -> /found by luck", "\"luck\""),
+        ] {
+            let error = text.parse::<Pair>().unwrap_err();
+            assert!(error.contains(named), "{text}: {error}");
+            assert!(error.contains("write it as"), "{text}: {error}");
+        }
+    }
+}

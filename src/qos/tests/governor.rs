@@ -1,0 +1,405 @@
+//! Scenes from a robot's life.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use qos::{
+    Channel, Effect, Event, Failure, Governor, Limits, LocalState, RequestId, Side, Sla, Stamp,
+    Verdict, Why,
+};
+
+const MS: Duration = Duration::from_millis(1);
+
+struct Robot {
+    governor: Governor<&'static str>,
+    now: Instant,
+}
+
+impl Robot {
+    fn new(more: serde_json::Value) -> Self {
+        let mut sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3});
+        let given = more.as_object().unwrap().clone();
+        if given.contains_key("measure") {
+            sla = serde_json::json!({});
+        }
+        sla.as_object_mut().unwrap().extend(given);
+        let pairs = vec![
+            "/image -> /found by stamp".parse().unwrap(),
+            "/in -> /out by arrival".parse().unwrap(),
+        ];
+        let mut governor = Governor::new(Sla::parse(sla).unwrap(), pairs, Limits::default());
+        let now = Instant::now();
+        governor.link_up(now, false);
+        governor.begin(now);
+        Self { governor, now }
+    }
+
+    /// Time passes, deadlines are met; what was to be done since the last look, in words.
+    fn after(&mut self, ms: u32) -> Vec<String> {
+        let until = self.now + ms * MS;
+        while let Some(next) = self.governor.deadline().filter(|next| *next <= until) {
+            self.now = self.now.max(next);
+            self.governor.tick(self.now);
+        }
+        self.now = until;
+        self.effects()
+    }
+
+    fn effects(&mut self) -> Vec<String> {
+        let mut words = vec![];
+        while let Some(effect) = self.governor.next_effect() {
+            words.push(match effect {
+                Effect::Give { side, payload, .. } => format!("{payload} to {side:?}"),
+                Effect::Fail { reason, .. } => format!("fail: {reason}"),
+                Effect::SafeStop => "safe stop".into(),
+                Effect::Event(Event::Start(_)) => "start".into(),
+                Effect::Event(Event::Feed(_)) => "feed".into(),
+                Effect::Event(Event::StopFeeding(_)) => "stop feeding".into(),
+                Effect::Event(Event::Stop(_)) => "stop".into(),
+                Effect::Event(event) => format!("{event:?}"),
+            });
+        }
+        words
+    }
+
+    fn call(&mut self, payload: &'static str) -> RequestId {
+        let name: Arc<str> = "/add".into();
+        self.governor.call(self.now, &name, payload)
+    }
+
+    fn image(&mut self, secs: u32, payload: &'static str) {
+        let name: Arc<str> = "/image".into();
+        self.governor
+            .input(self.now, &name, Some(Stamp { secs, nsecs: 0 }), payload);
+    }
+
+    fn input(&mut self, payload: &'static str) {
+        let name: Arc<str> = "/in".into();
+        self.governor.input(self.now, &name, None, payload);
+    }
+
+    fn found(&mut self, side: Side, secs: u32) -> Verdict {
+        let stamp = Some(Stamp { secs, nsecs: 0 });
+        self.governor
+            .output(self.now, side, "/found", stamp, Duration::ZERO)
+    }
+
+    fn out(&mut self, side: Side) -> Verdict {
+        self.governor
+            .output(self.now, side, "/out", None, Duration::ZERO)
+    }
+
+    fn q(&self) -> f64 {
+        self.governor.satisfaction().q()
+    }
+}
+
+fn json(text: &str) -> serde_json::Value {
+    serde_json::from_str(text).unwrap()
+}
+
+#[test]
+fn pictures_under_way_go_to_a_warm_original_as_soon_as_it_is_fed() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15}"#));
+    assert_eq!(robot.effects(), ["start"]);
+    robot.governor.local(robot.now, LocalState::Ready);
+    // Five pictures a second; the network has just become slow.
+    robot.image(1, "first");
+    assert_eq!(robot.after(200), ["first to Cloud"]);
+    robot.image(2, "second");
+    assert_eq!(robot.after(200), ["second to Cloud"]);
+    robot.image(3, "third");
+    // At 500 ms the second one is late, too: Q is below the threshold, and the third is still fresh.
+    assert_eq!(
+        robot.after(101),
+        ["third to Cloud", "feed", "third to Local"]
+    );
+    robot.after(60);
+    assert_eq!(robot.found(Side::Local, 3), Verdict::Deliver);
+    robot.image(4, "fourth");
+    assert_eq!(robot.effects(), ["fourth to Cloud", "fourth to Local"]);
+    // What the cloud answers late is delivered where nobody has answered, and dropped where somebody has.
+    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
+    assert_eq!(robot.found(Side::Cloud, 3), Verdict::Drop);
+}
+
+#[test]
+fn a_late_answer_does_not_count_again() {
+    let mut robot = Robot::new(json(r#"{"local": "none", "initial": 8}"#));
+    let id = robot.call("sum");
+    robot.after(301);
+    assert_eq!(robot.q(), 4.0);
+    robot.after(700);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, id),
+        Verdict::Deliver
+    );
+    assert_eq!(robot.q(), 4.0);
+    assert_eq!(robot.governor.report(robot.now).counts.late, 1);
+}
+
+#[test]
+fn the_clouds_time_counts_though_the_local_answer_won() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    assert_eq!(robot.effects(), ["start", "feed"]);
+    let id = robot.call("sum");
+    assert_eq!(robot.after(10), ["sum to Cloud", "sum to Local"]);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Local, id),
+        Verdict::Deliver
+    );
+    assert_eq!(
+        robot.q(),
+        3.0,
+        "the local answer says nothing about the cloud"
+    );
+    robot.after(80);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, id),
+        Verdict::Drop
+    );
+    assert_eq!(robot.q(), 5.0);
+    assert_eq!(robot.effects(), ["stop feeding"]);
+}
+
+#[test]
+fn the_link_is_lost_while_the_local_original_runs() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 5}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    let id = robot.call("sum");
+    robot.after(10);
+    robot.governor.link_down(robot.now);
+    assert_eq!(robot.effects(), ["feed", "sum to Local"]);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Local, id),
+        Verdict::Deliver
+    );
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, id),
+        Verdict::Drop
+    );
+    assert_eq!(
+        robot.q(),
+        2.5,
+        "lost with the link: late already, whatever comes"
+    );
+}
+
+#[test]
+fn the_link_is_lost_and_there_is_no_local_original() {
+    let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 3}"#));
+    assert_eq!(robot.effects(), ["start"]);
+    robot.governor.local(robot.now, LocalState::Missing);
+    robot.governor.local(robot.now, LocalState::Missing);
+    assert_eq!(robot.effects(), ["SaidOnceMissing"]);
+    let (answered, lost) = (robot.call("first"), robot.call("second"));
+    robot.after(10);
+    robot.governor.link_down(robot.now);
+    assert!(robot.effects().is_empty(), "the link may come back in time");
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, answered),
+        Verdict::Deliver
+    );
+    robot.governor.link_down(robot.now);
+    let words = robot.after(301);
+    assert_eq!(words.len(), 1, "{words:?}");
+    assert!(words[0].contains("the link is down"), "{words:?}");
+    assert!(words[0].contains("there is no local original"), "{words:?}");
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, lost),
+        Verdict::Drop
+    );
+}
+
+#[test]
+fn a_call_fails_only_when_both_sides_failed() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.effects();
+    let id = robot.call("sum");
+    robot.effects();
+    let no = Failure::Unreachable("servant ended".into());
+    robot.governor.failed(robot.now, Side::Cloud, id, &no);
+    assert!(robot.effects().is_empty());
+    let no = Failure::Refused("division by zero".into());
+    robot.governor.failed(robot.now, Side::Local, id, &no);
+    assert_eq!(
+        robot.effects(),
+        ["fail: cloud: servant ended; local: division by zero"]
+    );
+    robot.governor.failed(robot.now, Side::Local, id, &no);
+    assert!(robot.effects().is_empty());
+}
+
+#[test]
+fn stateful_asks_one_side_at_a_time_and_hands_back() {
+    let mut robot = Robot::new(json(
+        r#"{"local": "warm", "mode": "stateful", "initial": 1}"#,
+    ));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.input("a");
+    assert_eq!(robot.effects(), ["start", "a to Cloud"]);
+    robot.governor.link_down(robot.now);
+    robot.input("b");
+    assert_eq!(robot.effects()[0], "feed");
+    assert!(!robot.governor.sides().cloud);
+    robot.governor.link_up(robot.now, true);
+    let report = robot.governor.report(robot.now);
+    assert_eq!(
+        report.events.last().unwrap().event,
+        Event::StopFeeding(Why::LinkUp)
+    );
+    robot.effects();
+    robot.input("c");
+    assert!(robot.effects().iter().all(|word| !word.contains("Local")));
+}
+
+#[test]
+fn without_stamps_one_request_is_outstanding_and_forgotten_at_t_max() {
+    let mut robot = Robot::new(json(r#"{"local": "none", "initial": 8}"#));
+    robot.input("a");
+    robot.after(50);
+    robot.input("b");
+    assert_eq!(
+        robot.governor.report(robot.now).counts.requests,
+        1,
+        "b is fed, but a is outstanding"
+    );
+    robot.after(40);
+    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    assert_eq!(robot.q(), 10.0);
+    assert_eq!(
+        robot.out(Side::Cloud),
+        Verdict::Deliver,
+        "more than one output is none of our business"
+    );
+    robot.input("c");
+    robot.after(301);
+    assert_eq!(robot.q(), 5.0);
+    robot.input("d");
+    robot.after(100);
+    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    assert_eq!(robot.q(), 7.0);
+    assert_eq!(robot.governor.report(robot.now).counts.requests, 3);
+}
+
+#[test]
+fn without_stamps_both_answer_and_one_is_heard() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.input("a");
+    assert_eq!(robot.out(Side::Local), Verdict::Deliver);
+    robot.after(301);
+    robot.input("b");
+    assert_eq!(robot.out(Side::Local), Verdict::Deliver);
+    assert_eq!(robot.out(Side::Cloud), Verdict::Drop, "late to a");
+    assert_eq!(robot.out(Side::Cloud), Verdict::Drop, "late to b");
+}
+
+#[test]
+fn a_node_that_does_not_copy_stamps_is_noticed() {
+    let mut robot = Robot::new(json(r#"{"local": "none"}"#));
+    for secs in 1..=12 {
+        robot.image(secs, "scan");
+        robot.after(20);
+        assert_eq!(robot.found(Side::Cloud, 1000 + secs), Verdict::Deliver);
+        robot.after(20);
+    }
+    let words = robot.effects();
+    let report = robot.governor.report(robot.now);
+    assert!(
+        report
+            .events
+            .iter()
+            .any(|event| event.event == Event::Uncorrelated("/image".into())),
+        "{words:?}"
+    );
+    assert_eq!(report.pairs[0], "/image -> /found by arrival");
+    assert_eq!(report.counts.desired, 4);
+}
+
+#[test]
+fn the_safe_stop_comes_when_nobody_answers_in_time() {
+    let stop =
+        r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
+    let mut robot = Robot::new(json(stop));
+    robot.image(1, "picture");
+    robot.effects();
+    assert!(robot.after(300).is_empty());
+    assert_eq!(robot.after(1), ["safe stop"]);
+    robot.image(2, "picture");
+    robot.after(100);
+    assert_eq!(robot.found(Side::Cloud, 2), Verdict::Deliver);
+    assert!(robot.after(1000).is_empty());
+}
+
+#[test]
+fn frames_per_second_start_the_local_original_and_stop_the_robot() {
+    let mut robot = Robot::new(json(
+        r#"{"measure": {"frames_per_second": {"output": "/found", "desire": 10, "min": 4, "over": 2}},
+            "local": "cold", "initial": 5, "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#,
+    ));
+    robot.governor.wanted(robot.now, true);
+    for _ in 0..3 {
+        robot.after(100);
+        assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
+    }
+    assert_eq!(robot.q(), 9.0);
+    // Q 9, 4.5, 2.25
+    assert_eq!(robot.after(400), ["safe stop"]);
+    assert_eq!(robot.after(250), ["safe stop", "start"]);
+    robot.governor.local(robot.now, LocalState::Ready);
+    assert_eq!(robot.effects(), ["feed"]);
+    robot.after(50);
+    assert_eq!(robot.found(Side::Local, 1), Verdict::Deliver);
+    assert!(
+        robot.after(200).iter().all(|word| word != "safe stop"),
+        "the local original's frames count for that"
+    );
+}
+
+#[test]
+fn a_crash_of_the_local_original_brings_calls_back_to_the_cloud() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.link_down(robot.now);
+    let id = robot.call("sum");
+    robot.effects();
+    robot.governor.link_up(robot.now, false);
+    assert_eq!(robot.effects(), ["sum to Cloud"]);
+    robot.governor.local_crashed(robot.now, "signal 11");
+    let words = robot.effects();
+    assert_eq!(words, ["Crashed(\"signal 11\")", "stop feeding"]);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, id),
+        Verdict::Deliver
+    );
+    robot.governor.local(robot.now, LocalState::Ready);
+    assert_eq!(robot.effects(), ["feed"]);
+}
+
+#[test]
+fn what_is_no_request_goes_where_requests_go() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
+    let info: Arc<str> = "/camera_info".into();
+    robot.governor.input(robot.now, &info, None, "info");
+    assert_eq!(robot.effects(), ["start", "info to Cloud"]);
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.effects();
+    robot.governor.input(robot.now, &info, None, "info");
+    assert_eq!(robot.effects(), ["info to Cloud", "info to Local"]);
+    assert_eq!(robot.governor.report(robot.now).counts.requests, 0);
+    // Only one side speaks on topics that answer nothing.
+    let status = |robot: &mut Robot, side| {
+        robot
+            .governor
+            .output(robot.now, side, "/status", None, Duration::ZERO)
+    };
+    assert_eq!(status(&mut robot, Side::Local), Verdict::Deliver);
+    assert_eq!(status(&mut robot, Side::Cloud), Verdict::Drop);
+    assert_eq!(Channel::Topic(info.clone()), Channel::Topic(info));
+}
