@@ -20,6 +20,8 @@ mod portal;
 mod push;
 #[path = "stories/refusals.rs"]
 mod refusals;
+#[path = "stories/spares.rs"]
+mod spares;
 
 /// A story under its function's name.
 fn story(name: &str, tell: fn() -> Told) -> Trial {
@@ -87,6 +89,10 @@ fn main() -> ExitCode {
             archives_that_reach_out_of_their_tree,
             reserved_and_taken_names,
             a_disk_with_no_room,
+        ],
+        stories![spares:
+            a_robot_takes_the_container_made_ahead_and_another_is_made,
+            a_killed_daemons_spares_end_without_a_word,
         ],
     ]
     .into_iter()

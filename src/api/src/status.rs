@@ -31,6 +31,9 @@ pub struct Status {
     pub services: usize,
     /// Servants alive now.
     pub servants: usize,
+    /// Containers made ahead, for robots to come.
+    #[serde(default)]
+    pub spares: usize,
     /// Connections of robots now.
     pub connections: usize,
     /// What does not work as it should on this machine.

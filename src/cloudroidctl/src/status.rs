@@ -65,8 +65,8 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         (
             "servants",
             format!(
-                "{} with {} connections",
-                status.servants, status.connections
+                "{} with {} connections; {} spare containers",
+                status.servants, status.connections, status.spares
             ),
         ),
         ("isolation", isolation),

@@ -20,6 +20,7 @@ mod handle;
 mod nodes;
 mod readiness;
 mod restart;
+mod spares;
 mod tail;
 
 use std::collections::{BTreeSet, HashMap};
@@ -43,6 +44,7 @@ pub(crate) use nodes::how_it_ended;
 pub use tail::{read as read_log, record as log_record};
 
 use driver::Beginning;
+use spares::Spares;
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]
@@ -60,6 +62,7 @@ pub(crate) struct Inner {
     pub(crate) admission: Admission,
     pub(crate) definitions: Definitions,
     servants: Mutex<Servants>,
+    spares: Spares,
     ending: AtomicBool,
 }
 
@@ -90,6 +93,7 @@ impl Choreographer {
             admission,
             definitions: Definitions::default(),
             servants: Mutex::default(),
+            spares: Spares::default(),
             ending: AtomicBool::new(false),
         };
         Choreographer {
@@ -108,7 +112,7 @@ impl Choreographer {
             });
         };
         let key = (service.to_owned(), robot.to_owned());
-        let (handle, lease) = {
+        let (handle, lease, spare) = {
             let mut servants = inner.servants.lock();
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
@@ -122,8 +126,10 @@ impl Choreographer {
                     return Ok(Lease::new(Arc::clone(handle)));
                 }
             }
+            let spare = inner.spares.take(&revision);
+            let id = spare.as_ref().map(|spare| spare.container.id().to_owned());
             let handle = Arc::new(Handle::new(
-                names::servant_id(service),
+                id.unwrap_or_else(|| names::servant_id(service)),
                 robot.to_owned(),
                 anonymous,
                 Asked::new(revision.plan.limits, inner.config.limits),
@@ -133,9 +139,10 @@ impl Choreographer {
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
             let lease = Lease::new(Arc::clone(&handle));
-            (handle, lease)
+            (handle, lease, spare)
         };
-        tokio::spawn(driver::drive(Arc::clone(inner), handle, Beginning::Asked));
+        let beginning = Beginning::Asked(spare);
+        tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
         Ok(lease)
     }
 
@@ -160,6 +167,10 @@ impl Choreographer {
                 (Some(record), Some(revision)) => {
                     self.adopt_one(record, revision, servant);
                     adopted += 1;
+                }
+                // A spare, or one that was killed before it had nodes: nobody misses it.
+                (None, _) if servant.processes().await.is_ok_and(|all| all.is_empty()) => {
+                    servant.stop().await?;
                 }
                 _ => {
                     inner.journal.warning(
@@ -222,7 +233,7 @@ impl Choreographer {
         tokio::spawn(driver::drive(
             Arc::clone(inner),
             handle,
-            Beginning::Adopted(servant, permit),
+            Beginning::Adopted(servant, Some(permit)),
         ));
     }
 
@@ -310,6 +321,32 @@ impl Choreographer {
         self.inner.ending.store(true, Ordering::SeqCst);
     }
 
+    /// Keeps spare containers from now on; comes back at once.
+    pub fn keep_spares(&self) {
+        tokio::spawn(spares::keep(Arc::clone(&self.inner)));
+        self.inner.spares.look();
+    }
+
+    /// Has spares made for what is published now.
+    pub fn look_at_spares(&self) {
+        self.inner.spares.look();
+    }
+
+    /// Ends the spares of what is not published any more.
+    pub async fn end_stale_spares(&self) -> Result<(), Error> {
+        spares::tidy(&self.inner, false).await
+    }
+
+    /// Ends all spares and makes no more.
+    pub async fn end_spares(&self) {
+        spares::end_all(&self.inner).await;
+    }
+
+    /// Spare containers that there are.
+    pub fn spares(&self) -> usize {
+        self.inner.spares.count()
+    }
+
     /// Reads the definitions of everything published, so that no robot waits for that.
     pub async fn read_definitions(&self) -> Result<(), Error> {
         let inner = &self.inner;
@@ -339,21 +376,27 @@ impl Choreographer {
             .check(self.inner.promised_for(limits))?)
     }
 
-    /// Images that live servants were started from; they must stay.
+    /// Images that live servants and spares were started from; they must stay.
     pub fn images_in_use(&self) -> Vec<String> {
-        self.inner
-            .servants
-            .lock()
-            .all
-            .values()
-            .map(|handle| handle.revision.image.clone())
-            .collect()
+        let mut images = self.inner.spares.images();
+        let servants = self.inner.servants.lock();
+        images.extend(
+            servants
+                .all
+                .values()
+                .map(|handle| handle.revision.image.clone()),
+        );
+        images
     }
 }
 
 impl Inner {
     fn promised(&self, handle: &Handle) -> Amount {
         self.promised_for(&handle.asked())
+    }
+
+    fn is_ending(&self) -> bool {
+        self.ending.load(Ordering::SeqCst)
     }
 
     /// Limits asked for at push are a promise; else the configured reserve is.

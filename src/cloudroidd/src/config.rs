@@ -92,6 +92,8 @@ pub struct Servant {
     pub grace: Time,
     /// The same for connections that named no robot.
     pub anonymous_grace: Time,
+    /// Containers made ahead, without nodes: one for each of the services used last, so many at most.
+    pub spares: usize,
 }
 
 /// What clients may do to the port.
@@ -171,6 +173,7 @@ impl Default for Servant {
             start: Time::seconds(30),
             grace: Time::seconds(60),
             anonymous_grace: Time::seconds(0),
+            spares: 8,
         }
     }
 }

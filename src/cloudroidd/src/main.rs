@@ -233,6 +233,7 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
     );
     supervision::ready();
     app.choreographer.read_definitions().await?;
+    app.choreographer.keep_spares();
     signals.end_asked().await;
     supervision::stopping();
     tokio::select! {
@@ -330,6 +331,7 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
 async fn drain(app: &App) {
     app.choreographer.close();
     app.pusher.cancel_all().await;
+    app.choreographer.end_spares().await;
     if app.config.keeps_servants() {
         tracing::info!(
             "ending; {} servants go on",

@@ -249,7 +249,7 @@ impl Pusher {
             }
         };
         let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);
-        built.map_err(|error| push_error(&error, &self.home))
+        built.map_err(|error| push_error(&error, &self.home, &options.source))
     }
 
     async fn turn(&self, service: &str) -> OwnedMutexGuard<()> {
@@ -310,26 +310,44 @@ fn push_event(event: BuildEvent) -> PushEvent {
     }
 }
 
-fn push_error(error: &rootfs_builder::Error, home: &Path) -> Error {
+fn push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error {
+    let (message, log) = match error {
+        // The complete log has been sent line by line.
+        rootfs_builder::Error::BuildFailed {
+            package,
+            last_lines,
+            ..
+        } => {
+            let lines = last_lines.lines().map(str::to_owned).collect();
+            (format!("the build of {package} failed"), lines)
+        }
+        error => (
+            as_the_pusher_knows_it(&error.to_string(), home, source),
+            Vec::new(),
+        ),
+    };
     Error::Push {
-        message: without_build_paths(&error.to_string(), home),
+        message,
         next: None,
-        log: Vec::new(),
+        log,
     }
 }
 
-/// The pusher's own paths mean something to him, those of the build do not.
-fn without_build_paths(text: &str, home: &Path) -> String {
+/// Names what was pushed as the pusher did (`source`), and leaves out where the build is: that means nothing to him.
+fn as_the_pusher_knows_it(text: &str, home: &Path, source: &str) -> String {
     let builds = format!("{}/", home.join("build").display());
     let mut parts = text.split(builds.as_str());
     let mut mended = parts.next().unwrap_or_default().to_owned();
     for part in parts {
         let inside = part.split_once('/').map_or(part, |(_, inside)| inside);
-        mended.push_str(
-            inside
-                .strip_prefix(PUSHED)
-                .map_or(inside, |below| below.trim_start_matches('/')),
-        );
+        match inside.strip_prefix(PUSHED) {
+            Some(below) if source.is_empty() => mended.push_str(below.trim_start_matches('/')),
+            Some(below) => {
+                mended.push_str(source.trim_end_matches('/'));
+                mended.push_str(below);
+            }
+            None => mended.push_str(inside),
+        }
     }
     mended
 }
@@ -355,14 +373,32 @@ mod tests {
 
     #[test]
     fn paths_of_the_build_are_told_as_the_pusher_knows_them() {
+        let told =
+            |text: &str, source: &str| as_the_pusher_knows_it(text, Path::new("/home"), source);
         let text = "/home/build/push-1/pushed/src/a/package.xml, line 4: malformed; see /home/build/push-1/log";
         assert_eq!(
-            without_build_paths(text, Path::new("/home")),
-            "src/a/package.xml, line 4: malformed; see log"
+            told(text, "../torn/"),
+            "../torn/src/a/package.xml, line 4: malformed; see log"
         );
         assert_eq!(
-            without_build_paths("nothing to mend", Path::new("/home")),
-            "nothing to mend"
+            told("there is no package.xml in /home/build/push-1/pushed", "."),
+            "there is no package.xml in ."
+        );
+        assert_eq!(told("nothing to mend", "x"), "nothing to mend");
+    }
+
+    #[test]
+    fn a_failed_build_is_told_with_the_compilers_words() {
+        let failed = rootfs_builder::Error::BuildFailed {
+            package: "broken".into(),
+            log: "/home/build/push-1/log".into(),
+            last_lines: "main.cpp:3: error: expected ;\nmake: *** [all] Error 2".into(),
+        };
+        let problem = push_error(&failed, Path::new("/home"), "broken").problem();
+        assert_eq!(problem.detail, "the build of broken failed");
+        assert_eq!(
+            problem.log,
+            ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]
         );
     }
 }

@@ -144,6 +144,7 @@ pub fn status(app: &App) -> Result<Status, Error> {
         limits: app.config.limits,
         services: app.state.service_names()?.len(),
         servants: servants.len(),
+        spares: app.choreographer.spares(),
         connections: servants.iter().map(|servant| servant.connections()).sum(),
         warnings: app.machine.warnings.clone(),
     })

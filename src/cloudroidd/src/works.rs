@@ -7,9 +7,10 @@ use bridge::{Bridge, BridgeOptions};
 use ros::bus::{Bus, BusError};
 use ros::ros1::Ros1Bus;
 
-use crate::choreographer::{Handle, Inner};
+use crate::choreographer::Inner;
 use crate::config::Config;
 use crate::sockets::ServantSockets;
+use crate::state::RevisionRecord;
 
 /// Where every servant's ROS Master listens, as seen from inside.
 pub const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
@@ -28,13 +29,13 @@ impl Works {
     /// Connects to the Master of a running container and sets a bridge before it.
     pub async fn reach(
         inner: &Inner,
-        handle: &Handle,
+        revision: &RevisionRecord,
         container: &Arc<dyn servant::engine::Servant>,
     ) -> Result<Arc<Works>, BusError> {
         let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
         let (bus, registry) = tokio::join!(
             Ros1Bus::connect(sockets, MASTER, NODE),
-            inner.definitions.registry(&inner.store, &handle.revision),
+            inner.definitions.registry(&inner.store, revision),
         );
         let bus: Arc<dyn Bus> = bus?;
         let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));

@@ -5,18 +5,20 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use api::Phase;
+use futures_util::future::join_all;
 use package::interface::Interface;
 use servant::engine::{ContainerState, Servant};
-use servant::spec::{Profile, Spec};
+use servant::spec::{NodeSpec, Profile, Spec};
 use tokio::time::{Instant, timeout_at};
 
 use super::handle::{Failure, Handle};
 use super::nodes::Nodes;
+use super::spares::{self, Spare};
 use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
 use crate::definitions;
 use crate::errors::{Error, with_last_words};
-use crate::state::{self, ServantRecord};
+use crate::state::{self, RevisionRecord, ServantRecord};
 use crate::works::Works;
 
 /// Lines of the log that explain a failure.
@@ -26,16 +28,16 @@ const SETTLED: Duration = Duration::from_secs(5);
 
 /// How a servant begins.
 pub(super) enum Beginning {
-    /// A robot asked for it.
-    Asked,
+    /// A robot asked for it; it may have been made but for its nodes.
+    Asked(Option<Spare>),
     /// An earlier daemon started it.
-    Adopted(Arc<dyn Servant>, Permit),
+    Adopted(Arc<dyn Servant>, Option<Permit>),
 }
 
 /// Runs the servant's life to its end and cleans up after it.
-pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, beginning: Beginning) {
+pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning: Beginning) {
     let mut permit = None;
-    let outcome = live(&inner, &handle, beginning, &mut permit).await;
+    let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
     let outcome = outcome.map_err(|failure| with_log(failure, &handle));
     handle.set_over(&outcome);
@@ -56,6 +58,10 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, beginning: Beg
     }
     drop(permit);
     inner.forget(&handle);
+    if let Beginning::Asked(Some(spare)) = beginning {
+        spares::give_back(&inner, spare).await;
+    }
+    inner.spares.look();
     handle.set_phase(if outcome.is_ok() {
         Phase::Stopped
     } else {
@@ -101,11 +107,11 @@ fn tell_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -
 async fn live(
     inner: &Arc<Inner>,
     handle: &Arc<Handle>,
-    beginning: Beginning,
+    beginning: &mut Beginning,
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
-    let (container, fresh) = match beginning {
-        Beginning::Asked => {
+    let (container, works, fresh) = match beginning {
+        Beginning::Asked(spare) => {
             let permit = tokio::select! {
                 permit = admit(inner, handle) => permit?,
                 reason = handle.end_asked() => return Ok(reason),
@@ -114,18 +120,24 @@ async fn live(
             handle.set_promise(permit.promise());
             *kept = Some(permit);
             handle.set_phase(Phase::Admitted);
-            (start(inner, handle).await?, true)
+            record(inner, handle)?;
+            match use_spare(handle, spare.take()).await {
+                Some(spare) => (spare.container, Some(spare.works), true),
+                None => (start(inner, handle).await?, None, true),
+            }
         }
         Beginning::Adopted(container, permit) => {
-            handle.set_promise(permit.promise());
-            *kept = Some(permit);
-            (container, false)
+            if let Some(permit) = permit.as_ref() {
+                handle.set_promise(permit.promise());
+            }
+            *kept = permit.take();
+            (Arc::clone(container), None, false)
         }
     };
     handle.set_container(Arc::clone(&container));
     handle.set_phase(Phase::Created);
     let mut nodes = Nodes::new(inner, handle, &container);
-    let mut supervised = pin!(run(inner, handle, &container, &mut nodes, fresh));
+    let mut supervised = pin!(run(inner, handle, &container, works, &mut nodes, fresh));
     tokio::select! {
         // A node's end says more than that of its container, and comes first where both come at once.
         biased;
@@ -140,20 +152,15 @@ async fn run(
     inner: &Arc<Inner>,
     handle: &Arc<Handle>,
     container: &Arc<dyn Servant>,
+    reached: Option<Arc<Works>>,
     nodes: &mut Nodes<'_>,
     fresh: bool,
 ) -> Result<String, Failure> {
-    let limit = inner.config.servant.start.0;
-    let deadline = Instant::now() + limit;
-    let works = timeout_at(deadline, Works::reach(inner, handle, container))
-        .await
-        .map_err(|_| {
-            Failure::broken(format!(
-                "did not start its ROS Master within {} s",
-                limit.as_secs()
-            ))
-        })?
-        .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))?;
+    let deadline = Instant::now() + inner.config.servant.start.0;
+    let works = match reached {
+        Some(works) => works,
+        None => reach(inner, handle, container, deadline).await?,
+    };
     handle.set_works(Arc::clone(&works));
     handle.set_phase(Phase::Starting);
     tokio::select! {
@@ -161,6 +168,7 @@ async fn run(
         failure = nodes.supervise() => return Err(failure),
     }
     handle.set_phase(Phase::Ready);
+    inner.spares.look();
     let took = state::now().saturating_sub(handle.created);
     let message = if fresh {
         format!(
@@ -211,10 +219,8 @@ async fn abandoned(handle: &Handle) {
         .await;
 }
 
-async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Servant>, Failure> {
-    let broken = |error: Error| Failure::broken(format!("could not be started: {error}"));
-    let spec = spec(inner, handle).await.map_err(broken)?;
-    // Before it runs: a daemon killed now finds it again.
+/// Writes down that the servant is, before it runs: a daemon killed now finds it again.
+fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
     let record = ServantRecord {
         id: handle.id.clone(),
         service: handle.service().to_owned(),
@@ -224,32 +230,75 @@ async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Serva
         created: handle.created,
         limits: api::Limits::default(),
     };
-    inner
-        .state
-        .add_servant(&record)
-        .map_err(|error| broken(error.into()))?;
-    inner
-        .engine
-        .start(spec)
-        .await
-        .map_err(|error| broken(error.into()))
+    let added = inner.state.add_servant(&record);
+    added.map_err(|error| could_not_start(error.into()))
 }
 
-async fn spec(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Spec, Error> {
+async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Servant>, Failure> {
+    let nodes = handle.revision.plan.nodes.clone();
+    let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes).await;
+    let started = inner.engine.start(spec.map_err(could_not_start)?).await;
+    started.map_err(|error| could_not_start(error.into()))
+}
+
+/// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
+async fn use_spare(handle: &Handle, spare: Option<Spare>) -> Option<Spare> {
+    let spare = spare?;
+    // In their order and without waiting for one another. A program that cannot be executed is refused here, and
+    // looked at where the ends of nodes are.
+    let nodes = handle.revision.plan.nodes.iter().cloned();
+    let started = join_all(nodes.map(|node| spare.container.start_node(node))).await;
+    let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
+    if started.iter().any(lost) {
+        spare.end().await;
+        return None;
+    }
+    Some(spare)
+}
+
+fn could_not_start(error: Error) -> Failure {
+    Failure::broken(format!("could not be started: {error}"))
+}
+
+/// Reaches the ROS Master in the container and sets a bridge before it.
+async fn reach(
+    inner: &Arc<Inner>,
+    handle: &Arc<Handle>,
+    container: &Arc<dyn Servant>,
+    deadline: Instant,
+) -> Result<Arc<Works>, Failure> {
+    let late = |_| {
+        let limit = inner.config.servant.start.0.as_secs();
+        Failure::broken(format!("did not start its ROS Master within {limit} s"))
+    };
+    timeout_at(deadline, Works::reach(inner, &handle.revision, container))
+        .await
+        .map_err(late)?
+        .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))
+}
+
+/// What the engine is to make: a servant of this revision, with these nodes.
+pub(super) async fn spec(
+    inner: &Arc<Inner>,
+    id: &str,
+    revision: &RevisionRecord,
+    limits: &api::Limits,
+    nodes: Vec<NodeSpec>,
+) -> Result<Spec, Error> {
     let store = Arc::clone(&inner.store);
-    let digest = handle.revision.image.clone();
+    let digest = revision.image.clone();
     let layers = tokio::task::spawn_blocking(move || definitions::layers(&store, &digest))
         .await
         .map_err(|_| Error::Internal("extracting layers"))??;
-    let plan = &handle.revision.plan;
+    let plan = &revision.plan;
     Ok(Spec {
-        id: handle.id.clone(),
+        id: id.to_owned(),
         layers,
         writable: None,
         profile: Profile::Servant,
-        limits: engine_limits(&handle.limits()),
+        limits: engine_limits(limits),
         environment: plan.environment.clone(),
-        nodes: plan.nodes.clone(),
+        nodes,
         owned_directories: Vec::new(),
         mounts: Vec::new(),
         resident: crate::shim::resident_config(&plan.parameters),

@@ -65,6 +65,12 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         )
     });
     gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
+    gauge(
+        out,
+        "cloudroid_spares",
+        "Containers made ahead.",
+        [(String::new(), choreographer.spares() as f64)],
+    );
     let mut connections: BTreeMap<String, usize> = BTreeMap::new();
     for handle in &handles {
         *connections.entry(handle.service().to_owned()).or_default() += handle.connections();

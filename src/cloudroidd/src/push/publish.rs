@@ -15,14 +15,16 @@ impl Pusher {
     /// Writes the revision; from here on it is what new servants are started from.
     pub(super) async fn publish(&self, record: RevisionRecord) -> Result<u64, Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.store));
-        blocking("publishing", move || {
+        let published = blocking("publishing", move || {
             let number = state.publish(&record)?;
             // A crash before these is mended at the next start.
             tag(&store, &record.service, number, &record.image)?;
             tag_current(&store, &record.service, &record.image)?;
             Ok(number)
         })
-        .await
+        .await;
+        self.choreographer.look_at_spares();
+        published
     }
 
     /// Makes an earlier revision the current one.
@@ -56,6 +58,7 @@ impl Pusher {
             tag_current(&store, &target.service, &target.image)
         })
         .await?;
+        self.choreographer.look_at_spares();
         let about = NewEvent {
             service: Some(name),
             ..NewEvent::default()
@@ -77,6 +80,7 @@ impl Pusher {
             .choreographer
             .stop("its service was removed", |handle| handle.service() == name)
             .await;
+        self.choreographer.end_stale_spares().await?;
         let (store, service) = (Arc::clone(&self.store), name.to_owned());
         blocking("removing a service", move || {
             store.untag(&service)?;
