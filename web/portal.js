@@ -63,7 +63,7 @@ function showMachine(status) {
   const facts = [
     ["Cores promised", gauge(room.cpus_reserved, room.cpus, `${+room.cpus_reserved.toFixed(2)} of ${room.cpus}`)],
     ["Memory promised", gauge(room.memory_reserved, room.memory, `${size(room.memory_reserved)} of ${size(room.memory)}`)],
-    ["Servants", String(status.servants)],
+    ["Servants", `${status.servants} (${status.spares} ready for more)`],
     ["Connections", String(status.connections)],
     ["Waiting for room", String(room.waiting)],
     ["Limits enforced by", version ? `cgroup v${version}` : "nothing"],
@@ -79,7 +79,8 @@ function showServices(services) {
     const open = element("button", service.name, "link");
     open.type = "button";
     open.addEventListener("click", () => { chosen = chosen === service.name ? null : service.name; look(); });
-    const counts = `${service.topics} topics, ${service.services} services, ${service.actions} actions, ${service.parameters} parameters`;
+    const counts = [[service.topics, "topic"], [service.services, "service"], [service.actions, "action"],
+      [service.parameters, "parameter"]].filter(([count]) => count > 0).map(([count, what]) => `${count} ${what}${count === 1 ? "" : "s"}`).join(", ");
     return row(open, String(service.revision), `${age(service.published)} ago`, counts, String(service.servants),
       limits(service.limits), name(service.address));
   }));

@@ -44,6 +44,24 @@ fn main() -> Result<()> {
     }
 }
 
+/// A daemon with the relay published; `servants` is added to the configuration's `[servant]`.
+fn serving(servants: &str) -> Result<Daemon> {
+    let place = tempfile::Builder::new()
+        .prefix("cloudroid-bench-")
+        .tempdir()?;
+    let daemon = Daemon::start(place, &format!("{CONFIG}{servants}"), &[])?;
+    eprintln!("pushing a launch file for topic_tools/relay");
+    let space = space(daemon.place(), "relay_only", None)?;
+    daemon.push(&[
+        space.to_str().context("UTF-8")?,
+        "--name",
+        "relay",
+        "--launch",
+        "relay.launch",
+    ])?;
+    Ok(daemon)
+}
+
 fn measure() -> Result<()> {
     ensure!(
         nix::unistd::geteuid().is_root(),
@@ -58,22 +76,18 @@ fn measure() -> Result<()> {
         .worker_threads(2)
         .enable_all()
         .build()?;
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let daemon = Daemon::start(place, CONFIG, &[])?;
-    eprintln!("pushing a launch file for topic_tools/relay");
-    let space = space(daemon.place(), "relay_only", None)?;
-    daemon.push(&[
-        space.to_str().context("UTF-8")?,
-        "--name",
-        "relay",
-        "--launch",
-        "relay.launch",
-    ])?;
+    let daemon = serving("")?;
     let image = Image::of(&daemon, "relay")?;
     let mut report = Report::new("servant");
-    starts::measure(&mut report, &daemon, &image, runtime.handle())?;
+    let without_spares = serving("spares = 0\n")?;
+    starts::measure(
+        &mut report,
+        &daemon,
+        &without_spares,
+        &image,
+        runtime.handle(),
+    )?;
+    drop(without_spares);
     crowd::measure(&mut report, &daemon, &image)?;
     report.finish()?;
     Ok(())

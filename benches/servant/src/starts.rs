@@ -80,6 +80,7 @@ impl<'a> Contestant<'a> {
 }
 
 const ROBOT: &str = "robot";
+const COLD: &str = "robot, no container made ahead";
 const NODE: &str = "node alone";
 const ENGINE: &str = "engine";
 const LIMITED: &str = "libcontainer alone, the same spec";
@@ -89,6 +90,7 @@ const UNLIMITED: &str = "libcontainer alone, without cgroups";
 pub(crate) fn measure(
     report: &mut Report,
     daemon: &Daemon,
+    without_spares: &Daemon,
     image: &Image,
     runtime: &Handle,
 ) -> Result<()> {
@@ -100,6 +102,7 @@ pub(crate) fn measure(
     let bundle = place.join("bundle");
     let mut contestants = vec![
         Contestant::ours(ROBOT, |_| robot(daemon, image)),
+        Contestant::ours(COLD, |_| robot(without_spares, image)),
         Contestant::ours(NODE, |_| native.time()),
         Contestant::ours(ENGINE, |spec| ours.time(spec.clone())),
         Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),
@@ -163,6 +166,17 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
             robots.best().as_secs_f64() * 1e3
         ));
     report
+        .figure(
+            "robot connects → node registered, bridged, without a container made ahead",
+            "ms",
+            median(needed(COLD)?),
+        )
+        .beside(
+            "node alone + 1.5 × libcontainer alone",
+            node + 1.5 * median(bare),
+        )
+        .note("the first robot of a service, and robots that come faster than containers are made");
+    report
         .figure("node alone: exec → registered", "ms", node)
         .note("in a chroot of the same layers, namespaces ready, the same Master");
     report
@@ -172,7 +186,7 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         .note("ours with limits read back, shim, Master and init");
     for other in all
         .iter()
-        .filter(|times| ![ROBOT, NODE, ENGINE].contains(&times.name.as_str()))
+        .filter(|times| ![ROBOT, COLD, NODE, ENGINE].contains(&times.name.as_str()))
     {
         if other.name != bare.name {
             report

@@ -231,13 +231,23 @@ impl<R: Read> TarReader<R> {
             .link
             .or_else(|| header.link_name_bytes().map(|link| link.into_owned()));
         let device = |number: io::Result<Option<u32>>| number.ok().flatten().unwrap_or(0);
-        let field = |value: io::Result<u64>| value.map_err(|error| self.malformed(error));
+        // Left blank means 0, as GNU tar reads it.
+        let blank = |raw: &[u8]| raw.iter().all(|byte| matches!(byte, 0 | b' '));
+        let field = |raw: &[u8], value: io::Result<u64>| match value {
+            Err(_) if blank(raw) => Ok(0),
+            value => value.map_err(|error| self.malformed(error)),
+        };
+        let old = header.as_old();
         let entry = Entry {
             kind,
             link: link.unwrap_or_default(),
             mode: header.mode().map_err(|error| self.malformed(error))? & 0o7777,
-            uid: extension.uid.map_or_else(|| field(header.uid()), Ok)?,
-            gid: extension.gid.map_or_else(|| field(header.gid()), Ok)?,
+            uid: extension
+                .uid
+                .map_or_else(|| field(&old.uid, header.uid()), Ok)?,
+            gid: extension
+                .gid
+                .map_or_else(|| field(&old.gid, header.gid()), Ok)?,
             mtime: extension
                 .mtime
                 .unwrap_or_else(|| header.mtime().unwrap_or(0)),

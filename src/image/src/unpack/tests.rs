@@ -137,6 +137,31 @@ fn an_ordinary_archive_arrives_gzip_or_not() {
 }
 
 #[test]
+fn owners_left_blank_are_root_and_owners_that_are_no_numbers_refused() {
+    let with_owner = |owner: &[u8; 8]| {
+        let mut bytes = Archive::new().file("package.xml", "<package/>").bytes();
+        bytes[108..116].copy_from_slice(owner);
+        // The checksum is of the header with spaces in the checksum's own field.
+        bytes[148..156].fill(b' ');
+        let sum: u32 = bytes[..512].iter().map(|byte| u32::from(*byte)).sum();
+        bytes[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
+        bytes
+    };
+    for blank in [b"\0\0\0\0\0\0\0\0", b"        "] {
+        let place = place();
+        unpack(
+            with_owner(blank).as_slice(),
+            &place.destination,
+            &Limits::default(),
+        )
+        .unwrap();
+        assert!(place.destination.join("package.xml").exists());
+    }
+    let refused = refusal_within(&with_owner(b"nobody\0\0"), &Limits::default());
+    assert_says(&refused, &["package.xml"]);
+}
+
+#[test]
 fn an_empty_destination_is_taken_and_a_full_one_left_alone() {
     let place = place();
     std::fs::create_dir(&place.destination).unwrap();
