@@ -27,7 +27,7 @@ pub use push::{PushEvent, PushOptions};
 pub use servant::{LogLine, Phase, Servant, Stopped};
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use size::Size;
-pub use status::{Capacity, Isolation, Status};
+pub use status::{Capacity, Clock, Isolation, Status};
 pub use stub::Stubs;
 
 /// Media type of streams: one JSON value per line.

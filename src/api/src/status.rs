@@ -65,3 +65,10 @@ pub struct Capacity {
     /// Servants waiting for room.
     pub waiting: usize,
 }
+
+/// The daemon's clock, for comparing another with it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Clock {
+    /// Milliseconds since 1970 with their fraction.
+    pub now: f64,
+}

@@ -63,10 +63,20 @@ pub struct ExecOriginal {
 /// Check.
 #[derive(Debug, Args)]
 pub struct Doctor {
-    /// The stub's share/PKG, where interface.toml and stub.toml are.
+    /// The stub's share/PKG, where interface.toml and stub.toml are; by default that of this very program.
     #[arg(long, value_name = "DIR")]
-    pub share: PathBuf,
+    pub share: Option<PathBuf>,
     /// The ROS package; by default the share directory's name.
     #[arg(long, value_name = "PKG")]
     pub package: Option<String>,
+    /// Only this part.
+    #[arg(long, value_enum)]
+    pub only: Option<Part>,
+}
+
+/// A part of what is checked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// Address, token, service, clock and MTU.
+    Server,
 }

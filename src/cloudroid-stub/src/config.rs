@@ -178,10 +178,10 @@ fn with(
             config.server
         );
     }
-    if let (Some(desire), Some(max)) = (config.desire, config.max)
-        && desire > max
-    {
-        bail!("desire ({desire} s) is greater than max ({max} s)");
+    if let (Some(desire), Some(max)) = (config.desire, config.max) {
+        if desire > max {
+            bail!("desire ({desire} s) is greater than max ({max} s)");
+        }
     }
     Ok(config)
 }

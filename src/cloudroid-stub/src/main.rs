@@ -15,6 +15,7 @@
 
 mod arguments;
 mod config;
+mod doctor;
 mod original;
 
 use std::process::ExitCode;
@@ -26,7 +27,7 @@ fn main() -> ExitCode {
     let outcome = match Arguments::parse().verb {
         Verb::Run(asked) => run(&asked),
         Verb::ExecOriginal(asked) => original::exec(&asked.node, &asked.argv),
-        Verb::Doctor(asked) => doctor(&asked),
+        Verb::Doctor(asked) => doctor::examine(&asked),
     };
     outcome.unwrap_or_else(|error| {
         eprintln!("cloudroid-stub: {error:#}");
@@ -37,11 +38,4 @@ fn main() -> ExitCode {
 fn run(asked: &arguments::Run) -> anyhow::Result<ExitCode> {
     let config = config::read(&asked.node.share, std::env::vars())?;
     anyhow::bail!("the link to {} is not there yet", config.server)
-}
-
-fn doctor(asked: &arguments::Doctor) -> anyhow::Result<ExitCode> {
-    let config = config::read(&asked.share, std::env::vars())?;
-    println!("server   {}", config.server);
-    println!("service  {}", config.service);
-    Ok(ExitCode::SUCCESS)
 }

@@ -106,6 +106,7 @@ pub fn router(app: Arc<App>) -> Router {
     let v1 = Router::new()
         .route("/status", get(api_v1::status))
         .route("/doctor", get(api_v1::doctor))
+        .route("/clock", get(api_v1::clock))
         .route("/events", get(api_v1::events))
         .route("/services", get(api_v1::services))
         .route(

@@ -34,6 +34,14 @@ pub async fn status(State(app): State<Arc<App>>) -> Answer<Status> {
     Ok(Json(views::status(&app)?))
 }
 
+/// The time here.
+pub async fn clock() -> Json<api::Clock> {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    Json(api::Clock {
+        now: since.map_or(0.0, |since| since.as_secs_f64() * 1000.0),
+    })
+}
+
 /// All checks of the machine, made anew.
 pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
     let home = app.home.clone();

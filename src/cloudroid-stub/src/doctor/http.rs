@@ -1,0 +1,133 @@
+//! One GET over a connection of its own: what the doctor asks the portal, before there is a link.
+
+use std::io;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use nix::sys::socket::{getsockopt, sockopt::IpMtu};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+/// For all of one answer.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// The doctor asks for nothing bigger.
+const LONGEST: u64 = 16 << 20;
+
+/// An answer.
+pub struct Answer {
+    /// HTTP status.
+    pub status: u16,
+    /// Its body.
+    pub body: Vec<u8>,
+    /// From the request to the first byte of the answer.
+    pub waited: Duration,
+    /// The path's MTU as the kernel knows it, where it does.
+    pub mtu: Option<i32>,
+}
+
+/// `GET path` from `authority` at `address`.
+pub async fn get(
+    address: SocketAddr,
+    authority: &str,
+    path: &str,
+    token: Option<&str>,
+) -> io::Result<Answer> {
+    tokio::time::timeout(PATIENCE, exchange(address, authority, path, token))
+        .await
+        .unwrap_or_else(|_| {
+            let words = format!("no whole answer to GET {path} within {PATIENCE:?}");
+            Err(io::Error::new(io::ErrorKind::TimedOut, words))
+        })
+}
+
+async fn exchange(
+    address: SocketAddr,
+    authority: &str,
+    path: &str,
+    token: Option<&str>,
+) -> io::Result<Answer> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.set_nodelay(true)?;
+    let mut request = format!(
+        "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\nUser-Agent: cloudroid-stub/{}\r\n",
+        env!("CARGO_PKG_VERSION")
+    );
+    if let Some(token) = token {
+        request.push_str(&format!("Authorization: Bearer {token}\r\n"));
+    }
+    request.push_str("\r\n");
+    let began = Instant::now();
+    stream.write_all(request.as_bytes()).await?;
+    let mut first = [0; 1];
+    stream.read_exact(&mut first).await?;
+    let waited = began.elapsed();
+    let mtu = getsockopt(&stream, IpMtu).ok();
+    let mut answer = first.to_vec();
+    stream.take(LONGEST).read_to_end(&mut answer).await?;
+    let (status, body) = understood(&answer)
+        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "this is no HTTP answer"))?;
+    Ok(Answer {
+        status,
+        body,
+        waited,
+        mtu,
+    })
+}
+
+/// Status and body. (RFC 9112; the portal sends bodies with a length or in chunks.)
+fn understood(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
+    let end = answer.windows(4).position(|four| four == b"\r\n\r\n")?;
+    let head = std::str::from_utf8(&answer[..end]).ok()?;
+    let status = head
+        .strip_prefix("HTTP/1.")?
+        .split(' ')
+        .nth(1)?
+        .parse()
+        .ok()?;
+    let body = &answer[end + 4..];
+    let chunked = head
+        .to_ascii_lowercase()
+        .contains("transfer-encoding: chunked");
+    let body = if chunked {
+        without_chunks(body)?
+    } else {
+        body.to_vec()
+    };
+    Some((status, body))
+}
+
+fn without_chunks(mut body: &[u8]) -> Option<Vec<u8>> {
+    let mut whole = Vec::new();
+    loop {
+        let end = body.windows(2).position(|two| two == b"\r\n")?;
+        let size = std::str::from_utf8(&body[..end]).ok()?;
+        let size = usize::from_str_radix(size.split(';').next()?.trim(), 16).ok()?;
+        body = &body[end + 2..];
+        if size == 0 {
+            return Some(whole);
+        }
+        whole.extend_from_slice(body.get(..size)?);
+        body = body.get(size + 2..)?;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn answers_are_understood_whole_or_in_chunks() {
+        let plain = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok";
+        assert_eq!(understood(plain), Some((200, b"ok".to_vec())));
+        let chunked =
+            b"HTTP/1.1 404 Not Found\r\nTransfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1;x\r\nc\r\n0\r\n\r\n";
+        assert_eq!(understood(chunked), Some((404, b"abc".to_vec())));
+        for broken in [
+            &b""[..],
+            b"SSH-2.0-x\r\n\r\n",
+            b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nff\r\nshort",
+        ] {
+            assert_eq!(understood(broken), None);
+        }
+    }
+}

@@ -1,0 +1,240 @@
+//! The server's side: is it reached, does it know the token and the service, does its clock agree, do big answers
+//! come through.
+
+use std::net::SocketAddr;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde_json::Value;
+
+use super::overlay::Place;
+use super::{Check, http};
+use crate::config::Config;
+
+/// The clock is asked so often; the quickest answer counts.
+const SAMPLES: usize = 5;
+/// A difference that is worth mending. Stamps are set right on the link, but people read logs of both sides.
+const IN_STEP: f64 = 0.1;
+
+/// All checks of the server. When it is not reached there is but one.
+pub async fn checks(config: &Config, place: &Place) -> Vec<Check> {
+    let portal = match Portal::find(config, place).await {
+        Ok(portal) => portal,
+        Err(check) => return vec![*check],
+    };
+    let reached = match portal.get("/healthz").await {
+        Ok(answer) if answer.status == 200 => Check::good(
+            "server",
+            format!(
+                "{} answers in {:.1} ms",
+                config.server,
+                millis(answer.waited)
+            ),
+        ),
+        Ok(answer) => {
+            let found = format!("{} answers with status {}", config.server, answer.status);
+            return vec![Check::bad("server", found, portal.other_server())];
+        }
+        Err(error) => {
+            let found = format!("{} is not reached: {error}", config.server);
+            return vec![Check::bad("server", found, portal.other_server())];
+        }
+    };
+    let mut checks = vec![reached, portal.service(config, place).await];
+    checks.push(portal.clock().await);
+    checks.push(portal.mtu().await);
+    checks
+}
+
+struct Portal {
+    address: SocketAddr,
+    authority: String,
+    token: Option<String>,
+    installer: String,
+}
+
+impl Portal {
+    async fn find(config: &Config, place: &Place) -> Result<Portal, Box<Check>> {
+        let installer = place.installer();
+        let mend = format!("{installer} --server ws://HOST:9090");
+        let authority = config
+            .server
+            .split_once("://")
+            .map_or(config.server.as_str(), |(_, rest)| rest)
+            .trim_end_matches('/')
+            .to_owned();
+        let token = token(config).map_err(|error| {
+            let mend = format!("{installer} --token TOKEN");
+            Box::new(Check::bad("token", error, mend))
+        })?;
+        let (host, port) = parts(&authority);
+        let found = tokio::net::lookup_host((host, port)).await;
+        match found.map(|mut addresses| addresses.next()) {
+            Ok(Some(address)) => Ok(Portal {
+                address,
+                authority,
+                token,
+                installer,
+            }),
+            Ok(None) => {
+                let found = format!("{host} has no address");
+                Err(Box::new(Check::bad("server", found, mend)))
+            }
+            Err(error) => {
+                let found = format!("{host} is not found: {error}");
+                Err(Box::new(Check::bad("server", found, mend)))
+            }
+        }
+    }
+
+    async fn get(&self, path: &str) -> std::io::Result<http::Answer> {
+        http::get(self.address, &self.authority, path, self.token.as_deref()).await
+    }
+
+    fn other_server(&self) -> String {
+        format!("{} --server ws://HOST:9090", self.installer)
+    }
+
+    /// The token and the service, by asking for the one with the other.
+    async fn service(&self, config: &Config, place: &Place) -> Check {
+        let name = &config.service;
+        let answer = match self.get(&format!("/api/v1/services/{name}")).await {
+            Ok(answer) => answer,
+            Err(error) => return Check::bad("service", error.to_string(), self.other_server()),
+        };
+        let body: Value = serde_json::from_slice(&answer.body).unwrap_or_default();
+        let words = body["detail"].as_str().unwrap_or_default();
+        match answer.status {
+            200 => {}
+            401 | 403 => {
+                let given = match self.token {
+                    Some(_) => "the token is refused",
+                    None => "the server wants a token",
+                };
+                let mend = format!("{} --token TOKEN", self.installer);
+                return Check::bad("token", format!("{given}: {words}"), mend);
+            }
+            404 => {
+                let mend =
+                    "have it pushed there (cloudroidctl push), or correct service in stub.toml";
+                return Check::bad("service", words, mend);
+            }
+            status => {
+                let found = format!("status {status}: {words}");
+                return Check::bad("service", found, "see the daemon's log on the server");
+            }
+        }
+        let there = body["revision"].as_u64();
+        match (there, place.revision()) {
+            (Some(there), Some(here)) if there != here => Check::warning(
+                "service",
+                format!("{name} is at revision {there}, this stub is of revision {here}"),
+                format!(
+                    "fetch it again: http://{}/stubs/{name}.tar.gz",
+                    self.authority
+                ),
+            ),
+            _ => Check::good("service", format!("{name} is published, the token is good")),
+        }
+    }
+
+    /// Half of the way there and back is what cannot be told from a difference.
+    async fn clock(&self) -> Check {
+        let mut best: Option<(Duration, f64)> = None;
+        for _ in 0..SAMPLES {
+            let Ok(answer) = self.get("/api/v1/clock").await else {
+                continue;
+            };
+            let here = now() - answer.waited.as_secs_f64() / 2.0;
+            let body: Value = serde_json::from_slice(&answer.body).unwrap_or_default();
+            let Some(there) = body["now"].as_f64() else {
+                continue;
+            };
+            if best.is_none_or(|(waited, _)| answer.waited < waited) {
+                best = Some((answer.waited, there / 1000.0 - here));
+            }
+        }
+        let Some((waited, ahead)) = best else {
+            return Check::warning(
+                "clock",
+                "the server does not tell its time",
+                "bring the server to this stub's version",
+            );
+        };
+        let unsure = waited.as_secs_f64() / 2.0;
+        let found = format!(
+            "the server's is {:.1} ms {} (give or take {:.1} ms)",
+            ahead.abs() * 1000.0,
+            if ahead < 0.0 { "behind" } else { "ahead" },
+            unsure * 1000.0
+        );
+        if ahead.abs() > IN_STEP + unsure {
+            Check::warning("clock", found, "sudo apt install chrony, on both sides")
+        } else {
+            Check::good("clock", found)
+        }
+    }
+
+    /// Where packets of the link's size are lost on the way, small answers come and big ones never do.
+    async fn mtu(&self) -> Check {
+        match self.get("/api/v1/openapi.json").await {
+            Ok(answer) => {
+                let mtu = answer
+                    .mtu
+                    .map_or_else(|| "not known".to_owned(), |mtu| format!("{mtu} bytes"));
+                let found = format!(
+                    "{mtu}; an answer of {} bytes came through",
+                    answer.body.len()
+                );
+                Check::good("mtu", found)
+            }
+            Err(error) => Check::bad(
+                "mtu",
+                format!("small answers come and a big one does not: {error}"),
+                "sudo ip link set dev INTERFACE mtu 1280",
+            ),
+        }
+    }
+}
+
+/// The token, as the settings say.
+fn token(config: &Config) -> Result<Option<String>, String> {
+    let text = match (&config.token, &config.token_file) {
+        (Some(token), _) => token.clone(),
+        (None, Some(path)) => std::fs::read_to_string(path)
+            .map_err(|error| format!("cannot read {}: {error}", path.display()))?,
+        (None, None) => return Ok(None),
+    };
+    Ok(Some(text.trim().to_owned()).filter(|token| !token.is_empty()))
+}
+
+/// Host and port; 9090 where none is said.
+fn parts(authority: &str) -> (&str, u16) {
+    let (host, port) = match authority.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => (host, port.parse().unwrap_or(9090)),
+        _ => (authority, 9090),
+    };
+    (host.trim_matches(['[', ']']), port)
+}
+
+fn now() -> f64 {
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0.0, |since| since.as_secs_f64())
+}
+
+fn millis(time: Duration) -> f64 {
+    time.as_secs_f64() * 1000.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_taken_apart() {
+        assert_eq!(parts("robots.local:80"), ("robots.local", 80));
+        assert_eq!(parts("server"), ("server", 9090));
+        assert_eq!(parts("[::1]:81"), ("::1", 81));
+        assert_eq!(parts("[::1]"), ("::1", 9090));
+    }
+}
