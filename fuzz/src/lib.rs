@@ -7,6 +7,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod codec;
 pub mod ros;
 pub mod rosbridge;
 
@@ -15,6 +16,16 @@ pub type Target = fn(&[u8]);
 
 /// Every target, by the name of its program and of its folder in `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
+    ("codec_zlib", codec::zlib),
+    ("codec_deflate", codec::deflate),
+    ("codec_zstd", codec::zstd),
+    ("codec_image", codec::image),
+    ("codec_grid", codec::grid),
+    ("codec_scan", codec::scan),
+    ("codec_cloud", codec::cloud),
+    ("codec_video", codec::video),
+    ("codec_frame", codec::frame),
+    ("codec_message", codec::message),
     ("rosbridge_json", rosbridge::json),
     ("rosbridge_cbor", rosbridge::cbor),
     ("rosbridge_fragments", rosbridge::fragments),

@@ -6,7 +6,7 @@
 //! - Where nothing is known, the last point of the same laser is nearer than the last point.
 //!
 //! The quotient is learned from the points before. Everything is IEEE arithmetic (products, quotients, square roots),
-//! so both sides learn the very same.
+//! so both sides learn the very same, whatever processors they have.
 
 use super::Known;
 use crate::Error;
@@ -185,8 +185,10 @@ impl<'a> Tracker<'a> {
             learned.quotient = self.last.quotient;
         }
         let usable = reference.is_finite() && reference != 0.0;
-        let guessed = if usable {
-            ((learned.quotient * reference) as f32).to_bits()
+        let product = (learned.quotient * reference) as f32;
+        // The bits of what is no number differ between processors.
+        let guessed = if usable && !product.is_nan() {
+            product.to_bits()
         } else {
             bits
         };
