@@ -217,11 +217,12 @@ pub(crate) fn encode_floats(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
 
 fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     let mut multiples = scale.multiples(bits);
-    // Zero is taken for "nothing measured" when all others are far from it.
-    let (mut zeros, mut nearest) = (0u32, u32::MAX);
+    // Zero is taken for "nothing measured" when all others are far from it. What does not fit is far, too.
+    let (mut zeros, mut nearest) = (0u32, i32::MAX);
     for &multiple in &multiples {
         zeros += u32::from(multiple == 0);
-        nearest = nearest.min(multiple.unsigned_abs().wrapping_sub(1));
+        let above_one = multiple.wrapping_abs().wrapping_sub(1) & i32::MAX;
+        nearest = nearest.min(above_one);
     }
     if zeros > 0 && nearest >= 15 {
         for multiple in &mut multiples {
@@ -233,12 +234,15 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
         }
     }
     let fits = |multiple: i32| multiple != Scale::NONE;
-    let (mut unfit, mut smallest, mut largest) = (0usize, i32::MAX, i32::MIN);
+    let (mut unfit, mut below, mut largest) = (0u32, i32::MAX, i32::MIN);
     for &multiple in &multiples {
-        unfit += usize::from(!fits(multiple));
-        smallest = smallest.min(if fits(multiple) { multiple } else { i32::MAX });
+        unfit += u32::from(multiple == Scale::NONE);
+        // One less than what does not fit is larger than everything else.
+        below = below.min(multiple.wrapping_sub(1));
         largest = largest.max(multiple);
     }
+    let mut smallest = below.wrapping_add(1);
+    let unfit = unfit as usize;
     if unfit == multiples.len() {
         (smallest, largest) = (0, 0);
     }
@@ -282,10 +286,9 @@ fn put_unfit(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -
         .find(|&(_, &multiple)| multiple == Scale::NONE)
         .map_or(0, |(&bits, _)| bits);
     let same =
-        |(&bits, &multiple): (&u32, &i32)| usize::from((multiple == Scale::NONE) & (bits == first));
-    if pairs().map(same).sum::<usize>() == unfit {
-        // One mark for "nothing", as most drivers have it.
-        put_apart(std::iter::repeat_n(first, unfit), out);
+        |(&bits, &multiple): (&u32, &i32)| u32::from((multiple == Scale::NONE) & (bits == first));
+    if pairs().map(same).sum::<u32>() as usize == unfit {
+        put_run(first, unfit as u32, out);
         return !measured(first) || unfit * 16 <= bits.len();
     }
     let apart = || {
@@ -299,19 +302,17 @@ fn put_unfit(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -
 
 /// Whether a float is one that a sensor measured rather than a mark for "nothing".
 fn measured(bits: u32) -> bool {
-    let value = f32::from_bits(bits);
-    value.is_finite() && value != 0.0
+    // In one comparison: neither zero, of either sign, nor infinite or more.
+    (bits & 0x7fff_ffff).wrapping_sub(1) < f32::INFINITY.to_bits() - 1
 }
 
 fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut flags = ORDERED | WIDE;
     let mut preamble = Vec::new();
-    let missing = bits.iter().any(|&bits| !measured(bits)).then(|| {
+    let unfit: u32 = bits.iter().map(|&bits| u32::from(!measured(bits))).sum();
+    let missing = (unfit > 0).then(|| {
         flags |= MISSING;
-        put_apart(
-            bits.iter().copied().filter(|&bits| !measured(bits)),
-            &mut preamble,
-        );
+        put_unmeasured(bits, unfit, &mut preamble);
         let mut lanes = shape.lanes();
         lanes.fill(bits, |bits| u8::from(!measured(bits)));
         lanes
@@ -326,6 +327,25 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
         missing,
     }
     .encode(shape.kinds(), out);
+}
+
+/// Lists the `unfit` floats that were not measured.
+fn put_unmeasured(bits: &[u32], unfit: u32, out: &mut Vec<u8>) {
+    let apart = || bits.iter().copied().filter(|&bits| !measured(bits));
+    let first = apart().next().unwrap_or(0);
+    let same: u32 = bits.iter().map(|&bits| u32::from(bits == first)).sum();
+    if same == unfit {
+        put_run(first, unfit, out);
+    } else {
+        put_apart(apart(), out);
+    }
+}
+
+/// As [`put_apart`], for one mark for "nothing", as most drivers have it.
+fn put_run(value: u32, count: u32, out: &mut Vec<u8>) {
+    let mut run = value.to_le_bytes().to_vec();
+    put_varint(&mut run, u64::from(count) - 1);
+    put_packed(&run, out);
 }
 
 /// Values listed apart: as runs, for they are mostly one and the same.
@@ -634,6 +654,16 @@ mod tests {
             Shape::Sequence(4),
         );
         floats(&[], Shape::Sequence(0));
+    }
+
+    #[test]
+    fn what_is_no_measurement_is_told() {
+        for value in [1.0, -1.0, f32::MIN_POSITIVE, f32::MAX, f32::MIN, 1e-45] {
+            assert!(measured(value.to_bits()), "{value}");
+        }
+        for value in [0.0, -0.0, f32::INFINITY, f32::NEG_INFINITY, f32::NAN] {
+            assert!(!measured(value.to_bits()), "{value}");
+        }
     }
 
     #[test]

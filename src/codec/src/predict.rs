@@ -88,6 +88,10 @@ pub(crate) trait Sample: Copy + Default + Eq {
     fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32;
     /// The context of an unease, below [`EASE`].
     fn context(unease: u32) -> u16;
+    /// [`Sample::context`] in arithmetic that the vectoriser can use.
+    fn context_of_many(unease: u32) -> u16;
+    /// Residuals have no other bits.
+    const RESIDUAL: u32;
     fn widen(self) -> u32;
 }
 
@@ -147,6 +151,15 @@ const fn half_octave(unease: u32) -> u8 {
     }
 }
 
+/// The logarithm of a number to the base of two, times 2^`fraction`, rounded down; anything for zero. The first bits of
+/// a float are one, without a branch.
+#[inline(always)]
+pub(crate) fn scaled_log(value: u32, fraction: u32) -> u32 {
+    // Of two bits four apart one is cleared, lest rounding carries into the bits that count (three at most).
+    let value = value & !(value >> 4);
+    ((value as f32).to_bits() >> (23 - fraction)).wrapping_sub(127 << fraction)
+}
+
 /// [`half_octave`] of small numbers, to be looked up.
 const HALF_OCTAVES: [u8; 1024] = {
     let mut contexts = [0; 1024];
@@ -196,6 +209,19 @@ impl Sample for u16 {
     }
 
     #[inline(always)]
+    fn context_of_many(unease: u32) -> u16 {
+        let unease = unease.min(1 << (EASE / 2));
+        let context = if unease < 2 {
+            unease
+        } else {
+            scaled_log(unease, 1)
+        };
+        context as u16
+    }
+
+    const RESIDUAL: u32 = (1 << 19) - 1;
+
+    #[inline(always)]
     fn widen(self) -> u32 {
         self.into()
     }
@@ -234,6 +260,18 @@ impl Sample for u32 {
     fn context(unease: u32) -> u16 {
         ((32 - unease.leading_zeros()) as u16).min(EASE - 1)
     }
+
+    #[inline(always)]
+    fn context_of_many(unease: u32) -> u16 {
+        let context = if unease == 0 {
+            0
+        } else {
+            scaled_log(unease, 0) + 1
+        };
+        (context as u16).min(EASE - 1)
+    }
+
+    const RESIDUAL: u32 = u32::MAX;
 
     #[inline(always)]
     fn widen(self) -> u32 {
@@ -303,6 +341,23 @@ mod tests {
             with_predictor!(kind, there_and_back());
         }
         assert!(Kind::read(8).is_err());
+    }
+
+    #[test]
+    fn contexts_of_many_are_as_those_of_one() {
+        let edges = (2..32).flat_map(|bit| [(1u32 << bit) - 1, 1 << bit, 3 << (bit - 1)]);
+        for unease in (0..300_000).chain(edges).chain([u32::MAX]) {
+            assert_eq!(
+                u16::context_of_many(unease),
+                u16::context(unease),
+                "{unease}"
+            );
+            assert_eq!(
+                u32::context_of_many(unease),
+                u32::context(unease),
+                "{unease}"
+            );
+        }
     }
 
     #[test]

@@ -48,7 +48,7 @@ impl Scale {
     pub(crate) const NONE: i32 = i32::MIN;
     /// Beyond this the product below is no longer good to half a multiple.
     const LARGEST: f32 = 4_000_000.0;
-    /// Adding and taking away this rounds to a whole number.
+    /// Adding this rounds to a whole number: there is no room for less.
     const ROUND: f32 = 12_582_912.0;
 
     pub(crate) fn named(name: u8) -> Result<Self, Error> {
@@ -84,7 +84,10 @@ impl Scale {
         let scaled = f32::from_bits(bits) * self.divisor;
         // Not a number fails the comparison too.
         let near = scaled.abs() <= Self::LARGEST;
-        let multiple = ((scaled + Self::ROUND) - Self::ROUND) as i32;
+        // The sum's last bits are the whole number; a conversion would look at what it cannot convert.
+        let multiple = (scaled + Self::ROUND)
+            .to_bits()
+            .wrapping_sub(Self::ROUND.to_bits()) as i32;
         if near & (self.value(multiple) == bits) {
             multiple
         } else {

@@ -12,7 +12,7 @@ use crate::entropy::bits::BitWriter;
 use crate::entropy::counts::{CONTEXTS, Order};
 use crate::entropy::tans::{Encoder, Histogram};
 use crate::padded::{Lanes, Padded};
-use crate::predict::{EASE, Kind, Predictor, Sample, with_predictor};
+use crate::predict::{EASE, Kind, Predictor, Sample, scaled_log, with_predictor};
 use crate::wire::put_block;
 
 /// The token of a missing sample.
@@ -21,26 +21,6 @@ const MISSING: u8 = LAST_TOKEN as u8 + 1;
 const EXACT: u32 = 16;
 /// The token of the largest difference.
 const LAST_TOKEN: usize = 16 + 27 * 4 + 3;
-
-/// The token of a difference.
-const fn token_of(residual: u32) -> u8 {
-    if residual < EXACT {
-        return residual as u8;
-    }
-    let octave = residual.ilog2();
-    (16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8
-}
-
-/// Tokens of small differences, to be looked up: computing them takes a branch nobody can foresee.
-const TOKENS: [u8; 1024] = {
-    let mut tokens = [0; 1024];
-    let mut residual = 0;
-    while residual < tokens.len() {
-        tokens[residual] = token_of(residual as u32);
-        residual += 1;
-    }
-    tokens
-};
 
 /// Per token: the smallest difference, and how many plain bits tell the rest.
 const RESIDUALS: [(u32, u32); 256] = {
@@ -58,19 +38,24 @@ const RESIDUALS: [(u32, u32); 256] = {
     residuals
 };
 
+/// A difference's token, and how many of its low bits follow plainly, in arithmetic that the vectoriser can use.
 #[inline(always)]
-fn token(residual: u32) -> u8 {
-    match TOKENS.get(residual as usize) {
-        Some(&token) => token,
-        None => token_of(residual),
+fn token(residual: u32) -> (u32, u32) {
+    let log = scaled_log(residual, 2);
+    if residual < EXACT {
+        (residual, 0)
+    } else {
+        (log, (log >> 2) - 2)
     }
 }
+
+/// The shift that merges all contexts into one.
+const ALL: u32 = CONTEXTS.ilog2();
 
 /// How many neighbouring contexts are merged into one (as a shift): tables cost bytes, and time.
 fn merge(samples: usize) -> u32 {
     match samples {
-        0..0x200 => 5,
-        0x200..0x800 => 4,
+        0..0x800 => ALL,
         0x800..0x1000 => 3,
         0x1000..0x2000 => 2,
         0x2000..0x8000 => 1,
@@ -118,7 +103,7 @@ impl<T: Sample> Wide<T> {
         for (index, plane) in self.samples.lanes.iter().enumerate() {
             let gaps = self.missing.as_ref().map(|missing| &missing.lanes[index]);
             let mut lane = vec![0u16; plane.width * plane.height];
-            let mut bits = BitWriter::default();
+            let mut bits = BitWriter::with_capacity(lane.len() / 2);
             for (y, keys) in lane.chunks_exact_mut(plane.width.max(1)).enumerate() {
                 let kind = row_kind(kind, y, plane.height);
                 with_predictor!(kind, row_keys::<T>(plane, gaps, y, shift, keys, &mut bits));
@@ -182,12 +167,18 @@ fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
 }
 
 fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize, some: usize) -> u64 {
-    let [a, b, c, d, v] = plane.neighbours(y);
-    let mut sum = 0u64;
-    for x in 0..v.len().min(some) {
-        sum += u64::from(32 - v[x].residual::<P>(a[x], b[x], c[x], d[x]).leading_zeros());
+    let length = plane.width.min(some);
+    let [a, b, c, d, v] = plane.neighbours(y).map(|row| &row[..length]);
+    let mut sum = 0u32;
+    for x in 0..length {
+        let residual = v[x].residual::<P>(a[x], b[x], c[x], d[x]) & T::RESIDUAL;
+        sum += if residual == 0 {
+            0
+        } else {
+            scaled_log(residual, 0) + 1
+        };
     }
-    sum
+    sum.into()
 }
 
 /// The context where the neighbour left (1) or above (2) is missing, or both.
@@ -211,46 +202,46 @@ fn row_keys<P: Predictor, T: Sample>(
     let rows = plane.neighbours(y).map(|row| &row[..width]);
     let gaps = gaps.map(|gaps| gaps.neighbours(y).map(|row| &row[..width]));
     let mut residuals = [0u32; CHUNK];
-    let mut uneases = [0u32; CHUNK];
+    let mut contexts = [0u16; CHUNK];
+    let mut tokens = [0u16; CHUNK];
+    let mut counts = [0u8; CHUNK];
     for (index, keys) in keys.chunks_mut(CHUNK).enumerate() {
         let range = index * CHUNK..index * CHUNK + keys.len();
         let [a, b, c, d, v] = rows.map(|row| &row[range.clone()]);
         let length = keys.len().min(CHUNK);
         for x in 0..length {
-            residuals[x] = v[x].residual::<P>(a[x], b[x], c[x], d[x]);
-            uneases[x] = T::unease::<P>(T::ease::<P>(b[x], c[x], d[x]), a[x], c[x]);
+            residuals[x] = v[x].residual::<P>(a[x], b[x], c[x], d[x]) & T::RESIDUAL;
         }
-        match gaps {
-            None => {
-                for (key, (&residual, &unease)) in
-                    keys.iter_mut().zip(residuals.iter().zip(&uneases))
-                {
-                    let token = token(residual);
-                    let (smallest, bits) = RESIDUALS[usize::from(token)];
-                    plain.put(residual - smallest, bits);
-                    *key = (T::context(unease) >> shift) << 8 | u16::from(token);
-                }
+        if shift != ALL {
+            for x in 0..length {
+                let unease = T::unease::<P>(T::ease::<P>(b[x], c[x], d[x]), a[x], c[x]);
+                contexts[x] = T::context_of_many(unease);
             }
-            Some(gaps) => {
-                let [left, above, _, _, here] = gaps.map(|row| &row[range.clone()]);
-                // Where gaps begin and end nobody can foresee, so there is no branch on them.
-                for (x, key) in keys.iter_mut().enumerate() {
-                    let (near, gap) = (left[x] | above[x] != 0, here[x] != 0);
-                    let unease = T::context(uneases[x & (CHUNK - 1)]);
-                    let context = if near {
-                        gap_context(left[x], above[x])
-                    } else {
-                        unease
-                    };
-                    let residual = if gap { 0 } else { residuals[x & (CHUNK - 1)] };
-                    let token = token(residual);
-                    let (smallest, bits) = RESIDUALS[usize::from(token)];
-                    plain.put(residual - smallest, bits);
-                    let symbol = if gap { MISSING } else { token };
-                    *key = (context >> shift) << 8 | u16::from(symbol);
+        }
+        for x in 0..length {
+            let (token, count) = token(residuals[x]);
+            (tokens[x], counts[x]) = (token as u16, count as u8);
+        }
+        if let Some(gaps) = gaps {
+            let [left, above, _, _, here] = gaps.map(|row| &row[range.clone()]);
+            // Where gaps begin and end nobody can foresee, so there is no branch on them.
+            let mask = |yes: bool| 0u16.wrapping_sub(yes.into());
+            for x in 0..length {
+                let gap = mask(here[x] != 0);
+                tokens[x] = tokens[x] & !gap | u16::from(MISSING) & gap;
+                counts[x] &= !gap as u8;
+            }
+            if shift != ALL {
+                for x in 0..length {
+                    let near = mask(left[x] | above[x] != 0);
+                    contexts[x] = contexts[x] & !near | gap_context(left[x], above[x]) & near;
                 }
             }
         }
+        for x in 0..length {
+            keys[x] = (contexts[x] >> shift) << 8 | tokens[x];
+        }
+        plain.put_low(&residuals[..length], &counts[..length]);
     }
 }
 
@@ -269,13 +260,25 @@ mod tests {
     ];
     const SEQUENCE: [Kind; 2] = [Kind::West, Kind::Line];
 
+    /// The token of a difference.
+    fn token_of(residual: u32) -> u8 {
+        if residual < EXACT {
+            return residual as u8;
+        }
+        let octave = residual.ilog2();
+        (16 + (octave - 4) * 4 + ((residual >> (octave - 2)) & 3)) as u8
+    }
+
     #[test]
     fn tokens_name_every_residual() {
         for residual in (0..70_000).chain([1 << 20, 1 << 31, u32::MAX]) {
-            let token = token(residual);
-            let (smallest, bits) = RESIDUALS[usize::from(token)];
-            assert!(usize::from(token) <= LAST_TOKEN && token == token_of(residual));
+            let (token, count) = token(residual);
+            let (smallest, bits) = RESIDUALS[token as usize];
+            assert!(token as usize <= LAST_TOKEN && token == u32::from(token_of(residual)));
+            assert_eq!(bits, count);
             assert!((smallest..=smallest + ((1u32 << bits) - 1)).contains(&residual));
+            // The bits that follow are the lowest ones as they are.
+            assert_eq!(smallest & ((1 << bits) - 1), 0);
         }
     }
 

@@ -44,7 +44,7 @@ impl Histogram {
 }
 
 /// Which symbol each state of one context belongs to, every symbol's states spread evenly.
-fn spread(counts: &Counts, log: u32) -> [u8; 1 << MAX_LOG] {
+fn spread(counts: &[u16], log: u32) -> [u8; 1 << MAX_LOG] {
     let size = 1usize << log;
     let step = (size >> 1) + (size >> 3) + 3;
     let mut symbols = [0u8; 1 << MAX_LOG];
@@ -95,6 +95,8 @@ impl Encoder {
         let base = context << self.log;
         let mut starts = [0usize; SYMBOLS];
         let mut start = base;
+        let used = counts.iter().rposition(|&count| count > 0);
+        let counts = &counts[..used.map_or(0, |last| last + 1)];
         for (symbol, &count) in counts.iter().enumerate().filter(|&(_, &count)| count > 0) {
             // A state sheds `most` or `most - 1` bits to land in count..2·count.
             let most = if count == 1 {
