@@ -13,8 +13,8 @@ use crate::outbox::Goodbye;
 use crate::seat::Seat;
 use crate::session::Session;
 use crate::shared::Shared;
-use crate::ws::{WebSocket, frame};
 use crate::{BridgeOptions, Metrics, SessionOptions};
+use ws::{WebSocket, frame};
 
 /// One servant's bridge.
 pub struct Bridge {

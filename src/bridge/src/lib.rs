@@ -47,7 +47,6 @@ mod session;
 mod shared;
 mod tf;
 mod topic_queue;
-mod ws;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use metrics::{Counter, Metrics};

@@ -11,7 +11,7 @@ use ros::schema::{MessageType, Registry};
 use rosbridge::{Compression, Format, Publish};
 
 use crate::Metrics;
-use crate::ws::frame::{BINARY, TEXT};
+use ws::frame::{BINARY, TEXT};
 
 /// A whole WebSocket message, ready to be sent to anyone.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -18,7 +18,7 @@ use crate::client::{Client, Inbox};
 use crate::cut::Cuts;
 use crate::outbox::{Control, Goodbye, Outgoing, TopicKey};
 use crate::sample::{Frame, Sample};
-use crate::ws::{Message, WebSocket, WsError, frame};
+use ws::{Message, WebSocket, WsError, frame};
 
 /// Bytes in the socket's queue beyond which nothing is added: so at most one big message stands before a small one.
 const SOCKET_FULL: usize = 64 * 1024;

@@ -17,23 +17,27 @@
 //! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed, "none"
 //! stateful = false     # the local original takes over only while the link is down
 //! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time
+//! # The name that an executable's node has when none is given, where that is not the executable's.
+//! nodes = { "listener.py" = "listener" }
 //! codec = "auto"       # "none", "auto" (lossless), or "video" (lossy pictures allowed)
 //! ```
 //!
 //! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by the node's
 //! private parameter `~cloudroid/KEY`.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use serde::Deserialize;
+use ros::bus::ParamValue;
+use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
 
 /// How the stub is to behave.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// The portal: `ws://host:port`.
@@ -82,10 +86,55 @@ pub struct Config {
     /// How messages are made smaller on the link.
     #[serde(default)]
     pub codec: Codec,
+    /// Executable → the name its node has when none is given.
+    #[serde(default)]
+    pub nodes: BTreeMap<String, String>,
+}
+
+impl Config {
+    /// This robot's id.
+    pub fn robot(&self) -> String {
+        let host = || {
+            nix::unistd::gethostname()
+                .ok()
+                .and_then(|name| name.into_string().ok())
+        };
+        self.robot
+            .clone()
+            .or_else(host)
+            .unwrap_or_else(|| "robot".to_owned())
+    }
+
+    /// The bearer token.
+    pub fn token(&self) -> anyhow::Result<Option<String>> {
+        if let Some(token) = &self.token {
+            return Ok(Some(token.clone()));
+        }
+        let Some(path) = &self.token_file else {
+            return Ok(None);
+        };
+        let home = std::env::var_os("HOME").map(PathBuf::from);
+        let path = match (path.strip_prefix("~"), home) {
+            (Ok(below), Some(home)) => home.join(below),
+            _ => path.clone(),
+        };
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("cannot read the token in {}", path.display()))?;
+        Ok(Some(text.trim().to_owned()))
+    }
+
+    /// With some keys given otherwise by ROS parameters.
+    pub fn with_parameters(&self, given: &BTreeMap<String, ParamValue>) -> anyhow::Result<Config> {
+        let mut table = Table::try_from(self)?;
+        for (key, value) in given {
+            table.insert(key.clone(), Value::try_from(value)?);
+        }
+        with(table, std::iter::empty())
+    }
 }
 
 /// When the local original runs.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Local {
     /// Started when it is needed.
@@ -98,7 +147,7 @@ pub enum Local {
 }
 
 /// How messages are made smaller.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Codec {
     /// Not at all.

@@ -11,12 +11,17 @@
 //! In: the command line as roslaunch gave it, `stub.toml` and `interface.toml` of the package's share directory, the
 //! robot's parameters. Out: the node's exit status.
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod arguments;
 mod config;
+mod connect;
 mod doctor;
+mod mirror;
 mod original;
+mod resolver;
+mod robot;
+mod run;
 
 use std::process::ExitCode;
 
@@ -24,8 +29,15 @@ use arguments::{Arguments, Verb};
 use clap::Parser;
 
 fn main() -> ExitCode {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("CLOUDROID_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .init();
     let outcome = match Arguments::parse().verb {
-        Verb::Run(asked) => run(&asked),
+        Verb::Run(asked) => run::run(&asked),
         Verb::ExecOriginal(asked) => original::exec(&asked.node, &asked.argv),
         Verb::Doctor(asked) => doctor::examine(&asked),
     };
@@ -33,9 +45,4 @@ fn main() -> ExitCode {
         eprintln!("cloudroid-stub: {error:#}");
         ExitCode::FAILURE
     })
-}
-
-fn run(asked: &arguments::Run) -> anyhow::Result<ExitCode> {
-    let config = config::read(&asked.node.share, std::env::vars())?;
-    anyhow::bail!("the link to {} is not there yet", config.server)
 }

@@ -104,6 +104,21 @@ impl Choreographer {
     /// The servant of `robot` for `service`: the one that is there, or a new one. Comes back at once; the lease
     /// tells when the servant can be used, and keeps it for as long as it lives.
     pub fn ensure(&self, service: &str, robot: &str, anonymous: bool) -> Result<Lease, Error> {
+        self.ensure_with(service, robot, anonymous, false)
+    }
+
+    /// The same for a robot's stub: a new servant begins without nodes, since stubs start them one by one.
+    pub fn ensure_linked(&self, service: &str, robot: &str) -> Result<Lease, Error> {
+        self.ensure_with(service, robot, false, true)
+    }
+
+    fn ensure_with(
+        &self,
+        service: &str,
+        robot: &str,
+        anonymous: bool,
+        linked: bool,
+    ) -> Result<Lease, Error> {
         let inner = &self.inner;
         let Some(revision) = inner.state.current(service)? else {
             return Err(Error::UnknownService {
@@ -136,6 +151,9 @@ impl Choreographer {
                 revision,
                 state::now(),
             ));
+            if linked {
+                handle.set_linked();
+            }
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
             let lease = Lease::new(Arc::clone(&handle));
@@ -224,6 +242,9 @@ impl Choreographer {
             revision,
             record.created,
         ));
+        if crate::linked::has_no_planned_node(&handle, &servant) {
+            handle.set_linked();
+        }
         {
             let mut servants = inner.servants.lock();
             servants.all.insert(record.id, Arc::clone(&handle));

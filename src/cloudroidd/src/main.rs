@@ -18,6 +18,7 @@ mod doctor;
 mod errors;
 mod home;
 mod journal;
+mod linked;
 mod names;
 mod portal;
 mod push;

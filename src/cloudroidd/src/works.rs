@@ -4,11 +4,13 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
 use bridge::{Bridge, BridgeOptions};
+use link::cloud::{Hub, HubOptions};
 use ros::bus::{Bus, BusError};
 use ros::ros1::Ros1Bus;
 
 use crate::choreographer::Inner;
 use crate::config::Config;
+use crate::linked::LinkedNodes;
 use crate::sockets::ServantSockets;
 use crate::state::RevisionRecord;
 
@@ -21,8 +23,12 @@ const NODE: &str = "/cloudroid_bridge";
 pub struct Works {
     /// Its ROS.
     pub bus: Arc<dyn Bus>,
-    /// Before it.
+    /// Before it, for rosbridge's clients.
     pub bridge: Arc<Bridge>,
+    /// Before it, for the robot's stubs.
+    pub hub: Arc<Hub>,
+    /// What those have started.
+    pub nodes: Arc<LinkedNodes>,
 }
 
 impl Works {
@@ -38,8 +44,25 @@ impl Works {
             inner.definitions.registry(&inner.store, revision),
         );
         let bus: Arc<dyn Bus> = bus?;
+        let nodes = Arc::new(LinkedNodes::new(inner, revision, container).await);
+        let options = HubOptions {
+            grace: inner.config.servant.grace.0,
+            ..HubOptions::default()
+        };
+        let hub = Hub::new(
+            container.id(),
+            Arc::clone(&bus),
+            Arc::clone(&registry),
+            Arc::clone(&nodes) as Arc<dyn link::cloud::Nodes>,
+            options,
+        );
         let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));
-        Ok(Arc::new(Works { bus, bridge }))
+        Ok(Arc::new(Works {
+            bus,
+            bridge,
+            hub,
+            nodes,
+        }))
     }
 
     /// Messages dropped because a client or the bridge was slow.

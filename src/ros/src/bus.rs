@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 
 mod queue;
 
@@ -115,7 +115,17 @@ pub trait Publisher: Send + Sync {
     fn dropped(&self) -> u64 {
         0
     }
+    /// Names of the connected nodes, in the order in which they came; empty where they cannot be told.
+    fn subscriber_names(&self) -> Vec<String> {
+        Vec::new()
+    }
 }
+
+/// One changed parameter: its key, and its value unless it was deleted.
+pub type ParamChange = (String, Option<ParamValue>);
+
+/// Parameters as they change: key and value, or no value where one was deleted.
+pub type ParamChanges = mpsc::UnboundedReceiver<ParamChange>;
 
 /// Answers the calls to one service that this side serves.
 #[async_trait]
@@ -280,6 +290,9 @@ pub trait Bus: Send + Sync + 'static {
     async fn search_param(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
     /// All keys that are set.
     async fn param_names(&self) -> Result<Vec<String>, BusError>;
+    /// Every change of any parameter from now on, those made by this side included. One watcher at a time: another
+    /// takes the place of the first.
+    async fn watch_params(&self) -> Result<ParamChanges, BusError>;
     /// Takes back everything registered and closes all connections. What is still held (subscriptions,
     /// publishers, guards) becomes inert.
     async fn close(&self) {}

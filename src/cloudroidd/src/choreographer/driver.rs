@@ -43,6 +43,7 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     handle.set_over(&outcome);
     let farewell = tell_end(&inner, &handle, &outcome);
     if let Some(works) = handle.take_works() {
+        works.hub.close(&farewell);
         works.bridge.close(&farewell);
     }
     if let Some(container) = handle.container()
@@ -161,10 +162,12 @@ async fn run(
         Some(works) => works,
         None => reach(inner, handle, container, deadline).await?,
     };
+    works.nodes.bind(handle);
     handle.set_works(Arc::clone(&works));
     handle.set_phase(Phase::Starting);
     tokio::select! {
-        ready = interface_there(inner, handle, &works, deadline) => ready?,
+        ready = interface_there(inner, handle, &works, deadline), if !handle.is_linked() => ready?,
+        () = std::future::ready(()), if handle.is_linked() => {}
         failure = nodes.supervise() => return Err(failure),
     }
     handle.set_phase(Phase::Ready);
@@ -235,10 +238,18 @@ fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
 }
 
 async fn start(inner: &Arc<Inner>, handle: &Arc<Handle>) -> Result<Arc<dyn Servant>, Failure> {
-    let nodes = handle.revision.plan.nodes.clone();
+    let nodes = planned(handle);
     let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes).await;
     let started = inner.engine.start(spec.map_err(could_not_start)?).await;
     started.map_err(|error| could_not_start(error.into()))
+}
+
+/// The nodes to begin with: those of a robot's stubs come one by one.
+fn planned(handle: &Handle) -> Vec<NodeSpec> {
+    if handle.is_linked() {
+        return Vec::new();
+    }
+    handle.revision.plan.nodes.clone()
 }
 
 /// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
@@ -246,7 +257,7 @@ async fn use_spare(handle: &Handle, spare: Option<Spare>) -> Option<Spare> {
     let spare = spare?;
     // In their order and without waiting for one another. A program that cannot be executed is refused here, and
     // looked at where the ends of nodes are.
-    let nodes = handle.revision.plan.nodes.iter().cloned();
+    let nodes = planned(handle).into_iter();
     let started = join_all(nodes.map(|node| spare.container.start_node(node))).await;
     let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
     if started.iter().any(lost) {

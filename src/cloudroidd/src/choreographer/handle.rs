@@ -1,6 +1,6 @@
 //! A servant as everybody but its driver sees it.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use api::{Limits, Millis, Phase};
@@ -98,6 +98,8 @@ pub struct Handle {
     connections: watch::Sender<usize>,
     /// 0: not idle.
     idle_until: AtomicU64,
+    /// Its nodes are started and ended by a robot's stubs.
+    linked: AtomicBool,
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
@@ -130,6 +132,7 @@ impl Handle {
             promise: OnceLock::new(),
             connections: watch::Sender::new(0),
             idle_until: AtomicU64::new(0),
+            linked: AtomicBool::new(false),
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
             container: OnceLock::new(),
@@ -193,6 +196,16 @@ impl Handle {
     /// Connections that use it now.
     pub fn connections(&self) -> usize {
         *self.connections.borrow()
+    }
+
+    /// Whether a robot's stubs start and end its nodes.
+    pub fn is_linked(&self) -> bool {
+        self.linked.load(Ordering::Relaxed)
+    }
+
+    /// From now on they do.
+    pub fn set_linked(&self) {
+        self.linked.store(true, Ordering::Relaxed);
     }
 
     /// Its container, once made.

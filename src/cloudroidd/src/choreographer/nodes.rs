@@ -50,6 +50,9 @@ impl<'a> Nodes<'a> {
             events: container.events(),
             alive: handle.revision.plan.nodes.len(),
         };
+        if handle.is_linked() {
+            return nodes;
+        }
         for node in handle
             .revision
             .plan
@@ -102,6 +105,10 @@ impl<'a> Nodes<'a> {
     ) -> Result<(), Failure> {
         // The engine lost it: the container's own state says why.
         let Ok(exit) = exit else { return Ok(()) };
+        if self.handle.is_linked() {
+            // A stub took its place.
+            return Ok(());
+        }
         let how = how_it_ended(&exit, &self.handle.limits());
         if exit.out_of_memory {
             // What it knew is lost, and it would do the same again: its robot is told and begins anew.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
-use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use bridge::{SessionEnd, SessionOptions};
 use hyper::upgrade::{OnUpgrade, Upgraded};
@@ -100,10 +100,12 @@ struct Asked {
     /// The configured default robot, which is everybody's.
     shared: bool,
     resume: Option<String>,
+    /// A robot's stub asks, in the link's protocol.
+    link: bool,
 }
 
 impl Asked {
-    fn read(app: &App, service: String, uri: &Uri) -> Result<Asked, Error> {
+    fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<Asked, Error> {
         let named = guard::query(uri, "robot");
         let shared = named.is_none() && uri.path() == "/" && app.config.default_robot.is_some();
         let robot = if shared {
@@ -114,7 +116,13 @@ impl Asked {
         if let Some(robot) = &robot {
             names::robot(robot)?;
         }
+        if link && robot.is_none() {
+            return Err(Error::BadRequest(
+                "a link needs the robot's id: ?robot=ID".to_owned(),
+            ));
+        }
         Ok(Asked {
+            link,
             service,
             robot,
             shared,
@@ -130,7 +138,8 @@ async fn connect(
     mut request: Request,
 ) -> Result<Response, Error> {
     let accept = handshake(&request)?;
-    let asked = Asked::read(&app, service, request.uri())?;
+    let link = asks_for_link(request.headers())?;
+    let asked = Asked::read(&app, service, link, request.uri())?;
     if app.state.service_package(&asked.service)?.is_none() {
         return Err(Error::UnknownService {
             exists: app.state.service_names()?,
@@ -138,6 +147,9 @@ async fn connect(
         });
     }
     // Who has shown a token is told by status when there is no room; who has not must be let in to show one.
+    if asked.link && !caller.trusted {
+        return Err(Error::Unauthorised("a link needs a token"));
+    }
     let lease = if caller.trusted {
         let lease = lease(&app, &asked, &caller)?;
         lease.admitted().await?;
@@ -150,6 +162,7 @@ async fn connect(
             "this connection cannot become a WebSocket".to_owned(),
         ));
     };
+    let is_link = asked.link;
     let sessions = app.sessions.clone();
     sessions.spawn(async move {
         match upgrade.await {
@@ -163,6 +176,10 @@ async fn connect(
     headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
     headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
     headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    if is_link {
+        let protocol = HeaderValue::from_static(link::SUBPROTOCOL);
+        headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
+    }
     Ok(response)
 }
 
@@ -194,6 +211,27 @@ fn handshake(request: &Request) -> Result<HeaderValue, Error> {
         .map_err(|_| bad("Sec-WebSocket-Key is malformed"))
 }
 
+/// Whether a robot's stub asks, in a version of the link's protocol that is spoken here.
+fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
+    let offered: Vec<&str> = headers
+        .get_all(header::SEC_WEBSOCKET_PROTOCOL)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(','))
+        .map(str::trim)
+        .filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS))
+        .collect();
+    match offered.as_slice() {
+        [] => Ok(false),
+        offered if offered.contains(&link::SUBPROTOCOL) => Ok(true),
+        offered => Err(Error::BadRequest(format!(
+            "the stub speaks {}, this server {}; install the stub again from /stubs, or the server's newer version",
+            offered.join(", "),
+            link::SUBPROTOCOL
+        ))),
+    }
+}
+
 /// The right to the servant that is asked for, if the robot's name is the caller's.
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     let Some(robot) = &asked.robot else {
@@ -202,6 +240,9 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     };
     if !asked.shared {
         check_owner(app, robot, caller)?;
+    }
+    if asked.link {
+        return app.choreographer.ensure_linked(&asked.service, robot);
     }
     app.choreographer.ensure(&asked.service, robot, false)
 }
@@ -283,6 +324,9 @@ async fn session<S>(
 ) where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
+    if asked.link {
+        return linked(&app, &asked, lease, io, read_ahead).await;
+    }
     let lease = match lease {
         Some(lease) => Ok(lease),
         None => {
@@ -342,6 +386,33 @@ async fn session<S>(
             tracing::info!("lost {} at servant {}: {reason}", handle.robot, handle.id)
         }
     }
+}
+
+/// A connection of a robot's stub.
+async fn linked<S>(app: &App, asked: &Asked, lease: Option<Lease>, io: S, read_ahead: bytes::Bytes)
+where
+    S: AsyncRead + AsyncWrite + Unpin + Send,
+{
+    let ready = match &lease {
+        Some(lease) => lease.ready().await,
+        None => Err(Error::Internal("taking a servant")),
+    };
+    let (Some(lease), Ok(works)) = (&lease, &ready) else {
+        let reason = ready
+            .err()
+            .map(|error| error.in_a_line())
+            .unwrap_or_default();
+        return bridge::refuse(io, TRY_AGAIN_LATER, &reason).await;
+    };
+    let robot = asked.robot.as_deref().unwrap_or_default();
+    let lost = tokio::select! {
+        lost = works.hub.serve(io, &read_ahead) => lost.to_string(),
+        () = app.ending.cancelled() => "the daemon is ending".to_owned(),
+    };
+    tracing::info!(
+        "the link of {robot} to servant {} ended: {lost}",
+        lease.handle().id
+    );
 }
 
 #[cfg(test)]

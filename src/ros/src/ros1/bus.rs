@@ -35,7 +35,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 
 use self::calls::CallPool;
@@ -46,8 +46,8 @@ use self::services::Served;
 use self::subscriptions::TopicIn;
 use super::{names, tcpros};
 use crate::bus::{
-    AdvertiseOptions, Bus, BusError, Graph, ParamValue, Publisher, ServiceHandler, ServiceType,
-    SubscribeOptions, Subscription, WireType,
+    AdvertiseOptions, Bus, BusError, Graph, ParamChange, ParamChanges, ParamValue, Publisher,
+    ServiceHandler, ServiceType, SubscribeOptions, Subscription, WireType,
 };
 use crate::net::Sockets;
 use crate::ros1::xmlrpc::{self, Limits, Value};
@@ -104,6 +104,7 @@ struct Inner {
     calls: CallPool,
     graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
+    param_watcher: Mutex<Option<mpsc::UnboundedSender<ParamChange>>>,
     closed: AtomicBool,
     runtime: Handle,
     tasks: Mutex<JoinSet<()>>,
@@ -186,6 +187,7 @@ impl Ros1Bus {
             calls: CallPool::default(),
             graph: watch::Sender::new(Arc::default()),
             shutdown: watch::Sender::new(None),
+            param_watcher: Mutex::default(),
             closed: AtomicBool::new(false),
             runtime: Handle::current(),
             tasks: Mutex::default(),
@@ -253,6 +255,15 @@ impl Inner {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
+    /// Asks the Master for every change, if anybody watches.
+    async fn subscribe_params(&self) -> Result<(), BusError> {
+        if self.param_watcher.lock().is_none() {
+            return Ok(());
+        }
+        let args = vec![self.registrar.slave_uri().into(), "/".into()];
+        self.master.call("subscribeParam", args).await.map(drop)
+    }
+
     fn check_open(&self) -> Result<(), BusError> {
         if self.closed.load(Ordering::Acquire) {
             return Err(BusError::Closed);
@@ -275,6 +286,7 @@ impl Inner {
             topic.end();
         }
         self.publications.lock().clear();
+        *self.param_watcher.lock() = None;
         self.services.lock().clear();
         self.calls.clear();
     }
@@ -380,6 +392,14 @@ impl Bus for Ros1Bus {
         Ok(names.to_strings())
     }
 
+    async fn watch_params(&self) -> Result<ParamChanges, BusError> {
+        self.inner.check_open()?;
+        let (sender, changes) = mpsc::unbounded_channel();
+        *self.inner.param_watcher.lock() = Some(sender);
+        self.inner.subscribe_params().await?;
+        Ok(changes)
+    }
+
     async fn close(&self) {
         if self.inner.closed.swap(true, Ordering::AcqRel) {
             return;
@@ -388,6 +408,10 @@ impl Bus for Ros1Bus {
             let publications: Vec<_> = self.inner.publications.lock().drain().collect();
             for (_, topic) in &publications {
                 topic.retire();
+            }
+            if self.inner.param_watcher.lock().take().is_some() {
+                let args = vec![self.inner.registrar.slave_uri().into(), "/".into()];
+                let _ = self.inner.master.call("unsubscribeParam", args).await;
             }
             self.inner.registrar.withdraw_all().await;
             for (_, topic) in &publications {

@@ -264,6 +264,11 @@ impl Publisher for Handle {
         self.topic.count.subscribe()
     }
 
+    fn subscriber_names(&self) -> Vec<String> {
+        let subscribers = self.topic.subscribers();
+        subscribers.iter().map(|peer| peer.name.clone()).collect()
+    }
+
     fn dropped(&self) -> u64 {
         self.topic.dropped.load(Ordering::Relaxed)
     }

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use async_trait::async_trait;
 
 use super::Inner;
+use crate::ros1::names;
 use crate::ros1::reply::{Args, Reply};
 use crate::ros1::xmlrpc::{Fault, Handler, Value};
 
@@ -20,7 +21,7 @@ impl Handler for Slave {
         let answer = match method {
             "publisherUpdate" => self.publisher_update(&mut args),
             "requestTopic" => self.request_topic(&mut args),
-            "paramUpdate" => Ok(Reply::done("nothing here is cached", 0)),
+            "paramUpdate" => self.param_update(&mut args),
             "getPid" => Ok(Reply::done("", pid())),
             "getMasterUri" => Ok(Reply::done("", self.bus.master.uri())),
             "getSubscriptions" => Ok(self.subscriptions()),
@@ -42,6 +43,20 @@ impl Slave {
         let topic = self.bus.subscriptions.lock().get(&name).cloned();
         if let Some(topic) = topic {
             topic.update(&self.bus, &publishers);
+        }
+        Ok(Reply::done("", 0))
+    }
+
+    fn param_update(&self, args: &mut Args) -> Result<Reply, Reply> {
+        args.text("caller_id")?;
+        let key = names::canonical(&args.text("key")?);
+        // An empty dictionary is how a deletion is told.
+        let value = match args.any("value")? {
+            Value::Struct(members) if members.is_empty() => None,
+            value => Some(value.into()),
+        };
+        if let Some(watcher) = &*self.bus.param_watcher.lock() {
+            let _ = watcher.send((key, value));
         }
         Ok(Reply::done("", 0))
     }

@@ -127,6 +127,10 @@ impl Inner {
     /// Makes the Master agree with what is wanted here.
     async fn correct(self: &Arc<Self>, differences: Vec<(super::registrar::Kind, String)>) {
         use super::registrar::Kind;
+        if !differences.is_empty() {
+            // The Master forgot us, so also that we watch its parameters.
+            let _ = self.subscribe_params().await;
+        }
         for (kind, name) in differences {
             if !self.registrar.is_wanted(kind, &name) {
                 self.registrar.withdraw_surplus(kind, &name).await;

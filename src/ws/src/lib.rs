@@ -1,10 +1,13 @@
-//! The server's end of a WebSocket (RFC 6455) behind its upgrade.
+//! Either end of a WebSocket (RFC 6455) behind its upgrade.
 //!
-//! Written for this bridge because the data path must not copy a big message once more: payloads go to the socket
+//! Written for the portal because the data path must not copy a big message once more: payloads go to the socket
 //! from where they were encoded (one vectored write for header and payload), and come from it in a buffer of their
-//! own that the ROS message is cut from. Reading and writing are polled separately, so one task can do both.
+//! own that the ROS message is cut from. Reading and writing are polled separately, so one task can do both. A robot's
+//! link is the client's end of the same.
 
-pub(crate) mod frame;
+#![forbid(unsafe_code)]
+
+pub mod frame;
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -27,13 +30,16 @@ const READ_AHEAD: usize = 4 << 20;
 /// Slices in one write.
 const MAX_SLICES: usize = 16;
 
-/// What a client sent.
+/// What the peer sent.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Message {
+pub enum Message {
     /// Not yet checked to be UTF-8.
     Text(Bytes),
+    /// A whole message.
     Binary(Bytes),
+    /// To be answered by a pong with the same payload.
     Ping(Bytes),
+    /// The answer to a ping.
     Pong(Bytes),
     /// Code (1005 where there is none) and reason.
     Close(u16, String),
@@ -41,10 +47,15 @@ pub(crate) enum Message {
 
 /// Why a connection cannot go on.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum WsError {
-    /// The client breaks the protocol or a limit; the code says which.
+pub enum WsError {
+    /// The peer breaks the protocol or a limit; the code says which.
     #[error("{reason}")]
-    Refused { code: u16, reason: String },
+    Refused {
+        /// The close code to send.
+        code: u16,
+        /// What is wrong.
+        reason: String,
+    },
     /// The socket failed.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -54,7 +65,8 @@ pub(crate) enum WsError {
 }
 
 impl WsError {
-    pub(crate) fn protocol(reason: &str) -> Self {
+    /// The peer breaks the protocol (1002).
+    pub fn protocol(reason: &str) -> Self {
         WsError::Refused {
             code: 1002,
             reason: reason.to_owned(),
@@ -70,8 +82,10 @@ impl WsError {
 }
 
 /// A connection.
-pub(crate) struct WebSocket<S> {
+pub struct WebSocket<S> {
     io: S,
+    /// A client masks what it sends, with bits from here; a server takes nothing that is not masked.
+    masks: Option<Masks>,
     max_frame: usize,
     max_message: usize,
     read: BytesMut,
@@ -85,9 +99,12 @@ pub(crate) struct WebSocket<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
-    pub(crate) fn new(io: S, read_ahead: &[u8], max_frame: usize, max_message: usize) -> Self {
+    /// The server's end. `read_ahead` came from the client behind its handshake; longer frames and messages than
+    /// these (bytes) end the connection.
+    pub fn new(io: S, read_ahead: &[u8], max_frame: usize, max_message: usize) -> Self {
         Self {
             io,
+            masks: None,
             max_frame,
             max_message,
             read: BytesMut::from(read_ahead),
@@ -99,8 +116,27 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
+    /// The client's end; `seed` is what its masks are made from, a random number.
+    pub fn client(
+        io: S,
+        read_ahead: &[u8],
+        max_frame: usize,
+        max_message: usize,
+        seed: u64,
+    ) -> Self {
+        Self {
+            masks: Some(Masks(seed | 1)),
+            ..Self::new(io, read_ahead, max_frame, max_message)
+        }
+    }
+
+    /// The stream below.
+    pub fn get_ref(&self) -> &S {
+        &self.io
+    }
+
     /// The next message; after an error there is none.
-    pub(crate) fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<Message, WsError>> {
+    pub fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<Message, WsError>> {
         loop {
             if self.header.is_none() {
                 self.header = self.next_header()?;
@@ -126,8 +162,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         let Some((header, size)) = Header::parse(&self.read)? else {
             return Ok(None);
         };
-        if header.mask.is_none() {
-            return Err(WsError::protocol("a client's frames must be masked"));
+        match (header.mask, &self.masks) {
+            (None, None) => return Err(WsError::protocol("a client's frames must be masked")),
+            (Some(_), Some(_)) => {
+                return Err(WsError::protocol("a server's frames must not be masked"));
+            }
+            _ => {}
         }
         if header.length > self.max_frame as u64 {
             return Err(WsError::too_long("frame", header.length, self.max_frame));
@@ -204,14 +244,24 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     /// Bytes queued and not yet taken by the socket.
-    pub(crate) fn queued(&self) -> usize {
+    pub fn queued(&self) -> usize {
         self.queued
     }
 
     /// Queues a frame; nothing is sent before [`poll_flush`](Self::poll_flush).
-    pub(crate) fn queue(&mut self, opcode: u8, payload: Bytes) {
+    pub fn queue(&mut self, opcode: u8, payload: Bytes) {
         let before = self.tail.len();
-        Header::write(&mut self.tail, opcode, payload.len());
+        if let Some(masks) = &mut self.masks {
+            let mask = masks.next();
+            Header::write(&mut self.tail, opcode, payload.len(), Some(mask));
+            // The mask makes a copy of any payload.
+            let start = self.tail.len();
+            self.tail.extend_from_slice(&payload);
+            frame::unmask(&mut self.tail[start..], mask);
+            self.queued += self.tail.len() - before;
+            return;
+        }
+        Header::write(&mut self.tail, opcode, payload.len(), None);
         self.queued += self.tail.len() - before + payload.len();
         if payload.len() <= COPIED {
             self.tail.extend_from_slice(&payload);
@@ -222,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     /// Queues a close frame; the reason is cut to what fits.
-    pub(crate) fn queue_close(&mut self, code: u16, reason: &str) {
+    pub fn queue_close(&mut self, code: u16, reason: &str) {
         let mut end = reason.len().min(frame::MAX_CONTROL - 2);
         while !reason.is_char_boundary(end) {
             end -= 1;
@@ -237,7 +287,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     /// Ready when all that was queued is in the socket.
-    pub(crate) fn poll_flush(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+    pub fn poll_flush(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         if !self.tail.is_empty() {
             self.write.push_back(self.tail.split().freeze());
         }
@@ -268,7 +318,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
 
     /// Sends what is queued (a close frame last), and waits for the client's; where its bytes cannot be told apart
     /// any more, for the end of the connection. Without that the client might see a reset instead of the reason.
-    pub(crate) async fn leave(&mut self, readable: bool) -> Result<(), WsError> {
+    pub async fn leave(&mut self, readable: bool) -> Result<(), WsError> {
         poll_fn(|cx| self.poll_flush(cx)).await?;
         if readable {
             loop {
@@ -287,6 +337,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 return Ok(());
             }
         }
+    }
+}
+
+/// Masks of a client's frames. They keep a script in a browser from choosing the bytes on the wire; a program that
+/// chooses its own bytes anyway needs them to be valid, not secret (xorshift64).
+struct Masks(u64);
+
+impl Masks {
+    fn next(&mut self) -> [u8; 4] {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        let [a, b, c, d, ..] = self.0.to_le_bytes();
+        [a, b, c, d]
     }
 }
 
@@ -312,5 +376,4 @@ fn is_sendable(code: u16) -> bool {
 }
 
 #[cfg(test)]
-#[path = "ws/tests.rs"]
 mod tests;

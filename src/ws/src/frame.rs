@@ -2,28 +2,38 @@
 
 use super::WsError;
 
-pub(crate) const CONTINUATION: u8 = 0;
-pub(crate) const TEXT: u8 = 1;
-pub(crate) const BINARY: u8 = 2;
-pub(crate) const CLOSE: u8 = 8;
-pub(crate) const PING: u8 = 9;
-pub(crate) const PONG: u8 = 10;
+/// Goes on where the last frame ended.
+pub const CONTINUATION: u8 = 0;
+/// UTF-8.
+pub const TEXT: u8 = 1;
+/// Bytes.
+pub const BINARY: u8 = 2;
+/// The end, with code and reason.
+pub const CLOSE: u8 = 8;
+/// Wants a pong.
+pub const PING: u8 = 9;
+/// Answers a ping.
+pub const PONG: u8 = 10;
 
 /// Longest payload of a control frame.
-pub(crate) const MAX_CONTROL: usize = 125;
+pub const MAX_CONTROL: usize = 125;
 
 /// What precedes a frame's payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Header {
-    pub(crate) last: bool,
-    pub(crate) opcode: u8,
-    pub(crate) mask: Option<[u8; 4]>,
-    pub(crate) length: u64,
+pub struct Header {
+    /// The message ends with this frame.
+    pub last: bool,
+    /// What it is.
+    pub opcode: u8,
+    /// From clients only.
+    pub mask: Option<[u8; 4]>,
+    /// Bytes of payload.
+    pub length: u64,
 }
 
 impl Header {
     /// Reads a header from the beginning of `bytes` and says how long it is; `None` while it is not all there.
-    pub(crate) fn parse(bytes: &[u8]) -> Result<Option<(Header, usize)>, WsError> {
+    pub fn parse(bytes: &[u8]) -> Result<Option<(Header, usize)>, WsError> {
         let [first, second, rest @ ..] = bytes else {
             return Ok(None);
         };
@@ -78,25 +88,27 @@ impl Header {
         )))
     }
 
-    /// Appends the header of a frame from the server: whole, and not masked.
-    pub(crate) fn write(out: &mut bytes::BytesMut, opcode: u8, length: usize) {
+    /// Appends the header of a whole frame, with the mask if it has one.
+    pub fn write(out: &mut bytes::BytesMut, opcode: u8, length: usize, mask: Option<[u8; 4]>) {
+        let masked = if mask.is_some() { 0x80 } else { 0 };
         out.extend_from_slice(&[0x80 | opcode]);
         match length {
-            0..=125 => out.extend_from_slice(&[length as u8]),
+            0..=125 => out.extend_from_slice(&[masked | length as u8]),
             126..=0xffff => {
-                out.extend_from_slice(&[126]);
+                out.extend_from_slice(&[masked | 126]);
                 out.extend_from_slice(&(length as u16).to_be_bytes());
             }
             _ => {
-                out.extend_from_slice(&[127]);
+                out.extend_from_slice(&[masked | 127]);
                 out.extend_from_slice(&(length as u64).to_be_bytes());
             }
         }
+        out.extend_from_slice(mask.as_ref().map_or(&[], |mask| mask.as_slice()));
     }
 }
 
 /// Takes a client's mask off (or puts one on).
-pub(crate) fn unmask(payload: &mut [u8], mask: [u8; 4]) {
+pub fn unmask(payload: &mut [u8], mask: [u8; 4]) {
     // Long enough for the widest vector registers; the compiler makes one instruction of each.
     let wide: [u8; 64] = std::array::from_fn(|at| mask[at % 4]);
     let mut blocks = payload.chunks_exact_mut(64);
@@ -141,7 +153,7 @@ mod tests {
         );
         for length in [0, 125, 126, 65535, 65536] {
             let mut out = bytes::BytesMut::new();
-            Header::write(&mut out, BINARY, length);
+            Header::write(&mut out, BINARY, length, None);
             let (header, size) = header(&out).unwrap();
             assert_eq!((header.length, size), (length as u64, out.len()));
         }

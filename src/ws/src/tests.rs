@@ -168,3 +168,20 @@ async fn parts_make_one_message_with_control_frames_between() {
         Message::Text(vec![0; 6].into())
     );
 }
+
+#[tokio::test]
+async fn a_client_s_end_is_understood_by_servers() {
+    let (ours, theirs) = tokio::io::duplex(4096);
+    let mut theirs = WebSocketStream::from_raw_socket(theirs, Role::Server, None).await;
+    let mut ours = WebSocket::client(ours, b"", LIMIT, LIMIT, 42);
+    for size in [0, 1, 125, 126, 8193, 65536, 300_000] {
+        ours.queue(frame::BINARY, Bytes::from(vec![7; size]));
+        let (sent, received) = tokio::join!(poll_fn(|cx| ours.poll_flush(cx)), theirs.next());
+        sent.unwrap();
+        assert_eq!(received.unwrap().unwrap(), Theirs::binary(vec![7; size]));
+        let answered = theirs.send(Theirs::binary(vec![9; size]));
+        let (sent, received) = tokio::join!(answered, next(&mut ours));
+        sent.unwrap();
+        assert_eq!(received.unwrap(), Message::Binary(vec![9; size].into()));
+    }
+}

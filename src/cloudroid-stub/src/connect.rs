@@ -1,0 +1,177 @@
+//! Opens a WebSocket to the portal (RFC 6455, section 4.1).
+
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use sha1::{Digest, Sha1};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use ws::WebSocket;
+
+use crate::resolver;
+
+/// The longest answer to the handshake.
+const MAX_HEAD: usize = 64 * 1024;
+const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
+/// Unsent bytes that the kernel may hold: what waits in it cannot be replaced by something newer.
+const UNSENT: u32 = 64 * 1024;
+
+/// Why there is no connection.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Trying again may help.
+    #[error("{0}")]
+    Unreachable(String),
+    /// The portal does not want this stub; trying again changes nothing.
+    #[error("{0}")]
+    Refused(String),
+}
+
+/// Connects to `path` of the portal at `server` (`ws://host:port`).
+pub async fn open(
+    server: &str,
+    path: &str,
+    token: Option<&str>,
+    patience: Duration,
+) -> Result<WebSocket<TcpStream>, Error> {
+    let Some(authority) = server.strip_prefix("ws://") else {
+        return Err(Error::Refused(format!(
+            "{server} is not reached: this stub speaks ws:// only"
+        )));
+    };
+    let opening = handshake(authority, path, token);
+    match timeout(patience, opening).await {
+        Ok(opened) => opened,
+        Err(_) => Err(Error::Unreachable(format!(
+            "{server} did not answer within {patience:?}"
+        ))),
+    }
+}
+
+async fn handshake(
+    authority: &str,
+    path: &str,
+    token: Option<&str>,
+) -> Result<WebSocket<TcpStream>, Error> {
+    let unreachable = |what: &str, error: std::io::Error| {
+        Error::Unreachable(format!("{what} {authority}: {error}"))
+    };
+    let (host, port) = match authority.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => (
+            host,
+            port.parse()
+                .map_err(|_| Error::Refused(format!("{authority:?} has no port such as 9090")))?,
+        ),
+        _ => (authority, 80),
+    };
+    let ip = resolver::resolve(host)
+        .await
+        .map_err(|error| unreachable("cannot find", error))?;
+    let mut stream = TcpStream::connect((ip, port))
+        .await
+        .map_err(|error| unreachable("cannot connect to", error))?;
+    let socket = socket2::SockRef::from(&stream);
+    let _ = socket.set_tcp_nodelay(true);
+    let _ = socket.set_tcp_notsent_lowat(UNSENT);
+    let key = STANDARD.encode(rand::random::<[u8; 16]>());
+    let mut request = format!(
+        "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: {}\r\nUser-Agent: cloudroid-stub/{}\r\n",
+        link::SUBPROTOCOL,
+        env!("CARGO_PKG_VERSION"),
+    );
+    if let Some(token) = token {
+        request.push_str(&format!("Authorization: Bearer {token}\r\n"));
+    }
+    request.push_str("\r\n");
+    let sent = stream.write_all(request.as_bytes()).await;
+    sent.map_err(|error| unreachable("cannot write to", error))?;
+    let mut answer = Vec::new();
+    let end = loop {
+        if let Some(end) = find(&answer, b"\r\n\r\n") {
+            break end + 4;
+        }
+        if answer.len() > MAX_HEAD {
+            return Err(Error::Refused(format!(
+                "{authority} does not answer in HTTP"
+            )));
+        }
+        match stream.read_buf(&mut answer).await {
+            Ok(0) => {
+                return Err(Error::Unreachable(format!(
+                    "{authority} closed the connection"
+                )));
+            }
+            Ok(_) => {}
+            Err(error) => return Err(unreachable("cannot read from", error)),
+        }
+    };
+    let head = String::from_utf8_lossy(&answer[..end]).into_owned();
+    let status: u16 = head
+        .split(' ')
+        .nth(1)
+        .and_then(|code| code.parse().ok())
+        .unwrap_or(0);
+    if status != 101 {
+        let problem = body(&mut stream, &head, answer.split_off(end)).await;
+        let text = format!("{authority} answers {status}: {problem}");
+        // No room and the like pass; what this stub is does not.
+        return Err(match status {
+            400..=499 if status != 408 && status != 429 => Error::Refused(text),
+            _ => Error::Unreachable(text),
+        });
+    }
+    let expected = STANDARD.encode(Sha1::digest(format!("{key}{GUID}")));
+    if header(&head, "sec-websocket-accept") != Some(&expected) {
+        return Err(Error::Refused(format!(
+            "{authority} is no WebSocket server"
+        )));
+    }
+    if header(&head, "sec-websocket-protocol") != Some(link::SUBPROTOCOL) {
+        return Err(Error::Refused(format!(
+            "{authority} does not speak {}: its version is older than this stub; install the stub from it again",
+            link::SUBPROTOCOL
+        )));
+    }
+    Ok(WebSocket::client(
+        stream,
+        &answer[end..],
+        link::MAX_FRAME,
+        link::MAX_RECORD,
+        rand::random(),
+    ))
+}
+
+/// What a problem document says, or the text as it is.
+async fn body(stream: &mut TcpStream, head: &str, mut begun: Vec<u8>) -> String {
+    let length = header(head, "content-length")
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(0_usize);
+    while begun.len() < length.min(MAX_HEAD)
+        && stream.read_buf(&mut begun).await.is_ok_and(|read| read > 0)
+    {}
+    let document: serde_json::Value = serde_json::from_slice(&begun).unwrap_or_default();
+    let said = ["detail", "next", "title"]
+        .iter()
+        .filter_map(|key| document[key].as_str());
+    let said: Vec<&str> = said.take(2).collect();
+    if said.is_empty() {
+        String::from_utf8_lossy(&begun).trim().to_owned()
+    } else {
+        said.join("; ")
+    }
+}
+
+fn header<'a>(head: &'a str, name: &str) -> Option<&'a str> {
+    head.lines().find_map(|line| {
+        let (key, value) = line.split_once(':')?;
+        key.eq_ignore_ascii_case(name).then(|| value.trim())
+    })
+}
+
+fn find(bytes: &[u8], wanted: &[u8]) -> Option<usize> {
+    bytes
+        .windows(wanted.len())
+        .position(|window| window == wanted)
+}

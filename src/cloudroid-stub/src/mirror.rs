@@ -1,0 +1,150 @@
+//! The node on the robot: what the real one has registered in its servant is registered here, and messages, calls and
+//! parameters are carried between the two.
+//!
+//! ```text
+//!  Graph ─▶ outputs: advertised here ──listeners──▶ cloud          data ─▶ publish
+//!        ─▶ inputs: subscribed to here ─▶ Open, data ─▶ cloud
+//!        ─▶ services: served here ─▶ call ─▶ cloud ─▶ answer
+//! ```
+//! Registrations outlive a lost link: the robot's other nodes see one node that lives on.
+
+mod calls;
+mod inputs;
+mod outputs;
+mod parameters;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use link::control::{Control, Exit, Graph};
+use link::record::Record;
+use link::{Handler, Session};
+use parking_lot::{Mutex, RwLock};
+use ros::bus::{Bus, ParamValue, WireType};
+use tokio::sync::{mpsc, watch};
+
+use calls::Calls;
+use inputs::Inputs;
+use outputs::Outputs;
+use parameters::Parameters;
+
+/// The node on the robot.
+pub struct Mirror {
+    bus: Arc<dyn Bus>,
+    session: RwLock<Arc<Session>>,
+    inputs: Inputs,
+    outputs: Outputs,
+    calls: Calls,
+    parameters: Parameters,
+    /// Definitions by name and md5.
+    types: Mutex<HashMap<(String, String), WireType>>,
+    siblings: RwLock<BTreeSet<String>>,
+    exit: watch::Sender<Option<Exit>>,
+    orders: mpsc::UnboundedSender<Control>,
+}
+
+impl Mirror {
+    /// A mirror on `bus`; its task ends with it.
+    pub fn start(bus: Arc<dyn Bus>, session: Arc<Session>) -> Arc<Self> {
+        let (orders, taken) = mpsc::unbounded_channel();
+        let mirror = Arc::new(Self {
+            bus,
+            session: RwLock::new(session),
+            inputs: Inputs::default(),
+            outputs: Outputs::default(),
+            calls: Calls::default(),
+            parameters: Parameters::default(),
+            types: Mutex::default(),
+            siblings: RwLock::default(),
+            exit: watch::Sender::new(None),
+            orders,
+        });
+        tokio::spawn(obey(Arc::downgrade(&mirror), taken));
+        mirror
+    }
+
+    /// How the real node ended, once it has.
+    pub fn exit(&self) -> watch::Receiver<Option<Exit>> {
+        self.exit.subscribe()
+    }
+
+    /// All parameters of the robot, and from now on their changes go to the cloud.
+    pub async fn parameters(self: &Arc<Self>) -> BTreeMap<String, ParamValue> {
+        parameters::begin(self).await
+    }
+
+    /// The session in use.
+    pub fn session(&self) -> Arc<Session> {
+        self.session.read().clone()
+    }
+
+    /// Another session takes the place of the one that was lost: calls under way have failed, and what the node
+    /// listens to is opened again.
+    pub fn renew(&self, session: Arc<Session>) {
+        *self.session.write() = session;
+        self.calls
+            .fail("the cloud has forgotten this call: its daemon or servant was restarted");
+        self.inputs.clear();
+    }
+
+    async fn apply(self: &Arc<Self>, graph: Graph) {
+        *self.siblings.write() = graph.siblings.iter().cloned().collect();
+        self.outputs.apply(self, &graph.outputs).await;
+        self.inputs.apply(self, &graph.inputs);
+        self.calls.apply(self, &graph.services).await;
+    }
+}
+
+impl Handler for Mirror {
+    fn record(&self, record: Record, arrived: i64) {
+        match record {
+            Record::Data(data) => self.outputs.take(data, arrived),
+            Record::Answer { id, response } => self.calls.answered(id, response),
+            Record::Call { id, .. } => {
+                let reason = "the robot serves nothing to its own node".to_owned();
+                self.session().answer(id, Err(reason));
+            }
+            Record::Control(json) => match serde_json::from_slice(&json) {
+                Ok(Control::Line { error: true, text }) => eprintln!("{text}"),
+                Ok(Control::Line { text, .. }) => println!("{text}"),
+                Ok(control) => drop(self.orders.send(control)),
+                Err(error) => tracing::debug!(%error, "the cloud tells something unknown"),
+            },
+        }
+    }
+}
+
+/// Does what the cloud tells, one thing after the other.
+async fn obey(mirror: std::sync::Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<Control>) {
+    while let Some(order) = orders.recv().await {
+        let Some(mirror) = mirror.upgrade() else {
+            return;
+        };
+        match order {
+            Control::Type {
+                name,
+                md5,
+                definition,
+            } => {
+                let key = (name.clone(), md5.clone());
+                let wire_type = WireType {
+                    name,
+                    md5,
+                    definition,
+                };
+                mirror.types.lock().insert(key, wire_type);
+            }
+            Control::Graph(graph) => mirror.apply(graph).await,
+            Control::Parameters(changes) => parameters::change(&mirror, changes).await,
+            Control::Exited(exit) => {
+                mirror.exit.send_replace(Some(exit));
+            }
+            Control::Notice {
+                warning: true,
+                text,
+            } => tracing::warn!("{text}"),
+            Control::Notice { text, .. } => tracing::info!("{text}"),
+            other => tracing::debug!(?other, "not for the robot"),
+        }
+    }
+}

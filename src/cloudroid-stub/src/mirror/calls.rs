@@ -1,0 +1,120 @@
+//! What the real node serves: served on the robot under this node's name.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use link::control::Served;
+use parking_lot::Mutex;
+use ros::bus::{ServiceHandler, ServiceType};
+use tokio::sync::oneshot;
+
+use super::Mirror;
+
+/// Services by name, and calls under way.
+#[derive(Default)]
+pub struct Calls {
+    services: Mutex<HashMap<String, Service>>,
+    waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, String>>>>,
+}
+
+struct Service {
+    md5: String,
+    channel: Arc<Mutex<u32>>,
+    _serving: Box<dyn Send + Sync>,
+}
+
+impl Calls {
+    /// The cloud has answered.
+    pub fn answered(&self, id: u32, response: Result<Bytes, String>) {
+        if let Some(caller) = self.waiting.lock().remove(&id) {
+            let _ = caller.send(response);
+        }
+    }
+
+    /// All calls under way have failed.
+    pub fn fail(&self, reason: &str) {
+        for (_, caller) in self.waiting.lock().drain() {
+            let _ = caller.send(Err(reason.to_owned()));
+        }
+    }
+
+    /// Serves what is new and takes back what is gone.
+    pub async fn apply(&self, mirror: &Arc<Mirror>, services: &[Served]) {
+        self.services.lock().retain(|name, service| {
+            let same = |served: &&Served| served.name == *name && served.md5 == service.md5;
+            services.iter().any(|served| same(&served))
+        });
+        for served in services {
+            if let Some(known) = self.services.lock().get(&served.name) {
+                *known.channel.lock() = served.channel;
+                continue;
+            }
+            let channel = Arc::new(Mutex::new(served.channel));
+            let handler = Arc::new(Forward {
+                mirror: Arc::downgrade(mirror),
+                channel: channel.clone(),
+            });
+            let service_type = ServiceType {
+                name: served.type_name.clone(),
+                md5: served.md5.clone(),
+            };
+            match mirror.bus.serve(&served.name, service_type, handler).await {
+                Ok(serving) => {
+                    let service = Service {
+                        md5: served.md5.clone(),
+                        channel,
+                        _serving: serving,
+                    };
+                    self.services.lock().insert(served.name.clone(), service);
+                }
+                Err(error) => {
+                    tracing::warn!(service = served.name, %error, "cannot be served");
+                }
+            }
+        }
+    }
+}
+
+/// Passes calls to the cloud.
+struct Forward {
+    mirror: Weak<Mirror>,
+    channel: Arc<Mutex<u32>>,
+}
+
+#[async_trait]
+impl ServiceHandler for Forward {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        let ended = || "the node is ending".to_owned();
+        let mirror = self.mirror.upgrade().ok_or_else(ended)?;
+        let channel = *self.channel.lock();
+        let (sender, answer) = oneshot::channel();
+        let id = {
+            // The answer may come at once: it must find its caller.
+            let mut waiting = mirror.calls.waiting.lock();
+            let id = mirror.session().call(channel, request);
+            waiting.insert(id, sender);
+            id
+        };
+        let abandoned = Abandoned {
+            mirror: &mirror,
+            id,
+        };
+        let answer = answer.await.unwrap_or_else(|_| Err(ended()));
+        drop(abandoned);
+        answer
+    }
+}
+
+/// Forgets a call whose caller has gone.
+struct Abandoned<'a> {
+    mirror: &'a Mirror,
+    id: u32,
+}
+
+impl Drop for Abandoned<'_> {
+    fn drop(&mut self) {
+        self.mirror.calls.waiting.lock().remove(&self.id);
+    }
+}

@@ -1,0 +1,146 @@
+//! What the real node listens to: subscribed to on the robot under this node's name, and sent up.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+
+use link::Quality;
+use link::clock::now;
+use link::control::{Control, Input, Wanted};
+use link::record::Data;
+use parking_lot::Mutex;
+use ros::bus::{Message, SubscribeOptions, WireType};
+use tokio::task::AbortHandle;
+
+use super::Mirror;
+
+/// Messages that the bus keeps while the link is busy.
+const QUEUE: usize = 256;
+
+/// Inputs by topic.
+#[derive(Default)]
+pub struct Inputs {
+    topics: Mutex<HashMap<String, Topic>>,
+    next: AtomicU32,
+}
+
+struct Topic {
+    wanted: Wanted,
+    feed: Arc<AtomicBool>,
+    reading: AbortHandle,
+}
+
+impl Drop for Topic {
+    fn drop(&mut self) {
+        self.reading.abort();
+    }
+}
+
+impl Inputs {
+    /// Subscribes to what is new and takes back what is gone.
+    pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[Wanted]) {
+        let mut topics = self.topics.lock();
+        topics.retain(|name, topic| {
+            let same = |wanted: &&Wanted| wanted.topic == *name && wanted.md5 == topic.wanted.md5;
+            inputs.iter().any(|wanted| same(&wanted))
+        });
+        for wanted in inputs {
+            let feed = match topics.get(&wanted.topic) {
+                Some(topic) => topic.feed.clone(),
+                None => {
+                    let feed = Arc::new(AtomicBool::new(wanted.feed));
+                    let reading = read(Arc::downgrade(mirror), wanted.clone(), feed.clone());
+                    let topic = Topic {
+                        wanted: wanted.clone(),
+                        feed: feed.clone(),
+                        reading: tokio::spawn(reading).abort_handle(),
+                    };
+                    topics.insert(wanted.topic.clone(), topic);
+                    feed
+                }
+            };
+            feed.store(wanted.feed, Ordering::Relaxed);
+        }
+    }
+
+    /// Takes everything back.
+    pub fn clear(&self) {
+        self.topics.lock().clear();
+    }
+}
+
+async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicBool>) {
+    let Some(bus) = mirror.upgrade().map(|mirror| mirror.bus.clone()) else {
+        return;
+    };
+    let known = wanted.type_name != "*";
+    let options = SubscribeOptions {
+        wire_type: known.then(|| WireType {
+            name: wanted.type_name.clone(),
+            md5: wanted.md5.clone(),
+            definition: String::new(),
+        }),
+        queue: QUEUE,
+    };
+    let mut subscription = match bus.subscribe(&wanted.topic, options).await {
+        Ok(subscription) => subscription,
+        Err(error) => {
+            tracing::warn!(topic = wanted.topic, %error, "cannot be subscribed to");
+            return;
+        }
+    };
+    let mut channels = Channels::default();
+    while let Some(message) = subscription.messages.recv().await {
+        let born = now();
+        let Some(mirror) = mirror.upgrade() else {
+            return;
+        };
+        // Other nodes of the servant hear each other inside.
+        if mirror.siblings.read().contains(&*message.publisher) || !feed.load(Ordering::Relaxed) {
+            continue;
+        }
+        let session = mirror.session();
+        let channel = channels.of(&mirror, &wanted.topic, &message);
+        let quality = if message.latching {
+            Quality::Each
+        } else {
+            Quality::Newest
+        };
+        let data = Data {
+            channel,
+            encoded: false,
+            latching: message.latching,
+            born,
+            left: 0,
+            serialise: 0,
+            answered: None,
+            message: message.bytes,
+        };
+        session.publish(data, quality);
+    }
+}
+
+/// A channel for all publishers that do not latch, and one for each that does: what each has latched is kept.
+#[derive(Default)]
+struct Channels {
+    by_publisher: HashMap<(Option<Arc<str>>, String), u32>,
+}
+
+impl Channels {
+    fn of(&mut self, mirror: &Mirror, topic: &str, message: &Message) -> u32 {
+        let publisher = message.latching.then(|| message.publisher.clone());
+        let key = (publisher, message.wire_type.md5.clone());
+        *self.by_publisher.entry(key).or_insert_with(|| {
+            let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
+            mirror.session().tell(&Control::Open(Input {
+                channel,
+                topic: topic.to_owned(),
+                type_name: message.wire_type.name.clone(),
+                md5: message.wire_type.md5.clone(),
+                definition: message.wire_type.definition.clone(),
+                latching: message.latching,
+            }));
+            channel
+        })
+    }
+}

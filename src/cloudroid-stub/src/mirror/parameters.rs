@@ -1,0 +1,92 @@
+//! Parameters: the robot's go to the cloud at the beginning and as they change; what the real node sets comes back.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use link::control::Control;
+use parking_lot::Mutex;
+use ros::bus::{ParamChange, ParamValue};
+
+use super::Mirror;
+
+/// Those of a Master itself.
+const OWN: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
+
+/// What was set here in the cloud's name: it does not go back.
+#[derive(Default)]
+pub struct Parameters {
+    set: Mutex<BTreeMap<String, ParamValue>>,
+}
+
+impl Parameters {
+    fn is_news(&self, key: &str, value: Option<&ParamValue>) -> bool {
+        let own = key
+            .trim_start_matches('/')
+            .split('/')
+            .next()
+            .is_some_and(|first| OWN.contains(&first));
+        let mut set = self.set.lock();
+        let echo = set.get(key) == value;
+        if !echo {
+            set.remove(key);
+        }
+        let echo = echo && value.is_some();
+        !own && !echo
+    }
+}
+
+/// All parameters now, and from now on their changes go to the cloud.
+pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
+    match mirror.bus.watch_params().await {
+        Ok(mut changes) => {
+            let mirror = Arc::downgrade(mirror);
+            tokio::spawn(async move {
+                while let Some(change) = changes.recv().await {
+                    let Some(mirror) = mirror.upgrade() else {
+                        return;
+                    };
+                    if mirror.parameters.is_news(&change.0, change.1.as_ref()) {
+                        mirror.session().tell(&Control::Parameters(vec![change]));
+                    }
+                }
+            });
+        }
+        Err(error) => tracing::warn!(%error, "parameters that change later do not reach the cloud"),
+    }
+    all(mirror).await
+}
+
+/// All parameters now.
+pub async fn all(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
+    match mirror.bus.get_param("/").await {
+        Ok(ParamValue::Map(mut all)) => {
+            all.retain(|name, _| !OWN.contains(&name.as_str()));
+            all
+        }
+        Ok(_) => BTreeMap::new(),
+        Err(error) => {
+            tracing::warn!(%error, "the robot's parameters cannot be read");
+            BTreeMap::new()
+        }
+    }
+}
+
+/// What the real node has set.
+pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
+    for (key, value) in changes {
+        let done = match value {
+            Some(value) => {
+                mirror
+                    .parameters
+                    .set
+                    .lock()
+                    .insert(key.clone(), value.clone());
+                mirror.bus.set_param(&key, value).await
+            }
+            None => mirror.bus.delete_param(&key).await,
+        };
+        if let Err(error) = done {
+            tracing::debug!(key, %error, "a parameter of the node cannot be set on the robot");
+        }
+    }
+}

@@ -1,0 +1,369 @@
+//! The life of a stub: from roslaunch's exec to the real node's exit status.
+//!
+//! ```text
+//!  Master reached ─▶ hello ─▶ Linked ──connection lost──▶ Away ──jittered backoff──▶ hello (resume)
+//!       │              │        └─ node exited ─▶ exit status        └─ SIGINT, shutdown ─▶ exit
+//!       │              └─ refused ─▶ the local original in its place, or an error
+//!       └─ not there: waits for it, as any node does
+//! ```
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use link::control::{Control, Exit, Hello, Resume, Sla, Welcome};
+use link::session::{receive_open, send_open};
+use link::{Lost, Session, SessionOptions};
+use nix::sys::signal::{SigHandler, Signal, kill, signal};
+use nix::unistd::Pid;
+use ros::bus::Bus;
+use ros::net::Sockets;
+use ros::ros1::{Ros1Bus, Ros1Options};
+use tokio::net::TcpStream;
+use tokio::signal::unix::{SignalKind, signal as signals};
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+use ws::WebSocket;
+
+use crate::config::{self, Config, Local};
+use crate::connect;
+use crate::mirror::Mirror;
+use crate::original;
+use crate::resolver::RobotSockets;
+use crate::robot::{Robot, usual_name};
+
+/// For the portal to accept a connection; a first one waits until the servant runs.
+const CONNECT: Duration = Duration::from_secs(10);
+const SERVANT: Duration = Duration::from_secs(120);
+/// Between attempts to connect, at first and at last.
+const BACKOFF: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(3));
+/// For the real node to end after it was told to. roslaunch escalates after 15 s.
+const FAREWELL: Duration = Duration::from_secs(12);
+/// Where no T_max is given, a link silent for so long counts as down.
+const SILENT: Duration = Duration::from_secs(2);
+
+/// How it ends.
+enum End {
+    /// The real node has ended.
+    Node(Exit),
+    /// Someone asked for it.
+    Asked,
+    /// The cloud does not want this stub.
+    Refused(String),
+}
+
+/// Runs the stub.
+pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
+    let share = &asked.node.share;
+    let config = config::read(share, std::env::vars())?;
+    let usual = config.nodes.get(&asked.node.node).cloned();
+    let usual = usual.unwrap_or_else(|| usual_name(&asked.node.node));
+    let robot = Robot::read(&asked.argv, &usual, &|name| std::env::var(name).ok())?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let end = runtime.block_on(live(asked, config.clone(), &robot))?;
+    drop(runtime);
+    match end {
+        End::Asked => Ok(ExitCode::SUCCESS),
+        End::Node(exit) => Ok(exit_as(&exit)),
+        End::Refused(reason) => {
+            if config.local != Local::None {
+                tracing::error!("{reason}; running the local original instead");
+                return original::exec(&asked.node, &asked.argv);
+            }
+            bail!("{reason}")
+        }
+    }
+}
+
+async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> anyhow::Result<End> {
+    let mut stopping = stopping()?;
+    let bus = tokio::select! {
+        bus = join(robot) => bus?,
+        () = stopped(&mut stopping) => return Ok(End::Asked),
+    };
+    let config = with_parameters(config, &*bus, &robot.node).await?;
+    let mut shutdown = bus.shutdown_requested();
+    let session = Arc::new(Session::new(session_options(&config)));
+    let mirror = Mirror::start(bus.clone(), session);
+    let parameters = mirror.parameters().await;
+    let mut hello = Hello {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        run: format!("{:016x}", rand::random::<u64>()),
+        machine: machine(),
+        node: robot.for_the_cloud(
+            &asked.node.package,
+            &asked.node.node,
+            &asked.node.share.to_string_lossy(),
+        ),
+        sla: sla(&config),
+        parameters,
+        ..Hello::default()
+    };
+    let mut exit = mirror.exit();
+    let end = {
+        let linked = keep_linked(&config, &mirror, &mut hello);
+        tokio::pin!(linked);
+        tokio::select! {
+            refused = &mut linked => End::Refused(refused),
+            ended = exit.wait_for(Option::is_some) => node_end(&ended),
+            signal = asked_to_stop(&mut stopping, &mut shutdown) => {
+                tracing::debug!(signal, "asked to end");
+                mirror.session().tell(&Control::Signal { signal });
+                let up = *mirror.session().up().borrow();
+                let patience = if up { FAREWELL } else { Duration::ZERO };
+                let mut exit = mirror.exit();
+                tokio::select! {
+                    ended = timeout(patience, exit.wait_for(Option::is_some)) => match ended {
+                        Ok(ended) => node_end(&ended),
+                        Err(_) => End::Asked,
+                    },
+                    _ = &mut linked => End::Asked,
+                    _ = asked_to_stop(&mut stopping, &mut shutdown) => End::Asked,
+                }
+            }
+        }
+    };
+    // In good order: the cloud ends what is left of the node at once.
+    mirror.session().end(1000, "the robot's node ended");
+    bus.close().await;
+    let mut up = mirror.session().up();
+    let _ = timeout(Duration::from_millis(500), up.wait_for(|up| !up)).await;
+    Ok(end)
+}
+
+fn node_end(exit: &Result<watch::Ref<'_, Option<Exit>>, watch::error::RecvError>) -> End {
+    match exit.as_ref().ok().and_then(|exit| (**exit).clone()) {
+        Some(exit) => {
+            if exit.code != Some(0) {
+                tracing::warn!("{}", exit.text);
+            }
+            End::Node(exit)
+        }
+        _ => End::Asked,
+    }
+}
+
+/// Joins the robot's ROS; waits for its Master as every node does.
+async fn join(robot: &Robot) -> anyhow::Result<Arc<Ros1Bus>> {
+    let mut told = false;
+    loop {
+        let joined = async {
+            let master = RobotSockets
+                .resolve(&robot.master_host, robot.master_port)
+                .await?;
+            let mut options = Ros1Options::new(master, &robot.node);
+            options.host = robot.host.clone();
+            anyhow::Ok(Ros1Bus::connect_with(Arc::new(RobotSockets), options).await?)
+        };
+        match joined.await {
+            Ok(bus) => return Ok(bus),
+            Err(error) if !told => {
+                told = true;
+                tracing::warn!("{error:#}; trying again until it is there");
+            }
+            Err(_) => {}
+        }
+        sleep(Duration::from_millis(200)).await;
+    }
+}
+
+/// The configuration with the node's private parameters `~cloudroid/…` over it.
+async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::Result<Config> {
+    match bus.get_param(&format!("{node}/cloudroid")).await {
+        Ok(ros::bus::ParamValue::Map(given)) => config
+            .with_parameters(&given)
+            .with_context(|| format!("parameters below {node}/cloudroid")),
+        _ => Ok(config),
+    }
+}
+
+fn session_options(config: &Config) -> SessionOptions {
+    let max = config.max.map(Duration::from_secs_f64);
+    // A ping is out, and its pong awaited, within T_max.
+    let silent = max.unwrap_or(SILENT).max(Duration::from_millis(50));
+    SessionOptions {
+        ping: (silent / 2).clamp(Duration::from_millis(100), Duration::from_secs(2)),
+        silent,
+        lost: (silent * 10).clamp(Duration::from_secs(3), Duration::from_secs(20)),
+        max_age: max,
+    }
+}
+
+fn sla(config: &Config) -> Sla {
+    Sla {
+        desire: config.desire,
+        max: config.max,
+        frames_per_second: config.frames_per_second,
+        age: config.age,
+    }
+}
+
+/// Keeps a link until the cloud refuses it; says why.
+async fn keep_linked(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
+    let mut pause = BACKOFF.0;
+    let mut resume: Option<String> = None;
+    let mut told = String::new();
+    loop {
+        match link_once(config, mirror, hello, &mut resume).await {
+            Ok(lost) => {
+                tracing::warn!("the link to {} was lost: {lost}", config.server);
+                pause = BACKOFF.0;
+                told.clear();
+            }
+            Err(connect::Error::Refused(reason)) => return reason,
+            Err(connect::Error::Unreachable(reason)) => {
+                if reason != told {
+                    tracing::warn!("no link: {reason}; trying again");
+                    told = reason;
+                }
+            }
+        }
+        sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
+        pause = (pause * 2).min(BACKOFF.1);
+    }
+}
+
+/// One connection, from its handshake to its loss.
+async fn link_once(
+    config: &Config,
+    mirror: &Arc<Mirror>,
+    hello: &mut Hello,
+    resume: &mut Option<String>,
+) -> Result<Lost, connect::Error> {
+    let path = format!("/{}?robot={}", config.service, config.robot());
+    let token = config
+        .token()
+        .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
+    let mut socket = connect::open(&config.server, &path, token.as_deref(), CONNECT).await?;
+    if resume.is_none() && hello.parameters.is_empty() {
+        hello.parameters = mirror.parameters().await;
+    }
+    let (received, ahead, next) = mirror.session().position();
+    hello.next = next;
+    hello.resume = resume.clone().map(|session| Resume {
+        session,
+        received,
+        ahead,
+    });
+    let welcome = timeout(SERVANT, greet(&mut socket, hello)).await;
+    let welcome = match welcome {
+        Ok(Ok(welcome)) => welcome,
+        Ok(Err(lost)) => return Err(connect::Error::Unreachable(lost.to_string())),
+        Err(_) => {
+            return Err(connect::Error::Unreachable(format!(
+                "no servant after {SERVANT:?}"
+            )));
+        }
+    };
+    match welcome {
+        Welcome::Refused {
+            reason,
+            again: true,
+        } => Err(connect::Error::Unreachable(reason)),
+        Welcome::Refused { reason, .. } => Err(connect::Error::Refused(reason)),
+        Welcome::Accepted {
+            session,
+            resumed,
+            received,
+            ahead,
+            next,
+            servant,
+        } => {
+            if !resumed && resume.is_some() {
+                mirror.renew(Arc::new(Session::new(session_options(config))));
+            }
+            *resume = Some(session);
+            tracing::info!(servant, resumed, "linked to {}", config.server);
+            let session = mirror.session();
+            session.reconnect(received, &ahead, next);
+            Ok(session.run(&mut socket, &**mirror).await)
+        }
+    }
+}
+
+async fn greet(socket: &mut WebSocket<TcpStream>, hello: &Hello) -> Result<Welcome, Lost> {
+    send_open(socket, hello).await?;
+    receive_open(socket, "welcome").await
+}
+
+/// The streams of signals that end a node.
+struct Stopping {
+    interrupt: tokio::signal::unix::Signal,
+    terminate: tokio::signal::unix::Signal,
+}
+
+fn stopping() -> std::io::Result<Stopping> {
+    Ok(Stopping {
+        interrupt: signals(SignalKind::interrupt())?,
+        terminate: signals(SignalKind::terminate())?,
+    })
+}
+
+async fn stopped(stopping: &mut Stopping) {
+    tokio::select! {
+        _ = stopping.interrupt.recv() => {}
+        _ = stopping.terminate.recv() => {}
+    }
+}
+
+/// A signal, or XML-RPC's `shutdown`, which means the same as SIGINT.
+async fn asked_to_stop(
+    stopping: &mut Stopping,
+    shutdown: &mut watch::Receiver<Option<String>>,
+) -> i32 {
+    tokio::select! {
+        _ = stopping.interrupt.recv() => Signal::SIGINT as i32,
+        _ = stopping.terminate.recv() => Signal::SIGTERM as i32,
+        asked = shutdown.changed() => {
+            if asked.is_err() {
+                std::future::pending::<()>().await;
+            }
+            Signal::SIGINT as i32
+        }
+    }
+}
+
+/// Ends as the real node did: by its code, or by its signal.
+fn exit_as(exit: &Exit) -> ExitCode {
+    if let Some(code) = exit.code {
+        return ExitCode::from(u8::try_from(code).unwrap_or(1));
+    }
+    if let Some(number) = exit.signal.and_then(|number| Signal::try_from(number).ok()) {
+        // The crash was the real node's: no core of the stub.
+        let _ = nix::sys::resource::setrlimit(nix::sys::resource::Resource::RLIMIT_CORE, 0, 0);
+        restore(number);
+        let _ = kill(Pid::this(), number);
+    }
+    ExitCode::FAILURE
+}
+
+#[allow(unsafe_code)]
+fn restore(number: Signal) {
+    // SAFETY: the default action runs no code of this process.
+    let _ = unsafe { signal(number, SigHandler::SigDfl) };
+}
+
+/// Tells this machine from others, without telling which it is.
+fn machine() -> String {
+    let id = [
+        "/etc/machine-id",
+        "/var/lib/dbus/machine-id",
+        "/proc/sys/kernel/random/boot_id",
+    ]
+    .iter()
+    .find_map(|path| {
+        std::fs::read_to_string(Path::new(path))
+            .ok()
+            .filter(|id| id.len() > 8)
+    });
+    let digest = <sha1::Sha1 as sha1::Digest>::digest(id.unwrap_or_default().trim());
+    digest
+        .iter()
+        .take(8)
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}

@@ -1,0 +1,295 @@
+//! What a servant does for its robot's stubs: nodes are started and ended one by one, as roslaunch does on the robot.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock, Weak};
+
+use async_trait::async_trait;
+use futures_util::FutureExt;
+use link::cloud::Nodes;
+use link::control::{Exit, Node, Sla};
+use ros::bus::ParamValue;
+use servant::engine::{NodeExit, Servant};
+use servant::spec::NodeSpec;
+use tokio::sync::mpsc;
+
+use crate::choreographer::{Handle, Inner, how_it_ended};
+use crate::definitions;
+use crate::state::RevisionRecord;
+
+/// How deep executables may lie below `share/PKG`.
+const DEPTH: usize = 4;
+/// Lines that wait for a slow link; more are lost, and stand in the servant's log.
+const LINES: usize = 256;
+
+/// Whether a servant that an earlier daemon started runs for stubs: it never knew the revision's own nodes.
+pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> bool {
+    let mut planned = handle.revision.plan.nodes.iter();
+    planned.all(|node| {
+        matches!(
+            container.wait_node(&node.name).now_or_never(),
+            Some(Err(servant::Error::NoNode { .. }))
+        )
+    })
+}
+
+/// The nodes of one servant.
+pub struct LinkedNodes {
+    revision: RevisionRecord,
+    /// A container is made before anybody asks for it.
+    handle: OnceLock<Weak<Handle>>,
+    container: Arc<dyn Servant>,
+    /// Extracted layers, lowest first.
+    layers: Vec<PathBuf>,
+}
+
+impl LinkedNodes {
+    /// Those of a running container.
+    pub async fn new(
+        inner: &Inner,
+        revision: &RevisionRecord,
+        container: &Arc<dyn Servant>,
+    ) -> LinkedNodes {
+        let (store, digest) = (Arc::clone(&inner.store), revision.image.clone());
+        let layers =
+            tokio::task::spawn_blocking(move || definitions::layers(&store, &digest)).await;
+        LinkedNodes {
+            revision: revision.clone(),
+            handle: OnceLock::new(),
+            container: Arc::clone(container),
+            layers: layers.ok().and_then(Result::ok).unwrap_or_default(),
+        }
+    }
+
+    /// From now on it is this servant's.
+    pub fn bind(&self, handle: &Arc<Handle>) {
+        let _ = self.handle.set(Arc::downgrade(handle));
+    }
+
+    /// Where the image has a file, as seen from inside.
+    fn has(&self, path: &Path) -> bool {
+        let below = path.strip_prefix("/").unwrap_or(path);
+        let found = self
+            .layers
+            .iter()
+            .rev()
+            .find_map(|layer| layer.join(below).symlink_metadata().ok());
+        // A character device is a whiteout.
+        found.is_some_and(|found| found.is_file() || found.is_dir() || found.is_symlink())
+    }
+
+    /// Install spaces, as the image's environment and its nodes name them.
+    fn prefixes(&self) -> Vec<PathBuf> {
+        let plan = &self.revision.plan;
+        let paths = plan
+            .environment
+            .get("CMAKE_PREFIX_PATH")
+            .map_or("", String::as_str);
+        let mut prefixes: Vec<PathBuf> = std::env::split_paths(paths).collect();
+        let programs = plan.nodes.iter().filter_map(|node| node.argv.first());
+        prefixes.extend(
+            programs.filter_map(|program| Some(Path::new(program).ancestors().nth(3)?.to_owned())),
+        );
+        prefixes.push("/usr".into());
+        for layer in &self.layers {
+            let distributions = std::fs::read_dir(layer.join("opt/ros"))
+                .into_iter()
+                .flatten()
+                .flatten();
+            prefixes
+                .extend(distributions.map(|entry| Path::new("/opt/ros").join(entry.file_name())));
+        }
+        let mut seen = BTreeSet::new();
+        prefixes.retain(|prefix| prefix.is_absolute() && seen.insert(prefix.clone()));
+        prefixes
+    }
+
+    /// The program that rosrun would start.
+    fn program(&self, node: &Node) -> Option<PathBuf> {
+        let prefixes = self.prefixes();
+        let direct = prefixes.iter().map(|prefix| {
+            prefix
+                .join("lib")
+                .join(&node.package)
+                .join(&node.executable)
+        });
+        direct.into_iter().find(|path| self.has(path)).or_else(|| {
+            let shares = prefixes
+                .iter()
+                .map(|prefix| prefix.join("share").join(&node.package));
+            shares
+                .into_iter()
+                .find_map(|share| self.below(&share, &node.executable))
+        })
+    }
+
+    fn below(&self, directory: &Path, name: &str) -> Option<PathBuf> {
+        let mut open = vec![(directory.to_owned(), 0)];
+        while let Some((directory, depth)) = open.pop() {
+            let here = directory.join(name);
+            if self.has(&here) {
+                return Some(here);
+            }
+            if depth == DEPTH {
+                continue;
+            }
+            let relative = directory.strip_prefix("/").unwrap_or(&directory);
+            for layer in &self.layers {
+                let entries = std::fs::read_dir(layer.join(relative))
+                    .into_iter()
+                    .flatten()
+                    .flatten();
+                let below =
+                    entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
+                open.extend(below.map(|entry| (directory.join(entry.file_name()), depth + 1)));
+            }
+        }
+        None
+    }
+
+    fn handle(&self) -> Result<Arc<Handle>, String> {
+        self.handle
+            .get()
+            .and_then(Weak::upgrade)
+            .ok_or_else(|| "the servant has ended".to_owned())
+    }
+
+    fn share(&self, node: &Node) -> Option<PathBuf> {
+        let shares = self
+            .prefixes()
+            .into_iter()
+            .map(|prefix| prefix.join("share").join(&node.package));
+        shares.into_iter().find(|share| self.has(share))
+    }
+
+    /// The revision's own nodes end: a stub's take their place.
+    async fn end_planned(&self, handle: &Handle) {
+        if handle.is_linked() {
+            return;
+        }
+        handle.set_linked();
+        for node in &self.revision.plan.nodes {
+            if self
+                .container
+                .signal_node(&node.name, libc::SIGINT)
+                .await
+                .is_ok()
+            {
+                let _ = self.container.wait_node(&node.name).await;
+            }
+        }
+    }
+}
+
+#[async_trait]
+impl Nodes for LinkedNodes {
+    async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
+        let handle = self.handle()?;
+        let Some(program) = self.program(node) else {
+            return Err(format!(
+                "the image of service {} has no executable {} in package {}: is it the package that was pushed, and with that node?",
+                self.revision.service, node.executable, node.package
+            ));
+        };
+        self.end_planned(&handle).await;
+        let (namespace, name) = node.name.rsplit_once('/').unwrap_or(("", &node.name));
+        let mut argv = vec![program.to_string_lossy().into_owned()];
+        argv.extend(
+            node.argv
+                .iter()
+                .map(|argument| self.translate(node, argument)),
+        );
+        argv.push(format!("__name:={name}"));
+        let namespace = if namespace.is_empty() { "/" } else { namespace };
+        let spec = NodeSpec {
+            name: node.name.clone(),
+            argv,
+            environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
+            directory: String::new(),
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
+        };
+        let started = self.container.start_node(spec).await;
+        started.map_err(|error| format!("{} cannot be started: {error}", node.name))
+    }
+
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+        let sent = self.container.signal_node(node, signal).await;
+        sent.map_err(|error| error.to_string())
+    }
+
+    async fn ended(&self, node: &str) -> Exit {
+        let limits = self
+            .handle()
+            .map(|handle| handle.limits())
+            .unwrap_or_default();
+        match self.container.wait_node(node).await {
+            Ok(exit) => Exit {
+                code: exit.code,
+                signal: exit.signal,
+                text: format!("{node} {}", how_it_ended(&exit, &limits)),
+            },
+            Err(error) => Exit {
+                text: error.to_string(),
+                ..Exit::default()
+            },
+        }
+    }
+
+    async fn is_running(&self, node: &str) -> bool {
+        let ended: Option<Result<NodeExit, _>> = self.container.wait_node(node).now_or_never();
+        ended.is_none()
+    }
+
+    fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)> {
+        let plan = &self.revision.plan;
+        let same = |planned: &&NodeSpec| {
+            let mut programs = planned.argv.iter().map(Path::new);
+            programs.any(|path| {
+                path.file_name()
+                    .is_some_and(|name| *name == *node.executable)
+            })
+        };
+        let Some(planned) = plan.nodes.iter().find(same) else {
+            return Vec::new();
+        };
+        let private = format!("{}/", planned.name);
+        let given = plan.parameters.iter().filter_map(|(key, value)| {
+            let below = key.strip_prefix(&private)?;
+            Some((format!("{}/{below}", node.name), value.clone()))
+        });
+        given.collect()
+    }
+
+    fn translate(&self, node: &Node, text: &str) -> String {
+        if node.share.is_empty() || !text.contains(&node.share) {
+            return text.to_owned();
+        }
+        match self.share(node) {
+            Some(share) => text.replace(&node.share, &share.to_string_lossy()),
+            None => text.to_owned(),
+        }
+    }
+
+    fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
+        let mut all = self.container.follow_log(false);
+        let (sender, lines) = mpsc::channel(LINES);
+        let node = node.to_owned();
+        tokio::spawn(async move {
+            loop {
+                tokio::select! {
+                    line = all.recv() => match line {
+                        Some(line) if line.node == node => {
+                            let _ = sender.try_send((line.stream == "stderr", line.line));
+                        }
+                        Some(_) => {}
+                        None => return,
+                    },
+                    () = sender.closed() => return,
+                }
+            }
+        });
+        lines
+    }
+}

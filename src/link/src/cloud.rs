@@ -1,0 +1,402 @@
+//! The cloud's end of links: one [`Hub`] before each servant, one link for each node that a robot's stub stands for.
+//!
+//! ```text
+//!  stub ═ WebSocket ═ Session ─┬─ inputs ──▶ Bus.advertise, publish ──▶ the real node
+//!                              ├─ outputs ◀── Bus.subscribe ◀────────── (only while the robot has a listener)
+//!                              ├─ calls ───▶ Bus.call ────────────────▶
+//!                              ├─ parameters ◀─▶ the servant's parameter server
+//!                              └─ Graph ◀── what the node has registered, as it changes
+//! ```
+//! A link outlives its connections for a grace time. Of an input that several nodes of the servant listen to, one
+//! link is the feeder; what nodes of one servant publish for each other stays inside.
+
+mod inputs;
+mod mirror;
+mod node_link;
+mod outputs;
+mod parameters;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use parking_lot::Mutex;
+use ros::bus::{Bus, ParamValue};
+use ros::schema::Registry;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::{mpsc, watch};
+use tokio::time::timeout;
+use ws::WebSocket;
+
+use crate::control::{Exit, Hello, Node, Request, Sla, Welcome};
+use crate::session::{Lost, SessionOptions, receive_open, send_open};
+use crate::{MAX_FRAME, MAX_RECORD};
+
+use node_link::NodeLink;
+
+/// For the robot's hello.
+const HELLO: Duration = Duration::from_secs(10);
+/// For a node of an earlier run to end, before it is killed, and after that.
+const STOP: [(i32, Duration); 3] = [
+    (2, Duration::from_secs(5)),
+    (15, Duration::from_secs(2)),
+    (9, Duration::from_secs(5)),
+];
+/// Where the runs of nodes are remembered beyond this process: below this key of the servant's parameters.
+const RUNS: &str = "/cloudroid_runs";
+
+/// What a servant does for its links.
+#[async_trait]
+pub trait Nodes: Send + Sync + 'static {
+    /// Starts the node; comes back when its program runs, or says why it cannot.
+    async fn start(&self, node: &Node, sla: &Sla) -> Result<(), String>;
+    /// Sends it a signal.
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), String>;
+    /// Waits for its end; at once if it does not run.
+    async fn ended(&self, node: &str) -> Exit;
+    /// Whether it runs.
+    async fn is_running(&self, node: &str) -> bool;
+    /// Parameters that the deployer gave for this executable: they win over the robot's.
+    fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)>;
+    /// A path or text of the robot as the servant knows it.
+    fn translate(&self, node: &Node, text: &str) -> String;
+    /// What the node prints from now on: on standard error or not, and the line.
+    fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)>;
+}
+
+/// Habits of a hub.
+#[derive(Debug, Clone)]
+pub struct HubOptions {
+    /// How long a link outlives its connection.
+    pub grace: Duration,
+    /// How long a service may take.
+    pub call_timeout: Duration,
+    /// How long first messages wait for the node to connect to their topic.
+    pub warm_up: Duration,
+}
+
+impl Default for HubOptions {
+    fn default() -> Self {
+        Self {
+            grace: Duration::from_secs(30),
+            call_timeout: Duration::from_secs(300),
+            warm_up: Duration::from_secs(1),
+        }
+    }
+}
+
+/// The links of one servant.
+pub struct Hub {
+    servant: String,
+    bus: Arc<dyn Bus>,
+    registry: Arc<Registry>,
+    nodes: Arc<dyn Nodes>,
+    options: HubOptions,
+    links: Mutex<BTreeMap<String, Arc<NodeLink>>>,
+    /// Grows when links come, go, or change what they listen to.
+    changes: watch::Sender<u64>,
+    /// One begins at a time: the second finds what the first left.
+    beginning: tokio::sync::Mutex<()>,
+    parameters: parameters::Known,
+    closed: watch::Sender<Option<String>>,
+}
+
+/// How a link is doing, for whoever explains.
+#[derive(Debug, Clone)]
+pub struct LinkStatus {
+    /// The node.
+    pub node: String,
+    /// Its connection is there and not silent.
+    pub up: bool,
+    /// Last round trip, milliseconds.
+    pub round_trip: Option<f64>,
+    /// The robot's clock minus ours, milliseconds.
+    pub clock: Option<f64>,
+    /// Bytes per second downwards, when it had to hurry.
+    pub throughput: Option<f64>,
+    /// Messages not sent down.
+    pub dropped: u64,
+    /// What the robot asked for.
+    pub sla: Sla,
+    /// Its last requests, as it told them, oldest first.
+    pub requests: Vec<Request>,
+}
+
+impl Hub {
+    /// A hub before a servant's ROS.
+    pub fn new(
+        servant: &str,
+        bus: Arc<dyn Bus>,
+        registry: Arc<Registry>,
+        nodes: Arc<dyn Nodes>,
+        options: HubOptions,
+    ) -> Arc<Self> {
+        Arc::new(Self {
+            servant: servant.to_owned(),
+            bus,
+            registry,
+            nodes,
+            options,
+            links: Mutex::default(),
+            changes: watch::Sender::new(0),
+            beginning: tokio::sync::Mutex::default(),
+            parameters: parameters::Known::default(),
+            closed: watch::Sender::new(None),
+        })
+    }
+
+    /// All links, by node.
+    pub fn status(&self) -> Vec<LinkStatus> {
+        self.links
+            .lock()
+            .values()
+            .map(|link| link.status())
+            .collect()
+    }
+
+    /// Ends every connection with these words, and all links.
+    pub fn close(&self, reason: &str) {
+        self.closed.send_replace(Some(reason.to_owned()));
+        for link in std::mem::take(&mut *self.links.lock()).into_values() {
+            link.session.end(1012, reason);
+            link.end();
+        }
+    }
+
+    /// Serves one connection behind its WebSocket upgrade, until it ends.
+    pub async fn serve<S>(self: &Arc<Self>, io: S, read_ahead: &[u8]) -> Lost
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send,
+    {
+        let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD);
+        let hello: Hello = match timeout(HELLO, receive_open(&mut socket, "hello")).await {
+            Ok(Ok(hello)) => hello,
+            Ok(Err(lost)) => return lost,
+            Err(_) => return Lost::Silent(HELLO),
+        };
+        let name = hello.node.name.clone();
+        let (link, resumed) = match self.attach(&hello).await {
+            Ok(attached) => attached,
+            Err(refusal) => {
+                tracing::info!(
+                    servant = self.servant,
+                    node = name,
+                    "a link was refused: {}",
+                    refusal.reason
+                );
+                let welcome = Welcome::Refused {
+                    reason: refusal.reason.clone(),
+                    again: refusal.again,
+                };
+                let _ = send_open(&mut socket, &welcome).await;
+                socket.queue_close(1008, "refused");
+                let _ = timeout(Duration::from_secs(1), socket.leave(true)).await;
+                return Lost::Closed {
+                    code: 1008,
+                    reason: refusal.reason,
+                };
+            }
+        };
+        let _seat = link.seat.lock().await;
+        let (received, ahead, next) = link.session.position();
+        let welcome = Welcome::Accepted {
+            session: link.id.clone(),
+            resumed,
+            received,
+            ahead,
+            next,
+            servant: self.servant.clone(),
+        };
+        let (theirs, theirs_ahead) = hello
+            .resume
+            .as_ref()
+            .filter(|_| resumed)
+            .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
+        link.session.reconnect(theirs, theirs_ahead, hello.next);
+        if let Err(lost) = send_open(&mut socket, &welcome).await {
+            return lost;
+        }
+        tracing::info!(
+            servant = self.servant,
+            node = name,
+            resumed,
+            "a robot's node is linked"
+        );
+        let kicked = link.kick.subscribe();
+        let lost = tokio::select! {
+            lost = link.session.run(&mut socket, &*link) => lost,
+            () = changed(kicked) => Lost::Closed { code: 1012, reason: "the robot came back on another connection".into() },
+        };
+        let for_good = matches!(
+            lost,
+            Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full
+        );
+        if for_good {
+            self.end(&link).await;
+        } else {
+            self.expire(&link);
+        }
+        lost
+    }
+
+    /// The link that the hello means, begun if need be; whether it goes on.
+    async fn attach(self: &Arc<Self>, hello: &Hello) -> Result<(Arc<NodeLink>, bool), Refusal> {
+        let node = &hello.node.name;
+        if !ros::ros1::names::is_global(node) {
+            return Err(Refusal::final_(format!(
+                "{node:?} is not an absolute node name"
+            )));
+        }
+        let _beginning = self.beginning.lock().await;
+        if let Some(reason) = &*self.closed.borrow() {
+            return Err(Refusal {
+                reason: reason.clone(),
+                again: true,
+            });
+        }
+        let earlier = self.links.lock().get(node).cloned();
+        if let Some(link) = earlier {
+            let same = link.run == hello.run;
+            let asked = hello.resume.as_ref().map(|resume| resume.session.as_str());
+            if same && asked == Some(&link.id) {
+                link.kick.send_modify(|kicks| *kicks += 1);
+                return Ok((link, true));
+            }
+            let alive = *link.session.up().borrow();
+            if !same && alive && link.machine != hello.machine {
+                return Err(Refusal::final_(format!(
+                    "another machine is connected as this robot and runs {node}; give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)"
+                )));
+            }
+            link.kick.send_modify(|kicks| *kicks += 1);
+            self.forget(&link);
+        }
+        self.parameters.watch(self).await;
+        let run_key = format!("{RUNS}/{}", node.trim_start_matches('/').replace('/', "__"));
+        let running = self.nodes.is_running(node).await;
+        let ours = running
+            && self.bus.get_param(&run_key).await.ok()
+                == Some(ParamValue::String(hello.run.clone()));
+        if running && !ours {
+            self.stop(node).await;
+        }
+        self.parameters.take(self, hello).await;
+        let lines = self.nodes.lines(node);
+        if !ours {
+            let _ = self
+                .bus
+                .set_param(&run_key, ParamValue::String(hello.run.clone()))
+                .await;
+            self.nodes
+                .start(&hello.node, &hello.sla)
+                .await
+                .map_err(Refusal::final_)?;
+        }
+        let link = NodeLink::begin(self, hello, session_options(&hello.sla), lines);
+        self.links.lock().insert(node.clone(), Arc::clone(&link));
+        self.changed();
+        Ok((link, false))
+    }
+
+    fn changed(&self) {
+        self.changes.send_modify(|changes| *changes += 1);
+    }
+
+    /// Whose inputs of this topic are sent: the first link that listens to it.
+    fn feeder(&self, topic: &str) -> Option<String> {
+        let links = self.links.lock();
+        let mut listening = links.values().filter(|link| link.listens_to(topic));
+        let first = listening.clone().find(|link| *link.session.up().borrow());
+        first
+            .or_else(|| listening.next())
+            .map(|link| link.node.clone())
+    }
+
+    fn siblings(&self, node: &str) -> Vec<String> {
+        let links = self.links.lock();
+        links.keys().filter(|name| *name != node).cloned().collect()
+    }
+
+    /// Takes the link out of reach.
+    fn forget(&self, link: &Arc<NodeLink>) {
+        let mut links = self.links.lock();
+        if links
+            .get(&link.node)
+            .is_some_and(|known| Arc::ptr_eq(known, link))
+        {
+            links.remove(&link.node);
+        }
+        drop(links);
+        link.end();
+        self.changed();
+    }
+
+    /// Ends the link and its node.
+    async fn end(&self, link: &Arc<NodeLink>) {
+        let current = self
+            .links
+            .lock()
+            .get(&link.node)
+            .is_some_and(|known| Arc::ptr_eq(known, link));
+        if current {
+            let _beginning = self.beginning.lock().await;
+            self.forget(link);
+            self.stop(&link.node).await;
+        }
+    }
+
+    /// Ends the link unless its robot comes back within the grace time.
+    fn expire(self: &Arc<Self>, link: &Arc<NodeLink>) {
+        let (hub, link) = (Arc::clone(self), Arc::clone(link));
+        let mut kicked = link.kick.subscribe();
+        tokio::spawn(async move {
+            if timeout(hub.options.grace, kicked.changed()).await.is_err() {
+                hub.end(&link).await;
+            }
+        });
+    }
+
+    async fn stop(&self, node: &str) {
+        for (signal, patience) in STOP {
+            if !self.nodes.is_running(node).await || self.nodes.signal(node, signal).await.is_err()
+            {
+                return;
+            }
+            if timeout(patience, self.nodes.ended(node)).await.is_ok() {
+                return;
+            }
+        }
+    }
+}
+
+struct Refusal {
+    reason: String,
+    again: bool,
+}
+
+impl Refusal {
+    fn final_(reason: impl Into<String>) -> Self {
+        Self {
+            reason: reason.into(),
+            again: false,
+        }
+    }
+}
+
+async fn changed(mut watched: watch::Receiver<u64>) {
+    let _ = watched.changed().await;
+}
+
+/// How the cloud watches a link: the robot pings often, so the cloud need not.
+fn session_options(sla: &Sla) -> SessionOptions {
+    SessionOptions {
+        ping: Duration::from_secs(5),
+        silent: Duration::from_secs(7),
+        lost: Duration::from_secs(20),
+        max_age: sla
+            .max
+            .filter(|max| *max > 0.0)
+            .map(Duration::from_secs_f64),
+    }
+}

@@ -1,0 +1,126 @@
+//! Topics of the robot that the node listens to: published in the servant as the robot's publishers publish them.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{AdvertiseOptions, Publisher, WireType};
+
+use super::Hub;
+use super::node_link::within;
+use crate::clock::now;
+use crate::control::Input;
+use crate::record::{Answered, Data};
+
+/// Messages kept for a slow node.
+const QUEUE: usize = 100;
+/// Messages, and bytes, that wait until the topic is advertised and the node connected.
+const WAITING: (usize, usize) = (256, 32 << 20);
+
+/// Channels by number.
+#[derive(Default)]
+pub(super) struct Inputs {
+    channels: Mutex<HashMap<u32, Channel>>,
+}
+
+struct Channel {
+    decoder: codec::Decoder,
+    state: State,
+}
+
+enum State {
+    /// Not advertised yet, or the node has not connected.
+    Waiting(VecDeque<Bytes>),
+    Open(Arc<dyn Publisher>),
+}
+
+impl Inputs {
+    /// Messages of this channel may come before it is open.
+    pub(super) fn expect(&self, channel: u32) {
+        let fresh = Channel {
+            decoder: codec::Decoder::new(crate::MAX_RECORD),
+            state: State::Waiting(VecDeque::new()),
+        };
+        self.channels.lock().insert(channel, fresh);
+    }
+
+    /// Publishes a message; says when.
+    pub(super) fn take(&self, data: &Data, arrived: i64) -> Option<Answered> {
+        let mut channels = self.channels.lock();
+        let channel = channels.get_mut(&data.channel)?;
+        let message = if data.encoded {
+            let mut message = Vec::new();
+            if let Err(error) = channel.decoder.decode(&data.message, &mut message) {
+                tracing::warn!(channel = data.channel, %error, "a message cannot be decoded");
+                return None;
+            }
+            Bytes::from(message)
+        } else {
+            data.message.clone()
+        };
+        match &mut channel.state {
+            State::Open(publisher) => publisher.publish(message),
+            State::Waiting(waiting) => {
+                waiting.push_back(message);
+                let mut bytes: usize = waiting.iter().map(Bytes::len).sum();
+                while waiting.len() > WAITING.0 || (waiting.len() > 1 && bytes > WAITING.1) {
+                    bytes -= waiting.pop_front().map_or(0, |oldest| oldest.len());
+                }
+            }
+        }
+        Some(Answered {
+            born: data.born,
+            taken: arrived,
+            given: now(),
+        })
+    }
+
+    /// Advertises, and lets messages through once the node has connected.
+    pub(super) async fn open(&self, hub: &Arc<Hub>, input: Input) {
+        let options = AdvertiseOptions {
+            wire_type: WireType {
+                name: input.type_name.clone(),
+                md5: input.md5.clone(),
+                definition: input.definition.clone(),
+            },
+            latch: input.latching,
+            queue: QUEUE,
+        };
+        let publisher: Arc<dyn Publisher> = match hub.bus.advertise(&input.topic, options).await {
+            Ok(publisher) => publisher.into(),
+            Err(error) => {
+                tracing::warn!(topic = input.topic, %error, "an input cannot be published");
+                return;
+            }
+        };
+        let graph = hub.bus.graph().borrow().clone();
+        let listeners = graph
+            .topics
+            .get(&input.topic)
+            .map_or(0, |ends| ends.subscribers.len());
+        within(
+            hub.options.warm_up,
+            publisher.subscribers(),
+            listeners.max(1),
+        )
+        .await;
+        let mut channels = self.channels.lock();
+        if let Some(channel) = channels.get_mut(&input.channel) {
+            if let State::Waiting(waiting) = &mut channel.state {
+                for message in waiting.drain(..) {
+                    publisher.publish(message);
+                }
+            }
+            channel.state = State::Open(publisher);
+        }
+    }
+
+    pub(super) fn close(&self, channel: u32) {
+        self.channels.lock().remove(&channel);
+    }
+
+    pub(super) fn clear(&self) {
+        self.channels.lock().clear();
+    }
+}

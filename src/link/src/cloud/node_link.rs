@@ -1,0 +1,229 @@
+//! One node's link: what the robot tells is done here, in order.
+
+use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::sync::{mpsc, watch};
+use tokio::task::AbortHandle;
+
+use super::inputs::Inputs;
+use super::outputs::Outputs;
+use super::{Hub, LinkStatus, mirror};
+use crate::control::{Control, Hello, Request, Sla};
+use crate::record::Record;
+use crate::session::{Handler, Session, SessionOptions};
+
+/// Requests remembered, for whoever explains.
+const REQUESTS: usize = 128;
+
+/// A robot's node, as the cloud sees it.
+pub(super) struct NodeLink {
+    pub(super) node: String,
+    pub(super) run: String,
+    pub(super) machine: String,
+    /// Names the session.
+    pub(super) id: String,
+    pub(super) session: Session,
+    /// Held by the connection that carries the session.
+    pub(super) seat: tokio::sync::Mutex<()>,
+    /// Grows when another connection, or nobody, is to carry it.
+    pub(super) kick: watch::Sender<u64>,
+    pub(super) hub: Weak<Hub>,
+    pub(super) inputs: Inputs,
+    pub(super) outputs: Outputs,
+    pub(super) services: Mutex<HashMap<u32, String>>,
+    pub(super) listening: Mutex<BTreeSet<String>>,
+    sla: Sla,
+    requests: Mutex<VecDeque<Request>>,
+    orders: mpsc::UnboundedSender<Control>,
+    tasks: Mutex<Vec<AbortHandle>>,
+}
+
+impl NodeLink {
+    pub(super) fn begin(
+        hub: &Arc<Hub>,
+        hello: &Hello,
+        options: SessionOptions,
+        mut lines: mpsc::Receiver<(bool, String)>,
+    ) -> Arc<Self> {
+        let (orders, taken) = mpsc::unbounded_channel();
+        let id = format!("{}-{:x}", hello.run, crate::clock::now());
+        let link = Arc::new(Self {
+            node: hello.node.name.clone(),
+            run: hello.run.clone(),
+            machine: hello.machine.clone(),
+            id,
+            session: Session::new(options),
+            seat: tokio::sync::Mutex::default(),
+            kick: watch::Sender::new(0),
+            hub: Arc::downgrade(hub),
+            inputs: Inputs::default(),
+            outputs: Outputs::default(),
+            services: Mutex::default(),
+            listening: Mutex::default(),
+            sla: hello.sla.clone(),
+            requests: Mutex::default(),
+            orders,
+            tasks: Mutex::default(),
+        });
+        let mut tasks = vec![
+            tokio::spawn(obey(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
+            tokio::spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
+        ];
+        let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
+        tasks.push(
+            tokio::spawn(async move {
+                let exit = nodes.ended(&watching.node).await;
+                watching.session.tell(&Control::Exited(exit));
+            })
+            .abort_handle(),
+        );
+        let printing = Arc::clone(&link);
+        tasks.push(
+            tokio::spawn(async move {
+                while let Some((error, text)) = lines.recv().await {
+                    printing.session.tell(&Control::Line { error, text });
+                }
+            })
+            .abort_handle(),
+        );
+        link.tasks.lock().extend(tasks);
+        link
+    }
+
+    /// Ends all that was done for the robot; the node is not touched.
+    pub(super) fn end(&self) {
+        self.kick.send_modify(|kicks| *kicks += 1);
+        for task in self.tasks.lock().drain(..) {
+            task.abort();
+        }
+        self.inputs.clear();
+        self.outputs.clear();
+    }
+
+    pub(super) fn listens_to(&self, topic: &str) -> bool {
+        self.listening.lock().contains(topic)
+    }
+
+    pub(super) fn status(&self) -> LinkStatus {
+        let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
+        let dropped = self.session.dropped();
+        LinkStatus {
+            node: self.node.clone(),
+            up: *self.session.up().borrow(),
+            round_trip: self.session.round_trip().map(milliseconds),
+            clock: self
+                .session
+                .clock()
+                .map(|sample| milliseconds(sample.offset)),
+            throughput: self.session.throughput(),
+            dropped: dropped.replaced + dropped.stale,
+            sla: self.sla.clone(),
+            requests: self.requests.lock().iter().cloned().collect(),
+        }
+    }
+
+    fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes) {
+        let name = self.services.lock().get(&service).cloned();
+        let (Some(name), Some(hub)) = (name, self.hub.upgrade()) else {
+            let gone = format!("{} does not serve this any more", self.node);
+            return self.session.answer(id, Err(gone));
+        };
+        let link = Arc::clone(self);
+        // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
+        tokio::spawn(async move {
+            let patience = hub.options.call_timeout;
+            let called = hub.bus.call(&name, request, patience).await;
+            link.session.answer(
+                id,
+                called.map_err(|error| match error {
+                    ros::bus::BusError::CallFailed { reason, .. } => reason,
+                    other => other.to_string(),
+                }),
+            );
+        });
+    }
+}
+
+impl Handler for Arc<NodeLink> {
+    fn record(&self, record: Record, arrived: i64) {
+        (**self).take(self, record, arrived);
+    }
+}
+
+impl Handler for NodeLink {
+    fn record(&self, record: Record, arrived: i64) {
+        // The hub holds every link by an Arc; one that it let go of hears no more.
+        let Some(hub) = self.hub.upgrade() else {
+            return;
+        };
+        let link = hub.links.lock().get(&self.node).cloned();
+        if let Some(link) = link.filter(|link| std::ptr::eq(&**link, self)) {
+            self.take(&link, record, arrived);
+        }
+    }
+}
+
+impl NodeLink {
+    fn take(&self, this: &Arc<Self>, record: Record, arrived: i64) {
+        match record {
+            Record::Data(data) => {
+                if let Some(answered) = self.inputs.take(&data, arrived) {
+                    self.outputs.note(answered);
+                }
+            }
+            Record::Call {
+                id,
+                service,
+                request,
+            } => this.call(id, service, request),
+            Record::Answer { .. } => {}
+            Record::Control(json) => match serde_json::from_slice(&json) {
+                Ok(control) => {
+                    // Data may follow in the same breath.
+                    if let Control::Open(input) = &control {
+                        self.inputs.expect(input.channel);
+                    }
+                    let _ = self.orders.send(control);
+                }
+                Err(error) => {
+                    tracing::debug!(node = self.node, %error, "the robot tells something unknown");
+                }
+            },
+        }
+    }
+}
+
+/// Does what the robot tells, one thing after the other.
+async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<Control>) {
+    while let Some(order) = orders.recv().await {
+        match order {
+            Control::Open(input) => link.inputs.open(&hub, input).await,
+            Control::Close { channel } => link.inputs.close(channel),
+            Control::Listeners { channel, count } => {
+                link.outputs.listeners(&link, &hub, channel, count).await;
+            }
+            Control::Parameters(changes) => hub.parameters.change(&hub, changes).await,
+            Control::Signal { signal } => {
+                if let Err(reason) = hub.nodes.signal(&link.node, signal).await {
+                    tracing::debug!(node = link.node, signal, reason, "a signal did not arrive");
+                }
+            }
+            Control::Requests(requests) => {
+                let mut kept = link.requests.lock();
+                kept.extend(requests);
+                let surplus = kept.len().saturating_sub(REQUESTS);
+                kept.drain(..surplus);
+            }
+            other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
+        }
+    }
+}
+
+/// Waits for `done` to be true at most so long.
+pub(super) async fn within(patience: Duration, mut watched: watch::Receiver<usize>, wanted: usize) {
+    let _ = tokio::time::timeout(patience, watched.wait_for(|count| *count >= wanted)).await;
+}

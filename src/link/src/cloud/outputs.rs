@@ -1,0 +1,147 @@
+//! Topics that the node publishes: subscribed to in the servant only while the robot has listeners, so a node that
+//! works only for listeners does so here, too.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::SubscribeOptions;
+use tokio::task::AbortHandle;
+
+use super::Hub;
+use super::node_link::NodeLink;
+use crate::Quality;
+use crate::clock::now;
+use crate::record::{Answered, Data};
+
+/// Messages that the bus keeps for a busy link.
+const QUEUE: usize = 256;
+/// Inputs remembered, to say which one an output may answer.
+const RECENT: usize = 16;
+
+/// Outputs by channel.
+#[derive(Default)]
+pub(super) struct Outputs {
+    channels: Mutex<HashMap<u32, Channel>>,
+    recent: Mutex<VecDeque<Answered>>,
+}
+
+struct Channel {
+    topic: String,
+    reading: Option<AbortHandle>,
+}
+
+impl Drop for Channel {
+    fn drop(&mut self) {
+        if let Some(reading) = self.reading.take() {
+            reading.abort();
+        }
+    }
+}
+
+impl Outputs {
+    /// The robot is told of this output.
+    pub(super) fn add(&self, channel: u32, topic: &str) {
+        let fresh = Channel {
+            topic: topic.to_owned(),
+            reading: None,
+        };
+        self.channels.lock().insert(channel, fresh);
+    }
+
+    pub(super) fn remove(&self, channel: u32) {
+        self.channels.lock().remove(&channel);
+    }
+
+    pub(super) fn clear(&self) {
+        self.channels.lock().clear();
+    }
+
+    /// An input was given to the node.
+    pub(super) fn note(&self, answered: Answered) {
+        let mut recent = self.recent.lock();
+        if recent.len() == RECENT {
+            recent.pop_front();
+        }
+        recent.push_back(answered);
+    }
+
+    /// So many listen on the robot now.
+    pub(super) async fn listeners(
+        &self,
+        link: &Arc<NodeLink>,
+        hub: &Arc<Hub>,
+        channel: u32,
+        count: usize,
+    ) {
+        let topic = {
+            let mut channels = self.channels.lock();
+            let Some(known) = channels.get_mut(&channel) else {
+                return;
+            };
+            match (&known.reading, count) {
+                (Some(_), 0) => {
+                    if let Some(reading) = known.reading.take() {
+                        reading.abort();
+                    }
+                    return;
+                }
+                (None, 1..) => known.topic.clone(),
+                _ => return,
+            }
+        };
+        let options = SubscribeOptions {
+            wire_type: None,
+            queue: QUEUE,
+        };
+        let mut subscription = match hub.bus.subscribe(&topic, options).await {
+            Ok(subscription) => subscription,
+            Err(error) => {
+                tracing::warn!(topic, %error, "an output cannot be read");
+                return;
+            }
+        };
+        let reader = Arc::clone(link);
+        let reading = tokio::spawn(async move {
+            while let Some(message) = subscription.messages.recv().await {
+                // Other nodes of the servant have links of their own.
+                if *message.publisher == *reader.node {
+                    reader.send(channel, message.bytes, message.latching);
+                }
+            }
+        });
+        if let Some(known) = self.channels.lock().get_mut(&channel) {
+            known.reading = Some(reading.abort_handle());
+        } else {
+            reading.abort();
+        }
+    }
+
+    /// The input that a message may answer: the one of the same stamp, where there are several, is the robot's to
+    /// find; here it is the newest.
+    fn answered(&self) -> Option<Answered> {
+        self.recent.lock().back().copied()
+    }
+}
+
+impl NodeLink {
+    fn send(&self, channel: u32, message: Bytes, latching: bool) {
+        let data = Data {
+            channel,
+            encoded: false,
+            latching,
+            born: now(),
+            left: 0,
+            serialise: 0,
+            answered: self.outputs.answered(),
+            message,
+        };
+        let quality = if latching {
+            Quality::Each
+        } else {
+            Quality::Newest
+        };
+        self.session.publish(data, quality);
+    }
+}

@@ -1,0 +1,129 @@
+//! Parameters: the robot's are copied into the servant when a link begins, and changes cross both ways.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+use ros::bus::ParamValue;
+use tokio::task::AbortHandle;
+
+use super::{Hub, RUNS};
+use crate::control::{Control, Hello, Node};
+
+/// Those of a Master itself.
+const OWN: [&str; 5] = [
+    "run_id",
+    "rosdistro",
+    "rosversion",
+    "roslaunch",
+    "cloudroid_runs",
+];
+
+/// What was set here in the robot's name: it does not go back.
+#[derive(Default)]
+pub(super) struct Known {
+    set: Mutex<BTreeMap<String, ParamValue>>,
+    watching: Mutex<Option<AbortHandle>>,
+}
+
+impl Drop for Known {
+    fn drop(&mut self) {
+        if let Some(watching) = self.watching.lock().take() {
+            watching.abort();
+        }
+    }
+}
+
+impl Known {
+    /// Takes over all of the robot's parameters, those that the deployer gave last.
+    pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
+        let there = match hub.bus.get_param("/").await {
+            Ok(ParamValue::Map(there)) => there,
+            _ => BTreeMap::new(),
+        };
+        for (name, value) in &hello.parameters {
+            let value = translated(hub, &hello.node, value);
+            if !OWN.contains(&name.as_str()) && there.get(name) != Some(&value) {
+                self.set(hub, format!("/{name}"), value).await;
+            }
+        }
+        for (key, value) in hub.nodes.parameters(&hello.node) {
+            self.set(hub, key, value).await;
+        }
+    }
+
+    /// Parameters that changed on the robot.
+    pub(super) async fn change(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
+        for (key, value) in changes {
+            match value {
+                Some(value) => self.set(hub, key, value).await,
+                None => {
+                    self.set.lock().remove(&key);
+                    let _ = hub.bus.delete_param(&key).await;
+                }
+            }
+        }
+    }
+
+    async fn set(&self, hub: &Hub, key: String, value: ParamValue) {
+        self.set.lock().insert(key.clone(), value.clone());
+        if let Err(error) = hub.bus.set_param(&key, value).await {
+            tracing::warn!(key, %error, "a parameter of the robot cannot be set");
+        }
+    }
+
+    /// Tells robots what nodes set, from now on.
+    pub(super) async fn watch(&self, hub: &Arc<Hub>) {
+        if self.watching.lock().is_some() {
+            return;
+        }
+        let mut changes = match hub.bus.watch_params().await {
+            Ok(changes) => changes,
+            Err(error) => {
+                tracing::warn!(%error, "parameters that nodes set do not reach the robot");
+                return;
+            }
+        };
+        let weak = Arc::downgrade(hub);
+        let task = tokio::spawn(async move {
+            while let Some((key, value)) = changes.recv().await {
+                let Some(hub) = weak.upgrade() else { return };
+                hub.parameters.tell(&hub, key, value);
+            }
+        });
+        *self.watching.lock() = Some(task.abort_handle());
+    }
+
+    /// Tells the link whose node the parameter belongs to, or any: they are on one robot.
+    fn tell(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+        if key.starts_with(RUNS) || self.set.lock().get(&key) == value.as_ref() {
+            return;
+        }
+        self.set.lock().remove(&key);
+        let links = hub.links.lock();
+        let owner = links.values().find(|link| key.starts_with(&link.node));
+        if let Some(link) = owner.or_else(|| links.values().next()) {
+            link.session.tell(&Control::Parameters(vec![(key, value)]));
+        }
+    }
+}
+
+/// A value with the robot's paths replaced by the servant's.
+fn translated(hub: &Hub, node: &Node, value: &ParamValue) -> ParamValue {
+    match value {
+        ParamValue::String(text) => ParamValue::String(hub.nodes.translate(node, text)),
+        ParamValue::List(items) => ParamValue::List(
+            items
+                .iter()
+                .map(|item| translated(hub, node, item))
+                .collect(),
+        ),
+        ParamValue::Map(members) => ParamValue::Map(
+            members
+                .iter()
+                .map(|(name, member)| (name.clone(), translated(hub, node, member)))
+                .collect(),
+        ),
+        other => other.clone(),
+    }
+}

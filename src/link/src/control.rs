@@ -1,0 +1,285 @@
+//! What the two ends tell each other beside messages and calls: JSON, since it is seldom and will grow. Fields unknown
+//! to a reader are ignored, those absent have a default, so a minor addition needs no new version.
+
+use std::collections::BTreeMap;
+
+use ros::bus::ParamValue;
+use serde::{Deserialize, Serialize};
+
+/// The robot's first frame on every connection.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Hello {
+    /// The stub's own version, for logs.
+    pub version: String,
+    /// Made up when the stub's process began: names this life of the node.
+    pub run: String,
+    /// The robot's machine, so that two robots under one id can be told apart.
+    pub machine: String,
+    /// The session to go on with.
+    pub resume: Option<Resume>,
+    /// The first number that the robot will use on this connection.
+    pub next: u32,
+    /// The node to run; only its name is looked at in a resumed session.
+    pub node: Node,
+    /// What the robot's application promises itself.
+    pub sla: Sla,
+    /// All parameters of the robot, as a tree of values.
+    pub parameters: BTreeMap<String, ParamValue>,
+}
+
+/// What the robot has of an earlier connection.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Resume {
+    /// As the welcome named it.
+    pub session: String,
+    /// All numbers up to this one have come …
+    pub received: u32,
+    /// … and these.
+    pub ahead: Vec<u32>,
+}
+
+/// A node as roslaunch starts it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Node {
+    /// Absolute name, as it is on the robot.
+    pub name: String,
+    /// The package.
+    pub package: String,
+    /// The executable below its libexec directory.
+    pub executable: String,
+    /// Arguments, remaps and private parameters; nothing that begins with `__`.
+    pub argv: Vec<String>,
+    /// ROS_NAMESPACE.
+    pub namespace: String,
+    /// The stub's share directory: paths into it mean the same files of the package in the cloud.
+    pub share: String,
+    /// Services of the robot that the node calls.
+    pub calls: Vec<String>,
+}
+
+/// Response times and the like, in seconds.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Sla {
+    /// T_desire.
+    pub desire: Option<f64>,
+    /// T_max.
+    pub max: Option<f64>,
+    /// Least rate of an output.
+    pub frames_per_second: Option<f64>,
+    /// Greatest age of an output.
+    pub age: Option<f64>,
+}
+
+/// The cloud's first frame on every connection.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Welcome {
+    /// The session goes on, or has begun.
+    Accepted {
+        /// Names it.
+        session: String,
+        /// It goes on: what the robot has not acknowledged is sent again.
+        resumed: bool,
+        /// What the cloud has of the robot's numbers.
+        received: u32,
+        /// And those.
+        ahead: Vec<u32>,
+        /// The first number that the cloud will use on this connection.
+        next: u32,
+        /// The servant, for logs.
+        servant: String,
+    },
+    /// There will be no session.
+    Refused {
+        /// Why, and what to do.
+        reason: String,
+        /// Trying again may help.
+        again: bool,
+    },
+}
+
+/// Everything told later.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Control {
+    /// Robot: a topic's publisher whose messages come as this channel.
+    Open(Input),
+    /// Robot: that publisher is gone.
+    Close {
+        /// Which.
+        channel: u32,
+    },
+    /// Robot: so many listen to an output now.
+    Listeners {
+        /// Which.
+        channel: u32,
+        /// How many nodes of the robot, other nodes of this servant not counted.
+        count: usize,
+    },
+    /// Both: parameters that changed; without a value: was deleted.
+    Parameters(Vec<(String, Option<ParamValue>)>),
+    /// Robot: send the node this signal.
+    Signal {
+        /// Its number.
+        signal: i32,
+    },
+    /// Robot: the last frame of an output could not be decoded.
+    Keyframe {
+        /// Which.
+        channel: u32,
+    },
+    /// Both: a frame of a channel was decoded, later ones may refer to it.
+    Decoded {
+        /// Which channel.
+        channel: u32,
+        /// The codec's number of the frame.
+        sequence: u64,
+    },
+    /// Cloud: a type that later names refer to.
+    Type {
+        /// `package/Type`.
+        name: String,
+        /// Its hash.
+        md5: String,
+        /// With all it contains.
+        definition: String,
+    },
+    /// Cloud: all that the node has registered now.
+    Graph(Graph),
+    /// Cloud: the node has ended.
+    Exited(Exit),
+    /// Cloud: something that belongs into the robot's log.
+    Notice {
+        /// It needs attention.
+        warning: bool,
+        /// In words.
+        text: String,
+    },
+    /// Cloud: a line that the node printed.
+    Line {
+        /// On standard error.
+        error: bool,
+        /// Without its end.
+        text: String,
+    },
+    /// Robot: how a request went, for the cloud's statistics.
+    Requests(Vec<Request>),
+}
+
+/// How the node ended.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Exit {
+    /// Exit code, when it exited.
+    pub code: Option<i32>,
+    /// Signal number, when it was killed.
+    pub signal: Option<i32>,
+    /// In words.
+    pub text: String,
+}
+
+/// A publisher of the robot that the node listens to.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Input {
+    /// Number of the channel, chosen by the robot.
+    pub channel: u32,
+    /// The topic.
+    pub topic: String,
+    /// `package/Type`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// Its hash.
+    pub md5: String,
+    /// With all it contains.
+    pub definition: String,
+    /// Newcomers get the last message.
+    pub latching: bool,
+}
+
+/// What a node has registered.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Graph {
+    /// What it publishes.
+    pub outputs: Vec<Output>,
+    /// What it subscribes to.
+    pub inputs: Vec<Wanted>,
+    /// What it serves.
+    pub services: Vec<Served>,
+    /// Other nodes of the same servant: what they publish on the robot is not sent up again.
+    pub siblings: Vec<String>,
+}
+
+/// An output.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Output {
+    /// Number of its channel, chosen by the cloud.
+    pub channel: u32,
+    /// The topic.
+    pub topic: String,
+    /// `package/Type`, as a `Type` before said.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// Its hash.
+    pub md5: String,
+}
+
+/// An input.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Wanted {
+    /// The topic.
+    pub topic: String,
+    /// `package/Type`, or `*`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// Its hash, or `*`.
+    pub md5: String,
+    /// This robot's node is the one that sends it; else another node of the servant does.
+    pub feed: bool,
+}
+
+/// A service.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Served {
+    /// Number of its channel, chosen by the cloud.
+    pub channel: u32,
+    /// The service.
+    pub name: String,
+    /// `package/Type`.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// Its hash.
+    pub md5: String,
+}
+
+/// One request's way, times in milliseconds.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Request {
+    /// The input, service or action.
+    pub name: String,
+    /// From asked to answered; none when the cloud did not answer.
+    pub total: Option<f64>,
+    /// Encoding.
+    pub serialise: f64,
+    /// On the way up.
+    pub up: f64,
+    /// Waiting in the cloud.
+    pub queue: f64,
+    /// In the node.
+    pub compute: f64,
+    /// On the way down.
+    pub down: f64,
+    /// The local original's answer was taken.
+    pub local: bool,
+    /// The satisfaction after it.
+    pub satisfaction: f64,
+}

@@ -1,0 +1,261 @@
+//! What one WebSocket message of a link holds. All numbers are little endian.
+//!
+//! | first byte | then |
+//! |---|---|
+//! | 0 open | JSON: [`Hello`](crate::control::Hello), [`Welcome`](crate::control::Welcome) |
+//! | 1 whole | number u32 · record |
+//! | 2 begin | stream u32 · number u32 · total u32 · first bytes of a record |
+//! | 3 more | stream u32 · more bytes of it |
+//! | 4 ping | sent i64 · received u32 · bytes u64 |
+//! | 5 pong | sent i64 · arrived i64 · left i64 · received u32 · bytes u64 |
+//! | 6 ack | received u32 · bytes u64 |
+//!
+//! A record with a number other than 0 is kept by its sender until the peer has it, and sent again after a lost
+//! connection: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
+//! the sender knows how fast the link is. Times are nanoseconds since 1970 on the clock of whoever wrote them.
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+
+use crate::Error;
+
+const OPEN: u8 = 0;
+const WHOLE: u8 = 1;
+const BEGIN: u8 = 2;
+const MORE: u8 = 3;
+const PING: u8 = 4;
+const PONG: u8 = 5;
+const ACK: u8 = 6;
+
+/// One WebSocket message.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Frame {
+    /// The first each way.
+    Open(Bytes),
+    /// A record in one piece.
+    Whole {
+        /// 0: not kept.
+        number: u32,
+        /// The record.
+        record: Bytes,
+    },
+    /// The beginning of a record in several pieces.
+    Begin {
+        /// Names the record while it is under way.
+        stream: u32,
+        /// 0: not kept.
+        number: u32,
+        /// The record's length.
+        total: u32,
+        /// Its first bytes.
+        bytes: Bytes,
+    },
+    /// More of it.
+    More {
+        /// Which.
+        stream: u32,
+        /// Its next bytes.
+        bytes: Bytes,
+    },
+    /// Asks for a pong.
+    Ping {
+        /// When it left.
+        sent: i64,
+        /// What has come.
+        received: Received,
+    },
+    /// Answers a ping.
+    Pong {
+        /// The ping's.
+        sent: i64,
+        /// When the ping arrived.
+        arrived: i64,
+        /// When this left.
+        left: i64,
+        /// What has come.
+        received: Received,
+    },
+    /// Says what has come.
+    Ack(Received),
+}
+
+/// What has come from the peer.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Received {
+    /// All numbers up to and with this one.
+    pub number: u32,
+    /// Bytes of records, over the session.
+    pub bytes: u64,
+}
+
+impl Received {
+    fn put(self, out: &mut BytesMut) {
+        out.put_u32_le(self.number);
+        out.put_u64_le(self.bytes);
+    }
+
+    fn get(bytes: &mut Bytes) -> Self {
+        Self {
+            number: bytes.get_u32_le(),
+            bytes: bytes.get_u64_le(),
+        }
+    }
+}
+
+impl Frame {
+    /// As it goes into a WebSocket message.
+    pub fn encode(&self) -> Bytes {
+        let mut out = BytesMut::with_capacity(40 + self.payload().map_or(0, Bytes::len));
+        match self {
+            Frame::Open(_) => out.put_u8(OPEN),
+            Frame::Whole { number, .. } => {
+                out.put_u8(WHOLE);
+                out.put_u32_le(*number);
+            }
+            Frame::Begin {
+                stream,
+                number,
+                total,
+                ..
+            } => {
+                out.put_u8(BEGIN);
+                out.put_u32_le(*stream);
+                out.put_u32_le(*number);
+                out.put_u32_le(*total);
+            }
+            Frame::More { stream, .. } => {
+                out.put_u8(MORE);
+                out.put_u32_le(*stream);
+            }
+            Frame::Ping { sent, received } => {
+                out.put_u8(PING);
+                out.put_i64_le(*sent);
+                received.put(&mut out);
+            }
+            Frame::Pong {
+                sent,
+                arrived,
+                left,
+                received,
+            } => {
+                out.put_u8(PONG);
+                out.put_i64_le(*sent);
+                out.put_i64_le(*arrived);
+                out.put_i64_le(*left);
+                received.put(&mut out);
+            }
+            Frame::Ack(received) => {
+                out.put_u8(ACK);
+                received.put(&mut out);
+            }
+        }
+        if let Some(payload) = self.payload() {
+            out.put_slice(payload);
+        }
+        out.freeze()
+    }
+
+    fn payload(&self) -> Option<&Bytes> {
+        match self {
+            Frame::Open(bytes)
+            | Frame::Whole { record: bytes, .. }
+            | Frame::Begin { bytes, .. }
+            | Frame::More { bytes, .. } => Some(bytes),
+            _ => None,
+        }
+    }
+
+    /// Reads a WebSocket message; payloads are cut from it, not copied.
+    pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
+        let Some(&kind) = bytes.first() else {
+            return Err(Error::Protocol("an empty frame"));
+        };
+        let head = match kind {
+            OPEN => 1,
+            WHOLE | MORE => 5,
+            BEGIN => 13,
+            PING => 21,
+            PONG => 37,
+            ACK => 13,
+            _ => return Err(Error::Protocol("a frame of unknown kind")),
+        };
+        if bytes.len() < head {
+            return Err(Error::Protocol("a frame that ends in its head"));
+        }
+        bytes.advance(1);
+        Ok(match kind {
+            OPEN => Frame::Open(bytes),
+            WHOLE => Frame::Whole {
+                number: bytes.get_u32_le(),
+                record: bytes,
+            },
+            BEGIN => Frame::Begin {
+                stream: bytes.get_u32_le(),
+                number: bytes.get_u32_le(),
+                total: bytes.get_u32_le(),
+                bytes,
+            },
+            MORE => Frame::More {
+                stream: bytes.get_u32_le(),
+                bytes,
+            },
+            PING => Frame::Ping {
+                sent: bytes.get_i64_le(),
+                received: Received::get(&mut bytes),
+            },
+            PONG => Frame::Pong {
+                sent: bytes.get_i64_le(),
+                arrived: bytes.get_i64_le(),
+                left: bytes.get_i64_le(),
+                received: Received::get(&mut bytes),
+            },
+            _ => Frame::Ack(Received::get(&mut bytes)),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_come_back() {
+        let received = Received {
+            number: 7,
+            bytes: 1 << 40,
+        };
+        let bytes = Bytes::from_static(b"abc");
+        for frame in [
+            Frame::Open(bytes.clone()),
+            Frame::Whole {
+                number: 1,
+                record: bytes.clone(),
+            },
+            Frame::Begin {
+                stream: 2,
+                number: 0,
+                total: 9,
+                bytes: bytes.clone(),
+            },
+            Frame::More { stream: 2, bytes },
+            Frame::Ping { sent: -1, received },
+            Frame::Pong {
+                sent: 1,
+                arrived: 2,
+                left: i64::MAX,
+                received,
+            },
+            Frame::Ack(received),
+        ] {
+            assert_eq!(Frame::decode(frame.encode()).unwrap(), frame);
+        }
+    }
+
+    #[test]
+    fn broken_frames_are_refused() {
+        assert!(Frame::decode(Bytes::new()).is_err());
+        for kind in 0..=255_u8 {
+            let frame = Frame::decode(Bytes::copy_from_slice(&[kind]));
+            assert_eq!(frame.is_ok(), kind == OPEN, "{kind}");
+        }
+    }
+}

@@ -1,0 +1,147 @@
+//! From frames to records: pieces put together, doubles dropped, what has come counted. No I/O.
+
+use std::collections::{BTreeSet, HashMap};
+
+use bytes::{Bytes, BytesMut};
+
+use crate::frame::Received;
+use crate::{Error, MAX_RECORD};
+
+/// Records under way at once.
+const MAX_STREAMS: usize = 256;
+/// Bytes of records under way.
+const MAX_PARTIAL: usize = MAX_RECORD + (64 << 20);
+/// Numbers that came before one still missing.
+const MAX_AHEAD: usize = 65_536;
+/// Set aside for a record before its bytes have come.
+const READ_AHEAD: usize = 4 << 20;
+
+/// What has come over the life of a session.
+#[derive(Debug, Default)]
+pub(crate) struct Incoming {
+    number: u32,
+    ahead: BTreeSet<u32>,
+    bytes: u64,
+    streams: HashMap<u32, Partial>,
+    partial: usize,
+}
+
+#[derive(Debug)]
+struct Partial {
+    number: u32,
+    total: usize,
+    bytes: BytesMut,
+}
+
+impl Incoming {
+    /// All numbers up to this one have come, and those.
+    pub(crate) fn state(&self) -> (u32, Vec<u32>) {
+        (self.number, self.ahead.iter().copied().collect())
+    }
+
+    pub(crate) fn received(&self) -> Received {
+        Received {
+            number: self.number,
+            bytes: self.bytes,
+        }
+    }
+
+    /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again.
+    pub(crate) fn reconnect(&mut self, next: u32) {
+        self.streams.clear();
+        self.partial = 0;
+        self.ahead.clear();
+        self.number = next.wrapping_sub(1);
+    }
+
+    /// Takes a record in one piece; `None` if it had come before.
+    pub(crate) fn whole(&mut self, number: u32, record: Bytes) -> Result<Option<Bytes>, Error> {
+        self.bytes += record.len() as u64;
+        Ok(self.note(number)?.then_some(record))
+    }
+
+    /// Takes the beginning of a record in several pieces.
+    pub(crate) fn begin(
+        &mut self,
+        stream: u32,
+        number: u32,
+        total: u32,
+        bytes: &[u8],
+    ) -> Result<Option<Bytes>, Error> {
+        let total = total as usize;
+        if total > MAX_RECORD {
+            return Err(too_much("a record", total, MAX_RECORD));
+        }
+        if self.streams.len() >= MAX_STREAMS {
+            return Err(too_much(
+                "records under way",
+                self.streams.len(),
+                MAX_STREAMS,
+            ));
+        }
+        if bytes.len() > total || self.streams.contains_key(&stream) {
+            return Err(Error::Protocol("a record that begins twice or is too long"));
+        }
+        self.partial += total;
+        if self.partial > MAX_PARTIAL {
+            return Err(too_much("records under way", self.partial, MAX_PARTIAL));
+        }
+        let partial = Partial {
+            number,
+            total,
+            bytes: BytesMut::with_capacity(total.min(READ_AHEAD)),
+        };
+        self.streams.insert(stream, partial);
+        self.more(stream, bytes)
+    }
+
+    /// Takes more of it; the record once it is whole.
+    pub(crate) fn more(&mut self, stream: u32, bytes: &[u8]) -> Result<Option<Bytes>, Error> {
+        let Some(partial) = self.streams.get_mut(&stream) else {
+            return Err(Error::Protocol("more of a record that did not begin"));
+        };
+        self.bytes += bytes.len() as u64;
+        if partial.bytes.len() + bytes.len() > partial.total {
+            return Err(Error::Protocol("a record longer than it said"));
+        }
+        partial.bytes.extend_from_slice(bytes);
+        if partial.bytes.len() < partial.total {
+            return Ok(None);
+        }
+        let Some(whole) = self.streams.remove(&stream) else {
+            return Ok(None);
+        };
+        self.partial -= whole.total;
+        Ok(self.note(whole.number)?.then(|| whole.bytes.freeze()))
+    }
+
+    /// Whether a number is new.
+    fn note(&mut self, number: u32) -> Result<bool, Error> {
+        if number == 0 {
+            return Ok(true);
+        }
+        if number <= self.number || self.ahead.contains(&number) {
+            return Ok(false);
+        }
+        if number == self.number.wrapping_add(1) {
+            self.number = number;
+            while self.ahead.remove(&self.number.wrapping_add(1)) {
+                self.number = self.number.wrapping_add(1);
+            }
+            return Ok(true);
+        }
+        if self.ahead.len() >= MAX_AHEAD {
+            return Err(too_much("numbers ahead", self.ahead.len(), MAX_AHEAD));
+        }
+        self.ahead.insert(number);
+        Ok(true)
+    }
+}
+
+fn too_much(what: &'static str, bytes: usize, limit: usize) -> Error {
+    Error::TooMuch {
+        what,
+        bytes: bytes as u64,
+        limit: limit as u64,
+    }
+}

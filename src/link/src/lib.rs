@@ -1,0 +1,67 @@
+//! The link between a robot's stub and the cloud: the protocol, a session that outlives its connections, and the
+//! cloud's end of it.
+//!
+//! ```text
+//!  records ─▶ Outgoing: urgent first, small before big, newest wins ─▶ frames ─▶ WebSocket
+//!  WebSocket ─▶ frames ─▶ Incoming: pieces put together, doubles dropped ─▶ records
+//! ```
+//!
+//! A [`Session`] lives as long as its node: connections come and go below it. What must not be lost (control, calls,
+//! answers, small messages) is numbered, kept until the peer has it and sent again on the next connection; pictures
+//! and the like are not, since a newer one comes.
+//!
+//! A session's connection:
+//!
+//! ```text
+//!  (none) ──hello, welcome──▶ Up ──no pong in time──▶ Silent ──silent for long, socket lost──▶ (none)
+//!                              ▲────anything came───────┘
+//! ```
+
+#![forbid(unsafe_code)]
+
+pub mod clock;
+pub mod cloud;
+pub mod control;
+pub mod frame;
+mod incoming;
+mod outgoing;
+pub mod record;
+pub mod session;
+
+pub use outgoing::{Dropped, Quality};
+pub use session::{Handler, Lost, Session, SessionOptions};
+
+/// The WebSocket subprotocol of this version. Both ends list those they speak, newest first.
+pub const SUBPROTOCOL: &str = "cloudroid-link.v1";
+/// What all versions begin with.
+pub const SUBPROTOCOLS: &str = "cloudroid-link.";
+/// The longest WebSocket frame: a piece, or a hello with all of a robot's parameters.
+pub const MAX_FRAME: usize = 32 << 20;
+/// The longest record.
+pub const MAX_RECORD: usize = 256 << 20;
+
+/// What can go wrong with a peer.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The peer sends what makes no sense.
+    #[error("the other end broke the protocol: {0}")]
+    Protocol(&'static str),
+    /// More than can be kept.
+    #[error("the other end sends {what} of {bytes} bytes, more than the limit of {limit}")]
+    TooMuch {
+        /// What.
+        what: &'static str,
+        /// How much.
+        bytes: u64,
+        /// How much may be.
+        limit: u64,
+    },
+    /// JSON that is not what it should be.
+    #[error("the other end sends a {what} that cannot be read: {reason}")]
+    Json {
+        /// What.
+        what: &'static str,
+        /// Why.
+        reason: String,
+    },
+}

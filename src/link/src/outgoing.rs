@@ -1,0 +1,361 @@
+//! From records to frames: what goes next, in which pieces, and what is kept in case it is lost. No I/O, no clock of
+//! its own.
+//!
+//! ```text
+//!  urgent (control, calls, answers) ─┐
+//!  topic 7 ─ small ─ small ──────────┼─▶ next(): urgent, then small ones in turns, then a piece of a big one
+//!  topic 9 ─ big ────────────────────┘        (after SMALL_IN_A_ROW small ones a piece all the same)
+//! ```
+//! Deciding late is the point: the socket is given little at a time, so a newer picture can still replace one that
+//! waits, and a small message never waits for more than a piece.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use bytes::{BufMut, Bytes, BytesMut};
+
+use crate::frame::Frame;
+use crate::record::{LEFT_AT, Record};
+
+/// Records up to this size go in one piece, and are kept until the peer has them.
+pub(crate) const SMALL: usize = 32 * 1024;
+/// Pieces are made so long that one takes about this on the link as measured …
+const PIECE_TIME: f64 = 0.008;
+/// … between these.
+const PIECES: (usize, usize) = (4 * 1024, 64 * 1024);
+/// Before the link was measured.
+const FIRST_PIECE: usize = 32 * 1024;
+const SMALL_IN_A_ROW: u32 = 16;
+/// Messages that wait on one topic, and their bytes; the oldest give way. One always stays.
+const WAITING: (usize, usize) = (256, 2 << 20);
+/// Big messages that wait on one topic: only the newest counts.
+const BIG_WAITING: usize = 1;
+/// Records kept in case they are lost, and their bytes. Messages beyond go without a number.
+const KEPT: (usize, usize) = (2048, 4 << 20);
+/// Urgent records that may wait and be kept: beyond, the session is given up.
+const MAX_URGENT: usize = 65_536;
+const MAX_URGENT_BYTES: usize = 512 << 20;
+
+/// How a message may be treated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quality {
+    /// A newer one may take its place.
+    Newest,
+    /// Every one counts (latched messages, actions): never dropped for its age.
+    Each,
+}
+
+/// Messages not sent.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Dropped {
+    /// A newer one took their place.
+    pub replaced: u64,
+    /// They were too old.
+    pub stale: u64,
+}
+
+#[derive(Debug)]
+struct Out {
+    head: BytesMut,
+    payload: Bytes,
+    born: i64,
+    each: bool,
+    /// The topic's channel; none: urgent.
+    channel: Option<u32>,
+}
+
+impl Out {
+    fn len(&self) -> usize {
+        self.head.len() + self.payload.len()
+    }
+
+    /// Bytes from `at` on, at most `length`.
+    fn piece(&self, at: usize, length: usize) -> Bytes {
+        let end = (at + length).min(self.len());
+        let head = self.head.len();
+        if at >= head {
+            return self.payload.slice(at - head..end - head);
+        }
+        let mut piece = BytesMut::with_capacity(end - at);
+        piece.put_slice(&self.head[at..end.min(head)]);
+        piece.put_slice(&self.payload[..end.saturating_sub(head)]);
+        piece.freeze()
+    }
+}
+
+#[derive(Debug)]
+struct Sending {
+    stream: u32,
+    number: u32,
+    at: usize,
+    out: Out,
+}
+
+/// What goes out over the life of a session.
+#[derive(Debug)]
+pub(crate) struct Outgoing {
+    next_number: u32,
+    next_stream: u32,
+    urgent: VecDeque<Out>,
+    urgent_bytes: usize,
+    topics: BTreeMap<u32, VecDeque<Out>>,
+    /// Topics with something to send that is not under way.
+    turns: VecDeque<u32>,
+    sending: VecDeque<Sending>,
+    kept: VecDeque<(u32, Out)>,
+    kept_bytes: usize,
+    in_a_row: u32,
+    piece: usize,
+    max_age: Option<i64>,
+    pub(crate) dropped: Dropped,
+    /// Bytes of records given to the socket, over the session.
+    pub(crate) sent: u64,
+}
+
+impl Outgoing {
+    pub(crate) fn new(max_age: Option<i64>) -> Self {
+        Self {
+            next_number: 1,
+            next_stream: 0,
+            urgent: VecDeque::new(),
+            urgent_bytes: 0,
+            topics: BTreeMap::new(),
+            turns: VecDeque::new(),
+            sending: VecDeque::new(),
+            kept: VecDeque::new(),
+            kept_bytes: 0,
+            in_a_row: 0,
+            piece: FIRST_PIECE,
+            max_age,
+            dropped: Dropped::default(),
+            sent: 0,
+        }
+    }
+
+    /// Beyond what may wait: the peer does not take what it must.
+    pub(crate) fn is_full(&self) -> bool {
+        self.urgent.len() > MAX_URGENT || self.urgent_bytes > MAX_URGENT_BYTES
+    }
+
+    pub(crate) fn push(&mut self, record: &Record, quality: Quality) {
+        let (head, payload) = record.parts();
+        let (channel, born) = match record {
+            Record::Data(data) => (Some(data.channel), data.born),
+            _ => (None, 0),
+        };
+        let out = Out {
+            head,
+            payload,
+            born,
+            each: quality == Quality::Each,
+            channel,
+        };
+        let Some(channel) = channel else {
+            self.urgent_bytes += out.len();
+            self.urgent.push_back(out);
+            return;
+        };
+        let topic = self.topics.entry(channel).or_default();
+        let small = out.len() <= SMALL;
+        topic.push_back(out);
+        // A big message is only ever worth sending while it is the newest.
+        let limit = if small { WAITING.0 } else { BIG_WAITING };
+        let mut bytes: usize = topic.iter().map(Out::len).sum();
+        while topic.len() > limit || (topic.len() > 1 && bytes > WAITING.1) {
+            let Some(at) = topic
+                .iter()
+                .position(|out| !out.each || topic.len() > WAITING.0)
+            else {
+                break;
+            };
+            if at + 1 == topic.len() {
+                break;
+            }
+            bytes -= topic.remove(at).map_or(0, |gone| gone.len());
+            self.dropped.replaced += 1;
+        }
+        if topic.len() == 1 && !self.is_under_way(channel) {
+            self.turns.push_back(channel);
+        }
+    }
+
+    fn is_under_way(&self, channel: u32) -> bool {
+        let mut sending = self.sending.iter();
+        sending.any(|sending| sending.out.channel == Some(channel))
+    }
+
+    /// Forgets what waits on a channel.
+    pub(crate) fn forget(&mut self, channel: u32) {
+        self.topics.remove(&channel);
+        self.turns.retain(|turn| *turn != channel);
+    }
+
+    /// Whether anything waits.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.urgent.is_empty() && self.turns.is_empty() && self.sending.is_empty()
+    }
+
+    /// The next frame.
+    pub(crate) fn next(&mut self, now: i64) -> Option<Frame> {
+        if let Some(out) = self.urgent.pop_front() {
+            self.urgent_bytes -= out.len();
+            return Some(self.start(out, now));
+        }
+        let turn_for_big = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
+        if !turn_for_big && let Some(out) = self.next_message(now) {
+            self.in_a_row += 1;
+            return Some(self.start(out, now));
+        }
+        self.in_a_row = 0;
+        self.next_piece()
+    }
+
+    /// The next message in turn, without those that have become too old.
+    fn next_message(&mut self, now: i64) -> Option<Out> {
+        let channel = self.turns.pop_front()?;
+        let topic = self.topics.get_mut(&channel)?;
+        while topic.len() > 1
+            && let Some(first) = topic.front()
+            && !first.each
+            && self.max_age.is_some_and(|age| now - first.born > age)
+        {
+            topic.pop_front();
+            self.dropped.stale += 1;
+        }
+        let out = topic.pop_front()?;
+        // After a big one the topic waits until that is through.
+        if !topic.is_empty() && out.len() <= SMALL {
+            self.turns.push_back(channel);
+        }
+        Some(out)
+    }
+
+    fn start(&mut self, mut out: Out, now: i64) -> Frame {
+        if out.channel.is_some() {
+            out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
+        }
+        let length = out.len();
+        let number = self.number_for(&out);
+        if length <= SMALL {
+            self.sent += length as u64;
+            let record = out.piece(0, length);
+            self.keep(number, out);
+            return Frame::Whole { number, record };
+        }
+        let stream = self.next_stream;
+        self.next_stream = self.next_stream.wrapping_add(1);
+        let bytes = out.piece(0, self.piece);
+        self.sent += bytes.len() as u64;
+        let total = u32::try_from(length).unwrap_or(u32::MAX);
+        let at = bytes.len();
+        self.sending.push_back(Sending {
+            stream,
+            number,
+            at,
+            out,
+        });
+        Frame::Begin {
+            stream,
+            number,
+            total,
+            bytes,
+        }
+    }
+
+    fn number_for(&mut self, out: &Out) -> u32 {
+        let room = self.kept.len() < KEPT.0 && self.kept_bytes + out.len() <= KEPT.1;
+        let keep = out.channel.is_none() || (room && (out.len() <= SMALL || out.each));
+        if !keep {
+            return 0;
+        }
+        let number = self.next_number;
+        self.next_number += 1;
+        number
+    }
+
+    fn keep(&mut self, number: u32, out: Out) {
+        if number == 0 {
+            return;
+        }
+        self.kept_bytes += out.len();
+        let at = self.kept.partition_point(|(kept, _)| *kept < number);
+        self.kept.insert(at, (number, out));
+    }
+
+    fn next_piece(&mut self) -> Option<Frame> {
+        let mut sending = self.sending.pop_front()?;
+        let bytes = sending.out.piece(sending.at, self.piece);
+        sending.at += bytes.len();
+        self.sent += bytes.len() as u64;
+        let stream = sending.stream;
+        if sending.at < sending.out.len() {
+            self.sending.push_back(sending);
+        } else {
+            if let Some(channel) = sending.out.channel
+                && self
+                    .topics
+                    .get(&channel)
+                    .is_some_and(|topic| !topic.is_empty())
+            {
+                self.turns.push_back(channel);
+            }
+            self.keep(sending.number, sending.out);
+        }
+        Some(Frame::More { stream, bytes })
+    }
+
+    /// The peer has all numbers up to this one.
+    pub(crate) fn acknowledge(&mut self, number: u32) {
+        while let Some((kept, _)) = self.kept.front()
+            && *kept <= number
+        {
+            if let Some((_, out)) = self.kept.pop_front() {
+                self.kept_bytes -= out.len();
+            }
+        }
+    }
+
+    /// The link carries so many bytes per second.
+    pub(crate) fn set_throughput(&mut self, bytes_per_second: f64) {
+        let piece = (bytes_per_second * PIECE_TIME) as usize;
+        self.piece = piece.clamp(PIECES.0, PIECES.1);
+    }
+
+    /// The first number on the next connection.
+    pub(crate) fn next_number(&self) -> u32 {
+        self.next_number
+    }
+
+    /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
+    /// in order. Big messages that were under way are lost unless each one counts.
+    pub(crate) fn reconnect(&mut self, received: u32, ahead: &[u32]) {
+        for sending in std::mem::take(&mut self.sending) {
+            if sending.number != 0 {
+                self.keep(sending.number, sending.out);
+            } else {
+                self.dropped.replaced += 1;
+            }
+        }
+        for (number, out) in std::mem::take(&mut self.kept).into_iter().rev() {
+            if number <= received || ahead.contains(&number) {
+                continue;
+            }
+            match out.channel {
+                None => {
+                    self.urgent_bytes += out.len();
+                    self.urgent.push_front(out);
+                }
+                Some(channel) => self.topics.entry(channel).or_default().push_front(out),
+            }
+        }
+        self.kept_bytes = 0;
+        self.turns = self
+            .topics
+            .iter()
+            .filter(|(_, topic)| !topic.is_empty())
+            .map(|(channel, _)| *channel)
+            .collect();
+    }
+}
+
+#[cfg(test)]
+mod tests;

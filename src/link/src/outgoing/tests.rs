@@ -1,0 +1,147 @@
+use bytes::Bytes;
+use proptest::prelude::*;
+
+use super::*;
+use crate::incoming::Incoming;
+use crate::record::Data;
+
+fn data(channel: u32, born: i64, size: usize) -> Record {
+    Record::Data(Data {
+        channel,
+        encoded: false,
+        latching: false,
+        born,
+        left: 0,
+        serialise: 0,
+        answered: None,
+        message: Bytes::from(vec![born as u8; size]),
+    })
+}
+
+fn control(number: u8) -> Record {
+    Record::Control(Bytes::copy_from_slice(&[number]))
+}
+
+/// Takes a frame in, as the peer would.
+fn deliver(incoming: &mut Incoming, frame: Frame) -> Option<Record> {
+    let record = match frame {
+        Frame::Whole { number, record } => incoming.whole(number, record),
+        Frame::Begin {
+            stream,
+            number,
+            total,
+            bytes,
+        } => incoming.begin(stream, number, total, &bytes),
+        Frame::More { stream, bytes } => incoming.more(stream, &bytes),
+        other => panic!("{other:?}"),
+    };
+    record
+        .unwrap()
+        .map(|record| Record::decode(record).unwrap())
+}
+
+fn born(record: Option<Record>) -> Option<i64> {
+    match record {
+        Some(Record::Data(data)) => Some(data.born),
+        _ => None,
+    }
+}
+
+#[test]
+fn a_big_message_does_not_hold_up_small_ones() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    out.push(&data(1, 1, 1 << 20), Quality::Newest);
+    assert!(matches!(out.next(0), Some(Frame::Begin { .. })));
+    out.push(&data(2, 2, 10), Quality::Newest);
+    out.push(&control(9), Quality::Each);
+    let next = out.next(0).unwrap();
+    assert_eq!(deliver(&mut incoming, next), Some(control(9)));
+    let next = out.next(0).unwrap();
+    assert_eq!(born(deliver(&mut incoming, next)), Some(2));
+    assert!(matches!(out.next(0), Some(Frame::More { .. })));
+}
+
+#[test]
+fn a_flood_of_small_ones_does_not_stop_a_big_one() {
+    let mut out = Outgoing::new(None);
+    out.push(&data(1, 1, 200_000), Quality::Newest);
+    for n in 0..200 {
+        out.push(&data(2, n, 10), Quality::Newest);
+    }
+    let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).take(100).collect();
+    let pieces = frames
+        .iter()
+        .filter(|frame| matches!(frame, Frame::More { .. }));
+    assert!(pieces.count() >= 4, "{frames:?}");
+}
+
+#[test]
+fn newest_wins_among_big_ones_and_old_ones_are_not_sent() {
+    let mut out = Outgoing::new(Some(100));
+    for n in 0..5 {
+        out.push(&data(1, n, 1 << 17), Quality::Newest);
+    }
+    assert_eq!(out.dropped.replaced, 4);
+    for n in 0..5 {
+        out.push(&data(2, n * 50, 10), Quality::Newest);
+    }
+    let mut incoming = Incoming::default();
+    let mut came: Vec<i64> = std::iter::from_fn(|| out.next(250))
+        .filter_map(|frame| born(deliver(&mut incoming, frame)))
+        .collect();
+    assert_eq!(out.dropped.stale, 3, "those of 0, 50 and 100");
+    came.sort_unstable();
+    assert_eq!(came, [4, 150, 200]);
+}
+
+#[test]
+fn what_the_peer_has_is_let_go() {
+    let mut out = Outgoing::new(None);
+    out.push(&control(1), Quality::Each);
+    out.push(&control(2), Quality::Each);
+    while out.next(0).is_some() {}
+    assert_eq!(out.kept.len(), 2);
+    out.acknowledge(1);
+    assert_eq!(out.kept.len(), 1);
+    out.acknowledge(2);
+    assert_eq!((out.kept.len(), out.kept_bytes), (0, 0));
+}
+
+proptest! {
+    /// Connections are lost after any frame; what is numbered comes exactly once, and control in order.
+    #[test]
+    fn nothing_kept_is_lost_or_doubled(
+        sizes in prop::collection::vec(1_usize..100_000, 1..60),
+        cuts in prop::collection::vec(1_usize..12, 0..12),
+    ) {
+        let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+        for (n, size) in sizes.iter().enumerate() {
+            out.push(&Record::Call { id: n as u32, service: 0, request: vec![0; *size].into() }, Quality::Each);
+            out.push(&data(7, n as i64, size % 1000), Quality::Each);
+        }
+        let (mut calls, mut messages) = (Vec::new(), Vec::new());
+        let mut cuts = cuts.into_iter();
+        loop {
+            let frames = cuts.next().unwrap_or(usize::MAX);
+            // The last frame of a connection may be lost on its way.
+            for n in 0..frames {
+                let Some(frame) = out.next(0) else { break };
+                if n + 1 == frames { break }
+                match deliver(&mut incoming, frame) {
+                    Some(Record::Call { id, .. }) => calls.push(id),
+                    Some(Record::Data(data)) => messages.push(data.born),
+                    _ => {}
+                }
+            }
+            if out.is_empty() && frames == usize::MAX { break }
+            let (received, ahead) = incoming.state();
+            incoming.reconnect(out.next_number());
+            out.reconnect(received, &ahead);
+        }
+        calls.sort_unstable();
+        let expected: Vec<u32> = (0..sizes.len() as u32).collect();
+        prop_assert_eq!(calls, expected);
+        let expected: Vec<i64> = (0..sizes.len() as i64).collect();
+        prop_assert_eq!(messages, expected);
+    }
+}

@@ -1,0 +1,243 @@
+//! What the two ends of a link tell each other, as bytes.
+//!
+//! | first byte | then |
+//! |---|---|
+//! | 0 control | JSON, a [`Control`](crate::control::Control) |
+//! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · [answered: born i64 · taken i64 · given i64] · message |
+//! | 2 call | id u32 · service u32 · request |
+//! | 3 answer | id u32 · ok u8 · response, or why not |
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+
+use crate::Error;
+
+const CONTROL: u8 = 0;
+const DATA: u8 = 1;
+const CALL: u8 = 2;
+const ANSWER: u8 = 3;
+
+const ENCODED: u8 = 1;
+const ANSWERED: u8 = 2;
+const LATCHING: u8 = 4;
+/// Where `left` stands in a data record's head.
+pub(crate) const LEFT_AT: usize = 14;
+
+/// One thing told.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Record {
+    /// JSON.
+    Control(Bytes),
+    /// A message of a topic.
+    Data(Data),
+    /// A service call.
+    Call {
+        /// Chosen by the caller's end.
+        id: u32,
+        /// The channel of the service.
+        service: u32,
+        /// Serialized.
+        request: Bytes,
+    },
+    /// Its answer.
+    Answer {
+        /// The call's.
+        id: u32,
+        /// The serialized response, or why there is none.
+        response: Result<Bytes, String>,
+    },
+}
+
+/// A message of a topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Data {
+    /// Which, as `Open` or `Graph` said.
+    pub channel: u32,
+    /// `message` is a frame of a codec.
+    pub encoded: bool,
+    /// Its publisher gives newcomers the last message.
+    pub latching: bool,
+    /// When the sender had it from ROS, on the sender's clock.
+    pub born: i64,
+    /// When its first byte was given to the socket, on the sender's clock.
+    pub left: i64,
+    /// Microseconds spent encoding it.
+    pub serialise: u32,
+    /// From the cloud: the input that this may be an answer to.
+    pub answered: Option<Answered>,
+    /// Serialized.
+    pub message: Bytes,
+}
+
+/// The way of an input through the cloud.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Answered {
+    /// The input's own `born`, on the robot's clock: which one it was.
+    pub born: i64,
+    /// When it had arrived as a whole, on the cloud's clock.
+    pub taken: i64,
+    /// When it was given to the node, on the cloud's clock.
+    pub given: i64,
+}
+
+impl Record {
+    /// Head and payload, in this order on the wire.
+    pub fn parts(&self) -> (BytesMut, Bytes) {
+        let mut head = BytesMut::with_capacity(64);
+        let payload = match self {
+            Record::Control(json) => {
+                head.put_u8(CONTROL);
+                json.clone()
+            }
+            Record::Data(data) => {
+                head.put_u8(DATA);
+                head.put_u32_le(data.channel);
+                let answered = if data.answered.is_some() { ANSWERED } else { 0 };
+                let latching = if data.latching { LATCHING } else { 0 };
+                head.put_u8(answered | latching | if data.encoded { ENCODED } else { 0 });
+                head.put_i64_le(data.born);
+                debug_assert_eq!(head.len(), LEFT_AT, "where left is patched");
+                head.put_i64_le(data.left);
+                head.put_u32_le(data.serialise);
+                if let Some(answered) = &data.answered {
+                    head.put_i64_le(answered.born);
+                    head.put_i64_le(answered.taken);
+                    head.put_i64_le(answered.given);
+                }
+                data.message.clone()
+            }
+            Record::Call {
+                id,
+                service,
+                request,
+            } => {
+                head.put_u8(CALL);
+                head.put_u32_le(*id);
+                head.put_u32_le(*service);
+                request.clone()
+            }
+            Record::Answer { id, response } => {
+                head.put_u8(ANSWER);
+                head.put_u32_le(*id);
+                head.put_u8(u8::from(response.is_ok()));
+                match response {
+                    Ok(response) => response.clone(),
+                    Err(reason) => Bytes::copy_from_slice(reason.as_bytes()),
+                }
+            }
+        };
+        (head, payload)
+    }
+
+    /// Reads a record; its payload is cut from `bytes`, not copied.
+    pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
+        let short = || Error::Protocol("a record that ends in its head");
+        let Some(&kind) = bytes.first() else {
+            return Err(Error::Protocol("an empty record"));
+        };
+        let flags = bytes.get(5).copied().unwrap_or_default();
+        let head = match kind {
+            CONTROL => 1,
+            DATA if flags & ANSWERED != 0 => 50,
+            DATA => 26,
+            CALL => 9,
+            ANSWER => 6,
+            _ => return Err(Error::Protocol("a record of unknown kind")),
+        };
+        if bytes.len() < head {
+            return Err(short());
+        }
+        bytes.advance(1);
+        Ok(match kind {
+            CONTROL => Record::Control(bytes),
+            DATA => {
+                let channel = bytes.get_u32_le();
+                let flags = bytes.get_u8();
+                Record::Data(Data {
+                    channel,
+                    encoded: flags & ENCODED != 0,
+                    latching: flags & LATCHING != 0,
+                    born: bytes.get_i64_le(),
+                    left: bytes.get_i64_le(),
+                    serialise: bytes.get_u32_le(),
+                    answered: (flags & ANSWERED != 0).then(|| Answered {
+                        born: bytes.get_i64_le(),
+                        taken: bytes.get_i64_le(),
+                        given: bytes.get_i64_le(),
+                    }),
+                    message: bytes,
+                })
+            }
+            CALL => Record::Call {
+                id: bytes.get_u32_le(),
+                service: bytes.get_u32_le(),
+                request: bytes,
+            },
+            _ => {
+                let id = bytes.get_u32_le();
+                let ok = bytes.get_u8() != 0;
+                Record::Answer {
+                    id,
+                    response: if ok {
+                        Ok(bytes)
+                    } else {
+                        Err(String::from_utf8_lossy(&bytes).into_owned())
+                    },
+                }
+            }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn records_come_back() {
+        let data = Data {
+            channel: 3,
+            encoded: true,
+            latching: false,
+            born: -5,
+            left: 1 << 60,
+            serialise: 12,
+            answered: None,
+            message: Bytes::from_static(b"message"),
+        };
+        let answered = Data {
+            encoded: false,
+            latching: true,
+            answered: Some(Answered {
+                born: 1,
+                taken: 2,
+                given: 3,
+            }),
+            ..data.clone()
+        };
+        for record in [
+            Record::Control(Bytes::from_static(b"{}")),
+            Record::Data(data),
+            Record::Data(answered),
+            Record::Call {
+                id: 1,
+                service: 2,
+                request: Bytes::new(),
+            },
+            Record::Answer {
+                id: 1,
+                response: Ok(Bytes::from_static(b"x")),
+            },
+            Record::Answer {
+                id: 1,
+                response: Err("no".into()),
+            },
+        ] {
+            let (mut head, payload) = record.parts();
+            head.extend_from_slice(&payload);
+            let whole = head.freeze();
+            assert_eq!(Record::decode(whole.clone()).unwrap(), record);
+            let cut = whole.slice(..whole.len().min(4).saturating_sub(1));
+            assert!(Record::decode(cut).is_err() || matches!(record, Record::Control(_)));
+        }
+    }
+}

@@ -1,0 +1,150 @@
+use std::sync::Arc;
+
+use tokio::io::duplex;
+use tokio::sync::mpsc;
+
+use super::*;
+use crate::{MAX_FRAME, MAX_RECORD};
+
+struct To(mpsc::UnboundedSender<Record>);
+
+impl Handler for To {
+    fn record(&self, record: Record, _arrived: i64) {
+        let _ = self.0.send(record);
+    }
+}
+
+fn session() -> Arc<Session> {
+    Arc::new(Session::new(SessionOptions {
+        ping: Duration::from_millis(50),
+        silent: Duration::from_millis(500),
+        lost: Duration::from_secs(5),
+        max_age: None,
+    }))
+}
+
+fn sockets() -> (
+    WebSocket<tokio::io::DuplexStream>,
+    WebSocket<tokio::io::DuplexStream>,
+) {
+    let (robot, cloud) = duplex(1 << 16);
+    (
+        WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7),
+        WebSocket::new(cloud, b"", MAX_FRAME, MAX_RECORD),
+    )
+}
+
+fn data(channel: u32, size: usize) -> Data {
+    Data {
+        channel,
+        encoded: false,
+        latching: false,
+        born: now(),
+        left: 0,
+        serialise: 0,
+        answered: None,
+        message: Bytes::from(vec![1; size]),
+    }
+}
+
+/// Tells each what the other has, as hello and welcome do.
+fn open(robot: &Session, cloud: &Session) {
+    let (robot_has, robot_ahead, robot_next) = robot.position();
+    let (cloud_has, cloud_ahead, cloud_next) = cloud.position();
+    robot.reconnect(cloud_has, &cloud_ahead, cloud_next);
+    cloud.reconnect(robot_has, &robot_ahead, robot_next);
+}
+
+#[tokio::test]
+async fn calls_are_answered_once_however_often_the_link_is_cut() {
+    let (robot, cloud) = (session(), session());
+    let (to_robot, mut answers) = mpsc::unbounded_channel();
+    let (to_cloud, mut calls) = mpsc::unbounded_channel();
+    const CALLS: u32 = 2000;
+    let serving = cloud.clone();
+    tokio::spawn(async move {
+        while let Some(record) = calls.recv().await {
+            if let Record::Call { id, request, .. } = record {
+                serving.answer(id, Ok(request));
+            }
+        }
+    });
+    let calling = robot.clone();
+    tokio::spawn(async move {
+        for n in 0..CALLS {
+            let request = if n % 100 == 0 { 100_000 } else { 10 };
+            calling.call(1, vec![0; request].into());
+            calling.publish(data(1, 50_000), Quality::Newest);
+            tokio::task::yield_now().await;
+        }
+    });
+    let collected = tokio::spawn(async move {
+        let mut ids = Vec::new();
+        while ids.len() < CALLS as usize {
+            match answers.recv().await {
+                Some(Record::Answer { id, .. }) => ids.push(id),
+                _ => break,
+            }
+        }
+        // Doubles would come now.
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        while let Ok(record) = answers.try_recv() {
+            if let Record::Answer { id, .. } = record {
+                ids.push(id);
+            }
+        }
+        ids
+    });
+    let mut round = 0_u64;
+    while !collected.is_finished() {
+        open(&robot, &cloud);
+        let (mut at_robot, mut at_cloud) = sockets();
+        let (to_robot, to_cloud) = (To(to_robot.clone()), To(to_cloud.clone()));
+        let both = async {
+            tokio::join!(
+                robot.run(&mut at_robot, &to_robot),
+                cloud.run(&mut at_cloud, &to_cloud)
+            )
+        };
+        // Cut in the middle of whatever is on its way.
+        round += 1;
+        let _ = tokio::time::timeout(Duration::from_micros(300 * (round % 40 + 1)), both).await;
+    }
+    let mut ids = collected.await.unwrap();
+    ids.sort_unstable();
+    assert_eq!(ids.len(), CALLS as usize);
+    ids.dedup();
+    assert_eq!(ids.len(), CALLS as usize);
+}
+
+#[tokio::test]
+async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
+    let (robot, cloud) = (session(), session());
+    let (sender, _records) = mpsc::unbounded_channel();
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    let mut up = robot.up();
+    let (to_robot, to_cloud) = (To(sender.clone()), To(sender));
+    let peer = {
+        let cloud = cloud.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
+                () = async { loop { tokio::time::sleep(Duration::from_millis(10)).await; if cloud.clock().is_some() { break } } } => {}
+            }
+            // Still connected, but it says nothing more.
+            at_cloud
+        })
+    };
+    let running = robot.run(&mut at_robot, &to_robot);
+    tokio::select! {
+        lost = running => panic!("{lost}"),
+        result = async { up.wait_for(|up| *up).await.map(drop)?; up.wait_for(|up| !*up).await.map(drop) } => result.unwrap(),
+    }
+    let sample = robot.clock().unwrap();
+    assert!(
+        sample.offset.abs() <= sample.delay.max(1_000_000),
+        "{sample:?}"
+    );
+    drop(peer.await.unwrap());
+}
