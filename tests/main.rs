@@ -8,6 +8,8 @@ use support::Told;
 
 #[path = "stories/answer.rs"]
 mod answer;
+#[path = "stories/burglary.rs"]
+mod burglary;
 #[path = "stories/house.rs"]
 mod house;
 #[path = "stories/images.rs"]
@@ -22,6 +24,8 @@ mod push;
 mod refusals;
 #[path = "stories/spares.rs"]
 mod spares;
+#[path = "stories/survival.rs"]
+mod survival;
 
 /// A story under its function's name.
 fn story(name: &str, tell: fn() -> Told) -> Trial {
@@ -41,6 +45,11 @@ fn main() -> ExitCode {
     let arguments = Arguments::from_args();
     let trials: Vec<Trial> = [
         stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
+        stories![burglary:
+            no_attempt_to_break_out_succeeds,
+            nothing_of_the_host_is_reached,
+            neighbours_are_not_reached,
+        ],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,
             a_taken_port_is_named,
@@ -93,6 +102,14 @@ fn main() -> ExitCode {
         stories![spares:
             a_robot_takes_the_container_made_ahead_and_another_is_made,
             a_killed_daemons_spares_end_without_a_word,
+        ],
+        stories![survival:
+            a_killed_daemon_loses_nothing,
+            a_daemon_that_is_ended_says_why_and_keeps_its_servants,
+            a_killed_init_and_a_killed_shim_are_told,
+            nodes_end_as_ros_users_know_it,
+            a_locked_database_is_named_and_waited_for,
+            a_full_disk_is_named_and_robots_at_work_stay,
         ],
     ]
     .into_iter()

@@ -2,6 +2,7 @@
 //! robot on a WebSocket, and an eye for what is left behind.
 
 pub mod binaries;
+pub mod burglar;
 pub mod daemon;
 pub mod deployer;
 pub mod leftovers;

@@ -61,6 +61,13 @@ pub const ADDER: Service = Service {
     arguments: &["--node", "adder.py"],
 };
 
+/// Our hostile package.
+pub const BURGLAR: Service = Service {
+    name: "burglar_cpp",
+    package: Some("burglar_cpp"),
+    arguments: &["--node", "burglar"],
+};
+
 /// The world of this run.
 pub fn world() -> &'static World {
     WORLD.get_or_init(|| {

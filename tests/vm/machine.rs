@@ -57,7 +57,7 @@ pub fn control(id: &str, name: &str) -> anyhow::Result<String> {
 /// What the daemon and systemd said last.
 pub fn last_words() -> String {
     let journal = Command::new("journalctl")
-        .args(["-b", "--no-pager", "-o", "cat", "-n", "30"])
+        .args(["-b", "--no-pager", "-o", "cat", "-n", "15"])
         .output();
     journal.map_or_else(
         |error| error.to_string(),

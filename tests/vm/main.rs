@@ -60,6 +60,10 @@ fn main() -> ExitCode {
     let stories: Vec<Story> = [
         stories![limits:
             limits_are_in_the_kernels_own_files,
+            cores_are_shared_out_as_asked,
+            a_promised_servant_is_held_up_by_no_greedy_neighbours,
+            who_takes_too_much_memory_is_told_so,
+            a_fork_bomb_ends_when_its_servant_does,
         ],
         stories![restarts:
             a_killed_daemon_is_started_again_and_finds_its_servants,
@@ -70,10 +74,14 @@ fn main() -> ExitCode {
     .flatten()
     .filter(|story| chosen(story.name))
     .collect();
-    let cuts: Vec<Cut> = cuts![in_the_middle_of_a_start]
-        .into_iter()
-        .filter(|cut| chosen(cut.name))
-        .collect();
+    let cuts: Vec<Cut> = cuts![
+        in_the_middle_of_a_start,
+        in_the_middle_of_a_push,
+        in_the_middle_of_a_database_write,
+    ]
+    .into_iter()
+    .filter(|cut| chosen(cut.name))
+    .collect();
 
     if boot == 1 {
         told(

@@ -273,7 +273,10 @@ impl Choreographer {
         let (before, wanted) = (handle.asked(), change.or(handle.asked()));
         let promise = handle.promise().ok_or_else(unreached)?;
         promise.change(self.inner.promised_for(&wanted))?;
-        if let Err(error) = container.set_limits(engine_limits(&change)).await {
+        if let Err(error) = container
+            .set_limits(engine_limits(&handle::with_weight(change)))
+            .await
+        {
             // What the kernel took of it before it refused the rest is taken back.
             let earlier = engine_limits(&before.or(handle.limits()));
             let _ = container.set_limits(earlier).await;

@@ -1,26 +1,159 @@
 //! The power is cut in the middle of something. After the boot the store verifies, services are published, and
 //! nothing is left of what was half-made.
 
-pub mod in_the_middle_of_a_start {
-    use anyhow::ensure;
-    use serde_json::json;
-    use support::Told;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Instant;
 
-    use crate::machine::daemon;
+use anyhow::{Context, bail, ensure};
+use serde_json::json;
+use support::robot::PATIENCE;
+use support::{Told, binaries};
+
+use crate::machine::{HOME, SERVANTS, daemon, types};
+
+/// Services work, the store's blobs are what their names say, and of earlier servants and builds there is nothing.
+fn all_is_well() -> Told {
+    let daemon = daemon()?;
+    for part in ["servants", "build"] {
+        let left: Vec<_> = std::fs::read_dir(Path::new(HOME).join(part))?
+            .flatten()
+            .collect();
+        ensure!(left.is_empty(), "{part}: {left:?}");
+    }
+    ensure!(daemon.deployer().asks(&["servants"])? == json!([]));
+    if let Ok(entries) = std::fs::read_dir(SERVANTS) {
+        let kinds = entries.flatten().filter(|entry| entry.path().is_dir());
+        let left: Vec<_> = kinds.filter(|entry| entry.file_name() != "shims").collect();
+        ensure!(left.is_empty(), "cgroups: {left:?}");
+    }
+    ensure!(
+        !types("cat", &["/proc/self/mountinfo"])?.contains("overlay"),
+        "an overlay is mounted"
+    );
+    let blobs = Path::new(HOME).join("images/blobs/sha256");
+    for blob in std::fs::read_dir(&blobs)?.flatten() {
+        let name = blob.file_name().to_string_lossy().into_owned();
+        ensure!(!name.contains('.'), "{name} is half-made");
+        let sum = types("sha256sum", &[&blob.path().to_string_lossy()])?;
+        ensure!(sum.starts_with(&name), "blob {name} holds something else");
+    }
+    let services = daemon.deployer().asks(&["services"])?;
+    let names: Vec<&str> = services
+        .as_array()
+        .context("services")?
+        .iter()
+        .filter_map(|service| service["name"].as_str())
+        .collect();
+    ensure!(
+        names == ["adder_py", "burglar_cpp", "greeter_cpp", "small"],
+        "{names:?}"
+    );
+    let mut robot = daemon.robot("greeter_cpp?robot=after")?;
+    ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    robot.leaves()?;
+    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    Ok(())
+}
+
+/// Waits for what is in the middle.
+fn once(what: &str, there: impl Fn() -> bool) -> Told {
+    let deadline = Instant::now() + PATIENCE;
+    while !there() {
+        if Instant::now() > deadline {
+            bail!("{what} was not seen");
+        }
+        std::thread::yield_now();
+    }
+    Ok(())
+}
+
+fn begins(program: &str, arguments: &[&str]) -> anyhow::Result<Child> {
+    Command::new(binaries::path(program))
+        .args(arguments)
+        .env("CLOUDROID_HOME", HOME)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .context(program.to_owned())
+}
+
+/// A container is half-made: its directory is there, and its nodes are not.
+pub mod in_the_middle_of_a_start {
+    use super::*;
 
     pub fn before() -> Told {
         let daemon = daemon()?;
         let _ready = daemon
             .robot("greeter_cpp?robot=ready")?
             .calls("/greeter/count", json!({}))?;
-        Ok(())
+        let url = daemon.url("burglar_cpp?robot=starting");
+        std::thread::spawn(move || support::robot::Robot::connect(&url));
+        let servants = Path::new(HOME).join("servants");
+        once("a servant's launch record", || {
+            std::fs::read_dir(&servants).is_ok_and(|entries| {
+                entries.flatten().any(|entry| {
+                    entry.file_name().to_string_lossy().starts_with("burglar")
+                        && entry.path().join("spec.json").exists()
+                })
+            })
+        })
     }
 
     pub fn after() -> Told {
+        all_is_well()
+    }
+}
+
+/// A push has unpacked what was sent, and built nothing yet.
+pub mod in_the_middle_of_a_push {
+    use super::*;
+
+    pub fn before() -> Told {
+        daemon()?;
+        let _push = begins(
+            "cloudroidctl",
+            &[
+                "push",
+                "/stage/greeter_cpp",
+                "--name",
+                "halved",
+                "--node",
+                "greeter",
+            ],
+        )?;
+        let build = Path::new(HOME).join("build");
+        once("a build", || {
+            std::fs::read_dir(&build).is_ok_and(|mut entries| entries.next().is_some())
+        })
+    }
+
+    pub fn after() -> Told {
+        all_is_well()
+    }
+}
+
+/// The database is being written, again and again, when it happens.
+pub mod in_the_middle_of_a_database_write {
+    use super::*;
+
+    pub fn before() -> Told {
         let daemon = daemon()?;
-        ensure!(daemon.servants_of("greeter_cpp")?.is_empty());
-        let mut robot = daemon.robot("greeter_cpp?robot=ready")?;
-        ensure!(robot.calls("/greeter/count", json!({}))?["result"] == true);
-        Ok(())
+        let mut robot = daemon.robot("greeter_cpp?robot=written")?;
+        robot.calls("/greeter/count", json!({}))?;
+        let id = daemon.servant_of("greeter_cpp", "written")?["id"]
+            .as_str()
+            .context("an id")?
+            .to_owned();
+        let wal = Path::new(HOME).join("cloudroid.db-wal");
+        let size = || std::fs::metadata(&wal).map_or(0, |metadata| metadata.len());
+        let before = size();
+        let _set = begins("cloudroidctl", &["set", &id, "--pids", "77"])?;
+        once("a write to the database", || size() != before)
+    }
+
+    pub fn after() -> Told {
+        all_is_well()
     }
 }

@@ -1,10 +1,26 @@
 //! What the kernel enforces, and what is told of it.
 
-use anyhow::{Context, ensure};
-use serde_json::json;
-use support::Told;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
-use crate::machine::{control, daemon};
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::Told;
+use support::burglar::tries;
+use support::daemon::Daemon;
+use support::robot::PATIENCE;
+
+use crate::machine::{SERVANTS, control, daemon};
+
+/// The id of a robot's servant.
+fn id(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<String> {
+    let servant = daemon.servant_of(service, robot)?;
+    Ok(servant["id"].as_str().context("an id")?.to_owned())
+}
+
+fn set(daemon: &Daemon, id: &str, flags: &[&str]) -> anyhow::Result<Value> {
+    daemon.deployer().asks(&[&["set", id], flags].concat())
+}
 
 pub fn limits_are_in_the_kernels_own_files() -> Told {
     let daemon = daemon()?;
@@ -14,8 +30,192 @@ pub fn limits_are_in_the_kernels_own_files() -> Told {
     let id = servant["id"].as_str().context("an id")?;
     ensure!(servant["cgroup_version"] == 2, "{servant:#}");
     ensure!(control(id, "cpu.max")? == "50000 100000");
+    ensure!(
+        control(id, "cpu.weight")? == "500",
+        "as much as is promised"
+    );
     ensure!(control(id, "memory.max")? == (96 << 20).to_string());
     ensure!(control(id, "memory.swap.max")? == "0");
+    ensure!(control(id, "memory.oom.group")? == "1");
     ensure!(control(id, "pids.max")? == servant["enforced"]["pids"].to_string());
+    // Everything, while it works.
+    let changed = set(
+        &daemon,
+        id,
+        &[
+            "--cpus",
+            "0.75",
+            "--memory",
+            "128M",
+            "--memory-high",
+            "100M",
+            "--pids",
+            "99",
+            "--io-read",
+            "5M",
+            "--io-write",
+            "3M",
+            "--cpuset",
+            "1",
+            "--cpu-weight",
+            "300",
+        ],
+    )?;
+    ensure!(control(id, "cpu.max")? == "75000 100000");
+    ensure!(control(id, "cpu.weight")? == "300");
+    ensure!(control(id, "memory.max")? == (128 << 20).to_string());
+    ensure!(control(id, "memory.high")? == (100 << 20).to_string());
+    ensure!(control(id, "pids.max")? == "99");
+    ensure!(control(id, "cpuset.cpus")? == "1");
+    let io = control(id, "io.max")?;
+    ensure!(io.contains("rbps=5242880 wbps=3145728"), "{io}");
+    ensure!(
+        changed["enforced"]
+            == json!({
+                "cpus": 0.75, "cpu_weight": 300, "memory": 128 << 20, "memory_high": 100 << 20, "pids": 99,
+                "io_read": 5 << 20, "io_write": 3 << 20, "cpuset": "1",
+            }),
+        "{changed:#}"
+    );
+    robot.calls("/rosapi/get_time", json!({}))?;
+    daemon.deployer().types(&["stop", id])?.succeeded()?;
+    Ok(())
+}
+
+pub fn cores_are_shared_out_as_asked() -> Told {
+    let daemon = daemon()?;
+    let mut robot = daemon.robot("burglar_cpp?robot=burner")?;
+    tries(&mut robot, "burn", "2")?;
+    let id = id(&daemon, "burglar_cpp", "burner")?;
+    let used = || -> anyhow::Result<f64> {
+        let stat = control(&id, "cpu.stat")?;
+        let usage = stat
+            .lines()
+            .find_map(|line| line.strip_prefix("usage_usec "));
+        Ok(usage.context("usage_usec")?.parse::<f64>()? / 1e6)
+    };
+    let mut told = Vec::new();
+    for cores in [0.2, 0.5, 1.5] {
+        set(&daemon, &id, &["--cpus", &cores.to_string()])?;
+        let (began, before) = (Instant::now(), used()?);
+        // What is measured is a share of time: some has to pass.
+        std::thread::sleep(Duration::from_secs(4));
+        let got = (used()? - before) / began.elapsed().as_secs_f64();
+        told.push(format!(
+            "{:.0} % asked, {:.1} % got",
+            cores * 100.0,
+            got * 100.0
+        ));
+        ensure!((got - cores).abs() <= 0.05, "{told:?}");
+    }
+    println!("        {}", told.join("; "));
+    let servant = daemon.servant_of("burglar_cpp", "burner")?;
+    ensure!(
+        servant["usage"]["throttled_usec"].as_u64() > Some(100_000),
+        "{servant:#}"
+    );
+    ensure!(
+        servant["usage"]["pressure"]["cpu"].as_f64() > Some(1.0),
+        "{servant:#}"
+    );
+    let (_, metrics) = daemon.get("/metrics")?;
+    for name in ["throttled_seconds_total", "pressure_ratio"] {
+        ensure!(
+            metrics.contains(&format!("cloudroid_servant_{name}{{servant=\"{id}\"")),
+            "{metrics}"
+        );
+    }
+    tries(&mut robot, "rest", "")?;
+    Ok(())
+}
+
+pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Told {
+    let daemon = daemon()?;
+    let mut promised = daemon.robot("burglar_cpp?robot=burner")?;
+    let id = id(&daemon, "burglar_cpp", "burner")?;
+    set(&daemon, &id, &["--cpus", "1", "--cpu-weight", "100"])?;
+    let mut work = || -> anyhow::Result<f64> {
+        Ok(tries(&mut promised, "work", "20000000")?
+            .report
+            .parse::<f64>()?
+            / 1e6)
+    };
+    let alone = work()?.min(work()?);
+    let mut neighbours = Vec::new();
+    for number in 0..4 {
+        let mut neighbour = daemon.robot(&format!("burglar_cpp?robot=greedy{number}"))?;
+        tries(&mut neighbour, "burn", "2")?;
+        neighbours.push(neighbour);
+    }
+    let without = work()?;
+    // The promise counts once its weight is not taken away from it.
+    set(&daemon, &id, &["--cpu-weight", "1000"])?;
+    let with = work()?;
+    println!("        alone {alone:.2} s, without a promise {without:.2} s, with one {with:.2} s");
+    for neighbour in &mut neighbours {
+        tries(neighbour, "rest", "")?;
+    }
+    ensure!(
+        without > alone * 1.5,
+        "the neighbours are not greedy: {without} against {alone}"
+    );
+    ensure!(
+        with - alone <= (without - alone) / 3.0,
+        "{with} against {alone} and {without}"
+    );
+    daemon
+        .deployer()
+        .types(&["stop", "--service", "burglar_cpp"])?
+        .succeeded()?;
+    Ok(())
+}
+
+pub fn who_takes_too_much_memory_is_told_so() -> Told {
+    let daemon = daemon()?;
+    let mut robot = daemon.robot("small?robot=hungry")?;
+    robot.says(json!({"op": "set_level", "level": "warning"}))?;
+    robot.says(json!({"op": "call_service", "service": "/burglar/try", "args": {"what": "take", "argument": "400"}}))?;
+    let status = robot.hears_status("memory")?;
+    ensure!(
+        status["msg"]
+            .as_str()
+            .is_some_and(|text| text.contains("96M")),
+        "the limit is named: {status}"
+    );
+    let events = daemon.deployer().asks(&["events"])?;
+    let told = events.as_array().context("events")?.iter().any(|event| {
+        event["kind"] == "out-of-memory"
+            && event["message"]
+                .as_str()
+                .is_some_and(|text| text.contains("96M"))
+    });
+    ensure!(told, "{events:#}");
+    Ok(())
+}
+
+pub fn a_fork_bomb_ends_when_its_servant_does() -> Told {
+    let daemon = daemon()?;
+    let mut robot = daemon.robot("small?robot=bomber")?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    let id = id(&daemon, "small", "bomber")?;
+    set(&daemon, &id, &["--pids", "100"])?;
+    tries(&mut robot, "bomb", "")?;
+    let deadline = Instant::now() + PATIENCE;
+    while control(&id, "pids.current")?.parse::<u64>()? < 95 && Instant::now() < deadline {
+        std::thread::yield_now();
+    }
+    ensure!(
+        control(&id, "pids.current")?.parse::<u64>()? <= 100,
+        "the limit holds"
+    );
+    // Others do not notice.
+    daemon
+        .robot("greeter_cpp?robot=calm")?
+        .calls("/greeter/count", json!({}))?;
+    daemon.deployer().types(&["stop", &id])?.succeeded()?;
+    ensure!(
+        !Path::new(SERVANTS).join(&id).exists(),
+        "its cgroup is gone"
+    );
     Ok(())
 }

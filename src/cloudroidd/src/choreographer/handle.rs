@@ -79,6 +79,16 @@ impl Asked {
     }
 }
 
+/// Whoever is promised cores gets them before those who are not: a thousand of weight for each, where others have a
+/// hundred, unless a weight was asked for.
+pub(super) fn with_weight(asked: Limits) -> Limits {
+    let promised = |cpus: f64| ((cpus * 1000.0).round() as u64).clamp(100, 10_000);
+    Limits {
+        cpu_weight: asked.cpu_weight.or(asked.cpus.map(promised)),
+        ..asked
+    }
+}
+
 /// A servant.
 pub struct Handle {
     /// Its id.
@@ -148,7 +158,7 @@ impl Handle {
     /// The limits that it is to have.
     pub fn limits(&self) -> Limits {
         let asked = self.asked.lock();
-        asked.promised.or(asked.default)
+        with_weight(asked.promised).or(asked.default)
     }
 
     /// Those of them that somebody asked for, which are promised to it.

@@ -6,6 +6,7 @@
 #include <chrono>
 #include <cstdlib>
 #include <cstring>
+#include <fstream>
 #include <thread>
 #include <vector>
 
@@ -43,9 +44,12 @@ Outcome work(const std::string& rounds) {
 // So many megabytes, touched and kept.
 Outcome take(const std::string& megabytes) {
   size_t size = std::stoul(megabytes) << 20;
+  // Kept, lest the compiler sees that nobody needs it.
+  static std::vector<char*> taken;
   char* memory = static_cast<char*>(malloc(size));
   if (!memory) return outcome(-1);
   std::memset(memory, 'x', size);
+  taken.push_back(memory);
   return {true, megabytes + " MB taken"};
 }
 
@@ -70,6 +74,14 @@ Outcome end(const std::string& how) {
   return {true, how};
 }
 
+// "PATH TEXT": leaves a text in a file.
+Outcome leave(const std::string& argument) {
+  size_t space = argument.find(' ');
+  std::ofstream file(argument.substr(0, space));
+  file << argument.substr(space + 1);
+  return {static_cast<bool>(file.flush()), "written"};
+}
+
 // Answers after so many milliseconds.
 Outcome waitFor(const std::string& milliseconds) {
   std::this_thread::sleep_for(std::chrono::milliseconds(std::stoi(milliseconds)));
@@ -80,6 +92,7 @@ Outcome waitFor(const std::string& milliseconds) {
 
 const Tries& appetite() {
   static const Tries all{{"burn", burn}, {"rest", rest}, {"work", work},    {"take", take},
-                         {"bomb", bomb}, {"end", end},   {"wait", waitFor}};
+                         {"bomb", bomb}, {"end", end},   {"wait", waitFor},
+                         {"write", leave}};
   return all;
 }
