@@ -74,11 +74,13 @@ lint:
 	@cargo fmt --all --check
 	@echo "== clippy, warnings denied"
 	@cargo clippy --locked --workspace --all-targets -- -D warnings
+	@cargo clippy --locked -p codec --all-targets -- -D warnings # alone: without its feature video
 
 .PHONY: unit
 unit: build-dev
 	@echo "== unit tests"
 	@cargo test --locked --workspace --exclude stories
+	@cargo test --locked -p codec --test properties video # alone: without its feature video
 
 .PHONY: stories
 stories: build-dev ## the whole system, told as stories; ONLY=name runs those whose name contains it

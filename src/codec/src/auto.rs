@@ -190,6 +190,12 @@ impl Auto {
         }
     }
 
+    /// The link is another one: how fast it is must be measured again.
+    pub fn forget_link(&mut self) {
+        self.link = None;
+        self.challenger = None;
+    }
+
     /// Encodes with the codec chosen and measures it by `clock`, any steady clock.
     pub fn encode(
         &mut self,

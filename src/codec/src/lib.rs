@@ -7,7 +7,7 @@
 //! ```
 //! Pure: no I/O, no threads, no clock; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry their
 //! codec and its version, so codecs can change from message to message: [`Auto`] chooses
-//! them.
+//! them. [`Sender`] and [`Receiver`] put the three together, with what they tell each other.
 //!
 //! Every lossless codec restores the message bit by bit, and one that does not fit a message leaves it to zstd. Every
 //! decoder is safe with any input: it fails or returns a message of the declared size, within the limit it was given.
@@ -20,6 +20,7 @@ mod auto;
 mod cloud;
 mod codec;
 mod column;
+mod ends;
 mod entropy;
 mod error;
 mod generic;
@@ -39,6 +40,7 @@ mod wire;
 
 pub use auto::{Auto, Choice, Estimate, Reason};
 pub use codec::{Codec, UnknownCodec};
+pub use ends::{Answer, Policy, Receiver, Sender};
 pub use error::Error;
 pub use layout::Schema;
 pub use topic::{Decoded, Decoder, Encoded, Encoder, peek};

@@ -159,8 +159,8 @@ pub struct Decoded {
 
 /// Decodes the frames of one topic, in order.
 ///
-/// No frame makes it allocate more than a small multiple of the message it declares, and none may declare more than
-/// the limit; grids keep up to three messages besides. After an error that asks for a keyframe (see
+/// None may declare a message of more bytes than the limit, and none makes it allocate more than sixteen times what
+/// it declares (two to four, usually) and two MiB of tables; grids keep up to three messages besides. After an error that asks for a keyframe (see
 /// [`Error::wants_keyframe`]) the sender's [`Encoder::request_keyframe`] puts things right.
 #[derive(Debug)]
 pub struct Decoder {
