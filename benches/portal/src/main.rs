@@ -1,0 +1,82 @@
+//! `make bench ONLY=portal`: how fast messages and calls pass the daemon, between a client on loopback and a roscpp node
+//! in a servant. Beside it, in turns: the same node by raw TCPROS; a process that moves the bytes over the same hops;
+//! one that converts them by way of a tree of values. Needs root. The program calls itself for the relays
+//! (`relay PID HOW …`).
+
+#![forbid(unsafe_code)]
+
+mod contestants;
+mod line;
+mod node;
+mod rates;
+mod raw;
+mod relay;
+mod slow_reader;
+mod trips;
+mod value;
+mod watch;
+
+use anyhow::{Context, Result, bail, ensure};
+use bench_report::{Report, Target};
+use bench_servant::Daemon;
+
+use crate::node::Node;
+use crate::watch::Watch;
+
+/// One servant, which stays.
+const CONFIG: &str =
+    "[room]\ncpus = 64.0\nmemory = \"64G\"\n[servant]\nreserve_cpus = 0.1\ngrace = \"1h\"\n";
+
+/// What the daemon may need, in megabytes.
+const MEMORY: f64 = 60.0;
+
+fn main() -> Result<()> {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    match words.as_slice() {
+        ["relay", rest @ ..] => relay::run(rest),
+        [] => measure(""),
+        [only] => measure(only),
+        _ => bail!(
+            "it takes a part of a figure's name, or nothing; CLOUDROID_BENCH_FULL=1 measures longer"
+        ),
+    }
+}
+
+/// All figures whose names contain `only`.
+fn measure(only: &str) -> Result<()> {
+    let root = std::fs::metadata("/proc/self").is_ok_and(|about| {
+        use std::os::unix::fs::MetadataExt;
+        about.uid() == 0
+    });
+    ensure!(root, "servants are made by root: sudo make bench");
+    let place = tempfile::Builder::new()
+        .prefix("cloudroid-bench-")
+        .tempdir()?;
+    let daemon = Daemon::start(place, CONFIG, &[])?;
+    eprintln!("pushing rosbridge_fixture");
+    let fixture = bench_report::root().join("tests/packages/rosbridge_fixture");
+    daemon.push(&[
+        fixture.to_str().context("UTF-8")?,
+        "--name",
+        "meter",
+        "--node",
+        "rosbridge_fixture/meter",
+    ])?;
+    let node = Node::find(&daemon)?;
+    let watch = Watch::over(daemon.pid());
+    let mut report = Report::new("portal");
+    trips::measure(&mut report, &daemon, &node, only)?;
+    rates::measure(&mut report, &daemon, &node, only)?;
+    slow_reader::measure(&mut report, &daemon, &node, only)?;
+    let memory = watch.end()?;
+    report
+        .figure("memory of the daemon, at its peak", "MB", memory.rss)
+        .reach(Target::AtMost(MEMORY))
+        .note(format!(
+            "resident, during all this; {:.1} MB of it in proportion (PSS)",
+            memory.pss
+        ));
+    report.finish()?;
+    Ok(())
+}
