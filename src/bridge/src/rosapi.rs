@@ -84,7 +84,7 @@ impl Service {
     }
 
     async fn values(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-        let now = shared.bus.graph().borrow().clone();
+        let now = graph::with_own_topics(&shared.bus.graph().borrow());
         Ok(match self.name {
             "topics" => graph::topics(&now),
             "topics_for_type" => graph::topics_for_type(&now, &args.type_name),

@@ -15,7 +15,7 @@ use parking_lot::Mutex;
 use ros::schema::Registry;
 
 use buffer::Buffer;
-pub(crate) use republish::{GOAL_TOPIC, Republisher, SERVICE, definition};
+pub(crate) use republish::{GOAL_TOPIC, Republisher, SERVICE, STATUS_TOPIC, TOPICS, definition};
 use transform::Transform;
 
 const DEFINITIONS: &[(&str, &str)] = &[

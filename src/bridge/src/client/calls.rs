@@ -1,6 +1,8 @@
 //! `call_service`: a client calls a service of the servant, or one of rosapi's, which the bridge answers.
 
+use std::future::Future;
 use std::sync::Arc;
+use std::task::{Context, Waker};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -74,7 +76,7 @@ impl Client {
             ..call
         };
         let client = self.clone();
-        tokio::spawn(async move {
+        let mut call = Box::pin(async move {
             let _guard = guard;
             let answered = tokio::select! {
                 () = client.ended() => return,
@@ -85,6 +87,14 @@ impl Client {
                 Err(reason) => client.call_failed(&call, &reason),
             }
         });
+        // The request goes out at once; a task that waits for the answer is made while the node works on it.
+        if call
+            .as_mut()
+            .poll(&mut Context::from_waker(Waker::noop()))
+            .is_pending()
+        {
+            tokio::spawn(call);
+        }
         Ok(())
     }
 

@@ -289,7 +289,12 @@ impl Client {
             return Ok(());
         };
         drop(services);
-        if !op.result {
+        // Who says no says why in a text. Clients of the first rosbridge also say no and give values all the same:
+        // there the caller gets the values.
+        let has_values = op
+            .values
+            .is_some_and(|values| values.is_object() || values.is_list());
+        if !op.result && !has_values {
             let reason = op
                 .values
                 .and_then(|values| values.text())

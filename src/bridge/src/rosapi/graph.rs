@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use super::{NODE, Service, with_own};
 use crate::names::plain_type;
 use crate::shared::Shared;
+use crate::{presence, tf};
 
 /// Services asked for their type at once.
 const ASKED_AT_ONCE: usize = 16;
@@ -23,6 +24,35 @@ fn type_of(nodes: &TopicNodes) -> &str {
     } else {
         &nodes.type_name
     }
+}
+
+/// The graph with the topics that the bridge answers for, unless a node of the servant does.
+pub(super) fn with_own_topics(graph: &Graph) -> Graph {
+    let mut graph = graph.clone();
+    let ours = TopicNodes::default;
+    let republishes = graph
+        .topics
+        .get(tf::STATUS_TOPIC)
+        .is_some_and(|status| !status.publishers.is_empty());
+    if !republishes {
+        for (topic, type_name, published) in tf::TOPICS {
+            let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
+            nodes.type_name = type_name.to_owned();
+            let end = match published {
+                true => &mut nodes.publishers,
+                false => &mut nodes.subscribers,
+            };
+            end.push(NODE.to_owned());
+        }
+    }
+    for topic in presence::TOPICS {
+        let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
+        if nodes.publishers.is_empty() {
+            nodes.type_name = presence::type_name(topic).unwrap_or_default().to_owned();
+            nodes.publishers.push(NODE.to_owned());
+        }
+    }
+    graph
 }
 
 pub(super) fn topics(graph: &Graph) -> Value {

@@ -27,6 +27,28 @@ pub(crate) const GOAL_TOPIC: &str = "/tf2_web_republisher/goal";
 const CANCEL_TOPIC: &str = "/tf2_web_republisher/cancel";
 const FEEDBACK_TOPIC: &str = "/tf2_web_republisher/feedback";
 const RESULT_TOPIC: &str = "/tf2_web_republisher/result";
+pub(crate) const STATUS_TOPIC: &str = "/tf2_web_republisher/status";
+
+/// The action's topics: their types, and whether they are published by the action's server or to it.
+pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
+    (
+        GOAL_TOPIC,
+        "tf2_web_republisher/TFSubscriptionActionGoal",
+        false,
+    ),
+    (CANCEL_TOPIC, "actionlib_msgs/GoalID", false),
+    (
+        FEEDBACK_TOPIC,
+        "tf2_web_republisher/TFSubscriptionActionFeedback",
+        true,
+    ),
+    (
+        RESULT_TOPIC,
+        "tf2_web_republisher/TFSubscriptionActionResult",
+        true,
+    ),
+    (STATUS_TOPIC, "actionlib_msgs/GoalStatusArray", true),
+];
 /// Beginning of the names of topics made for callers of the service.
 const TOPIC_PREFIX: &str = "/tf_repub_";
 /// The node that seems to publish.

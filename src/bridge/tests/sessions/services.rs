@@ -292,6 +292,12 @@ async fn a_client_serves_and_each_call_is_answered_once() {
             .contains("not today")
     );
 
+    // As clients of the first rosbridge do: what was computed counts.
+    let modest = call(&[0; 16]);
+    let request = server.json().await;
+    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 7}, "result": false})).await;
+    assert_eq!(patiently(modest).await.unwrap().unwrap()[0], 7);
+
     let misfit = call(&[0; 16]);
     let request = server.json().await;
     server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": "x"}, "result": true})).await;

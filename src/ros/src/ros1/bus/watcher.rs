@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::time::sleep;
 
@@ -20,6 +20,26 @@ const PERIOD: Duration = Duration::from_secs(1);
 /// Between attempts to reach a Master that is gone, at first and at last.
 const PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// A Master may be silent so long before it is told: one that ends takes its bus with it, a moment later.
+const SILENCE: Duration = Duration::from_secs(3);
+
+/// Since when the Master has not answered, and whether that was told.
+#[derive(Default)]
+struct Silence {
+    since: Option<Instant>,
+    told: bool,
+}
+
+impl Silence {
+    fn goes_on(&mut self, error: &xmlrpc::Error) {
+        let since = *self.since.get_or_insert_with(Instant::now);
+        tracing::debug!(%error, "the ROS Master does not answer; trying again");
+        if !self.told && since.elapsed() >= SILENCE {
+            self.told = true;
+            tracing::warn!(%error, "the ROS Master has not answered for {SILENCE:?}; trying on");
+        }
+    }
+}
 
 /// Follows one bus's graph.
 pub(super) struct Watcher {
@@ -56,14 +76,18 @@ impl Watcher {
     /// Follows for ever.
     pub(super) async fn run(mut self) {
         let mut pause = PAUSE;
+        let mut silence = Silence::default();
         loop {
             if !self.waits {
                 sleep(PERIOD).await;
             }
             match self.look().await {
-                Ok(()) => pause = PAUSE,
+                Ok(()) => {
+                    pause = PAUSE;
+                    silence = Silence::default();
+                }
                 Err(error) => {
-                    tracing::warn!(%error, "the ROS Master does not answer; trying again");
+                    silence.goes_on(&error);
                     // Whoever answers next may be another Master.
                     self.known = -1;
                     self.waits = true;
