@@ -89,6 +89,8 @@ pub struct Subscription {
     pub messages: MessageReceiver,
     /// Messages dropped so far because `messages` was full.
     pub dropped: Arc<AtomicU64>,
+    /// How many publishers are connected now, and later.
+    pub publishers: watch::Receiver<usize>,
     /// Keeps the subscription alive.
     pub guard: Box<dyn Send + Sync>,
 }

@@ -92,6 +92,7 @@ async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
         };
         if link.connected.swap(false, Ordering::Relaxed) {
             pause = PAUSE;
+            topic.connected.send_modify(|count| *count -= 1);
         }
         if let Err(error) = result {
             let text = error.to_string();
@@ -141,6 +142,7 @@ async fn connect_and_read(
     let wire_type = Arc::new(wire_type);
     *link.peer.lock() = Some(wire_type.clone());
     link.connected.store(true, Ordering::Relaxed);
+    topic.connected.send_modify(|count| *count += 1);
     let publisher: Arc<str> = publisher.into();
     loop {
         let next = frames.next(&mut stream).await;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use tokio::sync::watch;
 
 use super::Inner;
 use super::link::{self, Link};
@@ -19,6 +20,8 @@ pub(super) struct TopicIn {
     pub(super) name: String,
     locals: Mutex<Locals>,
     links: Mutex<Links>,
+    /// Links that are connected.
+    pub(super) connected: watch::Sender<usize>,
 }
 
 /// One connection per publisher, by its address.
@@ -73,6 +76,7 @@ pub(super) async fn subscribe(
                 name: name.to_owned(),
                 locals: Mutex::default(),
                 links: Mutex::default(),
+                connected: watch::Sender::new(0),
             })
         });
         topic.add(Local {
@@ -97,6 +101,7 @@ pub(super) async fn subscribe(
     Ok(Subscription {
         dropped: messages.dropped(),
         messages,
+        publishers: topic.connected.subscribe(),
         guard: Box::new(guard),
     })
 }

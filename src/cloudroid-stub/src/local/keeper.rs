@@ -1,0 +1,343 @@
+//! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
+//! the application.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use qos::{
+    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Pair, Phases, Report, RequestId,
+    SafeStop, Side, Sla, Verdict,
+};
+use ros::bus::{BusError, Message};
+use tokio::sync::{Notify, mpsc, oneshot};
+use tokio::time::sleep_until;
+
+use super::original::{News, Original};
+use super::stamp::{Stamps, age};
+
+/// Longer than any call of a local service is waited for.
+const LOCAL_CALL: Duration = Duration::from_secs(24 * 3600);
+
+/// The way to the servant.
+pub trait Cloud: Send + Sync + 'static {
+    /// Sends an input; never blocks.
+    fn publish(&self, topic: &str, message: &Message);
+    /// Sends a call; its answer comes by [`Keeper::cloud_answered`] under the same id.
+    fn call(&self, request: RequestId, service: &str, bytes: Bytes);
+}
+
+/// The robot's nodes.
+pub trait Application: Send + Sync + 'static {
+    /// Publishes an output of the local original.
+    fn deliver(&self, topic: &str, message: Message);
+    /// Publishes the safe-stop message: nobody has answered in time.
+    fn safe_stop(&self, stop: &SafeStop);
+    /// A decision about the local original.
+    fn decided(&self, event: &Event);
+}
+
+/// What a request carries.
+#[derive(Debug, Clone)]
+pub enum Payload {
+    /// An input message.
+    Input(Message),
+    /// A serialized service request.
+    Call(Bytes),
+}
+
+/// One node's keeper. Its tasks end with it, and so does the local original.
+pub struct Keeper {
+    state: Mutex<State>,
+    cloud: Arc<dyn Cloud>,
+    robot: Arc<dyn Application>,
+    original: Option<Arc<Original>>,
+    safe_stop: Option<SafeStop>,
+    /// The next deadline may have changed.
+    wake: Arc<Notify>,
+    this: Weak<Self>,
+}
+
+struct State {
+    governor: Governor<Payload>,
+    stamps: Stamps,
+    callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
+}
+
+impl Keeper {
+    /// Begins, with the link down. Without an `original` the cloud is alone.
+    pub fn start(
+        sla: Sla,
+        pairs: Vec<Pair>,
+        original: Option<(Original, mpsc::UnboundedReceiver<News>)>,
+        cloud: Arc<dyn Cloud>,
+        robot: Arc<dyn Application>,
+    ) -> Arc<Self> {
+        let (original, news) = original.unzip();
+        let safe_stop = sla.safe_stop.clone();
+        let state = State {
+            governor: Governor::new(sla, pairs, Limits::default()),
+            stamps: Stamps::default(),
+            callers: HashMap::new(),
+        };
+        let keeper = Arc::new_cyclic(|this| Self {
+            state: Mutex::new(state),
+            cloud,
+            robot,
+            original: original.map(Arc::new),
+            safe_stop,
+            wake: Arc::default(),
+            this: this.clone(),
+        });
+        tokio::spawn(keep_time(Arc::downgrade(&keeper), keeper.wake.clone()));
+        match news {
+            Some(news) => drop(tokio::spawn(listen(Arc::downgrade(&keeper), news))),
+            None => keeper.with(|state, now| state.governor.local(now, LocalState::Missing)),
+        }
+        keeper.with(|state, now| state.governor.begin(now));
+        keeper
+    }
+
+    /// The application published an input.
+    pub fn input(&self, topic: &Arc<str>, message: Message) {
+        self.with(|state, now| {
+            let stamp = state.stamps.of(&message);
+            state
+                .governor
+                .input(now, topic, stamp, Payload::Input(message));
+        });
+    }
+
+    /// The application calls a service. When the caller goes, so does the request.
+    pub async fn call(
+        self: &Arc<Self>,
+        service: &Arc<str>,
+        request: Bytes,
+    ) -> Result<Bytes, String> {
+        let (sender, answer) = oneshot::channel();
+        let id = self.with(|state, now| {
+            let id = state.governor.call(now, service, Payload::Call(request));
+            state.callers.insert(id, sender);
+            id
+        });
+        let waiting = Waiting { keeper: self, id };
+        let answer = answer.await;
+        drop(waiting);
+        answer.unwrap_or_else(|_| Err("the node is ending".to_owned()))
+    }
+
+    /// The cloud answered a call.
+    pub fn cloud_answered(&self, id: RequestId, result: Result<Bytes, Failure>) {
+        self.answered(Side::Cloud, id, result);
+    }
+
+    /// The servant's node published. True where the application is to have it.
+    pub fn cloud_output(&self, topic: &str, message: &Message) -> bool {
+        self.output(Side::Cloud, topic, message)
+    }
+
+    /// The link is up; `resumed`: what was sent will be answered yet.
+    pub fn link_up(&self, resumed: bool) {
+        self.with(|state, now| state.governor.link_up(now, resumed));
+    }
+
+    /// The link is down.
+    pub fn link_down(&self) {
+        self.with(|state, now| state.governor.link_down(now));
+    }
+
+    /// Somebody listens to the node's outputs, or nobody does.
+    pub fn wanted(&self, wanted: bool) {
+        self.with(|state, now| state.governor.wanted(now, wanted));
+    }
+
+    /// Where the time of a request went.
+    pub fn phases(&self, phases: &Phases) {
+        self.state.lock().governor.phases(phases);
+    }
+
+    /// How it stands.
+    pub fn report(&self) -> Report {
+        self.state.lock().governor.report(Instant::now())
+    }
+
+    fn output(&self, side: Side, topic: &str, message: &Message) -> bool {
+        let verdict = self.with(|state, now| {
+            let stamp = state.stamps.of(message);
+            let age = stamp.map(age).unwrap_or_default();
+            state.governor.output(now, side, topic, stamp, age)
+        });
+        verdict == Verdict::Deliver
+    }
+
+    fn answered(&self, side: Side, id: RequestId, result: Result<Bytes, Failure>) {
+        self.with(|state, now| match result {
+            Ok(bytes) => {
+                if state.governor.answered(now, side, id) == Verdict::Deliver {
+                    state.reply(id, Ok(bytes));
+                }
+            }
+            Err(failure) => state.governor.failed(now, side, id, &failure),
+        });
+    }
+
+    /// Time has passed; gives the next deadline.
+    fn tick(&self) -> Option<Instant> {
+        self.change(|state, now| state.governor.tick(now));
+        self.state.lock().governor.deadline()
+    }
+
+    /// Something happened: changes the state, does what follows, and has the deadline looked at again.
+    fn with<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
+        let result = self.change(change);
+        self.wake.notify_one();
+        result
+    }
+
+    fn change<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
+        let (result, effects) = {
+            let mut state = self.state.lock();
+            let result = change(&mut state, Instant::now());
+            let effects: Vec<_> = std::iter::from_fn(|| state.governor.next_effect()).collect();
+            for effect in &effects {
+                if let Effect::Fail {
+                    request, reason, ..
+                } = effect
+                {
+                    state.reply(*request, Err(reason.clone()));
+                }
+            }
+            (result, effects)
+        };
+        for effect in effects {
+            self.carry_out(effect);
+        }
+        result
+    }
+
+    fn carry_out(&self, effect: Effect<Payload>) {
+        match effect {
+            Effect::Give {
+                side,
+                request,
+                channel,
+                payload,
+            } => match (side, channel, payload, request) {
+                (Side::Cloud, Channel::Topic(topic), Payload::Input(message), _) => {
+                    self.cloud.publish(&topic, &message);
+                }
+                (Side::Cloud, Channel::Call(service), Payload::Call(bytes), Some(id)) => {
+                    self.cloud.call(id, &service, bytes);
+                }
+                (Side::Local, channel, payload, request) => {
+                    self.give_local(&channel, payload, request)
+                }
+                _ => unreachable!("calls carry requests, topics carry messages"),
+            },
+            Effect::Fail {
+                reason, channel, ..
+            } => tracing::debug!(?channel, reason, "a request failed"),
+            Effect::SafeStop => {
+                if let Some(stop) = &self.safe_stop {
+                    self.robot.safe_stop(stop);
+                }
+            }
+            Effect::Event(event) => {
+                match (&event, &self.original) {
+                    (Event::Start(_), Some(original)) => original.start(),
+                    (Event::Stop(_), Some(original)) => original.stop(),
+                    _ => {}
+                }
+                self.robot.decided(&event);
+            }
+        }
+    }
+
+    fn give_local(&self, channel: &Channel, payload: Payload, request: Option<RequestId>) {
+        let Some(original) = &self.original else {
+            return;
+        };
+        match (channel, payload, request) {
+            (Channel::Topic(topic), Payload::Input(message), _) => original.feed(topic, &message),
+            (Channel::Call(service), Payload::Call(bytes), Some(id)) => {
+                let (original, service) = (original.clone(), service.clone());
+                let keeper = self.this.clone();
+                tokio::spawn(async move {
+                    let result = original.call(&service, bytes, LOCAL_CALL).await;
+                    drop(original);
+                    let result = result.map_err(|error| match error {
+                        BusError::CallFailed { reason, .. } => Failure::Refused(reason),
+                        other => Failure::Unreachable(other.to_string()),
+                    });
+                    if let Some(keeper) = keeper.upgrade() {
+                        keeper.answered(Side::Local, id, result);
+                    }
+                });
+            }
+            _ => unreachable!("calls carry requests, topics carry messages"),
+        }
+    }
+}
+
+impl State {
+    fn reply(&mut self, id: RequestId, answer: Result<Bytes, String>) {
+        if let Some(caller) = self.callers.remove(&id) {
+            let _ = caller.send(answer);
+        }
+    }
+}
+
+/// Cancels a request whose caller has gone.
+struct Waiting<'a> {
+    keeper: &'a Keeper,
+    id: RequestId,
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let id = self.id;
+        self.keeper.with(|state, now| {
+            if state.callers.remove(&id).is_some() {
+                state.governor.cancel(now, id);
+            }
+        });
+    }
+}
+
+/// Wakes the governor at its deadlines.
+async fn keep_time(keeper: Weak<Keeper>, wake: Arc<Notify>) {
+    loop {
+        let Some(deadline) = keeper.upgrade().map(|keeper| keeper.tick()) else {
+            return;
+        };
+        match deadline {
+            Some(deadline) => tokio::select! {
+                () = sleep_until(deadline.into()) => {}
+                () = wake.notified() => {}
+            },
+            None => wake.notified().await,
+        }
+    }
+}
+
+/// Takes what the local original says.
+async fn listen(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<News>) {
+    while let Some(news) = news.recv().await {
+        let Some(keeper) = keeper.upgrade() else {
+            return;
+        };
+        match news {
+            News::State(local) => keeper.with(|state, now| state.governor.local(now, local)),
+            News::Crashed(reason) => {
+                keeper.with(|state, now| state.governor.local_crashed(now, &reason))
+            }
+            News::Output(topic, message) => {
+                if keeper.output(Side::Local, &topic, &message) {
+                    keeper.robot.deliver(&topic, message);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! The local original as its user sees it: start, stop, feed, call; its state and its outputs come back.
+//!
+//! ```text
+//!             start              registered, inputs subscribed to
+//!  Stopped ──────────▶ Starting ──────────────────────────────────▶ Ready
+//!     ▲                   ▲  └─────────────── crash ◀────────────────┤
+//!     │                   └── after a pause, doubled each time ◀┘    │
+//!     └──────────────────────────── stop ◀────────────────────────────┘
+//! ```
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use qos::LocalState;
+use ros::bus::{AdvertiseOptions, Bus, BusError, Message, Publisher, SubscribeOptions, WireType};
+use tokio::process::Child;
+use tokio::sync::{mpsc, watch};
+use tokio::task::AbortHandle;
+use tokio::time::sleep;
+
+use super::place::Place;
+use super::process::{self, Program};
+
+/// Messages kept per topic: what waits longer is old.
+const QUEUE: usize = 16;
+/// Pauses after crashes, at first and at last; and how long a life forgives them.
+const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
+const FORGIVEN: Duration = Duration::from_secs(30);
+
+/// What the original needs.
+#[derive(Debug, Clone)]
+pub struct Setting {
+    /// Its executable, arguments and environment; none where no original is installed.
+    pub program: Option<Program>,
+    /// Its absolute node name.
+    pub node: String,
+    /// Inputs that must be subscribed to before it is ready, with their types.
+    pub inputs: BTreeMap<String, WireType>,
+    /// Outputs that are taken in.
+    pub outputs: Vec<String>,
+}
+
+/// What comes back.
+#[derive(Debug)]
+pub enum News {
+    /// Its state has changed.
+    State(LocalState),
+    /// It ended by itself and will be started again.
+    Crashed(String),
+    /// It published on this topic.
+    Output(Arc<str>, Message),
+}
+
+/// A handle; dropping it ends the process.
+pub struct Original {
+    orders: mpsc::UnboundedSender<Order>,
+    place: Arc<Place>,
+    publishers: Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>,
+    _tasks: Tasks,
+}
+
+enum Order {
+    Start,
+    Stop,
+}
+
+struct Tasks(Vec<AbortHandle>);
+
+impl Drop for Tasks {
+    fn drop(&mut self) {
+        for task in &self.0 {
+            task.abort();
+        }
+    }
+}
+
+impl Original {
+    /// Prepares everything but the process: the private ROS system with the parameters of `robot`, inputs advertised,
+    /// outputs subscribed to.
+    pub async fn new(
+        setting: Setting,
+        robot: Arc<dyn Bus>,
+    ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
+        let place = Arc::new(Place::new().await?);
+        let (news, received) = mpsc::unbounded_channel();
+        let mut tasks = Vec::new();
+        let mut sources = HashMap::new();
+        for output in &setting.outputs {
+            let options = SubscribeOptions {
+                wire_type: None,
+                queue: QUEUE,
+            };
+            let subscription = place.bus().subscribe(output, options).await?;
+            sources.insert(output.clone(), subscription.publishers.clone());
+            let (topic, news): (Arc<str>, _) = (output.as_str().into(), news.clone());
+            let task = tokio::spawn(async move {
+                // All of it, or the guard would stay behind and end the subscription.
+                let subscription = &mut { subscription };
+                while let Some(message) = subscription.messages.recv().await {
+                    if news.send(News::Output(topic.clone(), message)).is_err() {
+                        return;
+                    }
+                }
+            });
+            tasks.push(task.abort_handle());
+        }
+        let publishers = Arc::new(Mutex::new(HashMap::new()));
+        for (topic, wire_type) in &setting.inputs {
+            let publisher = advertise(&place, topic, wire_type).await?;
+            publishers.lock().insert(topic.clone(), publisher);
+        }
+        let (orders, taken) = mpsc::unbounded_channel();
+        let runner = Runner {
+            setting,
+            place: place.clone(),
+            robot,
+            publishers: publishers.clone(),
+            sources,
+            news,
+        };
+        tasks.push(tokio::spawn(runner.run(taken)).abort_handle());
+        let original = Self {
+            orders,
+            place,
+            publishers,
+            _tasks: Tasks(tasks),
+        };
+        Ok((original, received))
+    }
+
+    /// Starts the process, if it does not run.
+    pub fn start(&self) {
+        let _ = self.orders.send(Order::Start);
+    }
+
+    /// Ends the process, if it runs.
+    pub fn stop(&self) {
+        let _ = self.orders.send(Order::Stop);
+    }
+
+    /// Gives it a message. A topic that was not named in advance is advertised first, and its message may be too
+    /// early.
+    pub fn feed(&self, topic: &str, message: &Message) {
+        if let Some(publisher) = self.publishers.lock().get(topic) {
+            publisher.publish(message.bytes.clone());
+            return;
+        }
+        let (place, publishers) = (self.place.clone(), self.publishers.clone());
+        let (topic, message) = (topic.to_owned(), message.clone());
+        tokio::spawn(async move {
+            match advertise(&place, &topic, &message.wire_type).await {
+                Ok(publisher) => {
+                    publisher.publish(message.bytes);
+                    publishers.lock().entry(topic).or_insert(publisher);
+                }
+                Err(error) => tracing::debug!(topic, %error, "the local original is not fed"),
+            }
+        });
+    }
+
+    /// Calls one of its services.
+    pub async fn call(
+        &self,
+        service: &str,
+        request: Bytes,
+        timeout: Duration,
+    ) -> Result<Bytes, BusError> {
+        self.place.bus().call(service, request, timeout).await
+    }
+
+    /// The stub's node in its ROS system: for parameters that change later.
+    pub fn bus(&self) -> Arc<dyn Bus> {
+        self.place.bus().clone()
+    }
+}
+
+async fn advertise(
+    place: &Place,
+    topic: &str,
+    wire_type: &WireType,
+) -> Result<Box<dyn Publisher>, BusError> {
+    let options = AdvertiseOptions {
+        wire_type: wire_type.clone(),
+        latch: false,
+        queue: QUEUE,
+    };
+    place.bus().advertise(topic, options).await
+}
+
+struct Runner {
+    setting: Setting,
+    place: Arc<Place>,
+    robot: Arc<dyn Bus>,
+    publishers: Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>,
+    /// How many publish each output.
+    sources: HashMap<String, watch::Receiver<usize>>,
+    news: mpsc::UnboundedSender<News>,
+}
+
+impl Runner {
+    async fn run(self, mut orders: mpsc::UnboundedReceiver<Order>) {
+        while let Some(order) = orders.recv().await {
+            if matches!(order, Order::Start) {
+                let Some(program) = &self.setting.program else {
+                    self.tell(LocalState::Missing);
+                    continue;
+                };
+                self.live(program, &mut orders).await;
+                self.tell(LocalState::Stopped);
+            }
+        }
+    }
+
+    /// From start to stop, through all crashes.
+    async fn live(&self, program: &Program, orders: &mut mpsc::UnboundedReceiver<Order>) {
+        let mut pause = BACKOFF.0;
+        loop {
+            let born = Instant::now();
+            self.tell(LocalState::Starting);
+            let reason = match self.spawn(program).await {
+                Ok(mut child) => tokio::select! {
+                    reason = self.watch(&mut child) => reason,
+                    () = stopped(orders) => {
+                        process::end(&mut child).await;
+                        self.place.process_exited().await;
+                        return;
+                    }
+                },
+                Err(error) => format!("{error:#}"),
+            };
+            self.place.process_exited().await;
+            let _ = self.news.send(News::Crashed(reason));
+            if born.elapsed() > FORGIVEN {
+                pause = BACKOFF.0;
+            }
+            tokio::select! {
+                () = sleep(pause) => {}
+                () = stopped(orders) => return,
+            }
+            pause = (pause * 2).min(BACKOFF.1);
+        }
+    }
+
+    async fn spawn(&self, program: &Program) -> anyhow::Result<Child> {
+        // They may have changed since the last start.
+        self.place.copy_parameters(&*self.robot).await?;
+        program.spawn(self.place.uri())
+    }
+
+    /// Tells when it is ready; gives the reason when it ends.
+    async fn watch(&self, child: &mut Child) -> String {
+        tokio::select! {
+            status = child.wait() => return process::ended(status),
+            () = self.ready() => self.tell(LocalState::Ready),
+        }
+        process::ended(child.wait().await)
+    }
+
+    /// Its node is registered, listens to all inputs that are announced, and what it publishes is heard.
+    async fn ready(&self) {
+        self.place.registered(&self.setting.node).await;
+        let counts: Vec<_> = {
+            let publishers = self.publishers.lock();
+            let inputs = self.setting.inputs.keys();
+            inputs
+                .filter_map(|topic| Some(publishers.get(topic)?.subscribers()))
+                .collect()
+        };
+        for mut count in counts {
+            let _ = count.wait_for(|count| *count > 0).await;
+        }
+        let published = self.place.graph();
+        for (topic, source) in &self.sources {
+            let nodes = published.topics.get(topic).map(|topic| &topic.publishers);
+            if nodes.is_some_and(|nodes| nodes.contains(&self.setting.node)) {
+                let _ = source.clone().wait_for(|count| *count > 0).await;
+            }
+        }
+    }
+
+    fn tell(&self, state: LocalState) {
+        let _ = self.news.send(News::State(state));
+    }
+}
+
+/// Waits for the order to stop, or for nobody being left to give it.
+async fn stopped(orders: &mut mpsc::UnboundedReceiver<Order>) {
+    while let Some(order) = orders.recv().await {
+        if matches!(order, Order::Stop) {
+            return;
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! The original's process: in the stub's process group, so roslaunch's signals reach it, too.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use tokio::process::{Child, Command};
+use tokio::time::timeout;
+
+/// roslaunch's order and patience, shorter: the robot's application is not concerned any more.
+const ESCALATION: [(Signal, Duration); 2] = [
+    (Signal::SIGINT, Duration::from_secs(5)),
+    (Signal::SIGTERM, Duration::from_secs(2)),
+];
+
+/// What is run.
+#[derive(Debug, Clone)]
+pub struct Program {
+    /// The executable.
+    pub path: PathBuf,
+    /// Its arguments.
+    pub argv: Vec<String>,
+    /// Variables that differ from the stub's own.
+    pub environment: Vec<(&'static str, OsString)>,
+}
+
+impl Program {
+    /// Starts it. It is killed when what is returned is dropped.
+    pub fn spawn(&self, master: &str) -> anyhow::Result<Child> {
+        let mut command = Command::new(&self.path);
+        command
+            .args(&self.argv)
+            .envs(self.environment.iter().map(|(name, value)| (name, value)))
+            .env("ROS_MASTER_URI", master)
+            .env("ROS_HOSTNAME", "localhost")
+            .env_remove("ROS_IP")
+            .stdin(std::process::Stdio::null())
+            .kill_on_drop(true);
+        command.spawn().with_context(|| {
+            format!(
+                "the local original {} cannot be executed",
+                self.path.display()
+            )
+        })
+    }
+}
+
+/// Ends it as roslaunch would.
+pub async fn end(child: &mut Child) {
+    for (signal, patience) in ESCALATION {
+        let Some(pid) = child.id().and_then(|pid| i32::try_from(pid).ok()) else {
+            return;
+        };
+        // It is not reaped yet, so the number is still its own.
+        let _ = kill(Pid::from_raw(pid), signal);
+        if timeout(patience, child.wait()).await.is_ok() {
+            return;
+        }
+    }
+    let _ = child.kill().await;
+}
+
+/// How a process ended, in words.
+pub fn ended(status: std::io::Result<std::process::ExitStatus>) -> String {
+    match status {
+        Ok(status) => status.to_string(),
+        Err(error) => error.to_string(),
+    }
+}

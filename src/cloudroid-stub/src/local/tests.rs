@@ -1,0 +1,328 @@
+//! With a real process (an ordinary ROS node) and real Masters.
+
+mod node;
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use qos::{Event, LocalState, RequestId, SafeStop, Sla};
+use ros::bus::{Bus, Message, ParamValue, WireType};
+use ros::net::{HostSockets, Sockets};
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+use super::process::Program;
+use super::{Application, Cloud, Keeper, News, Original, Setting};
+
+/// Generous: it only bounds how long a failing test takes.
+const SOON: Duration = Duration::from_secs(20);
+
+/// A robot: a Master with a parameter, and a node on it.
+async fn robot() -> Arc<Ros1Bus> {
+    let listener = HostSockets
+        .listen(SocketAddr::from(([127, 0, 0, 1], 0)))
+        .await
+        .unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions {
+        uri: format!("http://{address}/"),
+        ..MasterOptions::default()
+    });
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/robot")
+        .await
+        .unwrap();
+    let greeting = ParamValue::String("hello ".into());
+    bus.set_param("/ns/relay_sibling/greeting", greeting)
+        .await
+        .unwrap();
+    bus
+}
+
+fn string_type() -> WireType {
+    WireType {
+        name: "std_msgs/String".into(),
+        md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+        definition: "string data\n".into(),
+    }
+}
+
+fn string(text: &str) -> Message {
+    let length = u32::try_from(text.len()).unwrap().to_le_bytes();
+    Message {
+        bytes: [&length[..], text.as_bytes()].concat().into(),
+        wire_type: Arc::new(string_type()),
+        publisher: "/app".into(),
+        latching: false,
+    }
+}
+
+fn text(message: &Message) -> String {
+    String::from_utf8(message.bytes[4..].to_vec()).unwrap()
+}
+
+fn setting(argv: &[&str]) -> Setting {
+    let argv = node::ARGUMENTS.iter().chain(argv).copied().chain([
+        "in:=/ns/in",
+        "out:=/absolute/out",
+        "__name:=relay",
+    ]);
+    Setting {
+        program: Some(Program {
+            path: std::env::current_exe().unwrap(),
+            argv: argv.map(str::to_owned).collect(),
+            environment: vec![("ROS_NAMESPACE", "/ns".into())],
+        }),
+        node: "/ns/relay".into(),
+        inputs: BTreeMap::from([("/ns/in".to_owned(), string_type())]),
+        outputs: vec!["/absolute/out".into()],
+    }
+}
+
+async fn state(news: &mut mpsc::UnboundedReceiver<News>, wanted: LocalState) {
+    let waiting = async {
+        while let Some(said) = news.recv().await {
+            match said {
+                News::State(state) if state == wanted => return,
+                News::Crashed(reason) => panic!("it crashed: {reason}"),
+                _ => {}
+            }
+        }
+        panic!("it ended before it was {wanted:?}");
+    };
+    timeout(SOON, waiting).await.unwrap();
+}
+
+async fn output(news: &mut mpsc::UnboundedReceiver<News>) -> String {
+    let waiting = async {
+        loop {
+            if let News::Output(_, message) = news.recv().await.unwrap() {
+                return text(&message);
+            }
+        }
+    };
+    timeout(SOON, waiting).await.unwrap()
+}
+
+#[tokio::test]
+async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
+    let robot = robot().await;
+    let (original, mut news) = Original::new(setting(&[]), robot.clone()).await.unwrap();
+    original.start();
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string("world"));
+    assert_eq!(
+        output(&mut news).await,
+        "hello world",
+        "a sibling's parameter was copied"
+    );
+    let graph = robot.graph().borrow().clone();
+    assert_eq!(
+        graph.nodes.keys().filter(|name| *name != "/robot").count(),
+        0,
+        "{graph:?}"
+    );
+    assert!(
+        graph
+            .topics
+            .keys()
+            .all(|name| name != "/absolute/out" && name != "/ns/in"),
+        "{graph:?}"
+    );
+    let parameters = robot.param_names().await.unwrap();
+    assert!(
+        parameters.iter().all(|name| name != "/ns/relay/seen"),
+        "what it writes stays with it: {parameters:?}"
+    );
+    original.stop();
+    state(&mut news, LocalState::Stopped).await;
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string("again"));
+    assert_eq!(output(&mut news).await, "hello again");
+}
+
+#[tokio::test]
+async fn a_crash_is_told_and_it_comes_back() {
+    let (original, mut news) = Original::new(setting(&["crash-on=boom"]), robot().await)
+        .await
+        .unwrap();
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string("boom"));
+    let crashed = async {
+        loop {
+            if let News::Crashed(reason) = news.recv().await.unwrap() {
+                return reason;
+            }
+        }
+    };
+    let reason = timeout(SOON, crashed).await.unwrap();
+    assert!(reason.contains('3'), "{reason}");
+    state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string("world"));
+    assert_eq!(output(&mut news).await, "hello world");
+}
+
+#[tokio::test]
+async fn what_cannot_run_is_said() {
+    let mut missing = setting(&[]);
+    missing.program = None;
+    let (original, mut news) = Original::new(missing, robot().await).await.unwrap();
+    original.start();
+    state(&mut news, LocalState::Missing).await;
+
+    let mut broken = setting(&[]);
+    broken.program.as_mut().unwrap().path = "/nonexistent/relay".into();
+    let (original, mut news) = Original::new(broken, robot().await).await.unwrap();
+    original.start();
+    let said = async {
+        loop {
+            if let News::Crashed(reason) = news.recv().await.unwrap() {
+                return reason;
+            }
+        }
+    };
+    let reason = timeout(SOON, said).await.unwrap();
+    assert!(reason.contains("/nonexistent/relay"), "{reason}");
+}
+
+/// A cloud that takes everything and answers when told.
+#[derive(Default)]
+struct Silent {
+    inputs: Mutex<Vec<Message>>,
+    calls: Mutex<Vec<RequestId>>,
+}
+
+impl Cloud for Silent {
+    fn publish(&self, _: &str, message: &Message) {
+        self.inputs.lock().push(message.clone());
+    }
+
+    fn call(&self, request: RequestId, _: &str, _: Bytes) {
+        self.calls.lock().push(request);
+    }
+}
+
+struct Listener(mpsc::UnboundedSender<String>);
+
+impl Application for Listener {
+    fn deliver(&self, _: &str, message: Message) {
+        let _ = self.0.send(text(&message));
+    }
+
+    fn safe_stop(&self, stop: &SafeStop) {
+        let _ = self.0.send(format!("stop on {}", stop.topic));
+    }
+
+    fn decided(&self, event: &Event) {
+        let name = format!("{event:?}");
+        let name = name.split('(').next().unwrap();
+        let _ = self.0.send(name.to_lowercase());
+    }
+}
+
+#[tokio::test]
+async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again() {
+    let robot = robot().await;
+    let sla = serde_json::json!({
+        "t_desire": 0.02, "t_max": 0.05, "local": "cold", "initial": 5,
+        "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"},
+    });
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let cloud = Arc::new(Silent::default());
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
+        Some(Original::new(setting(&[]), robot).await.unwrap()),
+        cloud.clone(),
+        Arc::new(Listener(told)),
+    );
+    keeper.link_up(false);
+    let topic: Arc<str> = "/ns/in".into();
+    keeper.input(&topic, string("lost"));
+    for expected in ["stop on /cmd_vel", "start", "feed"] {
+        let heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
+        assert_eq!(heard, expected);
+    }
+    keeper.input(&topic, string("world"));
+    let mut heard = String::new();
+    while heard != "hello world" {
+        heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
+    }
+    assert_eq!(
+        cloud.inputs.lock().len(),
+        2,
+        "the cloud is asked all the time"
+    );
+    // The cloud answers again, in time, until Q is above its threshold.
+    while heard != "stop" {
+        keeper.input(&topic, string("x"));
+        keeper.cloud_output("/absolute/out", &string("cloud"));
+        heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
+    }
+    let report = keeper.report();
+    assert!(
+        report.summary.contains("the cloud answers"),
+        "{}",
+        report.summary
+    );
+}
+
+#[tokio::test]
+async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
+    let sla = serde_json::json!({"t_desire": 10, "t_max": 20, "local": "warm", "initial": 5});
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let cloud = Arc::new(Silent::default());
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec![],
+        Some(Original::new(setting(&[]), robot().await).await.unwrap()),
+        cloud.clone(),
+        Arc::new(Listener(told)),
+    );
+    keeper.link_up(false);
+    let service: Arc<str> = "/ns/relay/echo".into();
+    let call = {
+        let (keeper, service) = (keeper.clone(), service.clone());
+        tokio::spawn(async move { keeper.call(&service, Bytes::from_static(b"request")).await })
+    };
+    while cloud.calls.lock().is_empty() {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(hears.recv().await.unwrap(), "start");
+    keeper.link_down();
+    let answer = timeout(SOON, call).await.unwrap().unwrap();
+    assert_eq!(answer, Ok(Bytes::from_static(b"request")));
+    let id = cloud.calls.lock()[0];
+    keeper.cloud_answered(id, Ok(Bytes::from_static(b"late")));
+    assert_eq!(keeper.report().counts.from_local, 1);
+}
+
+#[tokio::test]
+async fn without_a_local_original_a_call_fails_with_the_reason() {
+    let sla = serde_json::json!({"t_desire": 0.01, "t_max": 0.02});
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec![],
+        None,
+        Arc::new(Silent::default()),
+        Arc::new(Listener(told)),
+    );
+    let error = timeout(SOON, keeper.call(&"/add".into(), Bytes::new()))
+        .await
+        .unwrap()
+        .unwrap_err();
+    assert!(error.contains("the link is down"), "{error}");
+    assert!(error.contains("there is no local original"), "{error}");
+    assert_eq!(hears.recv().await.unwrap(), "saidoncemissing");
+    assert!(hears.try_recv().is_err());
+}

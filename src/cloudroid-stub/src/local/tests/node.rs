@@ -1,0 +1,116 @@
+//! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting from a sibling's parameter before it;
+//! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes.
+//!
+//! It is a process of its own: the tests' executable, told to run nothing but this.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use ros::bus::{
+    AdvertiseOptions, Bus, ParamValue, ServiceHandler, ServiceType, SubscribeOptions, WireType,
+};
+use ros::net::{HostSockets, Sockets};
+use ros::ros1::Ros1Bus;
+use ros::ros1::names::{self, PeerUri};
+
+struct Echo;
+
+#[async_trait]
+impl ServiceHandler for Echo {
+    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
+        Ok(request)
+    }
+}
+
+/// Arguments that make the tests' executable this node; others follow.
+pub const ARGUMENTS: [&str; 4] = [
+    "local::tests::node::relay_node",
+    "--exact",
+    "--ignored",
+    "--nocapture",
+];
+
+#[test]
+#[ignore = "a node that the other tests start"]
+fn relay_node() {
+    if std::env::args().any(|argument| argument == "__name:=relay") {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        runtime.block_on(run()).unwrap();
+    }
+}
+
+async fn run() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<String> = std::env::args().collect();
+    let given = |name: &str| {
+        let prefix = format!("{name}:=");
+        arguments
+            .iter()
+            .rev()
+            .find_map(|argument| argument.strip_prefix(&prefix))
+            .map(str::to_owned)
+    };
+    let namespace = std::env::var("ROS_NAMESPACE").unwrap_or_default();
+    let name = given("__name").unwrap_or_else(|| "relay".into());
+    let node = names::canonical(&format!("{namespace}/{name}"));
+    let topic = |name: &str| names::resolve(&given(name).unwrap_or_else(|| name.into()), &node);
+    let crash = arguments
+        .iter()
+        .find_map(|argument| argument.strip_prefix("crash-on="));
+
+    let master =
+        PeerUri::parse(&std::env::var("ROS_MASTER_URI")?, "http").ok_or("ROS_MASTER_URI")?;
+    let master = HostSockets.resolve(&master.host, master.port).await?;
+    let bus = Ros1Bus::connect(Arc::new(HostSockets), master, &node).await?;
+    let greeting = match bus.get_param(&format!("{node}_sibling/greeting")).await {
+        Ok(ParamValue::String(greeting)) => greeting,
+        _ => String::new(),
+    };
+    bus.set_param(&format!("{node}/seen"), ParamValue::Bool(true))
+        .await?;
+    let wire_type = WireType {
+        name: "std_msgs/String".into(),
+        md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+        definition: "string data\n".into(),
+    };
+    let echo_type = ServiceType {
+        name: "tests/Echo".into(),
+        md5: "0123456789abcdef0123456789abcdef".into(),
+    };
+    let _echo = bus
+        .serve(&format!("{node}/echo"), echo_type, Arc::new(Echo))
+        .await?;
+    let out = AdvertiseOptions {
+        wire_type: wire_type.clone(),
+        latch: false,
+        queue: 8,
+    };
+    let out = bus.advertise(&topic("out"), out).await?;
+    let input = SubscribeOptions {
+        wire_type: Some(wire_type),
+        queue: 8,
+    };
+    let mut input = bus.subscribe(&topic("in"), input).await?;
+    let mut end = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::interrupt())?;
+    loop {
+        tokio::select! {
+            message = input.messages.recv() => {
+                let Some(message) = message else { return Ok(()) };
+                let text = String::from_utf8_lossy(&message.bytes[4..]).into_owned();
+                if crash == Some(text.as_str()) {
+                    std::process::exit(3);
+                }
+                let text = format!("{greeting}{text}");
+                let length = u32::try_from(text.len())?.to_le_bytes();
+                out.publish([&length[..], text.as_bytes()].concat().into());
+            }
+            _ = end.recv() => {
+                bus.close().await;
+                return Ok(());
+            }
+        }
+    }
+}
