@@ -47,6 +47,11 @@ stub-dev:
 	@RUSTFLAGS="-C target-feature=+crt-static -C strip=debuginfo" $(STUB)
 	@install -D -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/debug/cloudroid-stub" "$(CARGO_TARGET_DIR)/debug/stubs/x86_64/cloudroid-stub"
 
+.PHONY: stub-cross
+stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it under qemu (as root)
+	@scripts/deps run
+	@scripts/stub-cross "$(CACHE)" "$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/debug"
+
 .PHONY: build
 build: ## build the daemon, the command line tool and the servants' init, optimised
 	@scripts/deps build

@@ -22,6 +22,8 @@ mod portal;
 mod push;
 #[path = "stories/refusals.rs"]
 mod refusals;
+#[path = "stories/shadowing.rs"]
+mod shadowing;
 #[path = "stories/spares.rs"]
 mod spares;
 #[path = "stories/survival.rs"]
@@ -110,6 +112,15 @@ fn main() -> ExitCode {
             nodes_end_as_ros_users_know_it,
             a_locked_database_is_named_and_waited_for,
             a_full_disk_is_named_and_robots_at_work_stay,
+        ],
+        stories![shadowing:
+            on_debians_layout_every_tool_finds_the_stub,
+            on_an_opt_ros_layout_every_tool_finds_the_stub,
+            without_the_original_the_stub_stands_alone,
+            what_is_not_outsourced_becomes_the_original,
+            the_installer_checks_before_it_writes_and_undoes_itself,
+            its_nodelets_cannot_be_loaded_on_the_robot,
+            stubs_are_served_to_those_who_may_and_say_what_is_lacking,
         ],
     ]
     .into_iter()

@@ -6,6 +6,7 @@ pub mod burglar;
 pub mod daemon;
 pub mod deployer;
 pub mod leftovers;
+pub mod machine;
 pub mod procfs;
 pub mod robot;
 pub mod world;

@@ -92,6 +92,13 @@ impl World {
         self.place.path().join(name)
     }
 
+    /// A new, empty directory, gone with its story.
+    pub fn directory(&self, name: &str) -> anyhow::Result<TempDir> {
+        Ok(tempfile::Builder::new()
+            .prefix(&format!("{name}-"))
+            .tempdir_in(self.place.path())?)
+    }
+
     /// A daemon of one's own.
     pub fn own(&self, name: &str) -> Setup {
         Setup::new(&self.home(name))

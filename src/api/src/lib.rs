@@ -7,6 +7,7 @@
 pub mod cpuset;
 pub mod doctor;
 pub mod event;
+pub mod explain;
 pub mod interface;
 pub mod limits;
 pub mod problem;

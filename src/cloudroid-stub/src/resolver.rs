@@ -203,11 +203,11 @@ fn address_in(message: &[u8], name: &str, id: Option<u16>) -> Option<Option<IpAd
         at += 10 + length;
         relevant |= owner.eq_ignore_ascii_case(name);
         // With an id the server has followed aliases for us.
-        if kind == TYPE_A
-            && relevant
-            && let &[a, b, c, d] = data
-        {
-            return Some(Some(Ipv4Addr::new(a, b, c, d).into()));
+        match *data {
+            [a, b, c, d] if kind == TYPE_A && relevant => {
+                return Some(Some(Ipv4Addr::new(a, b, c, d).into()));
+            }
+            _ => {}
         }
     }
     relevant.then_some(None)

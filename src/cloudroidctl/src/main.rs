@@ -6,6 +6,7 @@
 mod client;
 mod doctor;
 mod events;
+mod explain;
 mod limits;
 mod logs;
 mod output;
@@ -68,6 +69,7 @@ enum Verb {
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
     Stub(stub::Stub),
+    Explain(explain::Explain),
     Status(status::Status),
     Doctor(doctor::Doctor),
 }
@@ -111,6 +113,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
+        Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
     }

@@ -28,6 +28,14 @@ pub enum Error {
         /// What there is.
         exists: Vec<String>,
     },
+    /// No robot of that name is served, or was lately.
+    #[error("robot {name:?} is not served, and nothing is known of it")]
+    UnknownRobot {
+        /// Asked for.
+        name: String,
+        /// Those that are served.
+        exists: Vec<String>,
+    },
     /// No such revision.
     #[error("service {service} has no revision {revision}")]
     UnknownRevision {
@@ -184,6 +192,7 @@ impl Error {
         match self {
             Error::UnknownService { exists, .. }
             | Error::UnknownServant { exists, .. }
+            | Error::UnknownRobot { exists, .. }
             | Error::UnknownRevision { exists, .. }
             | Error::UnknownArchitecture { exists, .. } => problem.exists = exists.clone(),
             Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
@@ -199,6 +208,7 @@ impl Error {
         match self {
             Error::UnknownService { .. } => (S::NOT_FOUND, "unknown-service", "unknown service"),
             Error::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
+            Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
             Error::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
             Error::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
@@ -235,6 +245,9 @@ impl Error {
             Error::UnknownService { exists, .. } if exists.is_empty() => "publish one with: cloudroidctl push".into(),
             Error::UnknownService { .. } => "use one that exists, or publish it with: cloudroidctl push".into(),
             Error::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
+            Error::UnknownRobot { .. } => {
+                "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
+            }
             Error::UnknownRevision { service, .. } => {
                 format!("see those that exist with: cloudroidctl services {service}")
             }

@@ -16,6 +16,7 @@ mod config;
 mod definitions;
 mod doctor;
 mod errors;
+mod explain;
 mod home;
 mod journal;
 mod linked;

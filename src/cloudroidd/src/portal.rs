@@ -126,6 +126,7 @@ pub fn router(app: Arc<App>) -> Router {
                 .delete(api_v1::stop_servant),
         )
         .route("/servants/{id}/logs", get(api_v1::logs))
+        .route("/robots/{name}/explain", get(api_v1::explain))
         .route(
             "/push",
             post(crate::push::handle).layer(DefaultBodyLimit::disable()),

@@ -121,6 +121,8 @@ pub struct LinkStatus {
     pub sla: Sla,
     /// Its last requests, as it told them, oldest first.
     pub requests: Vec<Request>,
+    /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
+    pub unfed: Vec<String>,
 }
 
 impl Hub {

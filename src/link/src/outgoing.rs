@@ -201,7 +201,12 @@ impl Outgoing {
             return Some(self.start(out, now));
         }
         let turn_for_big = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
-        if !turn_for_big && let Some(out) = self.next_message(now) {
+        let message = if turn_for_big {
+            None
+        } else {
+            self.next_message(now)
+        };
+        if let Some(out) = message {
             self.in_a_row += 1;
             return Some(self.start(out, now));
         }
@@ -213,11 +218,9 @@ impl Outgoing {
     fn next_message(&mut self, now: i64) -> Option<Out> {
         let channel = self.turns.pop_front()?;
         let topic = self.topics.get_mut(&channel)?;
-        while topic.len() > 1
-            && let Some(first) = topic.front()
-            && !first.each
-            && self.max_age.is_some_and(|age| now - first.born > age)
-        {
+        let stale =
+            |first: &Out| !first.each && self.max_age.is_some_and(|age| now - first.born > age);
+        while topic.len() > 1 && topic.front().is_some_and(stale) {
             topic.pop_front();
             self.dropped.stale += 1;
         }
@@ -290,14 +293,11 @@ impl Outgoing {
         if sending.at < sending.out.len() {
             self.sending.push_back(sending);
         } else {
-            if let Some(channel) = sending.out.channel
-                && self
-                    .topics
-                    .get(&channel)
-                    .is_some_and(|topic| !topic.is_empty())
-            {
-                self.turns.push_back(channel);
-            }
+            let waiting = sending.out.channel.filter(|channel| {
+                let topic = self.topics.get(channel);
+                topic.is_some_and(|topic| !topic.is_empty())
+            });
+            self.turns.extend(waiting);
             self.keep(sending.number, sending.out);
         }
         Some(Frame::More { stream, bytes })
@@ -305,9 +305,7 @@ impl Outgoing {
 
     /// The peer has all numbers up to this one.
     pub(crate) fn acknowledge(&mut self, number: u32) {
-        while let Some((kept, _)) = self.kept.front()
-            && *kept <= number
-        {
+        while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, out)) = self.kept.pop_front() {
                 self.kept_bytes -= out.len();
             }

@@ -327,9 +327,10 @@ impl Session {
             return;
         }
         let mut state = self.state.lock();
-        while socket.queued() < LOW_WATER
-            && let Some(frame) = state.out.next(now())
-        {
+        while socket.queued() < LOW_WATER {
+            let Some(frame) = state.out.next(now()) else {
+                return;
+            };
             socket.queue(opcode::BINARY, frame.encode());
         }
     }

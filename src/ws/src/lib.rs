@@ -141,9 +141,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             if self.header.is_none() {
                 self.header = self.next_header()?;
             }
-            if let Some(header) = self.header
-                && header.length <= self.read.len() as u64
-            {
+            let complete = |header: &frame::Header| header.length <= self.read.len() as u64;
+            if let Some(header) = self.header.filter(complete) {
                 self.header = None;
                 let payload = self.read.split_to(header.length as usize);
                 if let Some(message) = self.accept(header, payload)? {

@@ -9,6 +9,7 @@ use serde_json::Value;
 use super::overlay::Place;
 use super::{Check, http};
 use crate::config::Config;
+use crate::resolver;
 
 /// The clock is asked so often; the quickest answer counts.
 const SAMPLES: usize = 5;
@@ -62,23 +63,19 @@ impl Portal {
             .map_or(config.server.as_str(), |(_, rest)| rest)
             .trim_end_matches('/')
             .to_owned();
-        let token = token(config).map_err(|error| {
+        let token = config.token().map_err(|error| {
             let mend = format!("{installer} --token TOKEN");
-            Box::new(Check::bad("token", error, mend))
+            Box::new(Check::bad("token", format!("{error:#}"), mend))
         })?;
+        let token = token.filter(|token| !token.is_empty());
         let (host, port) = parts(&authority);
-        let found = tokio::net::lookup_host((host, port)).await;
-        match found.map(|mut addresses| addresses.next()) {
-            Ok(Some(address)) => Ok(Portal {
-                address,
+        match resolver::resolve(host).await {
+            Ok(ip) => Ok(Portal {
+                address: SocketAddr::new(ip, port),
                 authority,
                 token,
                 installer,
             }),
-            Ok(None) => {
-                let found = format!("{host} has no address");
-                Err(Box::new(Check::bad("server", found, mend)))
-            }
             Err(error) => {
                 let found = format!("{host} is not found: {error}");
                 Err(Box::new(Check::bad("server", found, mend)))
@@ -194,17 +191,6 @@ impl Portal {
             ),
         }
     }
-}
-
-/// The token, as the settings say.
-fn token(config: &Config) -> Result<Option<String>, String> {
-    let text = match (&config.token, &config.token_file) {
-        (Some(token), _) => token.clone(),
-        (None, Some(path)) => std::fs::read_to_string(path)
-            .map_err(|error| format!("cannot read {}: {error}", path.display()))?,
-        (None, None) => return Ok(None),
-    };
-    Ok(Some(text.trim().to_owned()).filter(|token| !token.is_empty()))
 }
 
 /// Host and port; 9090 where none is said.

@@ -149,6 +149,14 @@ pub async fn set_limits(
     Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
 }
 
+/// Why a robot is slow, or on its local original.
+pub async fn explain(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Answer<api::explain::Explanation> {
+    Ok(Json(crate::explain::robot(&app, &name).await?))
+}
+
 /// Ends one servant.
 pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<Stopped> {
     app.choreographer.servant(&id)?;

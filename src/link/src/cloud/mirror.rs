@@ -53,9 +53,12 @@ impl Told {
             ..Graph::default()
         };
         for (topic, ends) in &seen.topics {
-            if ends.publishers.contains(&link.node)
-                && let Some(wire_type) = self.type_of(link, hub, topic, &ends.type_name).await
-            {
+            let wire_type = if ends.publishers.contains(&link.node) {
+                self.type_of(link, hub, topic, &ends.type_name).await
+            } else {
+                None
+            };
+            if let Some(wire_type) = wire_type {
                 let channel = self.channel(link, topic);
                 graph.outputs.push(Output {
                     channel,
@@ -75,10 +78,10 @@ impl Told {
             }
         }
         for (service, server) in &seen.services {
-            if *server == link.node
-                && let Some(served) = self.service(link, hub, service).await
-            {
-                graph.services.push(served);
+            if *server == link.node {
+                graph
+                    .services
+                    .extend(self.service(link, hub, service).await);
             }
         }
         self.let_go(link, &graph);

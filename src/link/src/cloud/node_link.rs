@@ -123,7 +123,27 @@ impl NodeLink {
             dropped: dropped.replaced + dropped.stale,
             sla: self.sla.clone(),
             requests: self.requests.lock().iter().cloned().collect(),
+            unfed: self.unfed(),
         }
+    }
+
+    /// Our own end publishes what the robot sends.
+    fn unfed(&self) -> Vec<String> {
+        let Some(hub) = self.hub.upgrade() else {
+            return Vec::new();
+        };
+        let graph = hub.bus.graph();
+        let graph = graph.borrow();
+        let fed = |topic: &&String| {
+            let ends = graph.topics.get(*topic);
+            ends.is_some_and(|ends| !ends.publishers.is_empty())
+        };
+        let listening = self.listening.lock();
+        listening
+            .iter()
+            .filter(|topic| !fed(topic))
+            .cloned()
+            .collect()
     }
 
     fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes) {

@@ -1,0 +1,111 @@
+//! Why a robot is slow, or answered locally, now: `GET /api/v1/robots/NAME/explain`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::event::Event;
+use crate::servant::Servant;
+
+/// All that is known of one robot, and what follows from it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Explanation {
+    /// The robot.
+    pub robot: String,
+    /// What follows, the weightiest first; empty when nothing is wrong.
+    pub causes: Vec<Cause>,
+    /// Its servants.
+    pub servants: Vec<Served>,
+    /// What happened to it last, oldest first.
+    pub events: Vec<Event>,
+}
+
+/// One reason.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Cause {
+    /// How much it matters.
+    pub weight: Weight,
+    /// What is so, with its figures.
+    pub what: String,
+    /// What to do about it.
+    pub next: String,
+}
+
+/// How much a cause matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Weight {
+    /// Nothing works with it.
+    Blocks,
+    /// It costs response time.
+    Slows,
+    /// Worth knowing.
+    Hint,
+}
+
+/// A servant of the robot, and the links to it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Served {
+    /// As in a list.
+    pub servant: Servant,
+    /// Share of the last moment in which it wanted to run and had used its cores up, 0 to 1.
+    pub throttled: f64,
+    /// Cores that it used in the last moment.
+    pub cores: f64,
+    /// One for each node that a stub stands for.
+    pub links: Vec<Link>,
+}
+
+/// A node's link and its last requests. Times are in milliseconds.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Link {
+    /// The node.
+    pub node: String,
+    /// Its connection is there and not silent.
+    pub up: bool,
+    /// Last round trip.
+    pub round_trip: Option<f64>,
+    /// The robot's clock minus this machine's.
+    pub clock: Option<f64>,
+    /// Bytes a second downwards, when it had to hurry.
+    pub throughput: Option<f64>,
+    /// Messages that were not sent down.
+    pub dropped: u64,
+    /// T_desire.
+    pub desire: Option<f64>,
+    /// T_max.
+    pub max: Option<f64>,
+    /// Q after the last request.
+    pub satisfaction: Option<f64>,
+    /// So many requests are known.
+    pub requests: usize,
+    /// Of them passed T_max, or were never answered by the cloud.
+    pub late: usize,
+    /// Of them were answered by the local original.
+    pub local: usize,
+    /// Where their time went.
+    pub phases: Vec<Part>,
+    /// Inputs that the node listens to and nobody on the robot publishes.
+    pub unfed: Vec<String>,
+}
+
+/// A part of the response time, over the last requests.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Part {
+    /// `serialise`, `up`, `queue`, `compute`, `down` or `total`.
+    pub name: String,
+    /// Median.
+    pub p50: f64,
+    /// 90th percentile.
+    pub p90: f64,
+    /// Maximum.
+    pub max: f64,
+}
+
+impl Link {
+    /// The part with the greatest median.
+    pub fn dominant(&self) -> Option<&Part> {
+        self.phases
+            .iter()
+            .filter(|part| part.name != "total" && part.p50 > 0.0)
+            .max_by(|a, b| a.p50.total_cmp(&b.p50))
+    }
+}

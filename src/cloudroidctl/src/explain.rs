@@ -1,0 +1,100 @@
+//! `explain`: one screen that says why a robot is slow, or on its local original.
+
+use api::explain::{Explanation, Link, Served, Weight};
+
+use crate::client::{Client, escaped};
+use crate::output::{self, Format, Table};
+
+/// Say why a robot is slow, or answered by its local original, now.
+#[derive(Debug, clap::Args)]
+pub struct Explain {
+    /// The robot.
+    robot: String,
+}
+
+impl Explain {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let path = format!("/api/v1/robots/{}/explain", escaped(&self.robot));
+        let explanation: Explanation = client.get(&path).await?;
+        match format {
+            Format::Json => output::json(&explanation),
+            Format::Table => print(&explanation),
+        }
+    }
+}
+
+fn print(explanation: &Explanation) -> anyhow::Result<()> {
+    if explanation.causes.is_empty() {
+        output::line(&format!("{}: nothing is wrong", explanation.robot))?;
+    }
+    for cause in &explanation.causes {
+        let mark = match cause.weight {
+            Weight::Blocks => "BLOCKS",
+            Weight::Slows => "slows ",
+            Weight::Hint => "hint  ",
+        };
+        output::line(&format!("{mark}  {}\n        {}", cause.what, cause.next))?;
+    }
+    for served in &explanation.servants {
+        servant(served)?;
+    }
+    if !explanation.events.is_empty() {
+        output::line("\nlately")?;
+    }
+    for event in &explanation.events {
+        output::line(&format!(
+            "  {}  {}",
+            output::clock(event.time),
+            event.message
+        ))?;
+    }
+    Ok(())
+}
+
+fn servant(served: &Served) -> anyhow::Result<()> {
+    let servant = &served.servant;
+    output::line(&format!(
+        "\n{} of {} (revision {}): {}, {} connections, {:.2} cores used, held back {:.0} % of the time, limits {}",
+        servant.id,
+        servant.service,
+        servant.revision,
+        servant.phase,
+        servant.connections,
+        served.cores,
+        served.throttled * 100.0,
+        output::limits(&servant.enforced.unwrap_or(servant.limits)),
+    ))?;
+    served.links.iter().try_for_each(link)
+}
+
+fn link(link: &Link) -> anyhow::Result<()> {
+    let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
+    output::line(&format!(
+        "  {}: link {}, round trip {}, clock {}, T_desire {}, T_max {}, Q {}; of {} requests {} late, {} answered locally",
+        link.node,
+        if link.up { "up" } else { "DOWN" },
+        millis(link.round_trip),
+        millis(link.clock),
+        millis(link.desire),
+        millis(link.max),
+        link.satisfaction
+            .map_or("-".to_owned(), |q| format!("{q:.1}")),
+        link.requests,
+        link.late,
+        link.local,
+    ))?;
+    let mut table = Table::new(&["    PART", "MEDIAN", "90 %", "MAX"]);
+    for part in &link.phases {
+        table.row([
+            format!("    {}", part.name),
+            format!("{:.1} ms", part.p50),
+            format!("{:.1} ms", part.p90),
+            format!("{:.1} ms", part.max),
+        ]);
+    }
+    if table.is_empty() {
+        return Ok(());
+    }
+    table.print()
+}

@@ -1,0 +1,500 @@
+//! Why is this robot slow, or on its local original? From what its stubs tell, and what the kernel counts.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
+use api::{Event, Phase};
+use link::cloud::LinkStatus;
+use link::control::Request;
+
+use crate::choreographer::{Handle, describe};
+use crate::errors::Error;
+use crate::portal::App;
+
+/// Between two looks at what a servant uses.
+const MOMENT: Duration = Duration::from_millis(400);
+/// Events that are told.
+const EVENTS: usize = 8;
+/// Of these many the robot's are looked for.
+const EVENTS_SEARCHED: u32 = 2000;
+/// Shares and differences from which on something is worth saying.
+const THROTTLED: f64 = 0.05;
+const WAITS: f64 = 10.0;
+const CLOCK_APART: f64 = 100.0;
+const LATE: f64 = 0.05;
+
+/// Explains one robot.
+pub async fn robot(app: &App, name: &str) -> Result<Explanation, Error> {
+    let all = app.choreographer.servants();
+    let mine: Vec<&Arc<Handle>> = all.iter().filter(|handle| handle.robot == name).collect();
+    let events = events(app, name)?;
+    if mine.is_empty() && events.is_empty() {
+        let mut exists: Vec<String> = all.iter().map(|handle| handle.robot.clone()).collect();
+        exists.sort();
+        exists.dedup();
+        return Err(Error::UnknownRobot {
+            name: name.to_owned(),
+            exists,
+        });
+    }
+    let servants = futures_util::future::join_all(mine.iter().map(|handle| served(handle))).await;
+    Ok(Explanation {
+        robot: name.to_owned(),
+        causes: causes(&servants, &events),
+        servants,
+        events,
+    })
+}
+
+fn events(app: &App, robot: &str) -> Result<Vec<Event>, Error> {
+    let mut events = app.state.events(0, EVENTS_SEARCHED)?;
+    events.retain(|event| event.robot.as_deref() == Some(robot));
+    let skipped = events.len().saturating_sub(EVENTS);
+    Ok(events.split_off(skipped))
+}
+
+async fn served(handle: &Handle) -> Served {
+    let before = describe(handle).await;
+    tokio::time::sleep(MOMENT).await;
+    let servant = describe(handle).await;
+    let spent = |of: fn(&api::Usage) -> u64| {
+        let (Some(before), Some(after)) = (&before.usage, &servant.usage) else {
+            return 0.0;
+        };
+        of(after).saturating_sub(of(before)) as f64 / MOMENT.as_micros() as f64
+    };
+    Served {
+        throttled: spent(|usage| usage.throttled_usec).min(1.0),
+        cores: spent(|usage| usage.cpu_usec),
+        links: links(handle),
+        servant,
+    }
+}
+
+/// The links to a servant, if it has got that far.
+fn links(handle: &Handle) -> Vec<Link> {
+    let status = handle.works().map(|works| works.hub.status());
+    status.unwrap_or_default().into_iter().map(link).collect()
+}
+
+fn link(status: LinkStatus) -> Link {
+    let millis = |seconds: f64| seconds * 1000.0;
+    let max = status.sla.max.map(millis);
+    let is_late = |request: &&Request| match (request.total, max) {
+        (Some(total), Some(max)) => total > max,
+        (answered, _) => answered.is_none(),
+    };
+    let requests = &status.requests;
+    let times = |of: fn(&Request) -> f64| {
+        let answered = requests.iter().filter(|request| request.total.is_some());
+        answered.map(of).collect::<Vec<_>>()
+    };
+    let phases = [
+        part("serialise", times(|request| request.serialise)),
+        part("up", times(|request| request.up)),
+        part("queue", times(|request| request.queue)),
+        part("compute", times(|request| request.compute)),
+        part("down", times(|request| request.down)),
+        part("total", times(|request| request.total.unwrap_or(f64::NAN))),
+    ];
+    Link {
+        up: status.up,
+        round_trip: status.round_trip,
+        clock: status.clock,
+        throughput: status.throughput,
+        dropped: status.dropped,
+        desire: status.sla.desire.map(millis),
+        max,
+        satisfaction: requests.last().map(|request| request.satisfaction),
+        requests: requests.len(),
+        late: requests.iter().filter(is_late).count(),
+        local: requests.iter().filter(|request| request.local).count(),
+        phases: phases.into_iter().flatten().collect(),
+        unfed: status.unfed,
+        node: status.node,
+    }
+}
+
+/// What follows from all that, the weightiest first.
+fn causes(servants: &[Served], events: &[Event]) -> Vec<Cause> {
+    let mut causes = Vec::new();
+    let mut say = |weight, what: String, next: String| causes.push(Cause { weight, what, next });
+    if servants.is_empty() {
+        let last = events.last().map(|event| event.message.as_str());
+        let what = match last {
+            Some(last) => format!("it has no servant; the last that happened: {last}"),
+            None => "it has no servant".to_owned(),
+        };
+        let next = "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned();
+        say(Weight::Blocks, what, next);
+    }
+    for served in servants {
+        of_servant(served, &mut say);
+        for link in &served.links {
+            of_link(served, link, &mut say);
+        }
+    }
+    causes.sort_by_key(|cause| cause.weight);
+    causes
+}
+
+fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
+    let servant = &served.servant;
+    let id = &servant.id;
+    if servant.phase != Phase::Ready {
+        let reason = servant.reason.as_deref().unwrap_or("no reason is known");
+        let weight = match servant.phase {
+            Phase::Failed | Phase::Stopped => Weight::Blocks,
+            _ => Weight::Slows,
+        };
+        say(
+            weight,
+            format!("{id} is {}: {reason}", servant.phase),
+            format!("cloudroidctl logs {id}"),
+        );
+    }
+    if servant.connections == 0 {
+        say(
+            Weight::Blocks,
+            format!("nothing of the robot is connected to {id}"),
+            "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned(),
+        );
+    }
+    if served.throttled > THROTTLED {
+        let cpus = servant
+            .enforced
+            .and_then(|limits| limits.cpus)
+            .or(servant.limits.cpus);
+        let limit = cpus.map_or_else(String::new, |cpus| format!(" of {cpus}"));
+        say(
+            Weight::Slows,
+            format!(
+                "{id} is held back by its CPU limit{limit} for {:.0} % of the time",
+                served.throttled * 100.0
+            ),
+            format!("give {} more cores: push it with --cpus N", servant.service),
+        );
+    }
+    let pressure = servant.usage.and_then(|usage| usage.pressure);
+    let waits = pressure.map(|pressure| {
+        [
+            ("a core", pressure.cpu),
+            ("memory", pressure.memory),
+            ("a disk", pressure.io),
+        ]
+    });
+    for (what, share) in waits.into_iter().flatten() {
+        // Being held back by one's own limit counts as waiting for a core, too.
+        let by_itself = what == "a core" && served.throttled > THROTTLED;
+        if share > WAITS && !by_itself {
+            say(
+                Weight::Slows,
+                format!("{id} waits for {what} {share:.0} % of the time"),
+                "see what else runs on the server: cloudroidctl servants".to_owned(),
+            );
+        }
+    }
+    let killed = servant.usage.map_or(0, |usage| usage.oom_kills);
+    if killed > 0 {
+        say(
+            Weight::Slows,
+            format!("{killed} processes of {id} were killed for want of memory"),
+            format!(
+                "give {} more memory: push it with --memory SIZE",
+                servant.service
+            ),
+        );
+    }
+    if servant.dropped > 0 {
+        say(
+            Weight::Hint,
+            format!(
+                "{} messages of {id} were dropped because a reader was slow",
+                servant.dropped
+            ),
+            "lower the rate of what is subscribed to, or compress it".to_owned(),
+        );
+    }
+}
+
+fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+    let node = &link.node;
+    if !link.up {
+        say(
+            Weight::Blocks,
+            format!("the link of {node} is down"),
+            "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
+        );
+    }
+    for topic in &link.unfed {
+        say(
+            Weight::Blocks,
+            format!("{node} listens to {topic}, which nobody on the robot publishes"),
+            format!("remap it to the topic that is meant: {topic}:=/THE/TOPIC"),
+        );
+    }
+    if let Some(clock) = link.clock.filter(|clock| clock.abs() > CLOCK_APART) {
+        let side = if clock > 0.0 { "ahead of" } else { "behind" };
+        say(
+            Weight::Hint,
+            format!(
+                "the robot's clock is {:.0} ms {side} the server's",
+                clock.abs()
+            ),
+            "sudo apt install chrony, on both sides".to_owned(),
+        );
+    }
+    if link.requests == 0 {
+        return;
+    }
+    let late = link.late as f64 / link.requests as f64;
+    if late > LATE {
+        let max = link
+            .max
+            .map_or_else(String::new, |max| format!(" ({max:.0} ms)"));
+        let (part, next) = blame(served, link);
+        say(
+            Weight::Slows,
+            format!(
+                "{} of the last {} requests of {node} passed T_max{max}{part}",
+                link.late, link.requests
+            ),
+            next,
+        );
+    }
+    if link.local > 0 {
+        let q = link
+            .satisfaction
+            .map_or_else(String::new, |q| format!(", Q is {q:.1}"));
+        say(
+            Weight::Hint,
+            format!(
+                "the local original answered {} of the last {} requests of {node}{q}",
+                link.local, link.requests
+            ),
+            "it stops by itself when the cloud keeps T_max again".to_owned(),
+        );
+    }
+}
+
+/// Where the time goes, and what helps there.
+fn blame(served: &Served, link: &Link) -> (String, String) {
+    let Some(part) = link.dominant() else {
+        return (
+            String::new(),
+            "no request was answered: see the robot's log".into(),
+        );
+    };
+    let text = format!(
+        "; most of the time goes into {} ({:.0} ms)",
+        part.name, part.p50
+    );
+    let next = match part.name.as_str() {
+        "up" | "down" => "look at the robot's network; codec = \"video\" in stub.toml sends less".to_owned(),
+        "queue" => "requests come faster than they are answered: lower their rate, or give more cores with --cpus".to_owned(),
+        "compute" => format!(
+            "the node itself is slow: push {} with more --cpus, or raise T_max",
+            served.servant.service
+        ),
+        _ => "the robot itself is busy: see top there".to_owned(),
+    };
+    (text, next)
+}
+
+/// Quantiles (nearest rank) of one part of the last requests; nothing when there were none.
+fn part(name: &str, mut times: Vec<f64>) -> Option<Part> {
+    times.retain(|time| time.is_finite());
+    times.sort_by(f64::total_cmp);
+    let rank = |percent: usize| {
+        times
+            .get((times.len() * percent).div_ceil(100).max(1) - 1)
+            .copied()
+    };
+    Some(Part {
+        name: name.to_owned(),
+        p50: rank(50)?,
+        p90: rank(90)?,
+        max: rank(100)?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn served(link: Link) -> Served {
+        Served {
+            servant: api::Servant {
+                id: "s1".into(),
+                service: "people".into(),
+                revision: 1,
+                robot: "rover".into(),
+                phase: Phase::Ready,
+                reason: None,
+                created: 0,
+                connections: 1,
+                idle_until: None,
+                limits: api::Limits {
+                    cpus: Some(0.5),
+                    ..api::Limits::default()
+                },
+                enforced: None,
+                cgroup_version: 2,
+                usage: Some(api::Usage::default()),
+                pids: Vec::new(),
+                dropped: 0,
+            },
+            throttled: 0.0,
+            cores: 0.0,
+            links: vec![link],
+        }
+    }
+
+    fn link() -> Link {
+        Link {
+            node: "/detect".into(),
+            up: true,
+            clock: Some(3.0),
+            max: Some(300.0),
+            requests: 100,
+            phases: vec![
+                part("up", vec![20.0; 3]).expect("times"),
+                part("compute", vec![90.0; 3]).expect("times"),
+            ],
+            ..Link::default()
+        }
+    }
+
+    fn texts(served: Served) -> Vec<(Weight, String)> {
+        causes(&[served], &[])
+            .into_iter()
+            .map(|cause| (cause.weight, format!("{}; {}", cause.what, cause.next)))
+            .collect()
+    }
+
+    #[test]
+    fn when_all_is_well_nothing_is_said() {
+        assert_eq!(texts(served(link())), []);
+    }
+
+    #[test]
+    fn late_requests_are_blamed_on_the_part_that_takes_longest() {
+        let causes = texts(served(Link { late: 20, ..link() }));
+        assert_eq!(causes.len(), 1);
+        assert!(
+            causes[0].1.starts_with(
+                "20 of the last 100 requests of /detect passed T_max (300 ms); most of the time goes into compute (90 ms)"
+            ),
+            "{causes:?}"
+        );
+    }
+
+    #[test]
+    fn each_thing_that_can_be_wrong_is_named() {
+        let mut all = served(Link {
+            up: false,
+            clock: Some(-2000.0),
+            unfed: vec!["/image".into()],
+            local: 7,
+            satisfaction: Some(2.5),
+            ..link()
+        });
+        all.throttled = 0.4;
+        all.servant.dropped = 3;
+        all.servant.usage = Some(api::Usage {
+            oom_kills: 1,
+            pressure: Some(api::Pressure {
+                cpu: 80.0,
+                memory: 30.0,
+                io: 0.0,
+            }),
+            ..api::Usage::default()
+        });
+        let causes = texts(all);
+        let words = [
+            "the link of /detect is down",
+            "listens to /image, which nobody on the robot publishes; remap it",
+            "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
+            "waits for memory 30 %",
+            "1 processes of s1 were killed",
+            "3 messages of s1 were dropped",
+            "2000 ms behind the server's",
+            "answered 7 of the last 100 requests of /detect, Q is 2.5",
+        ];
+        for words in words {
+            assert!(
+                causes.iter().any(|(_, text)| text.contains(words)),
+                "{words}: {causes:?}"
+            );
+        }
+        assert_eq!(causes.len(), words.len(), "{causes:?}");
+        assert!(causes.is_sorted_by_key(|(weight, _)| *weight));
+    }
+
+    #[test]
+    fn a_robot_without_a_servant_is_told_what_happened_last() {
+        let event = Event {
+            id: 1,
+            time: 0,
+            level: api::Level::Error,
+            kind: "servant-failed".into(),
+            service: None,
+            servant: None,
+            robot: Some("rover".into()),
+            message: "the servant ran out of memory".into(),
+        };
+        let causes = causes(&[], &[event]);
+        assert_eq!(causes[0].weight, Weight::Blocks);
+        assert!(causes[0].what.ends_with("the servant ran out of memory"));
+    }
+
+    #[test]
+    fn a_links_requests_are_summed_up() {
+        let request = |total: Option<f64>, local| Request {
+            total,
+            compute: 40.0,
+            local,
+            satisfaction: 6.0,
+            ..Request::default()
+        };
+        let seen = super::link(LinkStatus {
+            node: "/detect".into(),
+            up: true,
+            round_trip: Some(2.0),
+            clock: None,
+            throughput: None,
+            dropped: 0,
+            sla: link::control::Sla {
+                desire: Some(0.05),
+                max: Some(0.1),
+                ..Default::default()
+            },
+            requests: vec![
+                request(Some(50.0), false),
+                request(Some(150.0), true),
+                request(None, true),
+            ],
+            unfed: vec![],
+        });
+        assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
+        assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
+        let total = seen.phases.last().expect("parts");
+        assert_eq!(
+            (total.name.as_str(), total.p50, total.max),
+            ("total", 50.0, 150.0)
+        );
+        assert_eq!(
+            seen.dominant().map(|part| part.name.as_str()),
+            Some("compute")
+        );
+    }
+
+    #[test]
+    fn quantiles_are_nearest_ranks() {
+        let times: Vec<f64> = (1..=10).map(f64::from).collect();
+        let part = part("up", times).expect("times");
+        assert_eq!((part.p50, part.p90, part.max), (5.0, 9.0, 10.0));
+        assert_eq!(super::part("up", vec![f64::NAN]), None);
+    }
+}

@@ -1,0 +1,301 @@
+//! A robot installs a stub, and its own tools find it in the original's place.
+
+use anyhow::{Context, ensure};
+use support::Told;
+use support::deployer::path_str;
+use support::machine::Machine;
+use support::world::{PEOPLE, world};
+
+const SHELLS: [(&str, &str); 3] = [
+    ("sh", "setup.sh"),
+    ("bash", "setup.bash"),
+    ("zsh", "setup.zsh"),
+];
+const OVERLAY: &str = "/opt/cloudroid";
+
+/// Prints where each tool finds the package and its nodes, one line each.
+const LOOK: &str = r#"
+rospack find opencv_apps
+rosrun --prefix echo opencv_apps people_detect
+rosrun --prefix echo opencv_apps face_detection
+roslaunch --files opencv_apps people_detect.launch
+roslaunch --args /people_detect opencv_apps people_detect.launch | grep -o '/[^ ]*/people_detect '
+python3 -c "import roslib.packages as p; print(p.find_node('opencv_apps', 'people_detect'))"
+rospack find roslaunch
+"#;
+
+fn found_in(prefix: &str) -> String {
+    format!(
+        "{prefix}/share/opencv_apps\n{prefix}/lib/opencv_apps/people_detect\n\
+         {prefix}/lib/opencv_apps/face_detection\n{prefix}/share/opencv_apps/launch/people_detect.launch\n\
+         {prefix}/lib/opencv_apps/people_detect \n['{prefix}/lib/opencv_apps/people_detect']\n/usr/share/roslaunch\n"
+    )
+}
+
+/// A machine with the stub of people_detect unpacked in /root.
+fn machine() -> anyhow::Result<Machine> {
+    let daemon = world().with(PEOPLE)?;
+    let machine = Machine::new()?;
+    let place = world().directory("stub")?;
+    let directory = path_str(place.path());
+    let address = format!("http://{}", daemon.address);
+    // Over TCP, as a robot would: the archive then names the address that it was fetched from.
+    daemon
+        .deployer()
+        .types(&["--server", &address, "stub", "opencv_apps", "-o", directory])?
+        .succeeded()?;
+    machine.unpacks(&place.path().join("opencv_apps.tar.gz"))?;
+    Ok(machine)
+}
+
+fn installed() -> anyhow::Result<Machine> {
+    let machine = machine()?;
+    let outcome = machine
+        .runs("sh", "sh opencv_apps-stub/install.sh")?
+        .succeeded()?;
+    for words in [
+        "ok    server",
+        "ok    clock",
+        "the token is good",
+        ". /opt/cloudroid/setup.sh",
+    ] {
+        ensure!(
+            outcome.stdout.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    Ok(machine)
+}
+
+pub fn on_debians_layout_every_tool_finds_the_stub() -> Told {
+    let machine = installed()?;
+    let before = machine.runs("sh", LOOK)?.succeeded()?;
+    ensure!(before.stdout == found_in("/usr"), "{}", before.said());
+    for (shell, setup) in SHELLS {
+        // Twice, and with arguments that are the script's own, which a bare dot would hand on.
+        let script = format!(
+            "set -- --extend x\n. {OVERLAY}/{setup}\n. {OVERLAY}/{setup}\n{LOOK}\necho $CMAKE_PREFIX_PATH $*"
+        );
+        let found = machine.runs(shell, &script)?.succeeded()?;
+        let expected = format!("{}{OVERLAY}:/usr --extend x\n", found_in(OVERLAY));
+        ensure!(found.stdout == expected, "{shell}: {}", found.said());
+        let left = machine.runs(
+            shell,
+            &format!(". {OVERLAY}/{setup}; set | grep ^_cloudroid"),
+        )?;
+        ensure!(left.stdout.is_empty(), "{shell} keeps {}", left.stdout);
+    }
+    Ok(())
+}
+
+pub fn what_is_not_outsourced_becomes_the_original() -> Told {
+    let machine = installed()?;
+    let script = format!(
+        ". {OVERLAY}/setup.sh\n{OVERLAY}/lib/opencv_apps/face_detection __name:=y > /tmp/said 2>&1 &\n\
+         until grep -q 'contact master' /tmp/said; do kill -0 $! || break; sleep 0.1; done\n\
+         readlink /proc/$!/exe; tr '\\0' '\\n' < /proc/$!/environ | grep -c '{OVERLAY}'; cat /tmp/said >&2"
+    );
+    let become_it = machine.runs("sh", &script)?;
+    ensure!(
+        become_it.stdout == "/usr/lib/opencv_apps/face_detection\n0\n",
+        "{}",
+        become_it.said()
+    );
+    Ok(())
+}
+
+pub fn without_the_original_the_stub_stands_alone() -> Told {
+    let machine = installed()?;
+    machine
+        .runs("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?
+        .succeeded()?;
+    for (shell, setup) in SHELLS {
+        let found = machine.runs(shell, &format!(". {OVERLAY}/{setup}\n{LOOK}"))?;
+        ensure!(
+            found.stdout == found_in(OVERLAY),
+            "{shell}: {}",
+            found.said()
+        );
+    }
+    let source = format!(". {OVERLAY}/setup.sh\n");
+    machine
+        .runs("sh", &format!("{source}rosrun opencv_apps face_detection"))?
+        .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
+    let doctor = machine.runs(
+        "sh",
+        &format!("{source}rosrun opencv_apps cloudroid-stub doctor"),
+    )?;
+    let said = doctor.succeeded()?.stdout;
+    ensure!(
+        said.contains("people_detect is not installed on this robot: it runs in the cloud only")
+            && said.contains("mend it:  install the package opencv_apps"),
+        "{said}"
+    );
+    Ok(())
+}
+
+/// What upstream's packages install: catkin's own set-up files, made of its templates, below /opt/ros/noetic.
+const OPT_ROS: &str = r#"
+set -e
+ros=/opt/ros/noetic templates=/usr/share/catkin/cmake/templates
+mkdir -p $ros/lib $ros/share $ros/etc/catkin/profile.d
+mv /usr/lib/opencv_apps $ros/lib/; mv /usr/share/opencv_apps $ros/share/
+touch $ros/.catkin
+for file in setup.sh setup.bash setup.zsh; do sed "s|@SETUP_DIR@|$ros|" $templates/$file.in > $ros/$file; done
+sed "s|@PYTHON_EXECUTABLE@|/usr/bin/python3|; s|@CATKIN_LIB_ENVIRONMENT_PATHS@|'lib'|
+     s|@CATKIN_PKGCONFIG_ENVIRONMENT_PATHS@|'lib/pkgconfig'|; s|@PYTHON_INSTALL_DIR@|lib/python3/dist-packages|
+     s|@CATKIN_GLOBAL_BIN_DESTINATION@|bin|; s|@CMAKE_PREFIX_PATH_AS_IS@|$ros|; s|@[A-Z_]*@||g" \
+  $templates/_setup_util.py.in > $ros/_setup_util.py
+chmod +x $ros/_setup_util.py
+cp /usr/share/ros_environment/catkin_env_hook/1.ros_package_path.sh $ros/etc/catkin/profile.d/
+"#;
+
+pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Told {
+    let machine = installed()?;
+    machine.runs("bash", OPT_ROS)?.succeeded()?;
+    for (shell, setup) in SHELLS {
+        let upstream = format!(
+            "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n"
+        );
+        let before = machine.runs(shell, &format!("{upstream}{LOOK}"))?;
+        ensure!(
+            before.stdout == found_in("/opt/ros/noetic"),
+            "{shell}: {}",
+            before.said()
+        );
+        let script = format!("{upstream}. {OVERLAY}/{setup}\n{LOOK}");
+        let found = machine.runs(shell, &script)?;
+        ensure!(
+            found.stdout == found_in(OVERLAY),
+            "{shell}: {}",
+            found.said()
+        );
+    }
+    // The original is found there, too; and sourcing upstream again puts the stub out of its place, which is told.
+    let source = format!(
+        "set --\n. /opt/ros/noetic/setup.sh\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. {OVERLAY}/setup.sh\n"
+    );
+    let doctor = format!("{OVERLAY}/lib/opencv_apps/cloudroid-stub doctor");
+    let good = machine
+        .runs("sh", &format!("{source}{doctor}"))?
+        .succeeded()?;
+    ensure!(
+        good.stdout
+            .contains("people_detect is /opt/ros/noetic/lib/opencv_apps/people_detect"),
+        "{}",
+        good.said()
+    );
+    machine
+        .runs(
+            "sh",
+            &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"),
+        )?
+        .failed_saying(&["FAIL  shadowing", "mend it:  . /opt/cloudroid/setup.sh"])?;
+    Ok(())
+}
+
+pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Told {
+    let machine = machine()?;
+    let nobody = "sh opencv_apps-stub/install.sh --server ws://127.0.0.1:9";
+    machine.runs("sh", nobody)?.failed_saying(&[
+        "FAIL  server",
+        "is not reached",
+        "nothing was installed",
+    ])?;
+    let written = machine.runs("sh", &format!("ls -d {OVERLAY}"))?;
+    ensure!(written.status != 0, "{}", written.said());
+    machine
+        .runs(
+            "sh",
+            "sh opencv_apps-stub/setup.sh; sh -c '. opencv_apps-stub/setup.sh'",
+        )?
+        .succeeded()
+        .and_then(|outcome| {
+            ensure!(
+                outcome.stderr.contains("run install.sh"),
+                "{}",
+                outcome.said()
+            );
+            Ok(())
+        })?;
+    machine
+        .runs(
+            "sh",
+            "sh opencv_apps-stub/install.sh --prefix /root/mine --robot rover --token secret",
+        )?
+        .succeeded()?;
+    let settings = machine
+        .runs("sh", "cat /root/mine/share/opencv_apps/stub.toml; stat -c %a /root/mine/share/opencv_apps/token")?
+        .succeeded()?
+        .stdout;
+    ensure!(
+        settings.contains("robot = \"rover\"") && settings.ends_with("600\n"),
+        "{settings}"
+    );
+    // What the owner sets outlives another installation.
+    let again = "echo 'max = 0.4' >> /root/mine/share/opencv_apps/stub.toml\n\
+                 sh opencv_apps-stub/install.sh --prefix /root/mine > /dev/null\n\
+                 cat /root/mine/share/opencv_apps/stub.toml";
+    let kept = machine.runs("sh", again)?.succeeded()?.stdout;
+    ensure!(
+        kept.contains("max = 0.4") && kept.contains("robot = \"rover\""),
+        "{kept}"
+    );
+    machine
+        .runs(
+            "sh",
+            "sh /root/mine/share/opencv_apps/install.sh --uninstall",
+        )?
+        .succeeded()?;
+    let left = machine.runs("sh", "ls -A /root/mine; rospack find opencv_apps")?;
+    ensure!(left.stdout == "/usr/share/opencv_apps\n", "{}", left.said());
+    Ok(())
+}
+
+pub fn its_nodelets_cannot_be_loaded_on_the_robot() -> Told {
+    let machine = installed()?;
+    let script = format!(
+        "set -e\n. {OVERLAY}/setup.sh\nexport ROS_MASTER_URI=http://localhost:21311\n\
+         rosmaster --core -p 21311 > /dev/null 2>&1 &\n\
+         until rosparam list > /dev/null 2>&1; do kill -0 $!; sleep 0.2; done\n\
+         rosrun nodelet nodelet standalone opencv_apps/people_detect"
+    );
+    let refused = machine.runs("bash", &script)?;
+    ensure!(
+        refused
+            .said()
+            .contains("opencv_apps runs in the cloud: its nodelets cannot be loaded"),
+        "{}",
+        refused.said()
+    );
+    Ok(())
+}
+
+pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Told {
+    let daemon = world().with(PEOPLE)?;
+    let (status, body) = daemon.get("/stubs/nobody.tar.gz")?;
+    ensure!(
+        status == 404 && body.contains("opencv_apps"),
+        "{status} {body}"
+    );
+    let (status, body) = daemon.get("/stubs/opencv_apps.tar.gz?arch=riscv64")?;
+    ensure!(
+        status == 404 && body.contains("make stub-cross"),
+        "{status} {body}"
+    );
+    let stubs = daemon.deployer().asks(&["stub"])?;
+    ensure!(stubs["architectures"][0] == "x86_64", "{stubs}");
+    let place = world().directory("twice")?;
+    let archive = |name: &str| -> anyhow::Result<Vec<u8>> {
+        let directory = place.path().join(name);
+        let words = ["stub", "opencv_apps", "-o", path_str(&directory)];
+        daemon.deployer().types(&words)?.succeeded()?;
+        std::fs::read(directory.join("opencv_apps.tar.gz")).context("the archive")
+    };
+    ensure!(
+        archive("a")? == archive("b")?,
+        "the same stub twice differs"
+    );
+    Ok(())
+}

@@ -1,0 +1,120 @@
+//! A robot's own file system: Debian with its ROS, made once for all stories by mmdebstrap. Each machine writes to a
+//! layer of its own, and runs commands in a mount namespace that ends with them.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use nix::fcntl::{Flock, FlockArg};
+use tempfile::TempDir;
+
+use crate::deployer::{Outcome, run};
+use crate::world::world;
+
+/// What robots have: the tools that find and start nodes, three shells, and a package with its original nodes.
+const PACKAGES: [&str; 15] = [
+    "python3-roslaunch",
+    "python3-rosmaster",
+    "rosbash",
+    "rospack-tools",
+    "rosout",
+    "catkin",
+    "zsh",
+    "python3-rostopic",
+    "python3-rosnode",
+    "python3-rosservice",
+    "python3-rosparam",
+    "ros-std-msgs",
+    "libnodeletlib-tools",
+    "ros-opencv-apps",
+    "procps",
+];
+/// Launch files and package.xml are in this one; its dependencies are of no use here.
+const UNPACKED: &str = "libopencv-apps-dev";
+const SUITE: &str = "bookworm";
+
+/// A robot's computer.
+pub struct Machine {
+    base: PathBuf,
+    own: TempDir,
+}
+
+impl Machine {
+    /// A new one, with ROS below `/usr` and `opencv_apps` installed.
+    pub fn new() -> anyhow::Result<Machine> {
+        let own = world().directory("machine")?;
+        for name in ["upper", "work", "root"] {
+            std::fs::create_dir(own.path().join(name))?;
+        }
+        Ok(Machine { base: base()?, own })
+    }
+
+    /// Unpacks an archive of a stub in `/root`.
+    pub fn unpacks(&self, archive: &Path) -> anyhow::Result<()> {
+        let bytes = std::fs::read(archive)?;
+        let home = self.own.path().join("upper/root");
+        std::fs::create_dir_all(&home)?;
+        tar::Archive::new(flate2::read::GzDecoder::new(&bytes[..])).unpack(home)?;
+        Ok(())
+    }
+
+    /// Runs a script in a shell (`sh`, `bash` or `zsh`), as root at home.
+    pub fn runs(&self, shell: &str, script: &str) -> anyhow::Result<Outcome> {
+        let own = self.own.path();
+        run(Command::new("unshare")
+            .args(["--mount", "--propagation", "private", "sh", "-euc", INSIDE])
+            .arg("inside")
+            .args([shell, script])
+            .env("BASE", &self.base)
+            .env("OWN", own))
+    }
+}
+
+/// Ends whatever the script started: its process namespace ends with it.
+const INSIDE: &str = r#"
+mount -t overlay overlay -o "lowerdir=$BASE,upperdir=$OWN/upper,workdir=$OWN/work" "$OWN/root"
+mount --bind /dev "$OWN/root/dev"
+printf '127.0.0.1 localhost %s\n' "$(hostname)" > "$OWN/root/etc/hosts"
+cd "$OWN/root"
+exec unshare --pid --fork --kill-child sh -euc '
+  mount -t proc proc proc
+  exec chroot . /usr/bin/env -i PATH=/usr/bin:/bin HOME=/root TERM=dumb SHELL="/bin/$1" \
+    sh -c "cd; exec \"\$@\"" sh "$1" -c "$2"' inside "$@"
+"#;
+
+/// The file system that all share, named by what it is made of.
+fn base() -> anyhow::Result<PathBuf> {
+    let cache = std::env::var_os("XDG_CACHE_HOME")
+        .map(PathBuf::from)
+        .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))
+        .context("HOME says where caches are")?
+        .join("cloudroid/robots");
+    let mut hash = std::hash::DefaultHasher::new();
+    std::hash::Hash::hash(&(PACKAGES, UNPACKED, SUITE), &mut hash);
+    let name = format!("{SUITE}-{:016x}", std::hash::Hasher::finish(&hash));
+    let base = cache.join(&name);
+    std::fs::create_dir_all(&cache)?;
+    let lock = std::fs::File::create(cache.join(format!("{name}.lock")))?;
+    let _lock = Flock::lock(lock, FlockArg::LockExclusive).map_err(|(_, error)| error)?;
+    if base.exists() {
+        return Ok(base);
+    }
+    let half = cache.join(format!("{name}.half"));
+    if half.exists() {
+        std::fs::remove_dir_all(&half)?;
+    }
+    let unpack = format!(
+        "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED} && dpkg -x {UNPACKED}_*.deb / && rm {UNPACKED}_*.deb'"
+    );
+    let made = run(Command::new("mmdebstrap")
+        .args(["--quiet", "--mode=root", "--variant=minbase"])
+        .arg(format!("--include={}", PACKAGES.join(",")))
+        .arg("--aptopt=APT::Install-Recommends \"false\"")
+        .arg("--aptopt=APT::Sandbox::User \"root\"")
+        .arg(format!("--customize-hook={unpack}"))
+        .arg(SUITE)
+        .arg(&half))?;
+    ensure!(made.status == 0, "{}", made.said());
+    std::fs::rename(&half, &base)?;
+    Ok(base)
+}
