@@ -18,4 +18,6 @@ mod stamp;
 mod tests;
 
 pub use keeper::{Application, Cloud, Keeper};
-pub use original::{News, Original, Setting};
+pub use original::{Original, Setting};
+pub use process::Program;
+pub use stamp::is_stamped;

@@ -17,8 +17,6 @@ mod arguments;
 mod config;
 mod connect;
 mod doctor;
-// Driven by its tests until the mirror calls it.
-#[allow(dead_code, unused_imports)]
 mod local;
 mod mirror;
 mod original;

@@ -12,9 +12,10 @@ mod calls;
 mod inputs;
 mod outputs;
 mod parameters;
+pub mod promise;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use link::control::{Control, Exit, Graph};
 use link::record::Record;
@@ -27,6 +28,7 @@ use calls::Calls;
 use inputs::Inputs;
 use outputs::Outputs;
 use parameters::Parameters;
+use promise::Promise;
 
 /// The node on the robot.
 pub struct Mirror {
@@ -36,6 +38,7 @@ pub struct Mirror {
     outputs: Outputs,
     calls: Calls,
     parameters: Parameters,
+    promise: OnceLock<Promise>,
     /// Definitions by name and md5.
     types: Mutex<HashMap<(String, String), WireType>>,
     siblings: RwLock<BTreeSet<String>>,
@@ -54,6 +57,7 @@ impl Mirror {
             outputs: Outputs::default(),
             calls: Calls::default(),
             parameters: Parameters::default(),
+            promise: OnceLock::new(),
             types: Mutex::default(),
             siblings: RwLock::default(),
             exit: watch::Sender::new(None),
@@ -82,8 +86,10 @@ impl Mirror {
     /// listens to is opened again.
     pub fn renew(&self, session: Arc<Session>) {
         *self.session.write() = session;
-        self.calls
-            .fail("the cloud has forgotten this call: its daemon or servant was restarted");
+        self.calls.fail(
+            self.keeper(),
+            "the cloud has forgotten this call: its daemon or servant was restarted",
+        );
         self.inputs.clear();
     }
 
@@ -92,14 +98,15 @@ impl Mirror {
         self.outputs.apply(self, &graph.outputs).await;
         self.inputs.apply(self, &graph.inputs);
         self.calls.apply(self, &graph.services).await;
+        self.learn(&graph).await;
     }
 }
 
 impl Handler for Mirror {
     fn record(&self, record: Record, arrived: i64) {
         match record {
-            Record::Data(data) => self.outputs.take(data, arrived),
-            Record::Answer { id, response } => self.calls.answered(id, response),
+            Record::Data(data) => self.outputs.take(self.keeper(), data, arrived),
+            Record::Answer { id, response } => self.calls.answered(self.keeper(), id, response),
             Record::Call { id, .. } => {
                 let reason = "the robot serves nothing to its own node".to_owned();
                 self.session().answer(id, Err(reason));

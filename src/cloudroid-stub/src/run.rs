@@ -29,7 +29,8 @@ use ws::WebSocket;
 
 use crate::config::{self, Config, Local};
 use crate::connect;
-use crate::mirror::Mirror;
+use crate::local::{Program, Setting};
+use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::resolver::RobotSockets;
 use crate::robot::{Robot, usual_name};
@@ -89,6 +90,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     let mut shutdown = bus.shutdown_requested();
     let session = Arc::new(Session::new(session_options(&config)));
     let mirror = Mirror::start(bus.clone(), session);
+    if let Some(sla) = promise::sla(&config).context("the SLA")? {
+        mirror.promise(sla, local_original(asked, robot)).await?;
+    }
     let parameters = mirror.parameters().await;
     let mut hello = Hello {
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -178,6 +182,25 @@ async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::R
             .with_parameters(&given)
             .with_context(|| format!("parameters below {node}/cloudroid")),
         _ => Ok(config),
+    }
+}
+
+/// How the original would have been started without this stub.
+fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
+    let overlay = original::overlay(&asked.node.share);
+    let path = original::find(&asked.node, &|name| std::env::var(name).ok());
+    let (namespace, name) = robot.node.rsplit_once('/').unwrap_or_default();
+    let mut environment = original::environment(&overlay);
+    environment.push(("ROS_NAMESPACE", format!("{namespace}/").into()));
+    let mut argv = robot.argv.clone();
+    argv.push(format!("__name:={name}"));
+    Setting {
+        program: path.map(|path| Program {
+            path,
+            argv,
+            environment,
+        }),
+        node: robot.node.clone(),
     }
 }
 

@@ -179,7 +179,9 @@ impl<P: Clone> Arbiter<P> {
     /// `side` gave output number `output`. The side that is first with it keeps it: a node that answers one input
     /// with several messages on a topic is passed as it is.
     pub(crate) fn answer_with(&mut self, id: RequestId, side: Side, output: usize) -> Verdict {
-        let Some(record) = self.requests.get_mut(&id) else {
+        // The pair may have got further outputs since the request was made.
+        let known = |record: &&mut Record<P>| output < record.owners.len();
+        let Some(record) = self.requests.get_mut(&id).filter(known) else {
             return Verdict::Drop;
         };
         if output == 0 {

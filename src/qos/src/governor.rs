@@ -103,15 +103,6 @@ struct Stream {
 impl<P: Clone> Governor<P> {
     /// The link is down and the local original not started. `pairs` are those that [`find`](crate::find) gave.
     pub fn new(sla: Sla, pairs: Vec<Pair>, limits: Limits) -> Self {
-        let stream = |pair: Pair| Stream {
-            input: pair.input.as_str().into(),
-            by: pair.by.unwrap_or(Correlation::Arrival),
-            pair,
-            stamps: HashMap::new(),
-            outstanding: [None; 2],
-            owed: [None; 2],
-            unmatched: Some(0),
-        };
         let metered = |(output, meter): (&str, Meter)| Metered {
             output: output.to_owned(),
             delivered: meter.clone(),
@@ -122,7 +113,7 @@ impl<P: Clone> Governor<P> {
             decider: Decider::new(&sla),
             arbiter: Arbiter::new(limits),
             meter: Meter::new(&sla).map(metered),
-            pairs: pairs.into_iter().map(stream).collect(),
+            pairs: pairs.into_iter().map(Stream::new).collect(),
             link: false,
             counts: Counts::default(),
             phases: PhaseBook::default(),
@@ -161,6 +152,20 @@ impl<P: Clone> Governor<P> {
     /// The node is up; a warm local original is started now.
     pub fn begin(&mut self, now: Instant) {
         self.decide(now);
+    }
+
+    /// More of the interface has become known: pairs of new inputs, further outputs of known ones.
+    pub fn learn(&mut self, pairs: Vec<Pair>) {
+        for pair in pairs {
+            match self
+                .pairs
+                .iter_mut()
+                .find(|stream| stream.pair.input == pair.input)
+            {
+                Some(stream) => stream.pair.outputs = pair.outputs,
+                None => self.pairs.push(Stream::new(pair)),
+            }
+        }
     }
 
     /// The application calls a service or sends a goal.
@@ -728,6 +733,18 @@ impl<P: Clone> Governor<P> {
 }
 
 impl Stream {
+    fn new(pair: Pair) -> Self {
+        Self {
+            input: pair.input.as_str().into(),
+            by: pair.by.unwrap_or(Correlation::Arrival),
+            pair,
+            stamps: HashMap::new(),
+            outstanding: [None; 2],
+            owed: [None; 2],
+            unmatched: Some(0),
+        }
+    }
+
     fn shown(&self) -> String {
         Pair {
             by: Some(self.by),

@@ -1,17 +1,17 @@
 //! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
 //! the application.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Pair, Phases, Report, RequestId,
-    SafeStop, Side, Sla, Verdict,
+    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Pair, RequestId, SafeStop, Side,
+    Sla, Verdict,
 };
-use ros::bus::{BusError, Message};
+use ros::bus::{BusError, Message, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
@@ -100,6 +100,20 @@ impl Keeper {
         keeper
     }
 
+    /// More of the interface has become known.
+    pub async fn learn(
+        &self,
+        pairs: Vec<Pair>,
+        inputs: BTreeMap<String, WireType>,
+        outputs: Vec<String>,
+    ) -> anyhow::Result<()> {
+        self.with(|state, _| state.governor.learn(pairs));
+        match &self.original {
+            Some(original) => original.adapt(inputs, outputs).await,
+            None => Ok(()),
+        }
+    }
+
     /// The application published an input.
     pub fn input(&self, topic: &Arc<str>, message: Message) {
         self.with(|state, now| {
@@ -148,18 +162,9 @@ impl Keeper {
         self.with(|state, now| state.governor.link_down(now));
     }
 
-    /// Somebody listens to the node's outputs, or nobody does.
-    pub fn wanted(&self, wanted: bool) {
-        self.with(|state, now| state.governor.wanted(now, wanted));
-    }
-
-    /// Where the time of a request went.
-    pub fn phases(&self, phases: &Phases) {
-        self.state.lock().governor.phases(phases);
-    }
-
     /// How it stands.
-    pub fn report(&self) -> Report {
+    #[cfg(test)]
+    pub fn report(&self) -> qos::Report {
         self.state.lock().governor.report(Instant::now())
     }
 

@@ -37,10 +37,6 @@ pub struct Setting {
     pub program: Option<Program>,
     /// Its absolute node name.
     pub node: String,
-    /// Inputs that must be subscribed to before it is ready, with their types.
-    pub inputs: BTreeMap<String, WireType>,
-    /// Outputs that are taken in.
-    pub outputs: Vec<String>,
 }
 
 /// What comes back.
@@ -58,9 +54,16 @@ pub enum News {
 pub struct Original {
     orders: mpsc::UnboundedSender<Order>,
     place: Arc<Place>,
-    publishers: Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>,
-    _tasks: Tasks,
+    publishers: Publishers,
+    sources: Sources,
+    news: mpsc::UnboundedSender<News>,
+    tasks: Mutex<Tasks>,
 }
+
+/// The inputs that it is given.
+type Publishers = Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>;
+/// How many publish each output.
+type Sources = Arc<Mutex<HashMap<String, watch::Receiver<usize>>>>;
 
 enum Order {
     Start,
@@ -78,24 +81,60 @@ impl Drop for Tasks {
 }
 
 impl Original {
-    /// Prepares everything but the process: the private ROS system with the parameters of `robot`, inputs advertised,
-    /// outputs subscribed to.
+    /// Prepares everything but the process: the private ROS system, inputs advertised, outputs subscribed to. It is
+    /// ready when it listens to all `inputs`; those fed without being named here may lose their first message.
+    /// Parameters are those of `robot`.
     pub async fn new(
         setting: Setting,
+        inputs: BTreeMap<String, WireType>,
+        outputs: Vec<String>,
         robot: Arc<dyn Bus>,
     ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
         let place = Arc::new(Place::new().await?);
         let (news, received) = mpsc::unbounded_channel();
-        let mut tasks = Vec::new();
-        let mut sources = HashMap::new();
-        for output in &setting.outputs {
+        let publishers = Arc::default();
+        let sources = Arc::default();
+        let (orders, taken) = mpsc::unbounded_channel();
+        let runner = Runner {
+            setting,
+            place: place.clone(),
+            robot,
+            publishers: Arc::clone(&publishers),
+            sources: Arc::clone(&sources),
+            news: news.clone(),
+        };
+        let task = tokio::spawn(runner.run(taken)).abort_handle();
+        let original = Self {
+            orders,
+            place,
+            publishers,
+            sources,
+            news,
+            tasks: Mutex::new(Tasks(vec![task])),
+        };
+        original.adapt(inputs, outputs).await?;
+        Ok((original, received))
+    }
+
+    /// Advertises and subscribes to what is new in the interface.
+    pub async fn adapt(
+        &self,
+        inputs: BTreeMap<String, WireType>,
+        outputs: Vec<String>,
+    ) -> anyhow::Result<()> {
+        for output in outputs {
+            if self.sources.lock().contains_key(&output) {
+                continue;
+            }
             let options = SubscribeOptions {
                 wire_type: None,
                 queue: QUEUE,
             };
-            let subscription = place.bus().subscribe(output, options).await?;
-            sources.insert(output.clone(), subscription.publishers.clone());
-            let (topic, news): (Arc<str>, _) = (output.as_str().into(), news.clone());
+            let subscription = self.place.bus().subscribe(&output, options).await?;
+            self.sources
+                .lock()
+                .insert(output.clone(), subscription.publishers.clone());
+            let (topic, news): (Arc<str>, _) = (output.into(), self.news.clone());
             let task = tokio::spawn(async move {
                 // All of it, or the guard would stay behind and end the subscription.
                 let subscription = &mut { subscription };
@@ -105,30 +144,15 @@ impl Original {
                     }
                 }
             });
-            tasks.push(task.abort_handle());
+            self.tasks.lock().0.push(task.abort_handle());
         }
-        let publishers = Arc::new(Mutex::new(HashMap::new()));
-        for (topic, wire_type) in &setting.inputs {
-            let publisher = advertise(&place, topic, wire_type).await?;
-            publishers.lock().insert(topic.clone(), publisher);
+        for (topic, wire_type) in inputs {
+            if !self.publishers.lock().contains_key(&topic) {
+                let publisher = advertise(&self.place, &topic, &wire_type).await?;
+                self.publishers.lock().insert(topic, publisher);
+            }
         }
-        let (orders, taken) = mpsc::unbounded_channel();
-        let runner = Runner {
-            setting,
-            place: place.clone(),
-            robot,
-            publishers: publishers.clone(),
-            sources,
-            news,
-        };
-        tasks.push(tokio::spawn(runner.run(taken)).abort_handle());
-        let original = Self {
-            orders,
-            place,
-            publishers,
-            _tasks: Tasks(tasks),
-        };
-        Ok((original, received))
+        Ok(())
     }
 
     /// Starts the process, if it does not run.
@@ -170,11 +194,6 @@ impl Original {
     ) -> Result<Bytes, BusError> {
         self.place.bus().call(service, request, timeout).await
     }
-
-    /// The stub's node in its ROS system: for parameters that change later.
-    pub fn bus(&self) -> Arc<dyn Bus> {
-        self.place.bus().clone()
-    }
 }
 
 async fn advertise(
@@ -194,9 +213,8 @@ struct Runner {
     setting: Setting,
     place: Arc<Place>,
     robot: Arc<dyn Bus>,
-    publishers: Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>,
-    /// How many publish each output.
-    sources: HashMap<String, watch::Receiver<usize>>,
+    publishers: Publishers,
+    sources: Sources,
     news: mpsc::UnboundedSender<News>,
 }
 
@@ -263,20 +281,18 @@ impl Runner {
     async fn ready(&self) {
         self.place.registered(&self.setting.node).await;
         let counts: Vec<_> = {
-            let publishers = self.publishers.lock();
-            let inputs = self.setting.inputs.keys();
-            inputs
-                .filter_map(|topic| Some(publishers.get(topic)?.subscribers()))
-                .collect()
+            let inputs = self.publishers.lock();
+            inputs.values().map(|input| input.subscribers()).collect()
         };
         for mut count in counts {
             let _ = count.wait_for(|count| *count > 0).await;
         }
         let published = self.place.graph();
-        for (topic, source) in &self.sources {
-            let nodes = published.topics.get(topic).map(|topic| &topic.publishers);
+        let sources = self.sources.lock().clone();
+        for (topic, mut source) in sources {
+            let nodes = published.topics.get(&topic).map(|topic| &topic.publishers);
             if nodes.is_some_and(|nodes| nodes.contains(&self.setting.node)) {
-                let _ = source.clone().wait_for(|count| *count > 0).await;
+                let _ = source.wait_for(|count| *count > 0).await;
             }
         }
     }

@@ -43,8 +43,12 @@ impl Stamps {
     }
 }
 
-/// Whether the first field of a definition is a header.
+/// Whether the first field is a header: by the definition, or, before that has come, by the custom of naming such types.
 pub fn is_stamped(wire_type: &WireType) -> bool {
+    if wire_type.definition.is_empty() {
+        let (package, name) = wire_type.name.split_once('/').unwrap_or_default();
+        return name.ends_with("Stamped") || matches!(package, "sensor_msgs" | "stereo_msgs");
+    }
     let fields = wire_type
         .definition
         .lines()

@@ -17,8 +17,9 @@ use ros::ros1::master::{Master, MasterOptions};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
+use super::original::News;
 use super::process::Program;
-use super::{Application, Cloud, Keeper, News, Original, Setting};
+use super::{Application, Cloud, Keeper, Original, Setting};
 
 /// Generous: it only bounds how long a failing test takes.
 const SOON: Duration = Duration::from_secs(20);
@@ -80,9 +81,17 @@ fn setting(argv: &[&str]) -> Setting {
             environment: vec![("ROS_NAMESPACE", "/ns".into())],
         }),
         node: "/ns/relay".into(),
-        inputs: BTreeMap::from([("/ns/in".to_owned(), string_type())]),
-        outputs: vec!["/absolute/out".into()],
     }
+}
+
+async fn an_original(
+    setting: Setting,
+    robot: Arc<Ros1Bus>,
+) -> (Original, mpsc::UnboundedReceiver<News>) {
+    let inputs = BTreeMap::from([("/ns/in".to_owned(), string_type())]);
+    Original::new(setting, inputs, vec!["/absolute/out".into()], robot)
+        .await
+        .unwrap()
 }
 
 async fn state(news: &mut mpsc::UnboundedReceiver<News>, wanted: LocalState) {
@@ -113,7 +122,7 @@ async fn output(news: &mut mpsc::UnboundedReceiver<News>) -> String {
 #[tokio::test]
 async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
     let robot = robot().await;
-    let (original, mut news) = Original::new(setting(&[]), robot.clone()).await.unwrap();
+    let (original, mut news) = an_original(setting(&[]), robot.clone()).await;
     original.start();
     original.start();
     state(&mut news, LocalState::Ready).await;
@@ -151,9 +160,7 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
 
 #[tokio::test]
 async fn a_crash_is_told_and_it_comes_back() {
-    let (original, mut news) = Original::new(setting(&["crash-on=boom"]), robot().await)
-        .await
-        .unwrap();
+    let (original, mut news) = an_original(setting(&["crash-on=boom"]), robot().await).await;
     original.start();
     state(&mut news, LocalState::Ready).await;
     original.feed("/ns/in", &string("boom"));
@@ -175,13 +182,13 @@ async fn a_crash_is_told_and_it_comes_back() {
 async fn what_cannot_run_is_said() {
     let mut missing = setting(&[]);
     missing.program = None;
-    let (original, mut news) = Original::new(missing, robot().await).await.unwrap();
+    let (original, mut news) = an_original(missing, robot().await).await;
     original.start();
     state(&mut news, LocalState::Missing).await;
 
     let mut broken = setting(&[]);
     broken.program.as_mut().unwrap().path = "/nonexistent/relay".into();
-    let (original, mut news) = Original::new(broken, robot().await).await.unwrap();
+    let (original, mut news) = an_original(broken, robot().await).await;
     original.start();
     let said = async {
         loop {
@@ -241,7 +248,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
-        Some(Original::new(setting(&[]), robot).await.unwrap()),
+        Some(an_original(setting(&[]), robot).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );
@@ -284,7 +291,7 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec![],
-        Some(Original::new(setting(&[]), robot().await).await.unwrap()),
+        Some(an_original(setting(&[]), robot().await).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );

@@ -7,16 +7,20 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use link::control::Served;
 use parking_lot::Mutex;
+use qos::{Failure, RequestId};
 use ros::bus::{ServiceHandler, ServiceType};
 use tokio::sync::oneshot;
 
 use super::Mirror;
+use crate::local::Keeper;
 
 /// Services by name, and calls under way.
 #[derive(Default)]
 pub struct Calls {
     services: Mutex<HashMap<String, Service>>,
     waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, String>>>>,
+    /// Calls that the keeper has made: the link's id → the keeper's.
+    kept: Mutex<HashMap<u32, RequestId>>,
 }
 
 struct Service {
@@ -27,17 +31,40 @@ struct Service {
 
 impl Calls {
     /// The cloud has answered.
-    pub fn answered(&self, id: u32, response: Result<Bytes, String>) {
+    pub fn answered(&self, keeper: Option<&Arc<Keeper>>, id: u32, response: Result<Bytes, String>) {
+        let kept = self.kept.lock().remove(&id);
+        if let (Some(keeper), Some(request)) = (keeper, kept) {
+            keeper.cloud_answered(request, response.map_err(Failure::Refused));
+            return;
+        }
         if let Some(caller) = self.waiting.lock().remove(&id) {
             let _ = caller.send(response);
         }
     }
 
     /// All calls under way have failed.
-    pub fn fail(&self, reason: &str) {
+    pub fn fail(&self, keeper: Option<&Arc<Keeper>>, reason: &str) {
+        let kept = std::mem::take(&mut *self.kept.lock());
+        if let Some(keeper) = keeper {
+            for request in kept.into_values() {
+                keeper.cloud_answered(request, Err(Failure::Unreachable(reason.to_owned())));
+            }
+        }
         for (_, caller) in self.waiting.lock().drain() {
             let _ = caller.send(Err(reason.to_owned()));
         }
+    }
+
+    /// Calls on behalf of the keeper.
+    pub fn kept(&self, mirror: &Mirror, request: RequestId, service: &str, bytes: Bytes) {
+        let services = self.services.lock();
+        let Some(channel) = services.get(service).map(|service| *service.channel.lock()) else {
+            // It was taken back meanwhile.
+            return;
+        };
+        let mut kept = self.kept.lock();
+        let id = mirror.session().call(channel, bytes);
+        kept.insert(id, request);
     }
 
     /// Serves what is new and takes back what is gone.
@@ -54,6 +81,7 @@ impl Calls {
             let channel = Arc::new(Mutex::new(served.channel));
             let handler = Arc::new(Forward {
                 mirror: Arc::downgrade(mirror),
+                name: served.name.as_str().into(),
                 channel: channel.clone(),
             });
             let service_type = ServiceType {
@@ -80,6 +108,7 @@ impl Calls {
 /// Passes calls to the cloud.
 struct Forward {
     mirror: Weak<Mirror>,
+    name: Arc<str>,
     channel: Arc<Mutex<u32>>,
 }
 
@@ -88,6 +117,9 @@ impl ServiceHandler for Forward {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let ended = || "the node is ending".to_owned();
         let mirror = self.mirror.upgrade().ok_or_else(ended)?;
+        if let Some(keeper) = mirror.keeper() {
+            return keeper.call(&self.name, request).await;
+        }
         let channel = *self.channel.lock();
         let (sender, answer) = oneshot::channel();
         let id = {

@@ -21,6 +21,7 @@ const QUEUE: usize = 256;
 #[derive(Default)]
 pub struct Inputs {
     topics: Mutex<HashMap<String, Topic>>,
+    channels: Mutex<HashMap<String, Channels>>,
     next: AtomicU32,
 }
 
@@ -44,6 +45,10 @@ impl Inputs {
             let same = |wanted: &&Wanted| wanted.topic == *name && wanted.md5 == topic.wanted.md5;
             inputs.iter().any(|wanted| same(&wanted))
         });
+        // Subscribed to anew, a topic gets new channels.
+        self.channels
+            .lock()
+            .retain(|name, _| topics.contains_key(name));
         for wanted in inputs {
             let feed = match topics.get(&wanted.topic) {
                 Some(topic) => topic.feed.clone(),
@@ -63,8 +68,38 @@ impl Inputs {
         }
     }
 
+    /// Sends a message up.
+    pub fn send(&self, mirror: &Mirror, topic: &str, message: &Message) {
+        let born = now();
+        let channel = {
+            let mut channels = self.channels.lock();
+            let channels = match channels.get_mut(topic) {
+                Some(channels) => channels,
+                None => channels.entry(topic.to_owned()).or_default(),
+            };
+            channels.of(mirror, topic, message)
+        };
+        let quality = if message.latching {
+            Quality::Each
+        } else {
+            Quality::Newest
+        };
+        let data = Data {
+            channel,
+            encoded: false,
+            latching: message.latching,
+            born,
+            left: 0,
+            serialise: 0,
+            answered: None,
+            message: message.bytes.clone(),
+        };
+        mirror.session().publish(data, quality);
+    }
+
     /// Takes everything back.
     pub fn clear(&self) {
+        self.channels.lock().clear();
         self.topics.lock().clear();
     }
 }
@@ -89,9 +124,8 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
             return;
         }
     };
-    let mut channels = Channels::default();
+    let topic: Arc<str> = wanted.topic.as_str().into();
     while let Some(message) = subscription.messages.recv().await {
-        let born = now();
         let Some(mirror) = mirror.upgrade() else {
             return;
         };
@@ -99,24 +133,10 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         if mirror.siblings.read().contains(&*message.publisher) || !feed.load(Ordering::Relaxed) {
             continue;
         }
-        let session = mirror.session();
-        let channel = channels.of(&mirror, &wanted.topic, &message);
-        let quality = if message.latching {
-            Quality::Each
-        } else {
-            Quality::Newest
-        };
-        let data = Data {
-            channel,
-            encoded: false,
-            latching: message.latching,
-            born,
-            left: 0,
-            serialise: 0,
-            answered: None,
-            message: message.bytes,
-        };
-        session.publish(data, quality);
+        match mirror.keeper() {
+            Some(keeper) => keeper.input(&topic, message),
+            None => mirror.inputs.send(&mirror, &topic, &message),
+        }
     }
 }
 

@@ -6,11 +6,12 @@ use std::sync::Arc;
 use link::control::{Control, Output};
 use link::record::Data;
 use parking_lot::Mutex;
-use ros::bus::{AdvertiseOptions, Publisher, WireType};
+use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
 use super::Mirror;
+use crate::local::Keeper;
 
 /// Messages kept for a slow subscriber.
 const QUEUE: usize = 256;
@@ -23,7 +24,11 @@ pub struct Outputs {
 }
 
 struct Topic {
+    name: String,
     md5: String,
+    wire_type: Arc<WireType>,
+    /// Who publishes what comes from the cloud.
+    cloud: Arc<str>,
     channel: Mutex<u32>,
     publisher: Arc<dyn Publisher>,
     latched: Mutex<Latched>,
@@ -52,10 +57,21 @@ impl Drop for Topic {
 
 impl Outputs {
     /// Publishes a message of the cloud.
-    pub fn take(&self, data: Data, _arrived: i64) {
+    pub fn take(&self, keeper: Option<&Arc<Keeper>>, data: Data, _arrived: i64) {
         let Some(topic) = self.channels.lock().get(&data.channel).cloned() else {
             return;
         };
+        if let Some(keeper) = keeper {
+            let message = Message {
+                bytes: data.message.clone(),
+                wire_type: topic.wire_type.clone(),
+                publisher: topic.cloud.clone(),
+                latching: data.latching,
+            };
+            if !keeper.cloud_output(&topic.name, &message) {
+                return;
+            }
+        }
         let mut latched = topic.latched.lock();
         match &mut *latched {
             Latched::Kept(publisher) => publisher.publish(data.message),
@@ -66,6 +82,19 @@ impl Outputs {
             }
             Latched::Not => topic.publisher.publish(data.message),
         }
+    }
+
+    /// Publishes a message of this side, on a topic that is advertised.
+    pub fn publish(&self, topic: &str, message: bytes::Bytes) {
+        if let Some(topic) = self.topics.lock().get(topic) {
+            topic.publisher.publish(message);
+        }
+    }
+
+    /// The type of an output.
+    pub fn wire_type(&self, topic: &str) -> Option<Arc<WireType>> {
+        let topics = self.topics.lock();
+        topics.get(topic).map(|topic| topic.wire_type.clone())
     }
 
     /// Advertises what is new and takes back what is gone.
@@ -102,14 +131,17 @@ impl Outputs {
             definition: String::new(),
         });
         let options = AdvertiseOptions {
-            wire_type,
+            wire_type: wire_type.clone(),
             latch: false,
             queue: QUEUE,
         };
         match mirror.bus.advertise(&output.topic, options).await {
             Ok(publisher) => {
                 let topic = Arc::new(Topic {
+                    name: output.topic.clone(),
                     md5: output.md5.clone(),
+                    wire_type: Arc::new(wire_type),
+                    cloud: "cloud".into(),
                     channel: Mutex::new(output.channel),
                     publisher: publisher.into(),
                     latched: Mutex::default(),
