@@ -79,12 +79,21 @@ fn pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
         .collect()
 }
 
-/// Colour frames of a camera.
+/// Colour frames of a camera: recorded, else of the packaged video.
 pub fn colours() -> Result<Vec<Picture>> {
-    match recordings() {
-        Some(path) => pictures(&path, &["color1.png", "color2.png", "color3.png"]),
-        None => packaged_colours(),
+    if let Some(path) = recordings() {
+        return pictures(&path, &["color1.png", "color2.png", "color3.png"]);
     }
+    let (width, height, mut data) = video(150)?;
+    data.chunks_exact_mut(3).for_each(|pixel| pixel.swap(0, 2));
+    let frames = data.chunks_exact(width * height * 3).step_by(60);
+    let frames = frames.map(|frame| Picture {
+        width,
+        height,
+        depth: 3,
+        data: frame.to_vec(),
+    });
+    Ok(frames.collect())
 }
 
 /// Photographs of packages: `opencv-doc`'s, and scikit-image's where they could be fetched.

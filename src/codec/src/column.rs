@@ -104,14 +104,20 @@ fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<
     if samples.len() < 4096 {
         return None;
     }
-    let mut present = vec![false; 1 << 16];
+    // What is missing is noted in the upper half, so that nothing has to be looked at before.
+    let mut present = vec![false; 1 << 17];
     match missing {
         None => samples
             .iter()
             .for_each(|&sample| present[usize::from(sample)] = true),
         Some(missing) => {
-            for (&sample, &gap) in samples.iter().zip(missing.rows().flatten()) {
-                present[usize::from(sample)] |= gap == 0;
+            let mut rest = samples;
+            for gaps in missing.rows() {
+                let (row, after) = rest.split_at(gaps.len().min(rest.len()));
+                for (&sample, &gap) in row.iter().zip(gaps) {
+                    present[usize::from(gap != 0) << 16 | usize::from(sample)] = true;
+                }
+                rest = after;
             }
         }
     }

@@ -84,30 +84,33 @@ fn rows<'a>(data: &'a [u8], layout: &Image) -> impl Iterator<Item = &'a [u8]> {
 }
 
 fn shorts(data: &[u8], layout: &Image) -> Vec<u16> {
-    let order = if layout.big_endian {
-        u16::from_be_bytes
-    } else {
-        u16::from_le_bytes
-    };
     let mut samples = Vec::with_capacity(layout.width * layout.height);
     for row in rows(data, layout) {
-        samples.extend(row.chunks_exact(2).map(|bytes| order([bytes[0], bytes[1]])));
+        let shorts = row
+            .chunks_exact(2)
+            .map(|bytes| u16::from_le_bytes([bytes[0], bytes[1]]));
+        samples.extend(shorts);
+    }
+    if layout.big_endian {
+        samples
+            .iter_mut()
+            .for_each(|sample| *sample = sample.swap_bytes());
     }
     samples
 }
 
 fn words(data: &[u8], layout: &Image) -> Vec<u32> {
-    let order = if layout.big_endian {
-        u32::from_be_bytes
-    } else {
-        u32::from_le_bytes
-    };
     let mut samples = Vec::with_capacity(layout.width * layout.height);
     for row in rows(data, layout) {
-        samples.extend(
-            row.chunks_exact(4)
-                .map(|bytes| order([bytes[0], bytes[1], bytes[2], bytes[3]])),
-        );
+        let words = row
+            .chunks_exact(4)
+            .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]));
+        samples.extend(words);
+    }
+    if layout.big_endian {
+        samples
+            .iter_mut()
+            .for_each(|sample| *sample = sample.swap_bytes());
     }
     samples
 }

@@ -81,10 +81,8 @@ impl<T: Sample> Wide<T> {
                 plane.open_row(y);
                 let mut last = plane.samples[plane.start(y) - 1];
                 for (sample, &gap) in plane.row_mut(y).iter_mut().zip(gaps.row(y)) {
-                    if gap != 0 {
-                        *sample = last;
-                    }
-                    last = *sample;
+                    last = if gap != 0 { last } else { *sample };
+                    *sample = last;
                 }
             }
         }
@@ -132,7 +130,7 @@ impl<T: Sample> Wide<T> {
     /// The predictor whose differences take the fewest bits on some rows of a picture, or the beginning of a sequence.
     fn choose(&self, kinds: &[Kind]) -> Kind {
         /// Samples of a row that are looked at.
-        const SOME: usize = 64;
+        const SOME: usize = 40;
         if let [only] = kinds {
             return *only;
         }
