@@ -10,6 +10,8 @@ use support::Told;
 mod answer;
 #[path = "stories/burglary.rs"]
 mod burglary;
+#[path = "stories/grants.rs"]
+mod grants;
 #[path = "stories/house.rs"]
 mod house;
 #[path = "stories/images.rs"]
@@ -51,6 +53,10 @@ fn main() -> ExitCode {
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
             neighbours_are_not_reached,
+        ],
+        stories![grants:
+            a_service_is_given_what_its_operator_allows,
+            nothing_is_given_unasked_or_unallowed,
         ],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,

@@ -329,6 +329,7 @@ async fn look(
                 .collect(),
             owned_directories: Vec::new(),
             mounts: Vec::new(),
+            hosts: Vec::new(),
             resident: serde_json::to_value(&outcome.plan.parameters)?,
         })
         .await?;

@@ -121,6 +121,7 @@ pub(crate) async fn compile(
                         source: source.to_owned(),
                         target: "/cloudroid/source".into(),
                         writable: false,
+                        device: false,
                     }],
                     environment,
                     argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"]

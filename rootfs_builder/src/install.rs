@@ -175,6 +175,7 @@ async fn make(
                     source: debs,
                     target: "/cloudroid/debs".into(),
                     writable: false,
+                    device: false,
                 }],
                 environment,
                 argv: ["/bin/sh", "/cloudroid/install.sh"]

@@ -169,6 +169,7 @@ pub(crate) async fn ask(
                     source: out.clone(),
                     target: "/cloudroid/out".into(),
                     writable: true,
+                    device: false,
                 }],
                 environment,
                 argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"]

@@ -134,6 +134,7 @@ impl Site {
             }],
             owned_directories: run.owned,
             mounts: run.mounts,
+            hosts: Vec::new(),
             resident: serde_json::Value::Null,
         };
         let (line, mut lines) = mpsc::channel(256);

@@ -81,7 +81,7 @@ pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
 fn stage(place: &Path, spec: &Spec) -> Result<()> {
     let uid_range = (DEFAULT_UID_BASE, uids::RANGE);
     let skeleton = place.join("skeleton");
-    make_skeleton(&skeleton, &spec.id, &spec.layers, &spec.mounts)?;
+    make_skeleton(&skeleton, &spec.id, &spec.layers, &spec.mounts, &spec.hosts)?;
     let rootfs = Rootfs {
         layers: &spec.layers,
         skeleton: &skeleton,

@@ -19,7 +19,7 @@ impl Root {
     pub(crate) fn mount(place: &Path, spec: &Spec) -> Result<Self> {
         let (skeleton, path) = (place.join("skeleton"), place.join("root"));
         fs::create_dir_all(&path)?;
-        make_skeleton(&skeleton, &spec.id, &[], &[])?;
+        make_skeleton(&skeleton, &spec.id, &[], &[], &[])?;
         // Not shifted, it belongs to a stranger, and only who may enter it can mount on it.
         fs::set_permissions(skeleton.join("root"), fs::Permissions::from_mode(0o755))?;
         let lowers = [&skeleton].into_iter().chain(spec.layers.iter().rev());

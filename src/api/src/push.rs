@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use crate::grants::Grants;
 use crate::limits::Limits;
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
@@ -48,6 +49,9 @@ pub struct PushOptions {
     pub with: Vec<String>,
     /// Limits of a servant; those given are also reserved for it.
     pub limits: Limits,
+    /// What a servant is given beyond its container.
+    #[serde(skip_serializing_if = "Grants::is_empty")]
+    pub grants: Grants,
     /// What was pushed, in words, kept with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,

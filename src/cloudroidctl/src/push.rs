@@ -6,7 +6,7 @@ mod progress;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use api::{PushEvent, PushOptions};
+use api::{Grants, PushEvent, PushOptions, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
 
@@ -63,6 +63,15 @@ pub struct Push {
     with: Vec<String>,
     #[command(flatten)]
     limits: LimitFlags,
+    /// Device by its name in the machine's CDI specifications, such as nvidia.com/gpu=0; may be given several times.
+    #[arg(long = "device", value_name = "VENDOR/CLASS=NAME")]
+    devices: Vec<String>,
+    /// Directory or file of the daemon's machine, read-only inside; may be given several times.
+    #[arg(long = "volume", value_name = "SOURCE:TARGET", value_parser = volume)]
+    volumes: Vec<Volume>,
+    /// Where nodes may connect to, by TCP; may be given several times.
+    #[arg(long = "egress", value_name = "HOST:PORT")]
+    egress: Vec<String>,
 }
 
 fn parameter(text: &str) -> Result<(String, serde_json::Value), String> {
@@ -79,6 +88,18 @@ fn assignment(text: &str) -> Result<(String, String), String> {
     match text.split_once(":=") {
         Some((from, to)) if !from.is_empty() => Ok((from.to_owned(), to.to_owned())),
         _ => Err("write A:=B".to_owned()),
+    }
+}
+
+fn volume(text: &str) -> Result<Volume, String> {
+    match text.split_once(':') {
+        Some((source, target)) if source.starts_with('/') && target.starts_with('/') => {
+            Ok(Volume {
+                source: source.to_owned(),
+                target: target.to_owned(),
+            })
+        }
+        _ => Err("write SOURCE:TARGET, both absolute".to_owned()),
     }
 }
 
@@ -135,6 +156,11 @@ impl Push {
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
             limits: self.limits.into(),
+            grants: Grants {
+                devices: self.devices.clone(),
+                volumes: self.volumes.clone(),
+                egress: self.egress.clone(),
+            },
             source,
         })
     }

@@ -42,6 +42,8 @@ pub struct Config {
     pub portal: Portal,
     /// How big pushes may be.
     pub push: Push,
+    /// What pushes may ask for beyond a container.
+    pub allow: Allow,
 }
 
 /// Whether limits that cannot be set are an error.
@@ -110,6 +112,18 @@ pub struct Portal {
     pub drain: Time,
 }
 
+/// What of this machine a service may be given; nothing by default.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Allow {
+    /// CDI devices: `vendor.com/class=name`, or `vendor.com/class=*`.
+    pub devices: Vec<String>,
+    /// Directories and files; what is below a directory is allowed, too.
+    pub volumes: Vec<PathBuf>,
+    /// `HOST:PORT`, or `*:PORT`.
+    pub egress: Vec<String>,
+}
+
 /// How big pushes may be.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -150,6 +164,7 @@ impl Default for Config {
             servant: Servant::default(),
             portal: Portal::default(),
             push: Push::default(),
+            allow: Allow::default(),
         }
     }
 }

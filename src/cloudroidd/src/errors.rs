@@ -89,6 +89,9 @@ pub enum Error {
         /// Who wants it.
         newcomer: String,
     },
+    /// Something is asked for that is not granted.
+    #[error(transparent)]
+    Grant(#[from] crate::grants::GrantError),
     /// Something in the request is not what it should be.
     #[error("{0}")]
     BadRequest(String),
@@ -231,6 +234,7 @@ impl Error {
             Error::Ending => (S::SERVICE_UNAVAILABLE, "ending", "daemon ending"),
             Error::Push { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
             Error::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
+            Error::Grant(_) => (S::FORBIDDEN, "not-granted", "not granted"),
             Error::Engine(servant::Error::Refused { .. }) => {
                 (S::CONFLICT, "refused", "the servant refused")
             }

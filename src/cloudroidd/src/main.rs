@@ -17,6 +17,7 @@ mod definitions;
 mod doctor;
 mod errors;
 mod explain;
+mod grants;
 mod home;
 mod journal;
 mod linked;

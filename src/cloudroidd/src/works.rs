@@ -10,6 +10,7 @@ use ros::ros1::Ros1Bus;
 
 use crate::choreographer::Inner;
 use crate::config::Config;
+use crate::grants::Relays;
 use crate::linked::LinkedNodes;
 use crate::sockets::ServantSockets;
 use crate::state::RevisionRecord;
@@ -29,6 +30,7 @@ pub struct Works {
     pub hub: Arc<Hub>,
     /// What those have started.
     pub nodes: Arc<LinkedNodes>,
+    _relays: Relays,
 }
 
 impl Works {
@@ -56,12 +58,19 @@ impl Works {
             Arc::clone(&nodes) as Arc<dyn link::cloud::Nodes>,
             options,
         );
+        let relays = Relays::open(
+            &container.endpoint(),
+            &revision.plan.grants,
+            &inner.config.allow,
+        )
+        .await;
         let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));
         Ok(Arc::new(Works {
             bus,
             bridge,
             hub,
             nodes,
+            _relays: relays,
         }))
     }
 

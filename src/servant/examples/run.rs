@@ -110,6 +110,7 @@ async fn run(arguments: Vec<OsString>) -> Result<ExitCode, Failure> {
         nodes: vec![node],
         owned_directories: vec![],
         mounts: vec![],
+        hosts: Vec::new(),
         resident: serde_json::Value::Null,
     };
     let begun = Instant::now();

@@ -199,13 +199,14 @@ fn mounts(spec: &Spec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSpecError> 
     }
     for (extra, source) in spec.mounts.iter().zip(volumes) {
         let access = if extra.writable { "rw" } else { "ro" };
+        let devices = if extra.device { "dev" } else { "nodev" };
         let target = extra.target.to_string_lossy();
         let source = source.to_string_lossy();
         mounts.push(mount(
             &target,
             "bind",
             &source,
-            words(&["bind", "nosuid", "nodev", access]),
+            words(&["bind", "nosuid", devices, access]),
         )?);
     }
     Ok(mounts)
@@ -244,6 +245,7 @@ mod tests {
             nodes: vec![],
             owned_directories: vec![],
             mounts: vec![],
+            hosts: Vec::new(),
             resident: serde_json::Value::Null,
         }
     }

@@ -2,6 +2,7 @@
 //! process and must be able to outlive the daemon.
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -34,6 +35,9 @@ pub struct Spec {
     /// Extra mounts, such as model files.
     #[serde(default)]
     pub mounts: Vec<Mount>,
+    /// Names that mean an address of its own loopback, for `/etc/hosts`.
+    #[serde(default)]
+    pub hosts: Vec<(IpAddr, String)>,
     /// Handed as it is to the shim's resident (the composed ROS Master): initial parameters and the like.
     #[serde(default)]
     pub resident: serde_json::Value,
@@ -122,4 +126,7 @@ pub struct Mount {
     pub target: PathBuf,
     /// Whether processes may write there.
     pub writable: bool,
+    /// It is a device node, to be used as such; elsewhere device nodes are dead.
+    #[serde(default)]
+    pub device: bool,
 }

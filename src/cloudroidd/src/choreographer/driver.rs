@@ -18,6 +18,7 @@ use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
 use crate::definitions;
 use crate::errors::{Error, with_last_words};
+use crate::grants;
 use crate::state::{self, RevisionRecord, ServantRecord};
 use crate::works::Works;
 
@@ -302,16 +303,18 @@ pub(super) async fn spec(
         .await
         .map_err(|_| Error::Internal("extracting layers"))??;
     let plan = &revision.plan;
+    let granted = grants::resolve(&plan.grants, &inner.config.allow)?;
     Ok(Spec {
         id: id.to_owned(),
         layers,
         writable: None,
         profile: Profile::Servant,
         limits: engine_limits(limits),
-        environment: plan.environment.clone(),
+        environment: granted.environment_over(&plan.environment),
         nodes,
         owned_directories: Vec::new(),
-        mounts: Vec::new(),
+        mounts: granted.mounts,
+        hosts: granted.hosts,
         resident: crate::shim::resident_config(&plan.parameters),
     })
 }

@@ -77,6 +77,11 @@ impl Asked {
     pub fn new(promised: Limits, default: Limits) -> Asked {
         Asked { promised, default }
     }
+
+    /// Both together.
+    pub fn limits(&self) -> Limits {
+        with_weight(self.promised).or(self.default)
+    }
 }
 
 /// Whoever is promised cores gets them before those who are not: a thousand of weight for each, where others have a
@@ -157,8 +162,7 @@ impl Handle {
 
     /// The limits that it is to have.
     pub fn limits(&self) -> Limits {
-        let asked = self.asked.lock();
-        with_weight(asked.promised).or(asked.default)
+        self.asked.lock().limits()
     }
 
     /// Those of them that somebody asked for, which are promised to it.

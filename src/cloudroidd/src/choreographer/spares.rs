@@ -13,7 +13,7 @@ use parking_lot::Mutex;
 use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 
-use super::{Inner, driver};
+use super::{Asked, Inner, driver};
 use crate::errors::Error;
 use crate::names;
 use crate::state::RevisionRecord;
@@ -190,7 +190,7 @@ pub(super) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare, Error> {
     let id = names::servant_id(&revision.service);
-    let limits = revision.plan.limits.or(inner.config.limits);
+    let limits = Asked::new(revision.plan.limits, inner.config.limits).limits();
     let spec = driver::spec(inner, &id, &revision, &limits, Vec::new()).await?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.config.servant.start.0;

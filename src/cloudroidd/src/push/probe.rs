@@ -19,6 +19,7 @@ use super::{Pusher, blocking};
 use crate::admission::Amount;
 use crate::choreographer;
 use crate::errors::Error;
+use crate::grants::Relays;
 use crate::sockets::ServantSockets;
 use crate::state::Plan;
 use crate::works::MASTER;
@@ -49,6 +50,8 @@ pub(super) async fn interface(
         servant: Some(Arc::clone(&servant)),
         tasks: pusher.tasks.clone(),
     };
+    let endpoint = servant.endpoint();
+    let _ways_out = Relays::open(&endpoint, &plan.grants, &pusher.config.allow).await;
     let found = look(pusher, &servant, built, plan).await;
     trial.end().await?;
     found
@@ -180,16 +183,18 @@ async fn spec(
             .collect::<Result<_, _>>()?)
     })
     .await?;
+    let granted = crate::grants::resolve(&plan.grants, &pusher.config.allow)?;
     Ok(Spec {
         id: format!("{id}-probe"),
         layers,
         writable: None,
         profile: Profile::Servant,
         limits: choreographer::engine_limits(&options.limits.or(pusher.config.limits)),
-        environment: plan.environment.clone(),
+        environment: granted.environment_over(&plan.environment),
         nodes: plan.nodes.clone(),
         owned_directories: Vec::new(),
-        mounts: Vec::new(),
+        mounts: granted.mounts,
+        hosts: granted.hosts,
         resident: crate::shim::resident_config(&plan.parameters),
     })
 }

@@ -16,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 use super::{EVENTS_AHEAD, PUSHED, Pusher, receive};
 use crate::config;
 use crate::errors::Error;
+use crate::grants;
 use crate::names;
 use crate::portal::App;
 use crate::state::NewEvent;
@@ -103,6 +104,7 @@ impl Pusher {
         }
         config::check_limits(&options.limits)
             .map_err(|error| Error::BadRequest(error.to_string()))?;
+        grants::resolve(&options.grants, &self.config.allow)?;
         self.choreographer.check_limits(&options.limits)
     }
 

@@ -59,6 +59,9 @@ pub struct Plan {
     /// Limits that the push asked for.
     #[serde(default)]
     pub limits: api::Limits,
+    /// What the push asked for beyond a container; whether it is allowed is looked at anew at each start.
+    #[serde(default)]
+    pub grants: api::Grants,
     /// Start a node again when it fails, though it asked for no respawn: nobody else will.
     #[serde(default)]
     pub restart: bool,

@@ -73,6 +73,10 @@ fn problem(spec: &Spec) -> Option<String> {
             ));
         }
     }
+    let unprintable = |name: &str| name.is_empty() || name.contains(char::is_whitespace);
+    if let Some((_, name)) = spec.hosts.iter().find(|(_, name)| unprintable(name)) {
+        return Some(format!("{name:?} is no name of a host"));
+    }
     let limits = &spec.limits;
     if limits
         .cpus
@@ -150,6 +154,7 @@ mod tests {
             nodes: vec![],
             owned_directories: vec![],
             mounts: vec![],
+            hosts: Vec::new(),
             resident: serde_json::Value::Null,
         }
     }
@@ -165,6 +170,7 @@ mod tests {
             source: "/usr".into(),
             target: target.into(),
             writable: false,
+            device: false,
         };
         let faults = [
             (

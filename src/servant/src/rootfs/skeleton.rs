@@ -1,6 +1,7 @@
 //! The topmost layer: what every servant needs to find in a root that it cannot write.
 
 use std::fs;
+use std::net::IpAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
@@ -14,6 +15,7 @@ pub fn make_skeleton(
     id: &str,
     layers: &[PathBuf],
     mounts: &[Mount],
+    names: &[(IpAddr, String)],
 ) -> Result<(), Error> {
     make_directory(skeleton)?;
     for (name, mode) in [
@@ -32,9 +34,12 @@ pub fn make_skeleton(
         fs::set_permissions(&path, fs::Permissions::from_mode(mode))
             .map_err(Error::file("change", &path))?;
     }
-    let hosts = format!(
+    let mut hosts = format!(
         "127.0.0.1\tlocalhost\n127.0.0.1\t{id}\n::1\tlocalhost ip6-localhost ip6-loopback\n"
     );
+    for (address, name) in names {
+        hosts += &format!("{address}\t{name}\n");
+    }
     let files = [
         ("hosts", hosts),
         ("hostname", format!("{id}\n")),
@@ -95,6 +100,7 @@ mod tests {
             source: home.path().into(),
             target: target.into(),
             writable: false,
+            device: false,
         };
         let make = |name: &str, target: &str| {
             make_skeleton(
@@ -102,6 +108,7 @@ mod tests {
                 "x",
                 std::slice::from_ref(&layer),
                 &[mount(target)],
+                &[],
             )
         };
         let error = make("one", "/lib/models").unwrap_err().to_string();

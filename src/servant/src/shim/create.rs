@@ -139,6 +139,7 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
         &launch.spec.id,
         &launch.spec.layers,
         &launch.spec.mounts,
+        &launch.spec.hosts,
     )
     .map_err(|error| text(&error))?;
     let rootfs = Rootfs {

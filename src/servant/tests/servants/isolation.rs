@@ -109,6 +109,7 @@ async fn a_volume_is_there_and_read_only() {
         source: models.clone(),
         target: "/opt/models".into(),
         writable: false,
+        device: false,
     }];
     let servant = world.start(spec).await;
     assert_eq!(

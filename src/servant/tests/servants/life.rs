@@ -271,6 +271,7 @@ async fn a_creation_that_libcontainer_fails_harms_nobody() {
         source: "/usr".into(),
         target: "/proc/nowhere".into(),
         writable: false,
+        device: false,
     }];
     let id = spec.id.clone();
     let error = world

@@ -220,6 +220,7 @@ pub fn spec(nodes: Vec<NodeSpec>) -> Spec {
         nodes,
         owned_directories: vec![],
         mounts: vec![],
+        hosts: Vec::new(),
         resident: serde_json::Value::Null,
     }
 }

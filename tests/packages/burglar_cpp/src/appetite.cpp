@@ -82,6 +82,19 @@ Outcome leave(const std::string& argument) {
   return {static_cast<bool>(file.flush()), "written"};
 }
 
+// Whether the first bytes of a file can be read.
+Outcome readSome(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  char bytes[4];
+  return {static_cast<bool>(file.read(bytes, sizeof bytes)), path};
+}
+
+// What a variable of the environment holds.
+Outcome environment(const std::string& name) {
+  const char* value = getenv(name.c_str());
+  return {value != nullptr, value ? value : ""};
+}
+
 // Answers after so many milliseconds.
 Outcome waitFor(const std::string& milliseconds) {
   std::this_thread::sleep_for(std::chrono::milliseconds(std::stoi(milliseconds)));
@@ -93,6 +106,6 @@ Outcome waitFor(const std::string& milliseconds) {
 const Tries& appetite() {
   static const Tries all{{"burn", burn}, {"rest", rest}, {"work", work},    {"take", take},
                          {"bomb", bomb}, {"end", end},   {"wait", waitFor},
-                         {"write", leave}};
+                         {"write", leave}, {"read", readSome}, {"environment", environment}};
   return all;
 }

@@ -1,0 +1,238 @@
+//! Devices by the Container Device Interface (CNCF CDI 0.3 to 0.8): a specification, JSON or YAML, names a device and
+//! says what a container needs for it. Device nodes, mounts and environment are given. Hooks, which are programs to run on
+//! the host, are not run: a device with hooks works where it can do without them.
+
+use std::collections::BTreeMap;
+use std::os::unix::fs::FileTypeExt;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use servant::spec::Mount;
+
+use super::{GrantError, Granted};
+
+/// Where specifications lie, by the standard; the later overrides the earlier.
+pub fn directories() -> Vec<PathBuf> {
+    ["/etc/cdi", "/var/run/cdi"].map(PathBuf::from).into()
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Specification {
+    kind: String,
+    #[serde(default)]
+    devices: Vec<Device>,
+    #[serde(default)]
+    container_edits: Edits,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Device {
+    name: String,
+    #[serde(default)]
+    container_edits: Edits,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+struct Edits {
+    env: Vec<String>,
+    device_nodes: Vec<Node>,
+    mounts: Vec<Bind>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Node {
+    path: PathBuf,
+    host_path: Option<PathBuf>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Bind {
+    host_path: PathBuf,
+    container_path: PathBuf,
+}
+
+/// Adds what the device `name` needs.
+pub fn add(name: &str, directories: &[PathBuf], granted: &mut Granted) -> Result<(), GrantError> {
+    let mut devices = BTreeMap::new();
+    for path in files(directories) {
+        let specification = read(&path)?;
+        for device in &specification.devices {
+            let full = format!("{}={}", specification.kind, device.name);
+            let edits = (
+                path.clone(),
+                [&specification.container_edits, &device.container_edits].map(granted_by),
+            );
+            devices.insert(full, edits);
+        }
+    }
+    let known = devices.keys().cloned().collect::<Vec<_>>().join(", ");
+    let (path, edits) = devices
+        .remove(name)
+        .ok_or_else(|| GrantError::UnknownDevice {
+            name: name.to_owned(),
+            directories: directories
+                .iter()
+                .map(|one| one.display().to_string())
+                .collect::<Vec<_>>()
+                .join(" and "),
+            known: if known.is_empty() {
+                "none".to_owned()
+            } else {
+                known
+            },
+        })?;
+    for edit in edits {
+        let edit = edit.map_err(|reason| GrantError::Specification {
+            path: path.clone(),
+            reason,
+        })?;
+        for mount in edit.mounts {
+            // Devices of one vendor share files.
+            if !granted
+                .mounts
+                .iter()
+                .any(|there| there.target == mount.target)
+            {
+                granted.mounts.push(mount);
+            }
+        }
+        granted.environment.extend(edit.environment);
+    }
+    Ok(())
+}
+
+fn files(directories: &[PathBuf]) -> Vec<PathBuf> {
+    let is_one = |path: &PathBuf| {
+        let ending = path.extension().and_then(|ending| ending.to_str());
+        matches!(ending, Some("json" | "yaml"))
+    };
+    let mut all = Vec::new();
+    for directory in directories {
+        let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
+        let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_one).collect();
+        found.sort();
+        all.extend(found);
+    }
+    all
+}
+
+fn read(path: &Path) -> Result<Specification, GrantError> {
+    let broken = |reason: String| GrantError::Specification {
+        path: path.to_owned(),
+        reason,
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| broken(error.to_string()))?;
+    // Every JSON text is a YAML one.
+    serde_norway::from_str(&text).map_err(|error| broken(error.to_string()))
+}
+
+fn granted_by(edits: &Edits) -> Result<Granted, String> {
+    let mut granted = Granted::default();
+    for variable in &edits.env {
+        let (name, value) = variable
+            .split_once('=')
+            .ok_or_else(|| format!("{variable:?} is no NAME=VALUE"))?;
+        granted
+            .environment
+            .insert(name.to_owned(), value.to_owned());
+    }
+    for node in &edits.device_nodes {
+        let source = node.host_path.clone().unwrap_or_else(|| node.path.clone());
+        let kind = std::fs::metadata(&source)
+            .map_err(|error| format!("{}: {error}", source.display()))?
+            .file_type();
+        if !kind.is_char_device() && !kind.is_block_device() {
+            return Err(format!("{} is no device node", source.display()));
+        }
+        granted.mounts.push(Mount {
+            source,
+            target: node.path.clone(),
+            writable: false,
+            device: true,
+        });
+    }
+    for bind in &edits.mounts {
+        granted.mounts.push(Mount {
+            source: bind.host_path.clone(),
+            target: bind.container_path.clone(),
+            writable: false,
+            device: false,
+        });
+    }
+    Ok(granted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const YAML: &str = "\
+cdiVersion: 0.6.0
+kind: vendor.com/harmless
+containerEdits:
+  env: [VENDOR=here]
+devices:
+  - name: zero
+    containerEdits:
+      deviceNodes:
+        - path: /dev/vendor0
+          hostPath: /dev/zero
+      mounts:
+        - hostPath: /etc/hostname
+          containerPath: /usr/share/vendor
+          options: [ro]
+  - name: broken
+    containerEdits:
+      deviceNodes: [{path: /etc/hostname}]
+";
+
+    #[test]
+    fn a_device_brings_what_its_specification_says() {
+        let place = tempfile::tempdir().expect("a directory");
+        std::fs::write(place.path().join("vendor.yaml"), YAML).expect("written");
+        let directories = [place.path().to_owned()];
+        let mut granted = Granted::default();
+        add("vendor.com/harmless=zero", &directories, &mut granted).expect("known");
+        assert_eq!(granted.environment["VENDOR"], "here");
+        let targets: Vec<_> = granted
+            .mounts
+            .iter()
+            .map(|mount| (mount.target.to_str().expect("UTF-8"), mount.device))
+            .collect();
+        assert_eq!(
+            targets,
+            [("/dev/vendor0", true), ("/usr/share/vendor", false)]
+        );
+        let mut refused = |name| {
+            add(name, &directories, &mut granted)
+                .expect_err(name)
+                .to_string()
+        };
+        assert!(
+            refused("vendor.com/harmless=one")
+                .contains("there are: vendor.com/harmless=broken, vendor.com/harmless=zero")
+        );
+        assert!(refused("vendor.com/harmless=broken").contains("/etc/hostname is no device node"));
+    }
+
+    #[test]
+    fn a_later_directory_overrides_an_earlier() {
+        let place = tempfile::tempdir().expect("a directory");
+        let directories = ["one", "two"].map(|name| place.path().join(name));
+        for (directory, value) in directories.iter().zip(["first", "second"]) {
+            std::fs::create_dir(directory).expect("made");
+            let text = format!(
+                r#"{{"cdiVersion":"0.5.0","kind":"v.com/c","devices":[{{"name":"d","containerEdits":{{"env":["A={value}"]}}}}]}}"#
+            );
+            std::fs::write(directory.join("v.json"), text).expect("written");
+        }
+        let mut granted = Granted::default();
+        add("v.com/c=d", &directories, &mut granted).expect("known");
+        assert_eq!(granted.environment["A"], "second");
+    }
+}
