@@ -95,7 +95,7 @@ impl Outputs {
             wire_type: None,
             queue: QUEUE,
         };
-        let mut subscription = match hub.bus.subscribe(&topic, options).await {
+        let subscription = match hub.bus.subscribe(&topic, options).await {
             Ok(subscription) => subscription,
             Err(error) => {
                 tracing::warn!(topic, %error, "an output cannot be read");
@@ -104,6 +104,8 @@ impl Outputs {
         };
         let reader = Arc::clone(link);
         let reading = tokio::spawn(async move {
+            // All of it, or its guard would stay behind and end the subscription.
+            let subscription = &mut { subscription };
             while let Some(message) = subscription.messages.recv().await {
                 // Other nodes of the servant have links of their own.
                 if *message.publisher == *reader.node {

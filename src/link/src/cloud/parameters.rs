@@ -48,7 +48,8 @@ impl Known {
             }
         }
         for (key, value) in hub.nodes.parameters(&hello.node) {
-            self.set(hub, key, value).await;
+            // The robot shall see what its node really has.
+            let _ = hub.bus.set_param(&key, value).await;
         }
     }
 
