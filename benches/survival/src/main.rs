@@ -108,7 +108,8 @@ fn main() -> Result<()> {
             Err(_) => ROBOTS.len(),
         };
         let mut robot = daemon.robot(&path(ROBOTS[round as usize % ROBOTS.len()]))?;
-        if count(&mut robot)? != counted {
+        // More than was heard back may have been on its way.
+        if count(&mut robot)? < counted {
             forgotten += 1;
         }
         ensure!(lost == 0, "round {round}: {before:?} became {after:?}");

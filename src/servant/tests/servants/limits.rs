@@ -118,8 +118,35 @@ async fn limits_are_read_back_and_changed_while_it_runs() {
         }
     );
     assert_eq!(servant.enforced(), now);
+    processes(&*servant, 1).await;
     let usage = servant.usage().await.unwrap();
     assert!(usage.memory > 0 && usage.pids >= 2, "{usage:?}");
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn input_and_output_are_limited_where_the_host_can() {
+    let world = World::new();
+    let can = world
+        .engine
+        .cgroups()
+        .controllers()
+        .iter()
+        .any(|name| name == "io" || name == "blkio");
+    let mut spec = spec(vec![node("/a", &["sleep"])]);
+    // On a disk, or on something that is none.
+    let device = std::os::unix::fs::MetadataExt::dev(&std::fs::metadata(&spec.layers[0]).unwrap());
+    let on_disk = std::path::Path::new(&format!(
+        "/sys/dev/block/{}:{}",
+        libc::major(device),
+        libc::minor(device)
+    ))
+    .exists();
+    spec.limits.io_write = Some(5 << 20);
+    let servant = world.start(spec).await;
+    let limits = servant.enforced().limits;
+    let expected = (can && on_disk).then_some(5 << 20);
+    assert_eq!((limits.io_read, limits.io_write), (None, expected));
     world.stop(servant).await;
 }
 
