@@ -9,6 +9,9 @@ export CARGO_TARGET_DIR ?= $(CACHE)/cargo
 # Python clients (the demo's robot, the stories' roslibpy) live outside the clone, one environment per list of versions.
 VENV := $(CACHE)/python-$(shell sha256sum demo/requirements.txt | cut -c1-12)
 export CLOUDROID_PYTHON := $(VENV)/bin/python
+# The same for the stories' client in JavaScript.
+NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
+export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
 HOST := x86_64-unknown-linux-gnu
 PREFIX ?= /usr/local
 
@@ -28,6 +31,7 @@ demo-deps:
 .PHONY: test-deps
 test-deps: deps
 	@scripts/python "$(VENV)" demo/requirements.txt
+	@scripts/node "$(NODE)" tests/robots/package.json
 
 # PID 1 of every servant is static: it runs on whatever root file system a service has.
 INIT_FLAGS := --locked -p init --profile init --target $(HOST)
@@ -87,8 +91,13 @@ unit: build-dev
 	@cargo test --locked --workspace --exclude stories
 	@cargo test --locked -p codec --test properties video # alone: without its feature video
 
+.PHONY: robots
+robots:
+	@cargo build -q --locked --manifest-path tests/robots/roslibrust/Cargo.toml --target-dir "$(CARGO_TARGET_DIR)/robots"
+	@install -m 755 "$(CARGO_TARGET_DIR)/robots/debug/robot-with-roslibrust" "$(CARGO_TARGET_DIR)/debug/robot-with-roslibrust"
+
 .PHONY: stories
-stories: build-dev ## the whole system, told as stories; ONLY=name runs those whose name contains it
+stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
 	@cargo test --locked -p stories --test stories -- $(ONLY)
 

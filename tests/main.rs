@@ -10,6 +10,8 @@ use support::Told;
 mod answer;
 #[path = "stories/burglary.rs"]
 mod burglary;
+#[path = "stories/clients.rs"]
+mod clients;
 #[path = "stories/grants.rs"]
 mod grants;
 #[path = "stories/house.rs"]
@@ -57,6 +59,11 @@ fn main() -> ExitCode {
         stories![grants:
             a_service_is_given_what_its_operator_allows,
             nothing_is_given_unasked_or_unallowed,
+        ],
+        stories![clients:
+            roslibpy_finds_nothing_missing,
+            roslib_finds_nothing_missing,
+            roslibrust_finds_nothing_missing,
         ],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,

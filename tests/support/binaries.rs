@@ -41,3 +41,10 @@ pub fn python() -> PathBuf {
         .map(PathBuf::from)
         .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
 }
+
+/// Where roslib is (see scripts/node).
+pub fn node_modules() -> PathBuf {
+    std::env::var_os("CLOUDROID_NODE_MODULES")
+        .map(PathBuf::from)
+        .expect("CLOUDROID_NODE_MODULES names Node's packages; run the stories by make stories")
+}

@@ -68,6 +68,18 @@ pub const BURGLAR: Service = Service {
     arguments: &["--node", "burglar"],
 };
 
+/// What the suites of rosbridge's clients expect.
+pub const FIXTURE: Service = Service {
+    name: "rosbridge_fixture",
+    package: Some("rosbridge_fixture"),
+    arguments: &[
+        "--name",
+        "rosbridge_fixture",
+        "--node",
+        "rosbridge_fixture/fixture",
+    ],
+};
+
 /// The world of this run.
 pub fn world() -> &'static World {
     WORLD.get_or_init(|| {

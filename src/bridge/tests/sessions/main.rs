@@ -4,6 +4,7 @@
 mod support;
 
 mod actions;
+mod bad_input;
 mod manners;
 mod publishing;
 mod resuming;
