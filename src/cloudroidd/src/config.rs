@@ -98,6 +98,18 @@ pub struct Servant {
     pub spares: usize,
 }
 
+/// What JSON has no word for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NonFinite {
+    /// `null`, which every parser accepts.
+    Null,
+    /// `"NaN"`, `"Infinity"`, `"-Infinity"`.
+    Text,
+    /// `NaN`, `Infinity`, `-Infinity`: Python's words, refused by strict parsers.
+    Bare,
+}
+
 /// What clients may do to the port.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -106,6 +118,12 @@ pub struct Portal {
     pub max_message: Size,
     /// Biggest WebSocket frame.
     pub max_frame: Size,
+    /// Between pings; 0: none are sent.
+    pub ping: Time,
+    /// A connection from which nothing came for so long, not even a pong, is closed; 0: never.
+    pub idle: Time,
+    /// How NaN and infinities are written in JSON.
+    pub non_finite: NonFinite,
     /// For a request's header, and for the `auth` message where that is awaited.
     pub handshake: Time,
     /// For connections to end when the daemon does.
@@ -198,6 +216,9 @@ impl Default for Portal {
         Portal {
             max_message: Size(64 << 20),
             max_frame: Size(64 << 20),
+            ping: Time::seconds(15),
+            idle: Time::seconds(90),
+            non_finite: NonFinite::Null,
             handshake: Time::seconds(10),
             drain: Time::seconds(10),
         }

@@ -9,7 +9,7 @@ use ros::bus::{Bus, BusError};
 use ros::ros1::Ros1Bus;
 
 use crate::choreographer::Inner;
-use crate::config::Config;
+use crate::config::{Config, NonFinite};
 use crate::grants::Relays;
 use crate::linked::LinkedNodes;
 use crate::sockets::ServantSockets;
@@ -86,6 +86,13 @@ fn bridge_options(config: &Config) -> BridgeOptions {
     BridgeOptions {
         max_frame: bytes(config.portal.max_frame),
         max_message: bytes(config.portal.max_message),
+        ping_interval: config.portal.ping.0,
+        idle_timeout: config.portal.idle.0,
+        non_finite: match config.portal.non_finite {
+            NonFinite::Null => ros::codec::NonFinite::Null,
+            NonFinite::Text => ros::codec::NonFinite::String,
+            NonFinite::Bare => ros::codec::NonFinite::Bare,
+        },
         resume_grace: config.servant.grace.0,
         ..BridgeOptions::default()
     }
