@@ -18,6 +18,7 @@ pub mod service;
 pub mod size;
 pub mod status;
 pub mod stub;
+pub mod trial;
 
 pub use cpuset::CpuSet;
 pub use doctor::{Check, CheckStatus, Doctor};

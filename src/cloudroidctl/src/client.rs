@@ -279,7 +279,8 @@ async fn refusal(response: Response<Incoming>) -> anyhow::Error {
     }
 }
 
-async fn read<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
+/// The JSON of an answer.
+pub async fn read<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
     let body = response
         .into_body()
         .collect()

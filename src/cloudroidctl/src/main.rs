@@ -19,6 +19,7 @@ mod set;
 mod status;
 mod stop;
 mod stub;
+mod trial;
 
 use std::process::ExitCode;
 
@@ -69,6 +70,7 @@ enum Verb {
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
     Stub(stub::Stub),
+    Try(Box<trial::Try>),
     Explain(explain::Explain),
     Status(status::Status),
     Doctor(doctor::Doctor),
@@ -113,6 +115,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
+        Verb::Try(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,

@@ -6,7 +6,7 @@ mod progress;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use api::{Grants, PushEvent, PushOptions, Volume};
+use api::{Grants, PushEvent, PushOptions, ServiceDetail, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
 
@@ -115,6 +115,25 @@ fn mapping(text: &str) -> Result<(String, String), String> {
 impl Push {
     /// Sends the package, shows what is done with it, and ends with the service's address and interface.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let service = self.publish(client, format).await?;
+        match format {
+            Format::Table => services::show(&service),
+            Format::Json => Ok(()),
+        }
+    }
+
+    /// The same under a name that nobody else has, without the service's address and interface.
+    pub async fn under(
+        mut self,
+        name: &str,
+        client: &Client,
+        format: Format,
+    ) -> anyhow::Result<()> {
+        self.name = Some(name.to_owned());
+        self.publish(client, format).await.map(|_| ())
+    }
+
+    async fn publish(self, client: &Client, format: Format) -> anyhow::Result<ServiceDetail> {
         let options = self.options()?;
         let query = serde_json::to_string(&options)?;
         let uri = format!("/api/v1/push?options={}", escaped(&query));
@@ -171,7 +190,7 @@ async fn send(
     format: Format,
     uri: &str,
     path: Option<PathBuf>,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<ServiceDetail> {
     let (body, packing) = match path {
         Some(path) => {
             let (body, packing) = archive::of(&path)?;
@@ -192,13 +211,7 @@ async fn send(
         };
         progress.show(&event)?;
         match event {
-            PushEvent::Done { service, .. } => {
-                return if format == Format::Table {
-                    services::show(&service)
-                } else {
-                    Ok(())
-                };
-            }
+            PushEvent::Done { service, .. } => return Ok(*service),
             PushEvent::Error { problem } => {
                 return Err(packing_failed(packing).unwrap_or_else(|| problem.into()));
             }

@@ -30,6 +30,7 @@ mod state;
 mod stubs;
 mod supervision;
 mod tokens;
+mod trial;
 mod views;
 mod works;
 

@@ -116,6 +116,10 @@ pub fn router(app: Arc<App>) -> Router {
         .route("/services/{name}/interface", get(api_v1::interface))
         .route("/services/{name}/rollback", post(api_v1::rollback))
         .route(
+            "/services/{name}/trial",
+            post(api_v1::trial).layer(DefaultBodyLimit::max(api_v1::LARGEST_TRIAL)),
+        )
+        .route(
             "/servants",
             get(api_v1::servants).delete(api_v1::stop_servants),
         )

@@ -4,6 +4,7 @@
 //! In: definitions (`.msg`, `.srv`, `.action` texts) and sockets from a [`net::Sockets`].
 //! Out: a [`bus::Bus`] on which serialized messages are published, received and answered.
 
+pub mod bag;
 pub mod bus;
 pub mod codec;
 pub mod net;

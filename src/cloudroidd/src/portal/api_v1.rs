@@ -15,6 +15,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use super::App;
 use crate::choreographer::{self, describe};
 use crate::errors::Error;
+use crate::trial::Material;
 use crate::views;
 
 type Answer<T> = Result<Json<T>, Error>;
@@ -123,6 +124,41 @@ pub async fn rollback(
     };
     app.pusher.rollback(&name, asked.revision).await?;
     Ok(Json(views::service(&app, &name)?))
+}
+
+/// The largest recording for a trial: it is held in memory.
+pub const LARGEST_TRIAL: usize = 512 << 20;
+
+/// With what a service is tried.
+#[derive(Debug, Deserialize)]
+pub struct With {
+    kind: Kind,
+}
+
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Kind {
+    Bag,
+    Image,
+}
+
+/// What a service makes of a recording or a picture, and how fast.
+pub async fn trial(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Query(with): Query<With>,
+    body: Bytes,
+) -> Answer<api::trial::Trial> {
+    let material = tokio::task::spawn_blocking(move || match with.kind {
+        Kind::Image => crate::trial::Picture::read(&body).map(Material::Picture),
+        Kind::Bag => ros::bag::read(&body, crate::trial::RECORDED)
+            .map(Material::Bag)
+            .map_err(|error| Error::BadRequest(error.to_string())),
+    });
+    let material = material
+        .await
+        .map_err(|_| Error::Internal("reading what a service is tried with"))??;
+    Ok(Json(crate::trial::run(&app, &name, material).await?))
 }
 
 /// All servants.
