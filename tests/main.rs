@@ -20,6 +20,8 @@ mod house;
 mod images;
 #[path = "stories/isolation.rs"]
 mod isolation;
+#[path = "stories/link.rs"]
+mod link;
 #[path = "stories/portal.rs"]
 mod portal;
 #[path = "stories/push.rs"]
@@ -83,6 +85,12 @@ fn main() -> ExitCode {
             limits_are_changed_while_it_works,
             a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
             two_robots_see_nothing_of_each_other,
+        ],
+        stories![link:
+            a_greeter_in_the_cloud_is_a_node_of_the_robot,
+            two_nodes_share_a_servant,
+            what_a_stub_cannot_do_is_said,
+            the_robot_s_master_starts_again,
         ],
         stories![portal:
             topics_and_services_cross_both_ways,

@@ -9,6 +9,7 @@ pub mod leftovers;
 pub mod machine;
 pub mod procfs;
 pub mod robot;
+pub mod site;
 pub mod world;
 
 /// What a story ends with: an error is told with all its causes.

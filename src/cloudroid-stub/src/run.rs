@@ -297,7 +297,9 @@ async fn link_once(
             servant,
         } => {
             if !resumed && resume.is_some() {
-                mirror.renew(Arc::new(Session::new(session_options(config))));
+                let fresh = Session::new(session_options(config));
+                fresh.begin_at(hello.next);
+                mirror.renew(Arc::new(fresh));
             }
             *resume = Some(session);
             tracing::info!(servant, resumed, "linked to {}", config.server);

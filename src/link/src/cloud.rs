@@ -29,7 +29,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use crate::control::{Exit, Hello, Node, Request, Sla, Welcome};
+use crate::control::{Control, Exit, Hello, Node, Request, Sla, Welcome};
 use crate::session::{Lost, SessionOptions, receive_open, send_open};
 use crate::{MAX_FRAME, MAX_RECORD};
 
@@ -297,6 +297,13 @@ impl Hub {
         }
         let link = NodeLink::begin(self, hello, session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
+        // What the node has set before there was a link to tell.
+        if let Ok(ParamValue::Map(set)) = self.bus.get_param(node).await {
+            let set = set
+                .into_iter()
+                .map(|(key, value)| (format!("{node}/{key}"), Some(value)));
+            link.session.tell(&Control::Parameters(set.collect()));
+        }
         self.changed();
         Ok((link, false))
     }

@@ -318,6 +318,11 @@ impl Outgoing {
         self.piece = piece.clamp(PIECES.0, PIECES.1);
     }
 
+    /// Begins with this number, which the peer was told to expect.
+    pub(crate) fn begin_at(&mut self, number: u32) {
+        self.next_number = number;
+    }
+
     /// The first number on the next connection.
     pub(crate) fn next_number(&self) -> u32 {
         self.next_number

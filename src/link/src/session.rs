@@ -202,6 +202,12 @@ impl Session {
         (received, ahead, state.out.next_number())
     }
 
+    /// For a new session that takes the place of one the peer has forgotten: the first number that the peer was told
+    /// to expect. Before anything is sent.
+    pub fn begin_at(&self, number: u32) {
+        self.state.lock().out.begin_at(number);
+    }
+
     /// A new connection: what the peer has, and the first number that it will use.
     pub fn reconnect(&self, received: u32, ahead: &[u32], next: u32) {
         let mut state = self.state.lock();

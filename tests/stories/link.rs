@@ -1,0 +1,213 @@
+//! A robot's node in the cloud: the robot's side cannot tell it from the original.
+
+use std::collections::BTreeSet;
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::Signal;
+use ros::bus::{Bus, Graph, ParamValue};
+use support::Told;
+use support::site::{Running, Site, registered, string};
+use support::world::{ADDER, GREETER, world};
+
+const THE_GREETER: (&str, &str, &str) = ("greeter_cpp", "greeter_cpp", "greeter");
+const THE_ADDER: (&str, &str, &str) = ("adder_py", "adder_py", "adder.py");
+
+fn serves(service: &str) -> impl Fn(&Graph) -> bool {
+    let service = service.to_owned();
+    move |graph| graph.services.contains_key(&service)
+}
+
+fn text(message: &[u8]) -> String {
+    String::from_utf8_lossy(message).into_owned()
+}
+
+/// The message with what the node said when it fails.
+fn with_log<T>(outcome: anyhow::Result<T>, node: &Running) -> anyhow::Result<T> {
+    outcome.with_context(|| format!("the stub said:\n{}", node.said()))
+}
+
+pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Told {
+    let daemon = world().with(GREETER)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let run = |future| site.runtime.block_on(future);
+    run(app.set_param(
+        "/front/hello/style",
+        ParamValue::String("{name: robot's}".into()),
+    ))?;
+    let argv = [
+        "__name:=hello",
+        "__ns:=/front",
+        "~name:=/who",
+        "__log:=/nowhere/x.log",
+    ];
+    let mut stub = site.stub(&daemon, THE_GREETER, "linked-greeter", &argv)?;
+    with_log(
+        site.until(&app, "the service", serves("/front/hello/count")),
+        &stub,
+    )?;
+    // A topic in, remapped; a topic out; both with the original's names and types.
+    let names = site.says(&app, "/who", false)?;
+    site.connected(&*names, 1)?;
+    let mut greetings = site.hears(&app, "/front/hello/greeting")?;
+    names.publish(string("robot"));
+    let greeting = with_log(site.next(&mut greetings), &stub)?;
+    ensure!(text(&greeting.bytes).contains("hi robot"), "{greeting:?}");
+    ensure!(
+        greeting.wire_type.name == "greeter_cpp/Greeting" && &*greeting.publisher == "/front/hello",
+        "{greeting:?}"
+    );
+    // A newcomer is given the latched one.
+    let late = site.node("/late")?;
+    let mut again = site.hears(&late, "/front/hello/greeting")?;
+    ensure!(site.next(&mut again)?.bytes == greeting.bytes);
+    // A service, with a parameter of the robot behind it.
+    let response = site.calls(&app, "/front/hello/count", &[0])?;
+    ensure!(
+        text(&response).contains("robot's") && response[0] == 1,
+        "{response:?}"
+    );
+    // The node's logger is the node's.
+    ensure!(text(&site.calls(&app, "/front/hello/get_loggers", &[])?).contains("ros.roscpp"));
+    // roslaunch's way to end it.
+    stub.signal(Signal::SIGINT)?;
+    let status = stub.ends()?;
+    // As the real node ended: in good order, or with whatever befalls it at its end.
+    let crashed = std::os::unix::process::ExitStatusExt::signal(&status).is_some()
+        && stub.said().contains("was killed by");
+    ensure!(
+        status.code() == Some(0) || crashed,
+        "{status}: {}",
+        stub.said()
+    );
+    site.until(&app, "an empty graph", |graph| {
+        registered(graph, "/front/hello").is_empty()
+    })?;
+    Ok(())
+}
+
+pub fn two_nodes_share_a_servant() -> Told {
+    let daemon = world().with(GREETER)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let robot = "linked-pair";
+    let one = site.stub(&daemon, THE_GREETER, robot, &["__name:=one", "~name:=/who"])?;
+    let two = site.stub(&daemon, THE_GREETER, robot, &["__name:=two", "~name:=/who"])?;
+    with_log(site.until(&app, "the first", serves("/one/count")), &one)?;
+    with_log(site.until(&app, "the second", serves("/two/count")), &two)?;
+    let servants = daemon.deployer().asks(&["servants"])?;
+    let theirs = servants
+        .as_array()
+        .context("a list")?
+        .iter()
+        .filter(|servant| servant["robot"] == robot);
+    ensure!(theirs.count() == 1, "{servants:#}");
+    let names = site.says(&app, "/who", false)?;
+    site.connected(&*names, 2)?;
+    let mut first = site.hears(&app, "/one/greeting")?;
+    let mut second = site.hears(&app, "/two/greeting")?;
+    names.publish(string("robot"));
+    // Each hears it once, though both listen.
+    site.next(&mut first)?;
+    site.next(&mut second)?;
+    for service in ["/one/count", "/two/count"] {
+        let count = site.calls(&app, service, &[0])?;
+        ensure!(count[0] == 1, "{service}: {count:?}");
+    }
+    Ok(())
+}
+
+pub fn what_a_stub_cannot_do_is_said() -> Told {
+    let daemon = world().with(GREETER)?;
+    world().with(ADDER)?;
+    let site = Site::new()?;
+    let server = format!(
+        "server = \"ws://{}\"\nrobot = \"linked-wrong\"\nlocal = \"none\"\n",
+        daemon.address
+    );
+    let cases = [
+        (
+            format!("{server}service = \"nothing\""),
+            "greeter",
+            "nothing",
+        ),
+        (
+            format!("{server}service = \"greeter_cpp\""),
+            "no_such",
+            "no executable no_such",
+        ),
+        (
+            format!("{server}service = \"greeter_cpp\"\ntoken_file = \"/nowhere/token\""),
+            "greeter",
+            "/nowhere/token",
+        ),
+        (
+            format!("{server}service = \"greeter_cpp\"\nmaximum = 3"),
+            "greeter",
+            "maximum",
+        ),
+    ];
+    for (toml, executable, said) in cases {
+        let mut stub = site.stub_with(&toml, "greeter_cpp", executable, &["__name:=wrong"])?;
+        let status = stub.ends()?;
+        ensure!(
+            status.code() == Some(1) && stub.said().contains(said),
+            "{said}: {status}\n{}",
+            stub.said()
+        );
+    }
+    // A node that ends takes its stub along, with its status.
+    let mut stub = site.stub(&daemon, THE_ADDER, "linked-ended", &["__name:=adder"])?;
+    let app = site.node("/app")?;
+    with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
+    let servants = daemon.deployer().asks(&["servants"])?;
+    let pid = servants
+        .as_array()
+        .and_then(|all| {
+            all.iter()
+                .find(|servant| servant["robot"] == "linked-ended")
+        })
+        .and_then(|servant| servant["pids"][0].as_i64())
+        .context("its process")?;
+    nix::sys::signal::kill(
+        nix::unistd::Pid::from_raw(i32::try_from(pid)?),
+        Signal::SIGKILL,
+    )?;
+    let status = stub.ends()?;
+    ensure!(
+        std::os::unix::process::ExitStatusExt::signal(&status) == Some(9),
+        "{status}: {}",
+        stub.said()
+    );
+    Ok(())
+}
+
+pub fn the_robot_s_master_starts_again() -> Told {
+    let daemon = world().with(GREETER)?;
+    let mut site = Site::new()?;
+    let stub = site.stub(&daemon, THE_GREETER, "linked-master", &["__name:=greeter"])?;
+    let before = {
+        let app = site.node("/app")?;
+        let graph = with_log(
+            site.until(&app, "the service", serves("/greeter/count")),
+            &stub,
+        )?;
+        site.until(&app, "all of it", |graph| {
+            registered(graph, "/greeter").len() >= 5
+        })?;
+        registered(&app.graph().borrow(), "/greeter")
+            .union(&registered(&graph, "/greeter"))
+            .cloned()
+            .collect::<BTreeSet<_>>()
+    };
+    site.end_master();
+    site.start_master()?;
+    let app = site.node("/app")?;
+    with_log(
+        site.until(&app, "the same graph", |graph| {
+            registered(graph, "/greeter") == before
+        }),
+        &stub,
+    )?;
+    Ok(())
+}

@@ -1,0 +1,351 @@
+//! A robot's side of a link: a ROS Master, the robot's own nodes, and stubs in place of what runs in the cloud.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use bytes::Bytes;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use ros::bus::{
+    AdvertiseOptions, Bus, Graph, Message, Publisher, SubscribeOptions, Subscription, WireType,
+};
+use ros::net::HostSockets;
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use tempfile::TempDir;
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
+use tokio::task::JoinHandle;
+
+use crate::binaries;
+use crate::daemon::Daemon;
+use crate::robot::PATIENCE;
+
+/// A robot.
+pub struct Site {
+    /// Where its nodes of this process run.
+    pub runtime: Runtime,
+    /// Where its Master listens.
+    pub master: SocketAddr,
+    serving: Option<JoinHandle<()>>,
+    place: TempDir,
+}
+
+/// A node that runs as a process: a stub, or an original.
+pub struct Running {
+    child: Child,
+    log: PathBuf,
+}
+
+impl Site {
+    /// A robot with nothing but a Master.
+    pub fn new() -> anyhow::Result<Self> {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
+        let place = tempfile::Builder::new()
+            .prefix("cloudroid-site-")
+            .tempdir()?;
+        let mut site = Self {
+            runtime,
+            master: ([127, 0, 0, 1], 0).into(),
+            serving: None,
+            place,
+        };
+        site.start_master()?;
+        Ok(site)
+    }
+
+    /// Starts a Master, where the last one was if there was one.
+    pub fn start_master(&mut self) -> anyhow::Result<()> {
+        let at = self.master;
+        let listener = self.runtime.block_on(TcpListener::bind(at))?;
+        self.master = listener.local_addr()?;
+        let master = Master::new(MasterOptions::default());
+        let serving = async move { master.serve(listener, Arc::new(HostSockets)).await };
+        self.serving = Some(self.runtime.spawn(serving));
+        Ok(())
+    }
+
+    /// Ends the Master; what was registered there is forgotten.
+    pub fn end_master(&mut self) {
+        if let Some(serving) = self.serving.take() {
+            serving.abort();
+            let _ = self.runtime.block_on(serving);
+        }
+    }
+
+    /// A node of this process.
+    pub fn node(&self, name: &str) -> anyhow::Result<Arc<Ros1Bus>> {
+        let joined = Ros1Bus::connect(Arc::new(HostSockets), self.master, name);
+        Ok(self.runtime.block_on(joined)?)
+    }
+
+    /// Waits until the graph is as wanted.
+    pub fn until(
+        &self,
+        node: &Ros1Bus,
+        what: &str,
+        wanted: impl Fn(&Graph) -> bool,
+    ) -> anyhow::Result<Graph> {
+        let mut graphs = node.graph();
+        let found = self.runtime.block_on(async {
+            let found = tokio::time::timeout(PATIENCE, graphs.wait_for(|graph| wanted(graph)));
+            found
+                .await
+                .map(|found| found.map(|graph| (**graph).clone()))
+        });
+        match found {
+            Ok(graph) => Ok(graph?),
+            Err(_) => bail!("{what} did not come about: {:#?}", node.graph().borrow()),
+        }
+    }
+
+    /// Advertises a topic of strings.
+    pub fn says(
+        &self,
+        node: &Ros1Bus,
+        topic: &str,
+        latch: bool,
+    ) -> anyhow::Result<Box<dyn Publisher>> {
+        let options = AdvertiseOptions {
+            wire_type: WireType {
+                name: "std_msgs/String".into(),
+                md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+                definition: "string data\n".into(),
+            },
+            latch,
+            queue: 100,
+        };
+        Ok(self.runtime.block_on(node.advertise(topic, options))?)
+    }
+
+    /// Subscribes to a topic of any type.
+    pub fn hears(&self, node: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
+        let options = SubscribeOptions {
+            wire_type: None,
+            queue: 100,
+        };
+        Ok(self.runtime.block_on(node.subscribe(topic, options))?)
+    }
+
+    /// The next message.
+    pub fn next(&self, subscription: &mut Subscription) -> anyhow::Result<Message> {
+        let next = self
+            .runtime
+            .block_on(async { tokio::time::timeout(PATIENCE, subscription.messages.recv()).await });
+        next.context("a message should come")?
+            .context("the topic ended")
+    }
+
+    /// Waits until so many subscribers are connected.
+    pub fn connected(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
+        let mut now = publisher.subscribers();
+        let reached = self.runtime.block_on(async {
+            tokio::time::timeout(PATIENCE, now.wait_for(|now| *now == count))
+                .await
+                .is_ok()
+        });
+        ensure!(
+            reached,
+            "{count} subscribers should be connected, not {}",
+            *publisher.subscribers().borrow()
+        );
+        Ok(())
+    }
+
+    /// Calls a service.
+    pub fn calls(&self, node: &Ros1Bus, service: &str, request: &[u8]) -> anyhow::Result<Bytes> {
+        let request = Bytes::copy_from_slice(request);
+        Ok(self
+            .runtime
+            .block_on(node.call(service, request, PATIENCE))?)
+    }
+
+    /// Starts a stub for an executable of a service of the daemon, as robot `robot`.
+    pub fn stub(
+        &self,
+        daemon: &Daemon,
+        (service, package, executable): (&str, &str, &str),
+        robot: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
+        let toml = format!(
+            "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n",
+            daemon.address
+        );
+        self.stub_with(&toml, package, executable, argv)
+    }
+
+    /// The same with a `stub.toml` of one's own.
+    pub fn stub_with(
+        &self,
+        toml: &str,
+        package: &str,
+        executable: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
+        let overlay = tempfile::Builder::new()
+            .prefix("stub")
+            .tempdir_in(self.place.path())?
+            .keep();
+        let share = overlay.join("share").join(package);
+        std::fs::create_dir_all(&share)?;
+        std::fs::write(share.join("stub.toml"), toml)?;
+        let mut command = Command::new(binaries::path("stubs/x86_64/cloudroid-stub"));
+        command
+            .args(["run", "--package", package, "--node", executable, "--share"])
+            .arg(&share)
+            .arg("--")
+            .args(argv);
+        self.start(command, &overlay.join("log"))
+    }
+
+    /// Starts an original in the root file system of a service's image, in this machine's network.
+    pub fn original(
+        &self,
+        daemon: &Daemon,
+        service: &str,
+        program: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
+        let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
+        let config = manifest["config"]["digest"].as_str().context("a config")?;
+        let config = daemon.get_json(&format!("/v2/{service}/blobs/{config}"))?;
+        let diffs = config["rootfs"]["diff_ids"].as_array().context("layers")?;
+        let root = self.place.path().join("root");
+        std::fs::create_dir_all(&root)?;
+        let layers = diffs.iter().rev().filter_map(|diff| diff.as_str());
+        let layers: Vec<PathBuf> = layers
+            .map(|diff| layer(&daemon.home, diff))
+            .collect::<anyhow::Result<_>>()?;
+        let lowers: Vec<String> = layers
+            .iter()
+            .map(|layer| layer.display().to_string())
+            .collect();
+        let script = format!(
+            "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
+            lowers.join(":"),
+            root = root.display(),
+        );
+        let mut command = Command::new("unshare");
+        command
+            .args(["--mount", "sh", "-c", &script, "sh", program])
+            .args(argv);
+        command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
+        self.start(command, &self.place.path().join("original.log"))
+    }
+
+    fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {
+        let file = File::create(log)?;
+        let child = command
+            .env("ROS_MASTER_URI", format!("http://{}", self.master))
+            .env_remove("ROS_NAMESPACE")
+            .stdin(Stdio::null())
+            .stdout(file.try_clone()?)
+            .stderr(file)
+            .spawn()
+            .context("starting a node")?;
+        Ok(Running {
+            child,
+            log: log.to_owned(),
+        })
+    }
+}
+
+/// Where a layer is extracted.
+fn layer(home: &Path, diff: &str) -> anyhow::Result<PathBuf> {
+    let layers = home.join("layers");
+    let hex = diff.trim_start_matches("sha256:");
+    [
+        layers.join(hex),
+        layers.join(diff),
+        layers.join("sha256").join(hex),
+    ]
+    .into_iter()
+    .find(|path| path.is_dir())
+    .with_context(|| format!("layer {diff} below {}", layers.display()))
+}
+
+impl Running {
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// What it printed.
+    pub fn said(&self) -> String {
+        std::fs::read_to_string(&self.log).unwrap_or_default()
+    }
+
+    /// Sends it a signal.
+    pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        Ok(kill(
+            Pid::from_raw(i32::try_from(self.child.id())?),
+            signal,
+        )?)
+    }
+
+    /// Waits for its end.
+    pub fn ends(&mut self) -> anyhow::Result<ExitStatus> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait()? {
+                return Ok(status);
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "it should have ended:\n{}",
+                self.said()
+            );
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("{}", self.said());
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// What `node` has registered, as lines that can be compared: names and types.
+pub fn registered(graph: &Graph, node: &str) -> BTreeSet<String> {
+    let node = node.to_owned();
+    let mut lines = BTreeSet::new();
+    for (topic, ends) in &graph.topics {
+        if ends.publishers.contains(&node) {
+            lines.insert(format!("publishes {topic} [{}]", ends.type_name));
+        }
+        if ends.subscribers.contains(&node) {
+            lines.insert(format!("subscribes {topic} [{}]", ends.type_name));
+        }
+    }
+    for (service, server) in &graph.services {
+        if *server == node {
+            lines.insert(format!("serves {service}"));
+        }
+    }
+    lines
+}
+
+/// A serialized std_msgs/String.
+pub fn string(text: &str) -> Bytes {
+    let mut bytes = u32::try_from(text.len())
+        .unwrap_or(0)
+        .to_le_bytes()
+        .to_vec();
+    bytes.extend(text.as_bytes());
+    bytes.into()
+}
