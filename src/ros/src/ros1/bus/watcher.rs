@@ -12,8 +12,9 @@ use crate::bus::{BusError, Graph, TopicNodes};
 use crate::ros1::master::graph::{WAIT_GRAPH, from_value, wire_generation};
 use crate::ros1::xmlrpc::{self, Value};
 
-/// One long poll, and the grace for its answer.
-const POLL: i32 = 30;
+/// One long poll, seconds, and the grace for its answer. A Master that ends is seen at once, by its connection; asking
+/// again is all that an idle servant costs, so it is seldom.
+const POLL: i32 = 240;
 const GRACE: Duration = Duration::from_secs(10);
 /// Between two looks at a Master without the long poll.
 const PERIOD: Duration = Duration::from_secs(1);
