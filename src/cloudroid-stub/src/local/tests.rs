@@ -1,9 +1,8 @@
-//! With a real process (an ordinary ROS node) and real Masters.
-
-mod node;
+//! With a real process (an ordinary ROS node, `examples/relay.rs`) and real Masters.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -68,15 +67,24 @@ fn text(message: &Message) -> String {
     String::from_utf8(message.bytes[4..].to_vec()).unwrap()
 }
 
+/// The example stands beside the tests: `target/PROFILE/{examples,deps}`.
+fn relay() -> PathBuf {
+    let tests = std::env::current_exe().unwrap();
+    let path = tests.ancestors().nth(2).unwrap().join("examples/relay");
+    assert!(
+        path.is_file(),
+        "{} is missing: build it with cargo test -p cloudroid-stub, all targets",
+        path.display()
+    );
+    path
+}
+
 fn setting(argv: &[&str]) -> Setting {
-    let argv = node::ARGUMENTS.iter().chain(argv).copied().chain([
-        "in:=/ns/in",
-        "out:=/absolute/out",
-        "__name:=relay",
-    ]);
+    let names = ["in:=/ns/in", "out:=/absolute/out", "__name:=relay"];
+    let argv = argv.iter().chain(&names).copied();
     Setting {
         program: Some(Program {
-            path: std::env::current_exe().unwrap(),
+            path: relay(),
             argv: argv.map(str::to_owned).collect(),
             environment: vec![("ROS_NAMESPACE", "/ns".into())],
         }),

@@ -1,7 +1,7 @@
 //! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting from a sibling's parameter before it;
 //! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes.
 //!
-//! It is a process of its own: the tests' executable, told to run nothing but this.
+//! The tests of the local original start it in place of one.
 
 use std::sync::Arc;
 
@@ -23,27 +23,8 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// Arguments that make the tests' executable this node; others follow.
-pub const ARGUMENTS: [&str; 4] = [
-    "local::tests::node::relay_node",
-    "--exact",
-    "--ignored",
-    "--nocapture",
-];
-
-#[test]
-#[ignore = "a node that the other tests start"]
-fn relay_node() {
-    if std::env::args().any(|argument| argument == "__name:=relay") {
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()
-            .unwrap();
-        runtime.block_on(run()).unwrap();
-    }
-}
-
-async fn run() -> Result<(), Box<dyn std::error::Error>> {
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
     let given = |name: &str| {
         let prefix = format!("{name}:=");
