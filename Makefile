@@ -85,11 +85,14 @@ lint:
 	@cargo clippy --locked --workspace --all-targets -- -D warnings
 	@cargo clippy --locked -p codec --all-targets -- -D warnings # alone: without its feature video
 
+# A change is judged by the same cases every time; `make unit SEED=$RANDOM` looks for new ones.
+SEED ?= 1
+
 .PHONY: unit
-unit: build-dev
+unit: build-dev ## the crates' own tests; SEED=n for other random cases than the usual
 	@echo "== unit tests"
-	@cargo test --locked --workspace --exclude stories
-	@cargo test --locked -p codec --test properties video # alone: without its feature video
+	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked --workspace --exclude stories
+	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties video # alone: without its feature video
 
 .PHONY: robots
 robots:
