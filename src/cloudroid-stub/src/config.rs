@@ -36,6 +36,9 @@ use toml::{Table, Value};
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
 
+/// No time, rate or count of a configuration is as much.
+const MOST: f64 = 1e6;
+
 /// How the stub is to behave.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -227,6 +230,18 @@ fn with(
             config.server
         );
     }
+    for (key, value) in [
+        ("desire", config.desire),
+        ("max", config.max),
+        ("age", config.age),
+        ("frames_per_second", config.frames_per_second),
+        ("threshold", config.threshold),
+        ("initial", config.initial),
+    ] {
+        if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
+            bail!("{key} is {value}; it should be a number greater than 0 and less than {MOST}");
+        }
+    }
     if let (Some(desire), Some(max)) = (config.desire, config.max) {
         if desire > max {
             bail!("desire ({desire} s) is greater than max ({max} s)");
@@ -287,6 +302,9 @@ mod tests {
             ("desire", "2", "desire"),
             ("local", "hot", "hot"),
             ("max", "soon", "max"),
+            ("max", "nan", "max is NaN"),
+            ("desire", "-1", "desire is -1"),
+            ("age", "inf", "age is inf"),
         ] {
             let error = format!("{:#}", config(&[(key, value)]).unwrap_err());
             assert!(error.contains(named), "{error}");

@@ -115,7 +115,10 @@ async fn handshake(
         .unwrap_or(0);
     if status != 101 {
         let problem = body(&mut stream, &head, answer.split_off(end)).await;
-        let text = format!("{authority} answers {status}: {problem}");
+        let mut text = format!("{authority} answers {status}: {problem}");
+        if status == 401 {
+            text.push_str("; on this robot: install.sh --token TOKEN, or token_file in stub.toml");
+        }
         // No room and the like pass; what this stub is does not.
         return Err(match status {
             400..=499 if status != 408 && status != 429 => Error::Refused(text),
@@ -174,4 +177,57 @@ fn find(bytes: &[u8], wanted: &[u8]) -> Option<usize> {
     bytes
         .windows(wanted.len())
         .position(|window| window == wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::net::TcpListener;
+
+    use super::*;
+
+    /// What a server that `serves` one connection is taken for.
+    async fn met<F: Future<Output = ()> + Send + 'static>(
+        serves: impl FnOnce(TcpStream) -> F,
+    ) -> Error {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let server = format!("ws://{}", listener.local_addr().unwrap());
+        let opened = tokio::spawn(async move {
+            open(&server, "/any", None, Duration::from_secs(20))
+                .await
+                .err()
+        });
+        let served = tokio::spawn(serves(listener.accept().await.unwrap().0));
+        let error = opened.await.unwrap().expect("no link");
+        served.await.unwrap();
+        error
+    }
+
+    #[tokio::test]
+    async fn a_server_that_speaks_no_version_of_the_link_is_named() {
+        let error = met(|stream| async {
+            // An honest WebSocket server, which knows nothing of links.
+            let _ = tokio_tungstenite::accept_async(stream).await;
+        })
+        .await;
+        let Error::Refused(text) = error else {
+            panic!("trying again changes nothing, but: {error}");
+        };
+        assert!(text.contains("does not speak cloudroid-link.v1"), "{text}");
+        assert!(text.contains("install the stub from it again"), "{text}");
+    }
+
+    #[tokio::test]
+    async fn what_is_no_server_of_the_web_is_named() {
+        let error = met(|mut stream| async move {
+            let noise = vec![b'x'; MAX_HEAD * 2];
+            let _ = stream.write_all(&noise).await;
+        })
+        .await;
+        assert!(
+            error.to_string().contains("does not answer in HTTP"),
+            "{error}"
+        );
+        let error = met(|stream| async move { drop(stream) }).await;
+        assert!(matches!(error, Error::Unreachable(_)), "{error}");
+    }
 }

@@ -20,7 +20,9 @@ mod doctor;
 mod local;
 mod mirror;
 mod original;
+mod parameters;
 mod resolver;
+mod revision;
 mod robot;
 mod run;
 

@@ -1,8 +1,13 @@
 //! The node as roslaunch started it, and the robot's ROS as its environment tells.
 
+use std::path::{Component, Path, PathBuf};
+
 use anyhow::{Context, bail};
 use link::control;
 use ros::ros1::names::{self, PeerUri};
+
+use crate::original;
+use crate::revision::Revision;
 
 /// Where the Master is when nothing is said.
 const MASTER: &str = "http://localhost:11311";
@@ -65,7 +70,10 @@ impl Robot {
     }
 
     /// What the cloud is to run.
-    pub fn for_the_cloud(&self, package: &str, executable: &str, share: &str) -> control::Node {
+    pub fn for_the_cloud(&self, package: &str, executable: &str, share: &Path) -> control::Node {
+        let made_of = Revision::read(share);
+        let share = plain(share);
+        let directory = directory(&share, std::env::current_dir().unwrap_or_default());
         control::Node {
             name: self.node.clone(),
             package: package.to_owned(),
@@ -76,10 +84,37 @@ impl Robot {
                 .rsplit_once('/')
                 .map_or("", |(parent, _)| parent)
                 .to_owned(),
-            share: share.to_owned(),
+            share: share.to_string_lossy().into_owned(),
+            directory: directory.to_string_lossy().into_owned(),
+            revision: made_of.revision,
+            image: made_of.image,
             calls: Vec::new(),
         }
     }
+}
+
+/// A path without `..`, as others on the robot write it: launchers say `lib/PKG/../../share/PKG`, while rospack, and
+/// so `$(find PKG)`, say `share/PKG`.
+fn plain(path: &Path) -> PathBuf {
+    let mut plain = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::ParentDir if plain.file_name().is_some() => drop(plain.pop()),
+            Component::CurDir => {}
+            part => plain.push(part),
+        }
+    }
+    plain
+}
+
+/// The working directory. Within the overlay it is written as the share directory is, even where links lead there.
+fn directory(share: &Path, current: PathBuf) -> PathBuf {
+    let overlay = original::overlay(share);
+    let canonical = overlay.canonicalize();
+    let below = canonical
+        .ok()
+        .and_then(|overlay| Some(current.strip_prefix(overlay).ok()?.to_owned()));
+    below.map_or(current, |below| overlay.join(below))
 }
 
 /// The name of a node that is started without one, from its executable's.
@@ -129,7 +164,10 @@ mod tests {
             (robot.master_host.as_str(), robot.master_port),
             ("brain", 1234)
         );
-        assert_eq!(robot.for_the_cloud("p", "x", "").namespace, "/front");
+        assert_eq!(
+            robot.for_the_cloud("p", "x", Path::new("")).namespace,
+            "/front"
+        );
     }
 
     #[test]
@@ -139,8 +177,27 @@ mod tests {
             (robot.node.as_str(), robot.master_host.as_str()),
             ("/usual", "localhost")
         );
-        assert_eq!(robot.for_the_cloud("p", "x", "").namespace, "");
+        assert_eq!(robot.for_the_cloud("p", "x", Path::new("")).namespace, "");
         assert_eq!(usual_name("image-view.py"), "image_view");
+    }
+
+    #[test]
+    fn places_in_the_overlay_are_written_as_launch_files_write_them() {
+        let share = plain(Path::new("/o/lib/p/../../share/./p"));
+        assert_eq!(share, Path::new("/o/share/p"));
+        let place = tempfile::tempdir().unwrap();
+        let (real, link) = (place.path().join("real"), place.path().join("link"));
+        std::fs::create_dir_all(real.join("lib/p")).unwrap();
+        std::os::unix::fs::symlink(&real, &link).unwrap();
+        let current = real.canonicalize().unwrap().join("lib/p");
+        assert_eq!(
+            directory(&link.join("share/p"), current),
+            link.join("lib/p")
+        );
+        assert_eq!(
+            directory(&link.join("share/p"), "/root".into()),
+            Path::new("/root")
+        );
     }
 
     #[test]

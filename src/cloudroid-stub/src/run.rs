@@ -98,11 +98,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         version: env!("CARGO_PKG_VERSION").to_owned(),
         run: format!("{:016x}", rand::random::<u64>()),
         machine: machine(),
-        node: robot.for_the_cloud(
-            &asked.node.package,
-            &asked.node.node,
-            &asked.node.share.to_string_lossy(),
-        ),
+        node: robot.for_the_cloud(&asked.node.package, &asked.node.node, &asked.node.share),
         sla: sla(&config),
         parameters,
         ..Hello::default()

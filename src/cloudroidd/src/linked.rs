@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 
 use crate::choreographer::{Handle, Inner, how_it_ended};
 use crate::definitions;
-use crate::state::RevisionRecord;
+use crate::state::{RevisionRecord, State};
 
 /// How deep executables may lie below `share/PKG`.
 const DEPTH: usize = 4;
@@ -36,6 +36,7 @@ pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> boo
 /// The nodes of one servant.
 pub struct LinkedNodes {
     revision: RevisionRecord,
+    state: Arc<State>,
     /// A container is made before anybody asks for it.
     handle: OnceLock<Weak<Handle>>,
     container: Arc<dyn Servant>,
@@ -55,6 +56,7 @@ impl LinkedNodes {
             tokio::task::spawn_blocking(move || definitions::layers(&store, &digest)).await;
         LinkedNodes {
             revision: revision.clone(),
+            state: Arc::clone(&inner.state),
             handle: OnceLock::new(),
             container: Arc::clone(container),
             layers: layers.ok().and_then(Result::ok).unwrap_or_default(),
@@ -162,6 +164,23 @@ impl LinkedNodes {
         shares.into_iter().find(|share| self.has(share))
     }
 
+    /// Where the program runs: as on the robot, or where ROS's own default leads.
+    fn directory(&self, node: &Node, program: &Path) -> String {
+        let overlay = Path::new(&node.share).parent().and_then(Path::parent);
+        let beside = overlay
+            .is_some_and(|overlay| Path::new(&node.directory).starts_with(overlay.join("lib")));
+        if beside {
+            let parent = program.parent().unwrap_or(Path::new("/"));
+            return parent.to_string_lossy().into_owned();
+        }
+        let translated = self.translate(node, &node.directory);
+        if translated != node.directory {
+            return translated;
+        }
+        let home = self.revision.plan.environment.get("ROS_HOME").cloned();
+        home.unwrap_or_default()
+    }
+
     /// The revision's own nodes end: a stub's take their place.
     async fn end_planned(&self, handle: &Handle) {
         if handle.is_linked() {
@@ -185,6 +204,8 @@ impl LinkedNodes {
 impl Nodes for LinkedNodes {
     async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
         let handle = self.handle()?;
+        let (state, revision, made_of) = (&self.state, &self.revision, node.revision);
+        crate::revisions::fits(state, revision, made_of, &node.image)?;
         let Some(program) = self.program(node) else {
             return Err(format!(
                 "the image of service {} has no executable {} in package {}: is it the package that was pushed, and with that node?",
@@ -201,11 +222,12 @@ impl Nodes for LinkedNodes {
         );
         argv.push(format!("__name:={name}"));
         let namespace = if namespace.is_empty() { "/" } else { namespace };
+        let directory = self.directory(node, &program);
         let spec = NodeSpec {
             name: node.name.clone(),
             argv,
             environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
-            directory: String::new(),
+            directory,
             respawn: false,
             respawn_delay: 0.0,
             required: false,

@@ -24,6 +24,7 @@ mod linked;
 mod names;
 mod portal;
 mod push;
+mod revisions;
 mod shim;
 mod sockets;
 mod state;

@@ -25,6 +25,7 @@ pub struct Hello {
     /// What the robot's application promises itself.
     pub sla: Sla,
     /// All parameters of the robot, as a tree of values.
+    #[serde(with = "crate::values::tree")]
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
@@ -56,6 +57,12 @@ pub struct Node {
     pub namespace: String,
     /// The stub's share directory: paths into it mean the same files of the package in the cloud.
     pub share: String,
+    /// Where it was started: its working directory on the robot.
+    pub directory: String,
+    /// The service's revision that the stub was made of …
+    pub revision: Option<u64>,
+    /// … and the digest of its image, since another server counts otherwise.
+    pub image: String,
     /// Services of the robot that the node calls.
     pub calls: Vec<String>,
 }
@@ -121,7 +128,7 @@ pub enum Control {
         count: usize,
     },
     /// Both: parameters that changed; without a value: was deleted.
-    Parameters(Vec<(String, Option<ParamValue>)>),
+    Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),
     /// Robot: send the node this signal.
     Signal {
         /// Its number.

@@ -27,6 +27,7 @@ mod incoming;
 mod outgoing;
 pub mod record;
 pub mod session;
+mod values;
 
 pub use outgoing::{Dropped, Quality};
 pub use session::{Handler, Lost, Session, SessionOptions};

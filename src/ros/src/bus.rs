@@ -145,8 +145,8 @@ pub struct ServiceType {
     pub md5: String,
 }
 
-/// A ROS parameter value.
-#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+/// A ROS parameter value. NaN equals NaN: whoever looks for what has changed would never be done otherwise.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 #[serde(untagged)]
 pub enum ParamValue {
     /// `true` or `false`.
@@ -161,6 +161,20 @@ pub enum ParamValue {
     List(Vec<ParamValue>),
     /// A dictionary.
     Map(BTreeMap<String, ParamValue>),
+}
+
+impl PartialEq for ParamValue {
+    fn eq(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Bool(a), Self::Bool(b)) => a == b,
+            (Self::Int(a), Self::Int(b)) => a == b,
+            (Self::Double(a), Self::Double(b)) => a == b || (a.is_nan() && b.is_nan()),
+            (Self::String(a), Self::String(b)) => a == b,
+            (Self::List(a), Self::List(b)) => a == b,
+            (Self::Map(a), Self::Map(b)) => a == b,
+            _ => false,
+        }
+    }
 }
 
 /// What can go wrong on a bus.

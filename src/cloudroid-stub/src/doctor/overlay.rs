@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use serde::Deserialize;
 
 use super::Check;
 use crate::arguments::{Doctor, Node};
 use crate::config::Config;
 use crate::original;
+use crate::revision::Revision;
 
 /// Which stub is examined.
 #[derive(Debug, Clone)]
@@ -17,14 +17,6 @@ pub struct Place {
     pub share: PathBuf,
     /// The ROS package.
     pub package: String,
-}
-
-/// `revision.toml`, as far as it matters here.
-#[derive(Debug, Default, Deserialize)]
-struct Revision {
-    revision: Option<u64>,
-    #[serde(default)]
-    outsourced: Vec<String>,
 }
 
 impl Place {
@@ -55,12 +47,7 @@ impl Place {
 
     /// The service's revision that the stub was made of.
     pub fn revision(&self) -> Option<u64> {
-        self.made_of().revision
-    }
-
-    fn made_of(&self) -> Revision {
-        let text = std::fs::read_to_string(self.share.join("revision.toml")).unwrap_or_default();
-        toml::from_str(&text).unwrap_or_default()
+        Revision::read(&self.share).revision
     }
 }
 
@@ -78,7 +65,7 @@ pub fn checks(
     variable: &dyn Fn(&str) -> Option<String>,
 ) -> Vec<Check> {
     let mut checks = vec![shadowing(place, variable)];
-    for node in place.made_of().outsourced {
+    for node in Revision::read(&place.share).outsourced {
         checks.push(local(place, config, node, variable));
     }
     checks

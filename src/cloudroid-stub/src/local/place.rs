@@ -4,11 +4,13 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
 use anyhow::Context;
-use ros::bus::{Bus, Graph, ParamValue};
+use ros::bus::{Bus, Graph};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use tokio::task::AbortHandle;
+
+use crate::parameters;
 
 /// The stub's name in it.
 const NODE: &str = "/cloudroid_stub";
@@ -62,20 +64,10 @@ impl Place {
     /// Takes the robot's parameters over: all of them, because a node reads those of its neighbours, too
     /// (image_proc's are siblings).
     pub async fn copy_parameters(&self, from: &dyn Bus) -> anyhow::Result<()> {
-        let ParamValue::Map(all) = from
-            .get_param("/")
+        let all = parameters::all(from)
             .await
-            .context("the robot's parameters")?
-        else {
-            return Ok(());
-        };
+            .context("the robot's parameters")?;
         for (name, value) in all {
-            if matches!(
-                name.as_str(),
-                "run_id" | "roslaunch" | "rosdistro" | "rosversion"
-            ) {
-                continue;
-            }
             self.bus.set_param(&format!("/{name}"), value).await?;
         }
         Ok(())

@@ -8,9 +8,7 @@ use parking_lot::Mutex;
 use ros::bus::{ParamChange, ParamValue};
 
 use super::Mirror;
-
-/// Those of a Master itself.
-const OWN: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
+use crate::parameters::{self, OWN};
 
 /// What was set here in the cloud's name: it does not go back.
 #[derive(Default)]
@@ -51,19 +49,17 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                 }
             });
         }
-        Err(error) => tracing::warn!(%error, "parameters that change later do not reach the cloud"),
+        Err(error) => tracing::warn!(
+            "parameters that change later do not reach the cloud: {error}; mend those that are named next, then start this node again"
+        ),
     }
     all(mirror).await
 }
 
 /// All parameters now.
 pub async fn all(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
-    match mirror.bus.get_param("/").await {
-        Ok(ParamValue::Map(mut all)) => {
-            all.retain(|name, _| !OWN.contains(&name.as_str()));
-            all
-        }
-        Ok(_) => BTreeMap::new(),
+    match parameters::all(&*mirror.bus).await {
+        Ok(all) => all,
         Err(error) => {
             tracing::warn!(%error, "the robot's parameters cannot be read");
             BTreeMap::new()

@@ -140,6 +140,10 @@ async fn connect(
     let accept = handshake(&request)?;
     let link = asks_for_link(request.headers())?;
     let asked = Asked::read(&app, service, link, request.uri())?;
+    // A stub shows its token at once; without it nothing is told, not even what there is.
+    if asked.link && !caller.trusted {
+        return Err(Error::Unauthorised("a link needs a token"));
+    }
     if app.state.service_package(&asked.service)?.is_none() {
         return Err(Error::UnknownService {
             exists: app.state.service_names()?,
@@ -147,9 +151,6 @@ async fn connect(
         });
     }
     // Who has shown a token is told by status when there is no room; who has not must be let in to show one.
-    if asked.link && !caller.trusted {
-        return Err(Error::Unauthorised("a link needs a token"));
-    }
     let lease = if caller.trusted {
         let lease = lease(&app, &asked, &caller)?;
         lease.admitted().await?;

@@ -1,0 +1,25 @@
+//! `revision.toml` beside `stub.toml`: what the server made the stub of.
+
+use std::path::Path;
+
+use serde::Deserialize;
+
+/// The file, as far as it matters on the robot. Everything is absent in a stub that was put together by hand.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Revision {
+    /// The service's revision.
+    pub revision: Option<u64>,
+    /// Digest of its image.
+    pub image: String,
+    /// Executables that run in the cloud.
+    pub outsourced: Vec<String>,
+}
+
+impl Revision {
+    /// That of the stub with this share directory.
+    pub fn read(share: &Path) -> Self {
+        let text = std::fs::read_to_string(share.join("revision.toml")).unwrap_or_default();
+        toml::from_str(&text).unwrap_or_default()
+    }
+}
