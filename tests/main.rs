@@ -20,8 +20,12 @@ mod house;
 mod images;
 #[path = "stories/isolation.rs"]
 mod isolation;
+#[path = "stories/launched.rs"]
+mod launched;
 #[path = "stories/link.rs"]
 mod link;
+#[path = "stories/mishaps.rs"]
+mod mishaps;
 #[path = "stories/portal.rs"]
 mod portal;
 #[path = "stories/push.rs"]
@@ -86,11 +90,24 @@ fn main() -> ExitCode {
             a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
             two_robots_see_nothing_of_each_other,
         ],
+        stories![launched:
+            roslaunch_cannot_tell_the_stub_from_the_original,
+        ],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
             two_nodes_share_a_servant,
             what_a_stub_cannot_do_is_said,
             the_robot_s_master_starts_again,
+        ],
+        stories![mishaps:
+            a_later_revision_is_gone_on_with_unless_its_interface_differs,
+            another_version_of_the_protocol_is_named,
+            a_wrong_token_is_named,
+            two_robots_with_one_id_are_told,
+            parameters_that_cannot_be_carried_are_named_and_the_others_arrive,
+            a_missing_original_is_said_once_and_the_cloud_goes_on,
+            a_local_original_that_crashes_is_told_and_started_again,
+            a_service_that_is_gone_leaves_the_local_original,
         ],
         stories![portal:
             topics_and_services_cross_both_ways,

@@ -256,12 +256,12 @@ impl Daemon {
     ) -> anyhow::Result<(u16, String)> {
         let mut stream = TcpStream::connect(&self.address)?;
         stream.set_read_timeout(Some(PATIENCE))?;
-        let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
-        if !headers
-            .iter()
-            .any(|(name, _)| name.eq_ignore_ascii_case("host"))
-        {
-            text.push_str(&format!("Host: {}\r\n", self.address));
+        let mut text = format!("{method} {path} HTTP/1.1\r\n");
+        for (usual, value) in [("Connection", "close"), ("Host", &self.address)] {
+            let given = |(name, _): &(&str, &str)| name.eq_ignore_ascii_case(usual);
+            if !headers.iter().any(given) {
+                text.push_str(&format!("{usual}: {value}\r\n"));
+            }
         }
         for (name, value) in headers {
             text.push_str(&format!("{name}: {value}\r\n"));

@@ -1,6 +1,7 @@
 //! A robot's own file system: Debian with its ROS, made once for all stories by mmdebstrap. Each machine writes to a
 //! layer of its own, and runs commands in a mount namespace that ends with them.
 
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -8,7 +9,9 @@ use anyhow::{Context, ensure};
 use nix::fcntl::{Flock, FlockArg};
 use tempfile::TempDir;
 
-use crate::deployer::{Outcome, run};
+use crate::binaries;
+use crate::daemon::Daemon;
+use crate::deployer::{Outcome, path_str, run};
 use crate::world::world;
 
 /// What robots have: the tools that find and start nodes, three shells, and a package with its original nodes.
@@ -49,6 +52,44 @@ impl Machine {
         Ok(Machine { base: base()?, own })
     }
 
+    /// A new one with a stub of `service` unpacked in `/root`, fetched from where a robot would fetch it.
+    pub fn with_stub(daemon: &Daemon, service: &str) -> anyhow::Result<Machine> {
+        let machine = Machine::new()?;
+        let place = world().directory("stub")?;
+        let (address, directory) = (format!("http://{}", daemon.address), path_str(place.path()));
+        let words = ["--server", &address, "stub", service, "-o", directory];
+        daemon.deployer().types(&words)?.succeeded()?;
+        machine.unpacks(&place.path().join(format!("{service}.tar.gz")))?;
+        Ok(machine)
+    }
+
+    /// Copies a file of this machine to an absolute path, with this mode.
+    pub fn puts(&self, file: &Path, to: &str, mode: u32) -> anyhow::Result<()> {
+        let to = self
+            .own
+            .path()
+            .join("upper")
+            .join(to.trim_start_matches('/'));
+        std::fs::create_dir_all(to.parent().context("a directory")?)?;
+        std::fs::copy(file, &to)?;
+        Ok(std::fs::set_permissions(
+            to,
+            std::fs::Permissions::from_mode(mode),
+        )?)
+    }
+
+    /// Installs the original of `teller_py` below `/usr`.
+    pub fn has_teller(&self) -> anyhow::Result<()> {
+        let package = binaries::package("teller_py");
+        for (file, to, mode) in [
+            ("scripts/teller.py", "/usr/lib/teller_py/teller.py", 0o755),
+            ("package.xml", "/usr/share/teller_py/package.xml", 0o644),
+        ] {
+            self.puts(&package.join(file), to, mode)?;
+        }
+        Ok(())
+    }
+
     /// Unpacks an archive of a stub in `/root`.
     pub fn unpacks(&self, archive: &Path) -> anyhow::Result<()> {
         let bytes = std::fs::read(archive)?;
@@ -68,6 +109,12 @@ impl Machine {
             .env("BASE", &self.base)
             .env("OWN", own))
     }
+}
+
+/// A port that nobody listens on now, for a Master of a script's own.
+pub fn free_port() -> anyhow::Result<u16> {
+    let listener = std::net::TcpListener::bind(("127.0.0.1", 0))?;
+    Ok(listener.local_addr()?.port())
 }
 
 /// Ends whatever the script started: its process namespace ends with it.

@@ -25,6 +25,7 @@ use tokio::task::JoinHandle;
 
 use crate::binaries;
 use crate::daemon::Daemon;
+use crate::deployer::path_str;
 use crate::robot::PATIENCE;
 
 /// A robot.
@@ -206,6 +207,44 @@ impl Site {
             .arg("--")
             .args(argv);
         self.start(command, &overlay.join("log"))
+    }
+
+    /// Installs a stub of a service as its archive comes, with `settings` added to its `stub.toml`; gives the overlay.
+    pub fn installs(
+        &self,
+        daemon: &Daemon,
+        service: &str,
+        settings: &str,
+    ) -> anyhow::Result<PathBuf> {
+        let place = tempfile::Builder::new()
+            .prefix("installed")
+            .tempdir_in(self.place.path())?
+            .keep();
+        let words = ["stub", service, "-o", path_str(&place)];
+        daemon.deployer().types(&words)?.succeeded()?;
+        let archive = File::open(place.join(format!("{service}.tar.gz")))?;
+        tar::Archive::new(flate2::read::GzDecoder::new(archive)).unpack(&place)?;
+        let overlay = place.join(format!("{service}-stub"));
+        for package in std::fs::read_dir(overlay.join("share"))? {
+            let path = package?.path().join("stub.toml");
+            let text = std::fs::read_to_string(&path)?;
+            std::fs::write(path, format!("{text}{settings}"))?;
+        }
+        Ok(overlay)
+    }
+
+    /// Starts an executable of an installed stub.
+    pub fn runs(
+        &self,
+        overlay: &Path,
+        package: &str,
+        executable: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
+        let mut command = Command::new(overlay.join("lib").join(package).join(executable));
+        command.args(argv);
+        let log = tempfile::Builder::new().tempfile_in(self.place.path())?;
+        self.start(command, &log.into_temp_path().keep()?)
     }
 
     /// Starts an original in the root file system of a service's image, in this machine's network.

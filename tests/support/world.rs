@@ -61,6 +61,13 @@ pub const ADDER: Service = Service {
     arguments: &["--node", "adder.py"],
 };
 
+/// Our package that tells how its node was started.
+pub const TELLER: Service = Service {
+    name: "teller_py",
+    package: Some("teller_py"),
+    arguments: &["--node", "teller.py"],
+};
+
 /// Our hostile package.
 pub const BURGLAR: Service = Service {
     name: "burglar_cpp",

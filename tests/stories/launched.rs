@@ -1,0 +1,120 @@
+//! A robot launches as ever: the real roslaunch, with the original and with its stub.
+
+use anyhow::ensure;
+use support::Told;
+use support::machine::{Machine, free_port};
+use support::world::{TELLER, world};
+
+/// What every script begins with: a Master's address, the overlay if it is to be used, and how to hear the node.
+fn prelude(port: u16, setup: &str) -> String {
+    format!(
+        r#"set -u -m
+{setup}
+export ROS_MASTER_URI=http://localhost:{port}
+launch() {{
+  roslaunch -p {port} "$1" > "$1.log" 2>&1 &
+  launched=$!
+  until rosparam list > /dev/null 2>&1; do kill -0 $launched || {{ cat "$1.log"; exit 1; }}; sleep 0.1; done
+  exec 3< <(exec timeout 100 rostopic echo -p /told 2> /dev/null)
+}}
+told() {{
+  while read -r -t 60 -u 3 line; do
+    case $line in *,life*) echo "${{line#*,}}"; return ;; esac
+  done
+  echo "nothing was told"; cat /root/*.log; exit 1
+}}
+ends() {{ timeout 60 rostopic pub -1 /front/teller/end std_msgs/Int32 "$1" > /dev/null 2>&1; }}
+"#
+    )
+}
+
+const CONTRACT: &str = r#"
+cat > /root/prefix << 'END'
+#!/bin/sh
+echo "the prefix runs ${1##*/}" >> /root/prefixed
+exec "$@"
+END
+chmod +x /root/prefix
+cat > /root/respawn.launch << 'END'
+<launch>
+  <group ns="front">
+    <node pkg="teller_py" type="teller.py" name="teller" args="one 'two words' --three _number:=4" output="screen"
+          respawn="true" launch-prefix="/root/prefix">
+      <param name="word" value="hello"/>
+      <param name="file" value="$(find teller_py)/package.xml"/>
+      <param name="code" value="3"/>
+      <remap from="~told" to="/told"/>
+    </node>
+  </group>
+</launch>
+END
+cat > /root/required.launch << 'END'
+<launch>
+  <node pkg="teller_py" type="teller.py" name="teller" ns="/front" required="true" cwd="node">
+    <remap from="~told" to="/told"/>
+    <param name="code" value="5"/>
+  </node>
+  <node pkg="rosout" type="rosout" name="bystander"/>
+</launch>
+END
+
+launch /root/respawn.launch
+told
+echo "rosnode kill"; rosnode kill /front/teller > /dev/null
+told
+echo "exit code 3"; ends 2
+told
+echo "SIGINT to roslaunch"; kill -INT $launched
+wait $launched; echo "roslaunch ended with $?"
+grep -o 'has died.*exit code [0-9-]*' /root/respawn.launch.log | sed 's/pid [0-9]*/pid/'
+echo "farewells: $(grep -c '^told to end' /root/respawn.launch.log)"
+pgrep -fa '[l]ib/teller_py'
+cat /root/prefixed; rm /root/prefixed
+
+launch /root/required.launch
+told
+ends 1
+wait $launched; echo "roslaunch ended with $?"
+grep -o 'REQUIRED process' /root/required.launch.log
+grep -o 'has died.*exit code [0-9-]*' /root/required.launch.log | sed 's/pid [0-9]*/pid/' | sort -u
+pgrep -fa '[l]ib/teller_py'
+echo done
+"#;
+
+/// What the original does with it.
+const AS_EVER: &str = "\
+life 1 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+rosnode kill
+life 2 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+exit code 3
+life 3 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+SIGINT to roslaunch
+roslaunch ended with 0
+has died [pid, exit code 3
+farewells: 2
+the prefix runs teller.py
+the prefix runs teller.py
+the prefix runs teller.py
+life 1 of /front/teller in /front, directory the program's, arguments [], word none, number none, file missing
+roslaunch ended with 0
+REQUIRED process
+has died [pid, exit code 5
+done
+";
+
+pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Told {
+    for setup in ["", ". /opt/cloudroid/setup.sh"] {
+        let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
+        machine.has_teller()?;
+        machine
+            .runs(
+                "sh",
+                "sh teller_py-stub/install.sh --robot launched-contract",
+            )?
+            .succeeded()?;
+        let script = format!("{}{CONTRACT}", prelude(free_port()?, setup));
+        let outcome = machine.runs("bash", &script)?;
+        ensure!(outcome.stdout == AS_EVER, "{setup}: {}", outcome.said());
+    }
+    Ok(())
+}
