@@ -36,6 +36,8 @@ mod refusals;
 mod shadowing;
 #[path = "stories/spares.rs"]
 mod spares;
+#[path = "stories/strangers.rs"]
+mod strangers;
 #[path = "stories/survival.rs"]
 mod survival;
 
@@ -142,6 +144,13 @@ fn main() -> ExitCode {
         stories![spares:
             a_robot_takes_the_container_made_ahead_and_another_is_made,
             a_killed_daemons_spares_end_without_a_word,
+        ],
+        stories![strangers:
+            who_dribbles_an_upgrade_is_let_go,
+            rubbish_instead_of_an_upgrade_is_refused,
+            two_sockets_of_one_robot_share_its_servant,
+            nobody_takes_over_anothers_robot,
+            an_answer_waits_for_one_big_message_at_most,
         ],
         stories![survival:
             a_killed_daemon_loses_nothing,

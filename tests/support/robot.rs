@@ -25,6 +25,23 @@ impl Robot {
         Robot::try_connect(url).map_err(|refusal| anyhow::anyhow!("{url}: {refusal}"))
     }
 
+    /// Connects with a socket of its own side that takes little before it is read.
+    pub fn on_a_short_line(url: &str) -> anyhow::Result<Robot> {
+        let address = url
+            .strip_prefix("ws://")
+            .and_then(|rest| rest.split('/').next())
+            .context("a ws:// address")?;
+        let stream = TcpStream::connect(address)?;
+        nix::sys::socket::setsockopt(&stream, nix::sys::socket::sockopt::RcvBuf, &(64 * 1024))?;
+        let (socket, _) =
+            tungstenite::client(url, stream).map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
+        Ok(Robot {
+            socket,
+            backlog: VecDeque::new(),
+            calls: 0,
+        })
+    }
+
     /// Connects, or says with which HTTP status and body it was refused.
     pub fn try_connect(url: &str) -> Result<Robot, Refusal> {
         let address = url

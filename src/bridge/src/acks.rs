@@ -8,6 +8,10 @@ use crate::outbox::Control;
 
 /// Answers kept.
 const MAX_KEPT: usize = 1024;
+/// Bytes of those; the latest is always kept.
+const MAX_KEPT_BYTES: usize = 32 << 20;
+/// Bytes that are kept for no longer than it takes to ask whether they have arrived.
+const ASKED_ABOUT: usize = 4 << 20;
 /// How long an answer waits for a ping of its own. Most are followed by something else before that.
 const PATIENCE: Duration = Duration::from_secs(1);
 
@@ -15,6 +19,10 @@ const PATIENCE: Duration = Duration::from_secs(1);
 #[derive(Default)]
 pub(crate) struct Acks {
     kept: VecDeque<Sent>,
+    /// Bytes of those.
+    bytes: usize,
+    /// Bytes of those with no ping behind them yet.
+    unasked: usize,
     /// The number of the last ping.
     pings: u64,
 }
@@ -29,8 +37,14 @@ struct Sent {
 impl Acks {
     /// An answer goes out.
     pub(crate) fn sent(&mut self, control: Control, at: Instant) {
-        if self.kept.len() >= MAX_KEPT {
-            self.kept.pop_front();
+        let size = control.frame.bytes.len();
+        self.bytes += size;
+        self.unasked += size;
+        while self.kept.len() >= MAX_KEPT || self.bytes > MAX_KEPT_BYTES {
+            let Some(oldest) = self.kept.pop_front() else {
+                break;
+            };
+            self.bytes -= oldest.control.frame.bytes.len();
         }
         self.kept.push_back(Sent {
             control,
@@ -42,12 +56,17 @@ impl Acks {
     /// When a ping should follow what was sent.
     pub(crate) fn ping_due(&self) -> Option<Instant> {
         let unpinged = self.kept.partition_point(|sent| sent.ping <= self.pings);
-        self.kept.get(unpinged).map(|sent| sent.at + PATIENCE)
+        let patience = match self.unasked > ASKED_ABOUT {
+            true => Duration::ZERO,
+            false => PATIENCE,
+        };
+        self.kept.get(unpinged).map(|sent| sent.at + patience)
     }
 
     /// The payload of a ping that goes out now.
     pub(crate) fn ping(&mut self) -> [u8; 8] {
         self.pings += 1;
+        self.unasked = 0;
         self.pings.to_be_bytes()
     }
 
@@ -55,12 +74,17 @@ impl Acks {
     pub(crate) fn pong(&mut self, payload: &[u8]) {
         if let Ok(number) = payload.try_into().map(u64::from_be_bytes) {
             let known = self.kept.partition_point(|sent| sent.ping <= number);
-            self.kept.drain(..known);
+            let gone = self.kept.drain(..known);
+            self.bytes -= gone
+                .map(|sent| sent.control.frame.bytes.len())
+                .sum::<usize>();
         }
     }
 
     /// What was never acknowledged.
     pub(crate) fn take(&mut self) -> impl DoubleEndedIterator<Item = Control> + use<> {
+        self.bytes = 0;
+        self.unasked = 0;
         std::mem::take(&mut self.kept)
             .into_iter()
             .map(|sent| sent.control)
@@ -84,6 +108,32 @@ mod tests {
             fragment_size: None,
             answer: true,
         }
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded_and_big_answers_are_asked_about_at_once() {
+        let now = Instant::now();
+        let big = |size| Control {
+            frame: Frame {
+                format: Format::Json,
+                bytes: vec![0; size].into(),
+            },
+            ..answer("")
+        };
+        let mut acks = Acks::default();
+        acks.sent(big(5 << 20), now);
+        assert_eq!(acks.ping_due(), Some(now));
+        acks.ping();
+        assert_eq!(acks.ping_due(), None);
+        for _ in 0..100 {
+            acks.sent(big(5 << 20), now);
+        }
+        assert_eq!((acks.kept.len(), acks.bytes), (6, 30 << 20));
+        acks.sent(big(100 << 20), now);
+        assert_eq!((acks.kept.len(), acks.bytes), (1, 100 << 20));
+        let last = acks.ping();
+        acks.pong(&last);
+        assert_eq!((acks.kept.len(), acks.bytes), (0, 0));
     }
 
     #[test]

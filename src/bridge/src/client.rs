@@ -13,7 +13,8 @@ use std::time::Instant;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use rosbridge::{
-    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Png, Status,
+    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Payload,
+    Png, Status,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -24,6 +25,8 @@ use crate::shared::Shared;
 
 /// Messages packed in pictures in fragments in pictures: nobody needs more.
 const MAX_WRAPPING: usize = 4;
+/// Characters of a strange field's name that its sender is told.
+const SHOWN: usize = 48;
 
 /// The client.
 pub(crate) struct Client {
@@ -35,6 +38,8 @@ pub(crate) struct Client {
     level: AtomicU8,
     /// Calls and goals under way.
     under_way: AtomicUsize,
+    /// Bytes of their arguments.
+    under_way_bytes: AtomicUsize,
     ended: CancellationToken,
     subscriptions: Mutex<subscribing::Subscribed>,
     outlets: Mutex<publishing::Outlets>,
@@ -76,6 +81,7 @@ impl Client {
             resumable: options.resume.is_some(),
             level: AtomicU8::new(options.level as u8),
             under_way: AtomicUsize::new(0),
+            under_way_bytes: AtomicUsize::new(0),
             ended: CancellationToken::new(),
             subscriptions: Mutex::default(),
             outlets: Mutex::default(),
@@ -127,6 +133,7 @@ impl Client {
         };
         if self.hears(Level::Warning) {
             for field in rosbridge::unknown_fields(frame) {
+                let field: String = field.chars().take(SHOWN).collect();
                 let text = format!(
                     "{}: field {field:?} is not known and was ignored",
                     op.name()
@@ -323,11 +330,23 @@ impl Client {
         }
     }
 
-    /// Counts a call or goal as under way until the guard is dropped.
-    fn begin(self: &Arc<Self>) -> Result<UnderWay, String> {
-        let limit = self.shared.options.max_calls;
+    /// Counts a call or goal with these arguments as under way until the guard is dropped.
+    fn begin(self: &Arc<Self>, args: Option<Payload<'_>>) -> Result<UnderWay, String> {
+        let options = &self.shared.options;
+        let limit = options.max_calls;
+        let bytes = args.map_or(0, |args| args.bytes.len());
         let before = self.under_way.fetch_add(1, Ordering::Relaxed);
-        let guard = UnderWay(self.clone());
+        let bytes_before = self.under_way_bytes.fetch_add(bytes, Ordering::Relaxed);
+        let guard = UnderWay {
+            client: self.clone(),
+            bytes,
+        };
+        if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
+            return Err(format!(
+                "field \"args\" has {bytes} bytes, with those of calls and goals under way more than {}; wait for some to end",
+                options.max_call_bytes
+            ));
+        }
         if before >= limit {
             return Err(format!(
                 "{limit} calls and goals of this client are under way already; wait for some to end"
@@ -338,11 +357,18 @@ impl Client {
 }
 
 /// One call or goal under way.
-struct UnderWay(Arc<Client>);
+struct UnderWay {
+    client: Arc<Client>,
+    /// Of its arguments.
+    bytes: usize,
+}
 
 impl Drop for UnderWay {
     fn drop(&mut self) {
-        self.0.under_way.fetch_sub(1, Ordering::Relaxed);
+        self.client.under_way.fetch_sub(1, Ordering::Relaxed);
+        self.client
+            .under_way_bytes
+            .fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 

@@ -31,6 +31,11 @@ struct Cut {
 }
 
 impl Cuts {
+    /// Whether a frame would be cut: a text longer than `size`.
+    pub(crate) fn is_long(frame: &Frame, size: Option<usize>) -> bool {
+        frame.format == Format::Json && size.is_some_and(|size| frame.bytes.len() > size)
+    }
+
     /// Takes a frame to be cut, where it is a text longer than `size`. Gives whether it was taken.
     pub(crate) fn cut(
         &mut self,
@@ -38,9 +43,7 @@ impl Cuts {
         size: Option<usize>,
         key: Option<TopicKey>,
     ) -> bool {
-        let Some(size) =
-            size.filter(|size| frame.format == Format::Json && frame.bytes.len() > *size)
-        else {
+        let Some(size) = size.filter(|_| Self::is_long(frame, size)) else {
             return false;
         };
         let Ok(text) = String::from_utf8(frame.bytes.to_vec()) else {
@@ -60,7 +63,7 @@ impl Cuts {
         true
     }
 
-    /// Whether no more topics should be begun.
+    /// Whether no more messages should be begun.
     pub(crate) fn is_full(&self) -> bool {
         self.cuts.len() >= MAX_CUTS
     }

@@ -82,10 +82,12 @@ impl Hub {
             pump: OnceLock::new(),
         });
         let options = SubscribeOptions {
+            // Any MD5: a publisher with another definition is read by its own, or its listeners are told of it; a
+            // connection refused for it would only be silence.
             wire_type: message_type.map(|found| WireType {
                 name: found.name().to_owned(),
-                md5: found.md5().to_owned(),
-                definition: found.full_text().to_owned(),
+                md5: "*".to_owned(),
+                definition: String::new(),
             }),
             queue: shared.options.bus_queue,
         };

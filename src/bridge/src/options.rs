@@ -31,12 +31,14 @@ pub struct BridgeOptions {
     pub session_bytes: usize,
     /// Messages that the bus keeps for the bridge, per topic.
     pub bus_queue: usize,
-    /// Topics one client may subscribe to.
+    /// Subscriptions one client may have.
     pub max_subscriptions: usize,
     /// Topics, services and actions one client may advertise, together.
     pub max_advertisements: usize,
     /// Service calls and goals of one client that may be under way at once.
     pub max_calls: usize,
+    /// Bytes of arguments of those; a single call or goal may have more.
+    pub max_call_bytes: usize,
     /// How long a service may take when the call says nothing.
     pub call_timeout: Duration,
     /// How long a goal waits for its action server to connect.
@@ -70,6 +72,7 @@ impl Default for BridgeOptions {
             max_subscriptions: 1000,
             max_advertisements: 1000,
             max_calls: 1000,
+            max_call_bytes: 64 << 20,
             call_timeout: Duration::from_secs(300),
             action_timeout: Duration::from_secs(10),
             warm_up: Duration::from_secs(1),

@@ -319,7 +319,15 @@ impl Outbox {
 
     /// The next control message only: for the last words before goodbye.
     pub(crate) fn next_control(&self) -> Option<Control> {
+        self.next_control_if(|_| true)
+    }
+
+    /// The next control message, if it is one of those that `fits`.
+    pub(crate) fn next_control_if(&self, fits: impl Fn(&Control) -> bool) -> Option<Control> {
         let mut queues = self.queues.lock();
+        if !fits(queues.control.front()?) {
+            return None;
+        }
         let control = queues.control.pop_front()?;
         queues.control_bytes -= control.frame.bytes.len();
         Some(control)

@@ -41,6 +41,8 @@ pub(crate) struct Session<S> {
     inbox: Inbox,
     cuts: Cuts,
     heard: Instant,
+    /// Bytes received by then.
+    heard_bytes: u64,
     ping_at: Option<Instant>,
     acks: Acks,
     /// Reading was put off because answers wait.
@@ -75,6 +77,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             inbox: Inbox::new(&client.shared),
             cuts: Cuts::default(),
             heard: now,
+            heard_bytes: 0,
             ping_at: (!options.ping_interval.is_zero()).then(|| now + options.ping_interval),
             acks: Acks::default(),
             held_back: false,
@@ -113,7 +116,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         }
         loop {
             let next = if self.cuts.is_full() {
-                self.client.outbox.next_control().map(Outgoing::Control)
+                // One that would be cut, too, waits in its queue, which is bounded.
+                let whole =
+                    |control: &Control| !Cuts::is_long(&control.frame, control.fragment_size);
+                let control = self.client.outbox.next_control_if(whole);
+                control.map(Outgoing::Control)
             } else {
                 self.client.outbox.next(now)
             };
@@ -206,7 +213,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 self.held_back = true;
                 return Poll::Pending;
             }
-            let message = match ready!(self.socket.poll_next(cx)) {
+            let next = self.socket.poll_next(cx);
+            // A big message on a slow line is heard from its first byte on, not only at its end.
+            if self.heard_bytes != self.socket.received() {
+                self.heard_bytes = self.socket.received();
+                self.heard = now;
+            }
+            let message = match ready!(next) {
                 Ok(message) => message,
                 Err(WsError::Refused { code, reason }) => {
                     return Poll::Ready(Err(Stop::Close {
@@ -223,7 +236,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                     }));
                 }
             };
-            self.heard = now;
             self.take(message)?;
         }
         Poll::Ready(Ok(()))

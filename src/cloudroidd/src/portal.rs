@@ -31,8 +31,9 @@ use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use socket2::SockRef;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::{TcpListener, UnixListener};
+use tokio::net::{TcpListener, TcpStream, UnixListener};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -48,6 +49,8 @@ pub use guard::{Peer, query};
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+/// Bytes that the kernel takes for a connection beyond those that are on their way.
+const UNSENT: u32 = 128 * 1024;
 
 /// What requests are answered from.
 pub struct App {
@@ -182,8 +185,7 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
         };
         match accepted {
             Ok((stream, address)) => {
-                // Small messages are many here, and none may wait for the next.
-                let _ = stream.set_nodelay(true);
+                tune(&stream);
                 connections.spawn(serve(
                     Arc::clone(&app),
                     router.clone(),
@@ -198,6 +200,14 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
         }
     }
     drain(&app, connections).await;
+}
+
+/// Makes a connection fit for many small messages beside big ones. What cannot be set is not needed to go on.
+fn tune(stream: &TcpStream) {
+    // None of them waits for the next.
+    let _ = stream.set_nodelay(true);
+    // The kernel would take megabytes for a client that reads slowly, and an answer would wait behind all of them.
+    let _ = SockRef::from(stream).set_tcp_notsent_lowat(UNSENT);
 }
 
 /// Accepts connections on the Unix socket until the daemon ends.

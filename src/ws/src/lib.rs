@@ -96,6 +96,7 @@ pub struct WebSocket<S> {
     write: VecDeque<Bytes>,
     tail: BytesMut,
     queued: usize,
+    received: u64,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
@@ -113,6 +114,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             write: VecDeque::new(),
             tail: BytesMut::new(),
             queued: 0,
+            received: 0,
         }
     }
 
@@ -151,10 +153,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 continue;
             }
             self.make_room();
-            if ready!(poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read))? == 0 {
+            let read = ready!(poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read))?;
+            if read == 0 {
                 return Poll::Ready(Err(WsError::Eof));
             }
+            self.received += read as u64;
         }
+    }
+
+    /// Bytes received so far, those of an unfinished message included; not those that were read ahead.
+    pub fn received(&self) -> u64 {
+        self.received
     }
 
     fn next_header(&mut self) -> Result<Option<Header>, WsError> {

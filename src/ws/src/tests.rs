@@ -185,3 +185,18 @@ async fn a_client_s_end_is_understood_by_servers() {
         assert_eq!(received.unwrap(), Message::Binary(vec![9; size].into()));
     }
 }
+
+#[tokio::test]
+async fn what_has_come_of_an_unfinished_message_is_counted() {
+    let (ours, mut theirs) = tokio::io::duplex(4096);
+    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT);
+    // Five bytes are announced, masked with zeros.
+    let frame = [0x82, 0x85, 0, 0, 0, 0, 1, 2, 3, 4, 5];
+    for (sent, piece) in [(3, &frame[..3]), (8, &frame[3..8]), (11, &frame[8..])] {
+        tokio::io::AsyncWriteExt::write_all(&mut theirs, piece)
+            .await
+            .unwrap();
+        let polled = poll_fn(|cx| Poll::Ready(ours.poll_next(cx))).await;
+        assert_eq!((ours.received(), polled.is_ready()), (sent, sent == 11));
+    }
+}

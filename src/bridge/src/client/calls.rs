@@ -49,6 +49,7 @@ impl Client {
             Format::Json => Compression::None,
             Format::Cbor => Compression::Cbor,
         });
+        let args = op.args;
         let call = Call {
             service: String::new(),
             written: op.service.clone().into_owned(),
@@ -64,7 +65,7 @@ impl Client {
             fragment_size: op.fragment_size,
         };
         let (service, guard) =
-            match resolve(&op.service).and_then(|service| Ok((service, self.begin()?))) {
+            match resolve(&op.service).and_then(|service| Ok((service, self.begin(args)?))) {
                 Ok(found) => found,
                 Err(reason) => {
                     self.call_failed(&call, &reason);

@@ -15,6 +15,8 @@ use crate::tf;
 
 /// Messages on one topic that wait until its type is known.
 const MAX_UNTYPED: usize = 64;
+/// Bytes of all such messages of one client; one message may have more.
+const MAX_UNTYPED_BYTES: usize = 16 << 20;
 /// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
 const SLICED: usize = 16 * 1024;
 /// Messages kept per slow node where the client does not say.
@@ -200,6 +202,17 @@ impl Client {
             reply: reply.clone(),
         };
         let mut outlets = self.outlets.lock();
+        let waiting_bytes: usize = outlets
+            .untyped
+            .values()
+            .flatten()
+            .map(|other| other.payload.len())
+            .sum();
+        if waiting_bytes > 0 && waiting_bytes + waiting.payload.len() > MAX_UNTYPED_BYTES {
+            return Err(format!(
+                "topic {topic} has no known type yet, and {waiting_bytes} bytes wait for one already; advertise it first"
+            ));
+        }
         if let Some(others) = outlets.untyped.get_mut(topic) {
             if others.len() >= MAX_UNTYPED {
                 return Err(format!(

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
+use std::time::Instant;
 
 use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 
@@ -29,14 +30,36 @@ struct TopicListener {
     hears_clients: bool,
     client: Weak<Client>,
     topic: Arc<str>,
+    /// The type the client asked for, where it did.
+    wanted: Option<String>,
     id: Option<Id<'static>>,
     format: Format,
 }
 
+impl TopicListener {
+    /// The type of a message, where it is not the one that the client asked for.
+    fn misfit<'s>(&self, sample: &'s Sample) -> Option<&'s str> {
+        let offered = sample.wire_type.name.as_str();
+        let wanted = self.wanted.as_deref()?;
+        (wanted != offered && offered != "*").then_some(offered)
+    }
+}
+
 impl Listener for TopicListener {
     fn sample(&self, sample: &Arc<Sample>, replay: bool) {
-        if self.hears_clients || !sample.local {
-            self.outbox.sample(self.key, sample.clone(), replay);
+        if !self.hears_clients && sample.local {
+            return;
+        }
+        match self.misfit(sample) {
+            None => self.outbox.sample(self.key, sample.clone(), replay),
+            Some(offered) if self.outbox.may_complain(self.key, Instant::now()) => {
+                let wanted = self.wanted.as_deref().unwrap_or_default();
+                self.failed(&format!(
+                    "{} publishes {offered} there, not {wanted}; its messages are left out",
+                    sample.publisher
+                ));
+            }
+            Some(_) => {}
         }
     }
 
@@ -62,23 +85,37 @@ impl Client {
             fragment_size: op.fragment_size,
             compression: op.compression,
         };
+        let wanted = op
+            .type_name
+            .as_deref()
+            .filter(|name| *name != "*")
+            .map(|name| plain_type(name).into_owned());
         let limit = self.shared.options.max_subscriptions;
         let mut subscribed = self.subscriptions.lock();
+        let all: usize = subscribed
+            .values()
+            .map(|known| known.subscriptions.len())
+            .sum();
+        let is_new = subscribed
+            .get(&*op.topic)
+            .is_none_or(|known| !known.subscriptions.contains_key(&reply.id));
+        if is_new && all >= limit {
+            return Err(format!(
+                "this client has {limit} subscriptions already; unsubscribe from one"
+            ));
+        }
         if let Some(known) = subscribed.get_mut(&*op.topic) {
-            if known.subscriptions.len() >= limit && !known.subscriptions.contains_key(&reply.id) {
+            if let (Some(wanted), Some(earlier)) = (&wanted, &known.listener.wanted)
+                && wanted != earlier
+            {
                 return Err(format!(
-                    "topic {name} has {limit} subscriptions of this client already"
+                    "this client subscribes to {name} as {earlier}, not {wanted}; unsubscribe from it first"
                 ));
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
             self.apply_wishes(known);
             known.listening.hub().replay(known.listener.as_ref());
         } else {
-            if subscribed.len() >= limit {
-                return Err(format!(
-                    "this client has {limit} topics already; unsubscribe from one"
-                ));
-            }
             let topic: Arc<str> = op.topic.as_ref().into();
             let key = self.outbox.add_topic(topic.clone(), wishes);
             let listener = Arc::new(TopicListener {
@@ -87,6 +124,7 @@ impl Client {
                 hears_clients: self.hears_clients,
                 client: Arc::downgrade(self),
                 topic: topic.clone(),
+                wanted,
                 id: reply.id.clone(),
                 format: reply.format,
             });

@@ -1,60 +1,133 @@
 //! Fields that are missing, of the wrong kind, unknown or far too long; fragments that make no sense; pictures that are
 //! bombs. All are answered by name and reason, and the connection lives.
 
+use rosbridge::Format;
 use serde_json::{Value, json};
+use tokio_tungstenite::tungstenite::Message;
 
 use crate::support::{Client, World};
 
-/// A correct message of each op, without an id.
-fn messages() -> Vec<Value> {
+/// A correct message of each op with all its fields, but without an id; and the fields that it means nothing without.
+fn messages() -> Vec<(Value, &'static [&'static str])> {
     vec![
-        json!({"op": "advertise", "topic": "/a", "type": "std_msgs/String", "latch": false, "queue_size": 1}),
-        json!({"op": "unadvertise", "topic": "/a"}),
-        json!({"op": "publish", "topic": "/a", "msg": {"data": "x"}}),
-        json!({"op": "subscribe", "topic": "/a", "type": "std_msgs/String", "throttle_rate": 1, "queue_length": 1,
-            "fragment_size": 100, "compression": "none"}),
-        json!({"op": "unsubscribe", "topic": "/a"}),
-        json!({"op": "call_service", "service": "/rosapi/get_time", "fragment_size": 1000, "compression": "none",
-            "timeout": 1.0}),
-        json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Add"}),
-        json!({"op": "unadvertise_service", "service": "/s"}),
-        json!({"op": "service_response", "service": "/s", "values": {}, "result": true}),
-        json!({"op": "send_action_goal", "action": "/f", "action_type": "x_msgs/Count", "feedback": true}),
-        json!({"op": "cancel_action_goal", "action": "/f"}),
-        json!({"op": "action_feedback", "action": "/f", "values": {}}),
-        json!({"op": "action_result", "action": "/f", "values": {}, "status": 3, "result": true}),
-        json!({"op": "advertise_action", "action": "/f", "type": "x_msgs/Count"}),
-        json!({"op": "unadvertise_action", "action": "/f"}),
-        json!({"op": "fragment", "data": "x", "num": 0, "total": 2}),
-        json!({"op": "png", "data": "x", "num": 0, "total": 2}),
-        json!({"op": "set_level", "level": "error"}),
-        json!({"op": "status", "level": "error", "msg": "x"}),
+        (
+            json!({"op": "advertise", "topic": "/a", "type": "std_msgs/String", "latch": false, "queue_size": 1,
+                "md5sum": "*"}),
+            &["topic", "type"],
+        ),
+        (json!({"op": "unadvertise", "topic": "/a"}), &["topic"]),
+        (
+            json!({"op": "publish", "topic": "/a", "msg": {"data": "x"}, "type": "std_msgs/String", "latch": false,
+                "compression": "none"}),
+            &["topic", "msg"],
+        ),
+        (
+            json!({"op": "subscribe", "topic": "/a", "type": "std_msgs/String", "throttle_rate": 1, "queue_length": 1,
+                "fragment_size": 100, "compression": "none"}),
+            &["topic"],
+        ),
+        (json!({"op": "unsubscribe", "topic": "/a"}), &["topic"]),
+        (
+            json!({"op": "call_service", "service": "/rosapi/get_time", "type": "rosapi/GetTime", "args": {},
+                "fragment_size": 1000, "compression": "none", "timeout": 1.0}),
+            &["service"],
+        ),
+        (
+            json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Add", "compression": "none"}),
+            &["service", "type"],
+        ),
+        (
+            json!({"op": "unadvertise_service", "service": "/s"}),
+            &["service"],
+        ),
+        (
+            json!({"op": "service_response", "service": "/s", "values": {}, "result": true, "compression": "none"}),
+            &["service", "result"],
+        ),
+        (
+            json!({"op": "send_action_goal", "action": "/f", "action_type": "x_msgs/Count", "args": {}, "feedback": true,
+                "fragment_size": 1000, "compression": "none"}),
+            &["action", "action_type"],
+        ),
+        (
+            json!({"op": "cancel_action_goal", "action": "/f"}),
+            &["action", "id"],
+        ),
+        (
+            json!({"op": "action_feedback", "action": "/f", "values": {}, "compression": "none"}),
+            &["action", "values", "id"],
+        ),
+        (
+            json!({"op": "action_result", "action": "/f", "values": {}, "status": 4, "result": true,
+                "compression": "none"}),
+            &["action", "result"],
+        ),
+        (
+            json!({"op": "advertise_action", "action": "/f", "type": "x_msgs/Count", "compression": "none"}),
+            &["action", "type"],
+        ),
+        (
+            json!({"op": "unadvertise_action", "action": "/f"}),
+            &["action"],
+        ),
+        (
+            json!({"op": "fragment", "data": "x", "num": 0, "total": 2}),
+            &["data", "num", "total", "id"],
+        ),
+        (
+            json!({"op": "png", "data": "x", "num": 0, "total": 2}),
+            &["data", "num", "total"],
+        ),
+        (json!({"op": "set_level", "level": "error"}), &["level"]),
+        (
+            json!({"op": "status", "level": "error", "msg": "x"}),
+            &["level", "msg"],
+        ),
+        (
+            json!({"op": "auth", "mac": "a", "client": "b", "dest": "c", "rand": "d", "t": 1, "level": "e", "end": 2}),
+            &["mac", "client", "dest", "rand", "t", "end"],
+        ),
     ]
 }
 
-/// Fields without which an op means nothing.
-fn is_needed(op: &str, field: &str) -> bool {
-    match field {
-        "topic" | "service" | "action" | "action_type" | "level" | "data" => true,
-        "msg" => op == "status" || op == "publish",
-        "num" | "total" => op == "fragment",
-        "type" => op.starts_with("advertise"),
-        "values" => op == "action_feedback",
-        _ => false,
-    }
+/// Fields that hold messages: whether those fit is the type's affair.
+fn is_payload(op: &str, field: &str) -> bool {
+    matches!(field, "values" | "args") || (op == "publish" && field == "msg")
+}
+
+/// The message with an id, and that field as it is there.
+fn with(message: &Value, field: &str, value: Value) -> Value {
+    let mut changed = message.clone();
+    changed["id"] = "q".into();
+    changed[field] = value;
+    changed
 }
 
 /// Sends it, and gives the status messages that came of it.
-async fn answers(client: &mut Client, message: &Value, marker: usize) -> Vec<String> {
-    client.send(message.clone()).await;
-    let id = format!("marker {marker}");
-    client
-        .send(json!({"op": "call_service", "id": id, "service": "/rosapi/get_ros_version"}))
-        .await;
+async fn answers(client: &mut Client, message: &Value, format: Format) -> Vec<String> {
+    let marker =
+        json!({"op": "call_service", "id": "marker", "service": "/rosapi/get_ros_version"});
+    for message in [message, &marker] {
+        match format {
+            Format::Json => client.send(message.clone()).await,
+            Format::Cbor => {
+                let mut bytes = Vec::new();
+                ciborium::into_writer(message, &mut bytes).unwrap();
+                client.send_binary(bytes).await;
+            }
+        }
+    }
     let mut said = Vec::new();
     loop {
-        let heard = client.json().await;
-        if heard["id"] == id.as_str() {
+        let heard: Value = match client.next().await {
+            Message::Text(text) => serde_json::from_str(&text).unwrap(),
+            Message::Binary(bytes) => {
+                // Statuses only: the marker's answer may hold what JSON has not.
+                ciborium::from_reader(&*bytes).unwrap()
+            }
+            other => panic!("{other:?}"),
+        };
+        if heard["id"] == "marker" {
             return said;
         }
         if heard["op"] == "status" {
@@ -63,78 +136,145 @@ async fn answers(client: &mut Client, message: &Value, marker: usize) -> Vec<Str
     }
 }
 
-#[tokio::test]
-async fn every_field_that_is_missing_or_of_another_kind_is_named() {
+/// Sends each, and checks that a status names op and field and shows no more of the value than is of use.
+async fn are_refused_by_name(cases: Vec<(Value, &str)>) {
     let world = World::new().await;
-    let mut client = world.client().await;
-    let mut marker = 0;
-    for message in messages() {
-        let op = message["op"].as_str().unwrap();
-        let fields = message.as_object().unwrap();
-        for field in fields.keys().filter(|field| *field != "op") {
-            let mut cases = Vec::new();
-            let mut lacking = message.clone();
-            lacking.as_object_mut().unwrap().remove(field);
-            lacking["id"] = "q".into();
-            if is_needed(op, field) {
-                cases.push(lacking.clone());
-            }
-            // An object is wrong for every field but those that are payloads, and a number is wrong for these.
-            let payload = matches!(field.as_str(), "values") || (op == "publish" && field == "msg");
-            if !payload {
-                lacking[field] = json!({"x": [1, 2]});
-                cases.push(lacking);
-            }
-            for case in cases {
-                marker += 1;
-                let said = answers(&mut client, &case, marker).await;
-                let named = said.iter().any(|text| {
-                    text.starts_with(&format!("{op}: ")) && text.contains(&format!("{field:?}"))
-                });
-                assert!(named, "{case} was answered with {said:?}");
-            }
+    for format in [Format::Json, Format::Cbor] {
+        let mut client = world.client().await;
+        for (case, field) in &cases {
+            let op = case["op"].as_str().unwrap();
+            let said = answers(&mut client, case, format).await;
+            let named = said.iter().any(|text| {
+                text.starts_with(&format!("{op}: ")) && text.contains(&format!("{field:?}"))
+            });
+            let sent = case.to_string();
+            let shown: String = sent.chars().take(300).collect();
+            assert!(named, "{shown} was answered with {said:?}");
+            assert!(said.iter().all(|text| text.len() < 500), "{said:?}");
         }
     }
 }
 
 #[tokio::test]
-async fn a_field_too_many_is_told_as_a_warning_and_a_huge_one_is_refused() {
-    let world = World::new().await;
-    let mut client = world.client().await;
-    let long = "x".repeat(100_000);
-    let mut marker = 0;
-    for message in messages() {
-        let op = message["op"].as_str().unwrap().to_owned();
-        for field in ["topic", "service", "action", "type", "action_type", "id"] {
-            if field != "id" && message.get(field).is_none() {
-                continue;
-            }
-            let mut huge = message.clone();
-            huge["id"] = "q".into();
-            huge[field] = format!("/{long}").into();
-            marker += 1;
-            let said = answers(&mut client, &huge, marker).await;
-            let told = said
-                .iter()
-                .find(|text| text.starts_with(&format!("{op}: ")));
-            let told = told.unwrap_or_else(|| panic!("{op}: a huge {field:?}: {said:?}"));
-            assert!(told.len() < 1000, "{op}: {} bytes of answer", told.len());
+async fn a_field_that_is_missing_is_named() {
+    let messages = messages();
+    let mut cases = Vec::new();
+    for (message, needed) in &messages {
+        for field in *needed {
+            cases.push((with(message, field, Value::Null), *field));
+            let mut lacking = with(message, field, Value::Null);
+            lacking.as_object_mut().unwrap().remove(*field);
+            cases.push((lacking, field));
         }
     }
+    are_refused_by_name(cases).await;
+}
+
+#[tokio::test]
+async fn a_field_of_another_kind_is_named() {
+    let messages = messages();
+    let mut cases = Vec::new();
+    for (message, _) in &messages {
+        let op = message["op"].as_str().unwrap();
+        let fields = message.as_object().unwrap().keys();
+        for field in fields
+            .map(String::as_str)
+            .chain(["id"])
+            .filter(|field| *field != "op")
+        {
+            // An object is wrong for every field but those that are payloads, and a number is wrong for these. A
+            // response that fails may say anything why.
+            let wrong = match field {
+                "values" if op != "action_feedback" => continue,
+                field if is_payload(op, field) => json!(7),
+                _ => json!({"x": [1, 2]}),
+            };
+            cases.push((with(message, field, wrong), field));
+        }
+    }
+    are_refused_by_name(cases).await;
+}
+
+#[tokio::test]
+async fn a_number_out_of_range_is_named() {
+    let messages = messages();
+    let mut cases = Vec::new();
+    for (message, _) in &messages {
+        for (field, value) in message.as_object().unwrap() {
+            if !value.is_number() {
+                continue;
+            }
+            let mut wrong = vec![json!(-1), json!(-1e300)];
+            if !matches!(field.as_str(), "throttle_rate" | "timeout") {
+                // Those may have a part, and be as long as they like.
+                wrong.extend([json!(0.5), json!(1e300), json!(u64::MAX)]);
+            }
+            if message["op"] == "auth" {
+                wrong.retain(|value| !value.is_i64());
+            }
+            for value in wrong {
+                cases.push((with(message, field, value), field.as_str()));
+            }
+        }
+    }
+    assert!(cases.len() > 30, "{}", cases.len());
+    are_refused_by_name(cases).await;
+}
+
+#[tokio::test]
+async fn a_huge_field_is_refused_and_not_repeated() {
+    let long = format!("/{}", "x".repeat(100_000));
+    let messages = messages();
+    let mut cases = Vec::new();
+    for (message, _) in &messages {
+        let op = message["op"].as_str().unwrap();
+        let fields = message.as_object().unwrap();
+        for (field, value) in fields {
+            // Pieces of messages may be long. What a client says of itself is no answer's business.
+            let told = !matches!(field.as_str(), "op" | "data") && op != "status";
+            if told && value.is_string() {
+                cases.push((with(message, field, long.clone().into()), field.as_str()));
+            }
+        }
+        cases.push((with(message, "id", long.clone().into()), "id"));
+        // Instead of a number, or of a message.
+        for (field, value) in fields.iter().filter(|(_, value)| !value.is_string()) {
+            if op != "status" && !(field == "values" && op != "action_feedback") {
+                let _ = value;
+                cases.push((with(message, field, long.clone().into()), field.as_str()));
+            }
+        }
+    }
+    are_refused_by_name(cases).await;
+}
+
+#[tokio::test]
+async fn a_field_too_many_is_told_as_a_warning() {
+    let world = World::new().await;
+    let mut client = world.client().await;
     client
         .send(json!({"op": "set_level", "level": "warning"}))
         .await;
-    for mut message in messages() {
-        let op = message["op"].as_str().unwrap().to_owned();
+    let long = "y".repeat(10_000);
+    for (message, _) in messages() {
+        let op = message["op"].as_str().unwrap();
         if op == "set_level" {
             continue;
         }
-        message["id"] = "q".into();
-        message["colour"] = "red".into();
-        marker += 1;
-        let said = answers(&mut client, &message, marker).await;
+        let said = answers(
+            &mut client,
+            &with(&message, "colour", "red".into()),
+            Format::Json,
+        )
+        .await;
         let told = format!("{op}: field \"colour\" is not known and was ignored");
         assert!(said.contains(&told), "{op}: {said:?}");
+        let said = answers(&mut client, &with(&message, &long, 1.into()), Format::Json).await;
+        let told = format!("{op}: field \"{}\" is not known", &long[..48]);
+        assert!(
+            said.iter().any(|text| text.starts_with(&told)),
+            "{op}: {said:?}"
+        );
     }
 }
 

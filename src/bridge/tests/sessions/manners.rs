@@ -304,21 +304,71 @@ async fn a_client_that_floods_and_does_not_read_is_held_back_not_fed() {
 #[tokio::test]
 async fn ten_thousand_subscriptions_are_too_many() {
     let world = World::new().await;
-    let mut client = world.client().await;
-    let mut refused = 0;
-    for number in 0..2000 {
+    let refusal = "subscribe: this client has 1000 subscriptions already; unsubscribe from one";
+    let (mut broad, mut deep) = (world.client().await, world.client().await);
+    for number in 0..10_000 {
         let topic = format!("/t{number}");
-        client
-            .send(json!({"op": "subscribe", "topic": topic, "type": "std_msgs/String"}))
-            .await;
-        if number >= 1000 {
-            assert_eq!(
-                client.refusal().await,
-                "subscribe: this client has 1000 topics already; unsubscribe from one"
-            );
-            refused += 1;
+        let many = json!({"op": "subscribe", "topic": topic, "type": "std_msgs/String"});
+        let again =
+            json!({"op": "subscribe", "id": number, "topic": "/t", "type": "std_msgs/String"});
+        for (client, subscribe) in [(&mut broad, many), (&mut deep, again)] {
+            client.send(subscribe).await;
+            if number >= 1000 {
+                assert_eq!(client.refusal().await, refusal);
+            }
         }
     }
-    assert_eq!(refused, 1000);
-    client.settled().await;
+    for client in [&mut broad, &mut deep] {
+        client.settled().await;
+    }
+    // No more of them have reached ROS; and who gives one up may have another.
+    let named = |graph: &ros::bus::Graph| {
+        let topics = graph.topics.keys().filter(|topic| topic.starts_with("/t"));
+        topics.count()
+    };
+    world.in_graph(|graph| named(graph) == 1001).await;
+    broad
+        .send(json!({"op": "unsubscribe", "topic": "/t0"}))
+        .await;
+    broad
+        .send(json!({"op": "subscribe", "topic": "/other", "type": "std_msgs/String"}))
+        .await;
+    broad.settled().await;
+}
+
+#[tokio::test]
+async fn answers_in_fragments_wait_in_the_queue_that_is_bounded() {
+    let options = BridgeOptions {
+        control_messages: 100,
+        ..BridgeOptions::default()
+    };
+    let world = World::with(options).await;
+    let mut client = world.client().await;
+    let call = json!({"op": "call_service", "service": "/rosapi/message_details",
+        "args": {"type": "x_msgs/Place"}, "fragment_size": 10});
+    let mut asked = 0;
+    // It reads one fragment for every ninety long answers.
+    while !client.session.is_finished() {
+        for _ in 0..90 {
+            // A connection that is being closed may be gone already.
+            let _ = client.send_raw(Message::text(call.to_string())).await;
+            asked += 1;
+        }
+        let frames = &world.bridge.metrics().frames_in;
+        let taken = async {
+            while frames.get() < asked && !client.session.is_finished() {
+                tokio::task::yield_now().await;
+            }
+        };
+        patiently(taken).await;
+        assert!(asked < 1000, "{asked} answers are kept");
+        if !client.session.is_finished() {
+            client.next().await;
+        }
+    }
+    let end = client.session.await.unwrap();
+    assert!(
+        matches!(end, SessionEnd::Closed { code: 1008, .. }),
+        "{end:?}"
+    );
 }

@@ -179,6 +179,70 @@ async fn too_many_calls_at_once_are_refused() {
 }
 
 #[tokio::test]
+async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
+    let world = World::with(BridgeOptions {
+        max_call_bytes: 10_000,
+        ..BridgeOptions::default()
+    })
+    .await;
+    let gate = Arc::new(Notify::new());
+    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
+    let _fast = serves(&world, "/fast", None).await;
+    let mut client = world.client().await;
+    let padded = |service: &str, id: &str, padding: usize| {
+        let call = json!({"op": "call_service", "id": id, "service": service, "args": [1, 2]});
+        call.to_string()
+            .replace("[1", &format!("[{}1", " ".repeat(padding)))
+    };
+    // One alone may have more than that.
+    client.send_text(&padded("/slow", "first", 20_000)).await;
+    client.send_text(&padded("/fast", "second", 5_000)).await;
+    let answer = client.json().await;
+    assert_eq!(
+        (&answer["id"], &answer["result"]),
+        (&json!("second"), &json!(false))
+    );
+    assert_eq!(
+        answer["values"],
+        "field \"args\" has 5005 bytes, with those of calls and goals under way more than 10000; wait for some to end"
+    );
+    gate.notify_one();
+    assert_eq!(client.json().await["values"], json!({"sum": 3}));
+    client.send_text(&padded("/fast", "third", 5_000)).await;
+    assert_eq!(client.json().await["values"], json!({"sum": 3}));
+}
+
+#[tokio::test]
+async fn a_service_of_another_definition_is_not_called() {
+    let world = World::new().await;
+    let service_type = ServiceType {
+        name: "x_msgs/Add".to_owned(),
+        md5: "0123456789abcdef0123456789abcdef".to_owned(),
+    };
+    let _served = world
+        .node
+        .serve("/odd", service_type, Arc::new(Add { gate: None }))
+        .await
+        .unwrap();
+    world
+        .in_graph(|graph| graph.services.contains_key("/odd"))
+        .await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "call_service", "service": "/odd", "args": [1, 2]}))
+        .await;
+    let answer = client.json().await;
+    let reason = answer["values"].as_str().unwrap();
+    assert!(
+        reason.starts_with(
+            "service /odd has type x_msgs/Add with MD5 0123456789abcdef0123456789abcdef there and "
+        ),
+        "{answer}"
+    );
+    client.settled().await;
+}
+
+#[tokio::test]
 async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
     let world = World::new().await;
     let _served = serves(&world, "/add", None).await;

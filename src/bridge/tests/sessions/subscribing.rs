@@ -256,6 +256,92 @@ async fn a_node_that_sends_rubbish_is_named_and_harms_nobody() {
 }
 
 #[tokio::test]
+async fn a_later_publisher_of_another_type_is_named_and_left_out() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "subscribe", "id": "s", "topic": "/late", "type": "std_msgs/String"}))
+        .await;
+    client.settled().await;
+    let other = world.another_node("/other").await;
+    let wrong = world
+        .publishes(&other, "/late", "std_msgs/Int32", false)
+        .await;
+    connected(wrong.as_ref(), 1).await;
+    for _ in 0..100 {
+        wrong.publish(world.message("std_msgs/Int32", json!({"data": 7})));
+    }
+    let status = client.json().await;
+    assert_eq!(
+        status,
+        json!({"op": "status", "id": "s", "level": "error", "msg":
+            "subscribe: topic /late: /other publishes std_msgs/Int32 there, not std_msgs/String; its messages are left out"})
+    );
+    // The right one is heard, and the wrong one not complained about again and again.
+    let right = world
+        .node_publishes("/late", "std_msgs/String", false)
+        .await;
+    connected(right.as_ref(), 1).await;
+    right.publish(world.message("std_msgs/String", json!({"data": "well"})));
+    assert_eq!(client.json().await["msg"]["data"], "well");
+    // The same client cannot want both.
+    client
+        .send(json!({"op": "subscribe", "id": "t", "topic": "/late", "type": "std_msgs/Int32"}))
+        .await;
+    assert!(client.refusal().await.contains("/late"));
+    client.settled().await;
+}
+
+#[tokio::test]
+async fn a_publisher_with_another_definition_is_read_by_its_own() {
+    let world = World::new().await;
+    // The same name as one of ours, from a newer version of its package.
+    let definition = "string name\nuint8 number\nbool new\n".to_owned();
+    let newer = ros::schema::MessageType::from_full_text("x_msgs/Tag", &definition).unwrap();
+    let wire_type = |definition: String| ros::bus::WireType {
+        name: "x_msgs/Tag".into(),
+        md5: newer.md5().into(),
+        definition,
+    };
+    let options = |definition| ros::bus::AdvertiseOptions {
+        wire_type: wire_type(definition),
+        latch: true,
+        queue: 1,
+    };
+    let bytes = bytes::Bytes::from_static(b"\x01\0\0\0x\x07\x01");
+    let told = ros::bus::Bus::advertise(world.node.as_ref(), "/told", options(definition))
+        .await
+        .unwrap();
+    told.publish(bytes.clone());
+    let mute = ros::bus::Bus::advertise(world.node.as_ref(), "/mute", options(String::new()))
+        .await
+        .unwrap();
+    mute.publish(bytes);
+    world
+        .in_graph(|graph| graph.topics.contains_key("/told") && graph.topics.contains_key("/mute"))
+        .await;
+    let mut client = world.client().await;
+    for topic in ["/told", "/mute"] {
+        client
+            .send(json!({"op": "subscribe", "topic": topic, "type": "x_msgs/Tag"}))
+            .await;
+        let heard = client.json().await;
+        if topic == "/told" {
+            let value = json!({"name": "x", "number": 7, "new": true});
+            assert_eq!(heard["msg"], value, "{heard}");
+        } else {
+            let expected = format!(
+                "subscribe: topic /mute: its type x_msgs/Tag has MD5 {}, ours has ",
+                newer.md5()
+            );
+            let text = heard["msg"].as_str().unwrap();
+            assert!(text.starts_with(&expected), "{heard}");
+        }
+    }
+    client.settled().await;
+}
+
+#[tokio::test]
 async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
     let world = World::new().await;
     let definition = "int32 a\nstring b\n".to_owned();

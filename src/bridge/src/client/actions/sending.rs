@@ -48,7 +48,7 @@ impl Client {
             fragment_size: op.fragment_size,
             seen: Instant::now(),
             done: Arc::default(),
-            _under_way: self.begin()?,
+            _under_way: self.begin(op.args)?,
         };
         match self.prepare_goal(&op, compression) {
             Ok(prepared) => {
