@@ -30,6 +30,8 @@ mod mishaps;
 mod portal;
 #[path = "stories/push.rs"]
 mod push;
+#[path = "stories/readiness.rs"]
+mod readiness;
 #[path = "stories/refusals.rs"]
 mod refusals;
 #[path = "stories/shadowing.rs"]
@@ -132,6 +134,7 @@ fn main() -> ExitCode {
             a_revision_is_rolled_back,
             five_packaged_nodes_answer,
         ],
+        stories![readiness: a_node_that_is_slow_is_waited_for_until_its_interface_is_there],
         stories![refusals:
             a_directory_without_a_package,
             malformed_xml,

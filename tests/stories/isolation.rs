@@ -178,6 +178,23 @@ pub fn limits_are_changed_while_it_works() -> Told {
         status["capacity"]["cpus_reserved"].as_f64() >= Some(0.5),
         "what it has is promised to it: {status:#}"
     );
+    ensure!(
+        status["usage"]["memory"].as_u64() > Some(0)
+            && status["usage"]["cpu_usec"].as_u64() > Some(0),
+        "what servants use is told: {status:#}"
+    );
+    for (verb, words) in [
+        (
+            "status",
+            ["used by servants", "throttled", "machine waits for"],
+        ),
+        ("servants", ["MEMORY", "THROTTLED", "PRESSURE"]),
+    ] {
+        let said = deployer.types(&[verb])?.succeeded()?.stdout;
+        for word in words {
+            ensure!(said.contains(word), "{verb} does not tell {word}: {said}");
+        }
+    }
     // The same nodes, still at work.
     ensure!(after["pids"] == before["pids"]);
     ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::process::Command;
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
 use anyhow::{Context, bail, ensure};
 use nix::sys::signal::{Signal, kill};
@@ -236,11 +236,11 @@ pub fn nodes_end_as_ros_users_know_it() -> Told {
         ensure!(answer["result"] == true, "{answer}");
         Ok(())
     };
-    // Whatever its status, a node that is to respawn does.
+    // Whatever its status, a node that is to respawn does, after its delay.
     end("phoenix", "exit 0")?;
-    event(&daemon, "node-respawned", &[&id, "/phoenix"])?;
+    respawned(&daemon, 1, "exited with status 0")?;
     end_again_once_it_is_back(&daemon, "phoenix", "signal 11")?;
-    event(&daemon, "node-respawned", &[&id, "/phoenix"])?;
+    respawned(&daemon, 2, "was killed by SIGSEGV")?;
     // One that is not, does not, and the others work on.
     end("mortal", "exit 0")?;
     event(
@@ -250,7 +250,7 @@ pub fn nodes_end_as_ros_users_know_it() -> Told {
     )?;
     // `rosnode kill`: the node's own XML-RPC `shutdown`, asked for in its network namespace.
     rosnode_kills(&daemon, "phoenix")?;
-    event(&daemon, "node-respawned", &[&id, "/phoenix"])?;
+    respawned(&daemon, 3, "exited with status 0")?;
     // A required one takes all with it.
     end("king", "exit 3")?;
     event(
@@ -261,7 +261,30 @@ pub fn nodes_end_as_ros_users_know_it() -> Told {
     nothing_is_left(daemon)
 }
 
+/// Waits until phoenix is told to have come again for the `time`th time, and why.
+fn respawned(daemon: &Daemon, time: usize, how: &str) -> Told {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let told = respawns(daemon)?;
+        if let Some(event) = told.get(time - 1) {
+            let words = format!("/phoenix {how} and is started again after 1 s");
+            ensure!(event["message"].to_string().contains(&words), "{event:#}");
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "no {time}th event: {told:#?}");
+    }
+}
+
+fn respawns(daemon: &Daemon) -> anyhow::Result<Vec<Value>> {
+    let events = daemon.deployer().asks(&["events"])?;
+    let events = events.as_array().context("events")?.iter();
+    let of = |event: &&Value| event["kind"] == "node-respawned";
+    Ok(events.filter(of).cloned().collect())
+}
+
+/// Ends phoenix again when it is back, which it is not before its delay is over.
 fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Told {
+    let ended = respawns(daemon)?.last().context("its end")?["time"].clone();
     let deadline = Instant::now() + PATIENCE;
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
     loop {
@@ -270,6 +293,9 @@ fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Told {
             json!({"what": "end", "argument": how}),
         )?;
         if answer["result"] == true {
+            let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?;
+            let away = now.as_millis() as u64 - ended.as_u64().context("a time")?;
+            ensure!(away >= 1000, "{node} was back after {away} ms");
             return Ok(());
         }
         ensure!(
@@ -304,6 +330,27 @@ fn rosnode_kills(daemon: &Daemon, node: &str) -> Told {
     Ok(())
 }
 
+/// What `status` warns of.
+fn warnings(daemon: &Daemon) -> anyhow::Result<String> {
+    Ok(daemon.deployer().asks(&["status"])?["warnings"].to_string())
+}
+
+/// Looks with another program than ours.
+fn is_in_the_database(daemon: &Daemon, event: &Value) -> Told {
+    let script = format!(
+        "import sqlite3\nprint(*sqlite3.connect({:?}).execute('SELECT kind FROM events WHERE id = {}').fetchone())",
+        daemon.home.join("cloudroid.db"),
+        event["id"]
+    );
+    let found = run(Command::new("python3").args(["-c", &script]))?.succeeded()?;
+    ensure!(
+        Some(found.stdout.trim()) == event["kind"].as_str(),
+        "{} is not {event}",
+        found.stdout
+    );
+    Ok(())
+}
+
 pub fn a_locked_database_is_named_and_waited_for() -> Told {
     let (_, daemon) = settled("locked", &[GREETER])?;
     daemon
@@ -321,15 +368,28 @@ pub fn a_locked_database_is_named_and_waited_for() -> Told {
         .spawn()?;
     let mut said = [0; 6];
     std::io::Read::read_exact(locker.stdout.as_mut().context("piped")?, &mut said)?;
+    // Who was here is let in, and what happens is told although it cannot be written.
+    let mut before = daemon.robot("greeter_cpp?robot=before")?;
+    before.calls("/greeter/count", json!({"reset": false}))?;
     let refused = Robot::try_connect(&daemon.url("greeter_cpp?robot=during"));
     let words = match refused {
         Err(refusal) => refusal.to_string(),
         Ok(mut robot) => format!("{:?}", robot.hears_close()?),
     };
+    let unwritable = event(
+        &daemon,
+        "state-unwritable",
+        &["another program has locked it", "cloudroid.db"],
+    )?;
+    ensure!(warnings(&daemon)?.contains("another program has locked it"));
+    ensure!(daemon.get("/healthz")?.0 == 200);
+    before.calls("/greeter/count", json!({"reset": false}))?;
     drop(locker.stdin.take());
     locker.wait()?;
     ensure!(words.contains("database"), "{words}");
-    ensure!(daemon.get("/healthz")?.0 == 200);
+    event(&daemon, "state-writable", &["can be written again"])?;
+    ensure!(!warnings(&daemon)?.contains("locked"));
+    is_in_the_database(&daemon, &unwritable)?;
     let mut robot = daemon.robot("greeter_cpp?robot=after")?;
     ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
     drop(robot);
@@ -371,7 +431,16 @@ pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Told {
             early.calls("/greeter/count", json!({"reset": false}))?["result"] == true,
             "at work"
         );
+        // Who was here is let in again.
+        early.leaves()?;
+        let mut early = daemon.robot("greeter_cpp?robot=early")?;
+        ensure!(early.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+        let unwritable = event(&daemon, "state-unwritable", &["its disk is full"])?;
+        ensure!(warnings(&daemon)?.contains("its disk is full"));
+        ensure!(daemon.get("/healthz")?.0 == 200);
         std::fs::remove_file(&filler)?;
+        event(&daemon, "state-writable", &["can be written again"])?;
+        is_in_the_database(&daemon, &unwritable)?;
         let mut late = daemon.robot("greeter_cpp?robot=late")?;
         ensure!(late.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
         drop((early, late));

@@ -3,8 +3,10 @@
 
 pub mod binaries;
 pub mod burglar;
+pub mod burglary;
 pub mod daemon;
 pub mod deployer;
+pub mod grants;
 pub mod leftovers;
 pub mod machine;
 pub mod procfs;

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
-use crate::limits::Limits;
+use crate::limits::{Limits, Usage};
 
 /// What `GET /api/v1/status` answers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -36,6 +36,10 @@ pub struct Status {
     pub spares: usize,
     /// Connections of robots now.
     pub connections: usize,
+    /// What the servants that live use together; the pressure is the whole machine's, none where the kernel does not
+    /// tell.
+    #[serde(default)]
+    pub usage: Usage,
     /// What does not work as it should on this machine.
     pub warnings: Vec<String>,
 }

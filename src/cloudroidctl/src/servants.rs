@@ -59,8 +59,7 @@ impl Servants {
                     .map(|usage| format!("{:.1} s", usage.throttled_usec as f64 / 1e6))
                     .unwrap_or_default(),
                 usage
-                    .and_then(|usage| usage.pressure)
-                    .map(pressure)
+                    .map(|usage| usage.pressure.map_or("unknown".to_owned(), pressure))
                     .unwrap_or_default(),
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
             ]);

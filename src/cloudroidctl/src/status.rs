@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use api::Size;
+use api::{Pressure, Size};
 
 use crate::client::{Client, Unreachable};
 use crate::output::{self, Format};
@@ -69,6 +69,16 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
                 status.servants, status.connections, status.spares
             ),
         ),
+        (
+            "used by servants",
+            format!(
+                "{} of memory, {:.1} s of processor time, {:.1} s throttled",
+                Size(status.usage.memory),
+                status.usage.cpu_usec as f64 / 1e6,
+                status.usage.throttled_usec as f64 / 1e6
+            ),
+        ),
+        ("machine waits for", pressure(status.usage.pressure)),
         ("isolation", isolation),
         ("limits of a servant", output::limits(&status.limits)),
         (
@@ -90,4 +100,16 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         output::line(&format!("{:<20} {warning}", "warning"))?;
     }
     Ok(())
+}
+
+fn pressure(of: Option<Pressure>) -> String {
+    of.map_or_else(
+        || "unknown: its kernel does not tell (PSI)".to_owned(),
+        |of| {
+            format!(
+                "cpu {:.0} %, memory {:.0} %, io {:.0} % of the last 10 s",
+                of.cpu, of.memory, of.io
+            )
+        },
+    )
 }

@@ -63,6 +63,8 @@ pub(crate) struct Inner {
     pub(crate) definitions: Definitions,
     servants: Mutex<Servants>,
     spares: Spares,
+    /// Images whose nodes did not show all of their interface although they had all the time of a start.
+    incomplete: Mutex<BTreeSet<String>>,
     ending: AtomicBool,
 }
 
@@ -94,6 +96,7 @@ impl Choreographer {
             definitions: Definitions::default(),
             servants: Mutex::default(),
             spares: Spares::default(),
+            incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
         };
         Choreographer {
@@ -203,12 +206,12 @@ impl Choreographer {
                         },
                     );
                     servant.stop().await?;
-                    inner.state.remove_servant(servant.id())?;
+                    inner.state.remove_servant(servant.id());
                 }
             }
         }
         for gone in records.into_values() {
-            inner.state.remove_servant(&gone.id)?;
+            inner.state.remove_servant(&gone.id);
             inner.journal.warning(
                 "servant-lost",
                 &format!(

@@ -75,6 +75,8 @@ pub struct Granted {
     pub hosts: Vec<(IpAddr, String)>,
     /// What devices want every process to know.
     environment: BTreeMap<String, String>,
+    /// What of it is not done, in words.
+    pub unfulfilled: Vec<String>,
 }
 
 impl Granted {

@@ -37,9 +37,6 @@ impl Journal {
     }
 
     fn write(&self, level: Level, kind: &str, message: &str, about: &NewEvent<'_>) {
-        // A journal that cannot be written (a full disk, say) must not stop the work it tells of.
-        if let Err(error) = self.state.add_event(level, kind, message, about) {
-            tracing::error!("the event {kind} could not be written: {error}");
-        }
+        self.state.add_event(level, kind, message, about);
     }
 }

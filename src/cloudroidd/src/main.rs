@@ -260,6 +260,7 @@ fn build(
     let config = Arc::new(config);
     let tokens = Tokens::new(&config.tokens)?;
     let state = Arc::new(State::open(&home.database())?);
+    tokio::spawn(state::watch(Arc::clone(&state)));
     // Names bound to a token that is not known any more would be nobody's for ever.
     state.release_robots(tokens.hashes())?;
     let store = Arc::new(image::Store::open(&home.images(), &home.layers())?);

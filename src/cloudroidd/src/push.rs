@@ -168,6 +168,10 @@ impl Pusher {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         tell.step("starting it once to find its interface").await;
         let plan = plan_of(&built, options);
+        let granted = crate::grants::resolve(&plan.grants, &self.config.allow)?;
+        for warning in granted.unfulfilled {
+            tell.warning(warning).await;
+        }
         let found = probe::interface(self, id, &built, &plan, options).await?;
         for warning in found.warnings {
             tell.warning(warning).await;

@@ -1,9 +1,12 @@
 //! What must survive: services, their revisions, who owns a robot's name, which servant is whose, and the
-//! journal of events. SQLite in WAL mode; one connection, short statements.
+//! journal of events. SQLite in WAL mode; short statements; one connection that writes, and one that only reads, which
+//! no writer holds up.
 //!
 //! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
-//! perhaps the last); publishing waits for it.
+//! perhaps the last); publishing waits for it. What only tells of the past is kept in memory while the disk is full or
+//! another has locked the database ([`backlog`]); what promises something fails then.
 
+mod backlog;
 mod events;
 mod lives;
 mod services;
@@ -11,13 +14,15 @@ mod services;
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use api::Millis;
 use parking_lot::Mutex;
 use rusqlite::Connection;
 use serde::Serialize;
 
+use backlog::Backlog;
+pub use backlog::watch;
 pub use events::NewEvent;
 pub use lives::ServantRecord;
 pub use services::{Plan, RevisionRecord};
@@ -64,7 +69,9 @@ pub enum StateError {
 /// The database.
 pub struct State {
     connection: Mutex<Connection>,
+    reader: Mutex<Connection>,
     path: String,
+    backlog: Backlog,
     /// Revisions in use, by service and number.
     revisions: Mutex<HashMap<(String, u64), Arc<RevisionRecord>>>,
 }
@@ -92,12 +99,25 @@ impl State {
         connection
             .execute_batch(
                 "PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; \
-                 PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 5000;",
+                 PRAGMA foreign_keys = ON;",
             )
             .map_err(failed)?;
+        connection
+            .busy_handler(Some(wait_for_another))
+            .map_err(failed)?;
         migrate(&mut connection, &name)?;
+        let last = events::last(&connection).map_err(failed)?;
+        let mut reader = Connection::open(path).map_err(failed)?;
+        reader
+            .busy_handler(Some(wait_for_another))
+            .map_err(failed)?;
+        reader
+            .execute_batch("PRAGMA query_only = ON;")
+            .map_err(failed)?;
         Ok(State {
             connection: Mutex::new(connection),
+            reader: Mutex::new(reader),
+            backlog: Backlog::new(last),
             path: name,
             revisions: Mutex::default(),
         })
@@ -107,10 +127,32 @@ impl State {
         &self,
         work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
     ) -> Result<T, StateError> {
-        work(&mut self.connection.lock()).map_err(|source| StateError::Database {
+        let outcome = {
+            let mut connection = self
+                .connection
+                .try_lock()
+                .unwrap_or_else(|| aside(|| self.connection.lock()));
+            work(&mut connection)
+        };
+        outcome.map_err(|source| {
+            self.write_failed(&source);
+            self.failed(source)
+        })
+    }
+
+    /// Runs `work`, which only reads.
+    fn read<T>(
+        &self,
+        work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
+    ) -> Result<T, StateError> {
+        work(&self.reader.lock()).map_err(|source| self.failed(source))
+    }
+
+    fn failed(&self, source: rusqlite::Error) -> StateError {
+        StateError::Database {
             path: self.path.clone(),
             source,
-        })
+        }
     }
 
     /// Runs `work` so that it is on disk when this returns.
@@ -124,6 +166,29 @@ impl State {
             connection.pragma_update(None, "synchronous", "NORMAL")?;
             outcome
         })
+    }
+}
+
+/// For so long another may have the database locked before a statement fails.
+const LOCKED: Duration = Duration::from_secs(5);
+/// Between attempts.
+const RETRY: Duration = Duration::from_millis(10);
+
+/// SQLite asks, for the `attempts`th time, whether to wait until another has done with the database.
+fn wait_for_another(attempts: i32) -> bool {
+    if RETRY * attempts.unsigned_abs() >= LOCKED {
+        return false;
+    }
+    aside(|| std::thread::sleep(RETRY));
+    true
+}
+
+/// Waits without holding up the tasks that share this thread.
+fn aside<T>(wait: impl FnOnce() -> T) -> T {
+    use tokio::runtime::{Handle, RuntimeFlavor};
+    match Handle::try_current().map(|handle| handle.runtime_flavor()) {
+        Ok(RuntimeFlavor::MultiThread) => tokio::task::block_in_place(wait),
+        _ => wait(),
     }
 }
 

@@ -5,9 +5,11 @@ use std::sync::Arc;
 use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
 use package::interface as recorded;
 
+use crate::choreographer::Handle;
 use crate::errors::Error;
 use crate::portal::App;
 use crate::state::{RevisionRecord, State};
+use crate::supervision;
 
 /// The current revision of a service that exists.
 pub fn current(state: &State, name: &str) -> Result<Arc<RevisionRecord>, Error> {
@@ -119,8 +121,9 @@ fn topic(of: &recorded::Topic) -> api::interface::Topic {
 }
 
 /// The daemon at a glance.
-pub fn status(app: &App) -> Result<Status, Error> {
+pub async fn status(app: &App) -> Result<Status, Error> {
     let servants = app.choreographer.servants();
+    let usage = used(&servants).await;
     let (capacity, taken, waiting) = app.choreographer.admission().look();
     Ok(Status {
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -146,6 +149,32 @@ pub fn status(app: &App) -> Result<Status, Error> {
         servants: servants.len(),
         spares: app.choreographer.spares(),
         connections: servants.iter().map(|servant| servant.connections()).sum(),
-        warnings: app.machine.warnings.clone(),
+        usage,
+        warnings: app
+            .machine
+            .warnings
+            .iter()
+            .cloned()
+            .chain(app.state.unwritable())
+            .collect(),
     })
+}
+
+/// What they use together, and how much the machine waits.
+async fn used(servants: &[Arc<Handle>]) -> api::Usage {
+    let mut sum = api::Usage {
+        pressure: supervision::machine_pressure(),
+        ..api::Usage::default()
+    };
+    for container in servants.iter().filter_map(|servant| servant.container()) {
+        // One that has ended meanwhile uses nothing.
+        if let Ok(usage) = container.usage().await {
+            sum.cpu_usec += usage.cpu_usec;
+            sum.memory += usage.memory;
+            sum.pids += usage.pids;
+            sum.oom_kills += usage.oom_kills;
+            sum.throttled_usec += usage.throttled_usec;
+        }
+    }
+    sum
 }

@@ -25,11 +25,13 @@ mod cores;
 mod disk;
 mod files;
 mod hosts;
+mod unmet;
 mod v1;
 mod v2;
 
 use files::{read_number, read_pids};
 pub use hosts::Parent;
+pub use unmet::{missing, unmet};
 
 /// The directories of one servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -58,7 +60,12 @@ impl Cgroup {
     pub fn planned(parent: &Parent, spec: &Spec) -> Self {
         let asked = |hierarchy: &&hosts::Below| {
             let limits = &spec.limits;
-            !hierarchy.only_if_asked() || limits.io_read.or(limits.io_write).is_some()
+            let asked = |controller: &str| match controller {
+                "blkio" => limits.io_read.or(limits.io_write).is_some(),
+                "cpuset" => limits.cpuset.is_some(),
+                _ => true,
+            };
+            hierarchy.unified || hierarchy.controllers.iter().any(|name| asked(name))
         };
         let leaves = parent
             .hierarchies
@@ -81,6 +88,10 @@ impl Cgroup {
         for leaf in &self.leaves {
             make_directory(&leaf.directory)
                 .map_err(Error::file("make the cgroup", &leaf.directory))?;
+            if !leaf.unified && leaf.has("cpuset") {
+                v1::hand_down_cores(&leaf.directory)
+                    .map_err(Error::file("hand cores and memory to", &leaf.directory))?;
+            }
         }
         Ok(())
     }
@@ -236,11 +247,16 @@ impl Cgroup {
 
     /// A control file, when its controller is in use.
     fn file(&self, controller: &str, name: &str) -> Option<PathBuf> {
-        let has = |leaf: &&Leaf| leaf.controllers.iter().any(|known| known == controller);
         self.leaves
             .iter()
-            .find(has)
+            .find(|leaf| leaf.has(controller))
             .map(|leaf| leaf.directory.join(name))
+    }
+}
+
+impl Leaf {
+    fn has(&self, controller: &str) -> bool {
+        self.controllers.iter().any(|known| known == controller)
     }
 }
 
@@ -259,66 +275,5 @@ fn remove(directory: &Path) -> io::Result<()> {
     match fs::remove_dir(directory) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
         result => result,
-    }
-}
-
-/// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
-/// thousandth of one.
-pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
-    let mut missing = Vec::new();
-    let close = |asked: Option<f64>, got: Option<f64>, tolerance: f64| match (asked, got) {
-        (Some(asked), Some(got)) => (asked - got).abs() <= tolerance,
-        (Some(_), None) => false,
-        (None, _) => true,
-    };
-    let number = |value: Option<u64>| value.map(|value| value as f64);
-    if !close(asked.cpus, enforced.cpus, 0.001) {
-        missing.push("cpus");
-    }
-    if !close(number(asked.cpu_weight), number(enforced.cpu_weight), 1.0) {
-        missing.push("cpu_weight");
-    }
-    if !close(number(asked.memory), number(enforced.memory), 65536.0) {
-        missing.push("memory");
-    }
-    // Memory that is to be given back, like memory, comes in pages.
-    let high = (number(asked.memory_high), number(enforced.memory_high));
-    if !close(high.0, high.1, 65536.0) {
-        missing.push("memory_high");
-    }
-    if !close(number(asked.pids), number(enforced.pids), 0.0) {
-        missing.push("pids");
-    }
-    if !close(number(asked.io_read), number(enforced.io_read), 0.0) {
-        missing.push("io_read");
-    }
-    if !close(number(asked.io_write), number(enforced.io_write), 0.0) {
-        missing.push("io_write");
-    }
-    if asked.cpuset.is_some() && asked.cpuset != enforced.cpuset {
-        missing.push("cpuset");
-    }
-    missing
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_limit_that_is_not_in_force_is_named() {
-        let asked = Limits {
-            cpus: Some(1.5),
-            memory: Some(100_000_000),
-            pids: Some(10),
-            ..Limits::default()
-        };
-        let got = Limits {
-            memory: Some(99_999_744),
-            pids: None,
-            ..asked
-        };
-        assert_eq!(missing(&asked, &got), ["pids"]);
-        assert_eq!(missing(&Limits::default(), &got), [""; 0]);
     }
 }

@@ -92,6 +92,13 @@ pub struct Enforced {
     pub limits: Limits,
 }
 
+impl Enforced {
+    /// Which of the limits asked for are not in force, each with the reason.
+    pub fn unmet(&self, asked: &Limits) -> Vec<String> {
+        crate::cgroup::unmet(asked, self)
+    }
+}
+
 /// Usage as the kernel counts it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Usage {

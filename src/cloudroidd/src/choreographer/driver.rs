@@ -19,12 +19,13 @@ use crate::admission::Permit;
 use crate::definitions;
 use crate::errors::{Error, with_last_words};
 use crate::grants;
-use crate::state::{self, RevisionRecord, ServantRecord};
+use crate::state::{self, NewEvent, RevisionRecord, ServantRecord};
 use crate::works::Works;
 
 /// Lines of the log that explain a failure.
 const LOG_LINES: usize = 20;
-/// When nothing changes for so long although something of the interface is missing, it is not coming.
+/// When nothing changes for so long although something of the interface is missing, it is not coming: of a servant that
+/// was adopted, whose nodes may have been told to take it away, and of a revision that has kept robots waiting in vain.
 const SETTLED: Duration = Duration::from_secs(5);
 
 /// How a servant begins.
@@ -55,9 +56,7 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
             .journal
             .error("servant-leftover", &message, &handle.about());
     }
-    if let Err(error) = inner.state.remove_servant(&handle.id) {
-        tracing::error!("servant {} could not be forgotten: {error}", handle.id);
-    }
+    inner.state.remove_servant(&handle.id);
     drop(permit);
     inner.forget(&handle);
     if let Beginning::Asked(Some(spare)) = beginning {
@@ -138,6 +137,7 @@ async fn live(
     };
     handle.set_container(Arc::clone(&container));
     handle.set_phase(Phase::Created);
+    tell_unmet(inner, handle, &container);
     let mut nodes = Nodes::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, works, &mut nodes, fresh));
     tokio::select! {
@@ -146,6 +146,20 @@ async fn live(
         outcome = &mut supervised => outcome,
         reason = handle.end_asked() => Ok(reason),
         failure = container_over(&container) => Err(failure),
+    }
+}
+
+/// Of limits that somebody asked for and that are not in force; that of the others the daemon has warned at its start.
+fn tell_unmet(inner: &Inner, handle: &Handle, container: &Arc<dyn Servant>) {
+    let unmet = container.enforced().unmet(&engine_limits(&handle.asked()));
+    if !unmet.is_empty() {
+        let message = format!(
+            "servant {} runs without a limit that was asked for: {}",
+            handle.id,
+            unmet.join(", ")
+        );
+        let about = handle.about();
+        inner.journal.warning("limits-unmet", &message, &about);
     }
 }
 
@@ -167,7 +181,7 @@ async fn run(
     handle.set_works(Arc::clone(&works));
     handle.set_phase(Phase::Starting);
     tokio::select! {
-        ready = interface_there(inner, handle, &works, deadline), if !handle.is_linked() => ready?,
+        ready = interface_there(inner, handle, &works, deadline, fresh), if !handle.is_linked() => ready?,
         () = std::future::ready(()), if handle.is_linked() => {}
         failure = nodes.supervise() => return Err(failure),
     }
@@ -304,6 +318,15 @@ pub(super) async fn spec(
         .map_err(|_| Error::Internal("extracting layers"))??;
     let plan = &revision.plan;
     let granted = grants::resolve(&plan.grants, &inner.config.allow)?;
+    for what in &granted.unfulfilled {
+        let about = NewEvent {
+            service: Some(&revision.service),
+            servant: Some(id),
+            robot: None,
+        };
+        let message = format!("servant {id} of {}: {what}", revision.service);
+        inner.journal.warning("device-incomplete", &message, &about);
+    }
     Ok(Spec {
         id: id.to_owned(),
         layers,
@@ -335,14 +358,17 @@ async fn container_over(container: &Arc<dyn Servant>) -> Failure {
     }
 }
 
-/// Waits until everything that the interface promises is registered.
+/// Waits until everything that the interface promises is registered. Nodes may take their time between their
+/// registration and their first topic: all that the servant's start may take.
 async fn interface_there(
     inner: &Inner,
     handle: &Handle,
     works: &Works,
     deadline: Instant,
+    fresh: bool,
 ) -> Result<(), Failure> {
     let interface: &Interface = &handle.revision.interface;
+    let patient = fresh && !inner.incomplete.lock().contains(&handle.revision.image);
     let mut graphs = works.bus.graph();
     loop {
         let graph = graphs.borrow_and_update().clone();
@@ -352,15 +378,17 @@ async fn interface_there(
         }
         let nodes_missing = readiness::missing_nodes(interface, &graph);
         // Topics can come and go with what a node is told; nodes cannot.
-        let until = if nodes_missing.is_empty() {
-            deadline.min(Instant::now() + SETTLED)
-        } else {
+        let until = if patient || !nodes_missing.is_empty() {
             deadline
+        } else {
+            deadline.min(Instant::now() + SETTLED)
         };
         match timeout_at(until, graphs.changed()).await {
             Ok(Ok(())) => {}
             Ok(Err(_)) => return Err(Failure::broken("lost its ROS Master")),
             Err(_) if nodes_missing.is_empty() => {
+                let image = handle.revision.image.clone();
+                inner.incomplete.lock().insert(image);
                 let message = format!(
                     "servant {} is ready without {}",
                     handle.id,

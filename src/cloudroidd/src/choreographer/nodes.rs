@@ -30,6 +30,8 @@ pub(super) struct Nodes<'a> {
     pausing: FuturesUnordered<BoxFuture<'a, NodeSpec>>,
     backoffs: HashMap<String, Backoff>,
     events: tokio::sync::broadcast::Receiver<NodeEvent>,
+    /// How those that the engine starts again ended last.
+    ends: HashMap<String, String>,
     /// Nodes that still run or will run again.
     alive: usize,
 }
@@ -48,6 +50,7 @@ impl<'a> Nodes<'a> {
             pausing: FuturesUnordered::new(),
             backoffs: HashMap::new(),
             events: container.events(),
+            ends: HashMap::new(),
             alive: handle.revision.plan.nodes.len(),
         };
         if handle.is_linked() {
@@ -89,11 +92,58 @@ impl<'a> Nodes<'a> {
                     }
                 }
                 event = self.events.recv() => match event {
-                    Ok(NodeEvent::Respawning { node }) => self.tell("node-respawned", &format!("{node} is started again")),
-                    Ok(_) | Err(RecvError::Lagged(_)) => {}
+                    Ok(event) => self.happened(event),
+                    Err(RecvError::Lagged(_)) => {}
                     Err(RecvError::Closed) => std::future::pending().await,
                 },
             }
+        }
+    }
+
+    /// Takes in what the engine tells of its own accord.
+    fn happened(&mut self, event: NodeEvent) {
+        let (node, exit) = match event {
+            NodeEvent::Exited {
+                node,
+                code,
+                signal,
+                out_of_memory,
+            } => (
+                node,
+                NodeExit {
+                    code,
+                    signal,
+                    out_of_memory,
+                    exec_error: None,
+                },
+            ),
+            NodeEvent::ExecFailed { node, reason } => (
+                node,
+                NodeExit {
+                    code: None,
+                    signal: None,
+                    out_of_memory: false,
+                    exec_error: Some(reason),
+                },
+            ),
+            NodeEvent::Respawning { node } => {
+                let nodes = &self.handle.revision.plan.nodes;
+                let delay = nodes.iter().find(|one| one.name == node);
+                let delay = delay.map_or(0.0, |node| node.respawn_delay);
+                let how = self.ends.remove(&node);
+                let how = how.as_deref().unwrap_or("ended");
+                let message = format!("{node} {how} and is started again after {delay} s");
+                return self.tell("node-respawned", &message);
+            }
+            NodeEvent::Started { .. } => return,
+        };
+        let respawns = self.handle.revision.plan.nodes.iter();
+        if respawns
+            .filter(|one| one.respawn)
+            .any(|one| one.name == node)
+        {
+            let how = how_it_ended(&exit, &self.handle.limits());
+            self.ends.insert(node, how);
         }
     }
 

@@ -1,6 +1,7 @@
 //! Devices by the Container Device Interface (CNCF CDI 0.3 to 0.8): a specification, JSON or YAML, names a device and
 //! says what a container needs for it. Device nodes, mounts and environment are given. Hooks, which are programs to run on
-//! the host, are not run: a device with hooks works where it can do without them.
+//! the host, are not run (docs/adr/027): a device with hooks works where it can do without them, and its push is told of
+//! each by name.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::FileTypeExt;
@@ -40,6 +41,16 @@ struct Edits {
     env: Vec<String>,
     device_nodes: Vec<Node>,
     mounts: Vec<Bind>,
+    hooks: Vec<Hook>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Hook {
+    hook_name: String,
+    path: PathBuf,
+    #[serde(default)]
+    args: Vec<String>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -102,6 +113,12 @@ pub fn add(name: &str, directories: &[PathBuf], granted: &mut Granted) -> Result
             }
         }
         granted.environment.extend(edit.environment);
+        for hook in edit.unfulfilled {
+            let told = format!("device {name}: {hook}");
+            if !granted.unfulfilled.contains(&told) {
+                granted.unfulfilled.push(told);
+            }
+        }
     }
     Ok(())
 }
@@ -164,6 +181,16 @@ fn granted_by(edits: &Edits) -> Result<Granted, String> {
             device: false,
         });
     }
+    for hook in &edits.hooks {
+        // The first argument is the program's own name.
+        let does = hook.args.get(1..).unwrap_or_default().join(" ");
+        let command = format!("{} {does}", hook.path.display());
+        granted.unfulfilled.push(format!(
+            "its hook {} ({}) is not run; the device works where it can do without",
+            hook.hook_name,
+            command.trim_end()
+        ));
+    }
     Ok(granted)
 }
 
@@ -176,6 +203,10 @@ cdiVersion: 0.6.0
 kind: vendor.com/harmless
 containerEdits:
   env: [VENDOR=here]
+  hooks:
+    - hookName: createContainer
+      path: /usr/bin/vendor-hook
+      args: [vendor-hook, update-ldcache]
 devices:
   - name: zero
     containerEdits:
@@ -207,6 +238,13 @@ devices:
         assert_eq!(
             targets,
             [("/dev/vendor0", true), ("/usr/share/vendor", false)]
+        );
+        assert_eq!(
+            granted.unfulfilled,
+            [
+                "device vendor.com/harmless=zero: its hook createContainer (/usr/bin/vendor-hook update-ldcache) is not \
+                 run; the device works where it can do without"
+            ]
         );
         let mut refused = |name| {
             add(name, &directories, &mut granted)

@@ -32,7 +32,7 @@ pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> 
 
 /// The daemon at a glance.
 pub async fn status(State(app): State<Arc<App>>) -> Answer<Status> {
-    Ok(Json(views::status(&app)?))
+    Ok(Json(views::status(&app).await?))
 }
 
 /// The time here.

@@ -52,9 +52,15 @@ pub(super) async fn interface(
     };
     let endpoint = servant.endpoint();
     let _ways_out = Relays::open(&endpoint, &plan.grants, &pusher.config.allow).await;
+    let unmet = servant
+        .enforced()
+        .unmet(&choreographer::engine_limits(&options.limits));
     let found = look(pusher, &servant, built, plan).await;
     trial.end().await?;
-    found
+    let mut found = found?;
+    let warn = |what| format!("servants will run without a limit that was asked for: {what}");
+    found.warnings.extend(unmet.into_iter().map(warn));
+    Ok(found)
 }
 
 async fn look(

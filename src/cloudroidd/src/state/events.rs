@@ -1,8 +1,9 @@
 //! The journal.
 
 use api::{Event, Level, Millis};
-use rusqlite::params;
+use rusqlite::{Connection, params};
 
+use super::backlog::Write;
 use super::{State, StateError, now};
 
 /// Events beyond are forgotten, oldest first.
@@ -19,53 +20,70 @@ pub struct NewEvent<'a> {
     pub robot: Option<&'a str>,
 }
 
+/// The number of the last event ever written; 0 before the first.
+pub(super) fn last(connection: &Connection) -> rusqlite::Result<i64> {
+    connection.query_row(
+        "SELECT COALESCE((SELECT seq FROM sqlite_sequence WHERE name = 'events'), 0)",
+        [],
+        |row| row.get(0),
+    )
+}
+
+/// Writes an event that has its number.
+pub(super) fn insert(connection: &Connection, event: &Event) -> rusqlite::Result<()> {
+    connection
+        .prepare_cached(
+            "INSERT INTO events (id, time, level, kind, service, servant, robot, message)
+             VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)",
+        )?
+        .execute(params![
+            event.id,
+            event.time as i64,
+            level_name(event.level),
+            event.kind,
+            event.service,
+            event.servant,
+            event.robot,
+            event.message
+        ])?;
+    if event.id % 100 == 0 {
+        connection.execute(
+            "DELETE FROM events WHERE id <= ?1",
+            [event.id - EVENTS_KEPT],
+        )?;
+    }
+    Ok(())
+}
+
 impl State {
-    /// Writes an event into the journal and gives it back with its number.
-    pub fn add_event(
-        &self,
-        level: Level,
-        kind: &str,
-        message: &str,
-        about: &NewEvent<'_>,
-    ) -> Result<Event, StateError> {
-        let time = now();
-        let id = self.run(|connection| {
-            connection
-                .prepare_cached(
-                    "INSERT INTO events (time, level, kind, service, servant, robot, message)
-                     VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
-                )?
-                .execute(params![
-                    time as i64,
-                    level_name(level),
-                    kind,
-                    about.service,
-                    about.servant,
-                    about.robot,
-                    message
-                ])?;
-            let id = connection.last_insert_rowid();
-            if id % 100 == 0 {
-                connection.execute("DELETE FROM events WHERE id <= ?1", [id - EVENTS_KEPT])?;
-            }
-            Ok(id)
-        })?;
+    /// Writes an event into the journal; where nothing can be written now, later.
+    pub fn add_event(&self, level: Level, kind: &str, message: &str, about: &NewEvent<'_>) {
         let owned = |text: Option<&str>| text.map(str::to_owned);
-        Ok(Event {
-            id,
-            time,
+        self.write_or_keep(Write::Event(Event {
+            id: 0,
+            time: now(),
             level,
             kind: kind.to_owned(),
             service: owned(about.service),
             servant: owned(about.servant),
             robot: owned(about.robot),
             message: message.to_owned(),
-        })
+        }));
     }
 
     /// The newest `limit` events after number `since`, oldest first.
     pub fn events(&self, since: i64, limit: u32) -> Result<Vec<Event>, StateError> {
-        self.run(|connection| {
+        // First, so that none is missed that is being written meanwhile.
+        let kept = self.backlog.events(since);
+        let mut events = self.written_events(since, limit)?;
+        let last = events.last().map_or(since, |event| event.id);
+        events.extend(kept.into_iter().filter(|event| event.id > last));
+        let beyond = events.len().saturating_sub(limit as usize);
+        Ok(events.split_off(beyond))
+    }
+
+    fn written_events(&self, since: i64, limit: u32) -> Result<Vec<Event>, StateError> {
+        self.read(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, time, level, kind, service, servant, robot, message FROM

@@ -1,8 +1,9 @@
 //! Who is who while servants live: robots' names and their owners, servants and their robots.
 
 use api::{Limits, Millis};
-use rusqlite::params;
+use rusqlite::{OptionalExtension, params};
 
+use super::backlog::Write;
 use super::{State, StateError, now, to_json};
 use crate::tokens::TokenHash;
 
@@ -34,6 +35,19 @@ impl State {
         owner: Option<&TokenHash>,
         claim: bool,
     ) -> Result<Option<TokenHash>, StateError> {
+        // Who is known comes in even while nothing can be written.
+        let known: Option<Option<TokenHash>> = self.read(|connection| {
+            connection
+                .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
+                .query_row([robot], |row| row.get(0))
+                .optional()
+        })?;
+        if let Some(known) = known
+            && (known.is_some() || !claim)
+        {
+            self.robot_seen(robot);
+            return Ok(known);
+        }
         self.run(|connection| {
             connection
                 .prepare_cached(
@@ -87,15 +101,19 @@ impl State {
         .map(|_| ())
     }
 
-    /// Forgets a servant that has ended.
-    pub fn remove_servant(&self, id: &str) -> Result<(), StateError> {
-        self.run(|connection| connection.execute("DELETE FROM servants WHERE id = ?1", [id]))
-            .map(|_| ())
+    /// Forgets a servant that has ended; where nothing can be written now, later.
+    pub fn remove_servant(&self, id: &str) {
+        self.write_or_keep(Write::ServantGone(id.to_owned()));
+    }
+
+    /// Remembers that a robot came.
+    fn robot_seen(&self, robot: &str) {
+        self.write_or_keep(Write::RobotSeen(robot.to_owned(), now()));
     }
 
     /// All servants that an earlier daemon may have left.
     pub fn servants(&self) -> Result<Vec<ServantRecord>, StateError> {
-        self.run(|connection| {
+        self.read(|connection| {
             connection
                 .prepare_cached("SELECT id, service, revision, robot, anonymous, created, limits FROM servants ORDER BY created")?
                 .query_map([], |row| {

@@ -126,7 +126,7 @@ impl State {
 
     /// Names of all services.
     pub fn service_names(&self) -> Result<Vec<String>, StateError> {
-        self.run(|connection| {
+        self.read(|connection| {
             connection
                 .prepare_cached("SELECT name FROM services ORDER BY name")?
                 .query_map([], |row| row.get(0))?
@@ -136,7 +136,7 @@ impl State {
 
     /// The ROS package that a service was first made of.
     pub fn service_package(&self, name: &str) -> Result<Option<String>, StateError> {
-        self.run(|connection| {
+        self.read(|connection| {
             connection
                 .query_row(
                     "SELECT package FROM services WHERE name = ?1",
@@ -149,7 +149,7 @@ impl State {
 
     /// The current revision of a service.
     pub fn current(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, StateError> {
-        let current: Option<u64> = self.run(|connection| {
+        let current: Option<u64> = self.read(|connection| {
             connection
                 .prepare_cached("SELECT current FROM services WHERE name = ?1")?
                 .query_row([service], |row| row.get(0))
@@ -199,7 +199,7 @@ impl State {
             };
             Ok((record, row.get(4)?, row.get(5)?))
         };
-        let found = self.run(|connection| {
+        let found = self.read(|connection| {
             connection
                 .prepare_cached(
                     "SELECT r.image, r.published, s.package, r.source, r.plan, r.interface
@@ -238,7 +238,7 @@ impl State {
         condition: &str,
         values: impl rusqlite::Params,
     ) -> Result<Vec<RevisionLine>, StateError> {
-        self.run(|connection| {
+        self.read(|connection| {
             connection
                 .prepare_cached(&format!(
                     "SELECT service, number, image, published, source FROM revisions {condition}

@@ -149,7 +149,7 @@ fn servants_are_remembered_until_they_end() {
     };
     state.add_servant(&record).expect("written");
     assert_eq!(state.servants().expect("readable"), [record]);
-    state.remove_servant("a-1").expect("written");
+    state.remove_servant("a-1");
     assert!(state.servants().expect("readable").is_empty());
 }
 
@@ -161,9 +161,7 @@ fn the_newest_events_come_oldest_first() {
             service: Some("a"),
             ..NewEvent::default()
         };
-        state
-            .add_event(Level::Info, "test", &format!("number {number}"), &about)
-            .expect("written");
+        state.add_event(Level::Info, "test", &format!("number {number}"), &about);
     }
     let texts = |since, limit| -> Vec<String> {
         state
@@ -188,4 +186,65 @@ fn a_later_versions_database_is_left_alone() {
         .expect("written");
     let refused = State::open(&path).err().expect("too new").to_string();
     assert!(refused.contains("version 99"), "{refused}");
+}
+
+#[tokio::test]
+async fn what_is_told_while_another_has_the_database_is_kept_and_written_later() {
+    let (directory, state) = state();
+    let state = std::sync::Arc::new(state);
+    let tell = |message: &str| {
+        state.add_event(Level::Info, "test", message, &NewEvent::default());
+    };
+    tell("before");
+    let path = directory.path().join("cloudroid.db");
+    let other = Connection::open(&path).expect("a database");
+    other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
+    tell("during");
+    let messages = |state: &State| -> Vec<String> {
+        let events = state.events(0, 100).expect("readable");
+        events.into_iter().map(|event| event.message).collect()
+    };
+    assert_eq!(messages(&state), ["before", "during"], "told all the same");
+    let watching = tokio::spawn(watch(std::sync::Arc::clone(&state)));
+    while state.unwritable().is_none() {
+        tokio::task::yield_now().await;
+    }
+    state.remove_servant("a-1");
+    tell("later");
+    other.execute_batch("COMMIT").expect("unlocked");
+    while state.unwritable().is_some() {
+        tokio::task::yield_now().await;
+    }
+    let told = messages(&state);
+    watching.abort();
+    let _ = watching.await;
+    drop(state);
+    let again = State::open(&path).expect("the same database");
+    assert_eq!(messages(&again), told, "in the database now");
+    let kinds: Vec<String> = again
+        .events(0, 100)
+        .expect("readable")
+        .into_iter()
+        .map(|event| event.kind)
+        .collect();
+    assert_eq!(
+        kinds,
+        ["test", "test", "state-unwritable", "test", "state-writable"]
+    );
+    assert!(
+        told[2].contains("another program has locked it"),
+        "{told:?}"
+    );
+}
+
+#[test]
+fn a_known_robot_comes_in_while_nothing_can_be_written() {
+    let (directory, state) = state();
+    state.robot_owner("r1", None, false).expect("written");
+    let other = Connection::open(directory.path().join("cloudroid.db")).expect("a database");
+    other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
+    assert_eq!(state.robot_owner("r1", None, false).expect("known"), None);
+    let refused = state.robot_owner("r2", None, false).expect_err("new");
+    assert!(refused.to_string().contains("locked"), "{refused}");
+    assert!(state.unwritable().is_some());
 }

@@ -17,7 +17,7 @@ const UNIT: &str = "cloudroid-servants.service";
 /// Controllers that limits or the end of a servant need.
 const WANTED_V1: [&str; 3] = ["cpu", "memory", "pids"];
 /// Used only for servants whose limits ask for it.
-const IF_ASKED_V1: &str = "blkio";
+const IF_ASKED_V1: [&str; 2] = ["blkio", "cpuset"];
 /// Needed besides where no v2 hierarchy, which can do both, is mounted beside v1. Every hierarchy costs each start a
 /// grace period of the kernel (its `cgroup.procs` is written).
 const WITHOUT_V2: [&str; 2] = ["cpuacct", "freezer"];
@@ -102,7 +102,7 @@ impl Parent {
             let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has(name));
             hierarchy.unified
                 || has_any(&WANTED_V1)
-                || has_any(&[IF_ASKED_V1])
+                || has_any(&IF_ASKED_V1)
                 || lacks_v2 && has_any(&WITHOUT_V2)
         };
         let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
@@ -166,13 +166,6 @@ impl Parent {
             hierarchies: vec![below],
             reason,
         })
-    }
-}
-
-impl Below {
-    /// Whether a servant without a limit of input and output is better off without this hierarchy.
-    pub(super) fn only_if_asked(&self) -> bool {
-        !self.unified && self.controllers.iter().all(|name| name == IF_ASKED_V1)
     }
 }
 

@@ -1,6 +1,8 @@
 //! Control files of cgroup v1 (kernel documentation, admin-guide/cgroup-v1).
 
 use std::fs;
+use std::io;
+use std::path::Path;
 
 use super::files::{read_field, read_number};
 use super::{Cgroup, cores};
@@ -78,6 +80,30 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
         io_write: io(WRITE),
         cpuset,
     }
+}
+
+/// A cpuset takes no process before it has cores and memory nodes: each that has none is given those of the one above.
+pub(super) fn hand_down_cores(directory: &Path) -> io::Result<()> {
+    let above = directory.parent().filter(|above| is_empty(above));
+    if let Some(above) = above {
+        hand_down_cores(above)?;
+    }
+    for name in ["cpuset.cpus", "cpuset.mems"] {
+        let file = directory.join(name);
+        if fs::read_to_string(&file)?.trim().is_empty()
+            && let Some(above) = directory.parent()
+        {
+            fs::write(&file, fs::read_to_string(above.join(name))?)?;
+        }
+    }
+    Ok(())
+}
+
+/// Whether a cpuset has no cores yet; what is no cpuset is none of ours.
+fn is_empty(directory: &Path) -> bool {
+    ["cpuset.cpus", "cpuset.mems"].iter().any(|name| {
+        fs::read_to_string(directory.join(name)).is_ok_and(|text| text.trim().is_empty())
+    })
 }
 
 /// Processor time and memory.

@@ -308,15 +308,10 @@ impl Driver {
                 self.clients.tell(&FromShim::Enforced {
                     enforced: enforced.clone(),
                 });
-                Some(
-                    match cgroup::missing(&limits, &enforced.limits).as_slice() {
-                        [] => Ok(()),
-                        missing => Err(format!(
-                            "the kernel did not take the new {}",
-                            missing.join(", ")
-                        )),
-                    },
-                )
+                Some(match cgroup::unmet(&limits, &enforced).as_slice() {
+                    [] => Ok(()),
+                    unmet => Err(format!("cannot be set: {}", unmet.join(", "))),
+                })
             }
         }
     }

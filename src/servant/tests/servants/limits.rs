@@ -151,6 +151,60 @@ async fn input_and_output_are_limited_where_the_host_can() {
 }
 
 #[tokio::test]
+async fn nodes_stay_on_the_cores_they_were_given() {
+    let world = World::new();
+    let can = world.engine.cgroups().controllers();
+    let can = can.iter().any(|name| name == "cpuset");
+    let mut spec = spec(vec![node("/a", &["sleep"])]);
+    // The last of those that this very process may use.
+    let own = std::fs::read_to_string("/proc/self/status").unwrap();
+    let own = own
+        .lines()
+        .find_map(|line| line.strip_prefix("Cpus_allowed_list:"))
+        .unwrap();
+    let core: usize = own
+        .trim()
+        .rsplit([',', '-'])
+        .next()
+        .unwrap()
+        .parse()
+        .unwrap();
+    let mut cores = [0; 4];
+    cores[core / 64] |= 1 << (core % 64);
+    spec.limits.cpuset = Some(cores);
+    let servant = world.start(spec).await;
+    assert_eq!(servant.enforced().limits.cpuset, can.then_some(cores));
+    if can {
+        let pid = processes(&*servant, 1).await[0];
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        assert!(
+            status.contains(&format!("Cpus_allowed_list:\t{core}\n")),
+            "{status}"
+        );
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn what_version_1_cannot_limit_is_refused_by_name() {
+    let world = World::new();
+    let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    if servant.enforced().cgroup_version == 1 {
+        let high = Limits {
+            memory_high: Some(64 << 20),
+            ..Limits::default()
+        };
+        let refused = servant.set_limits(high).await.unwrap_err().to_string();
+        assert!(
+            refused.contains("memory_high (cgroup v1 has no memory.high"),
+            "{refused}"
+        );
+        assert_eq!(servant.enforced().unmet(&high).len(), 1);
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
 async fn where_isolation_is_required_a_limit_that_does_not_hold_is_refused() {
     let world = World::with(|config| config.isolation = Isolation::Require);
     let mut spec = spec(vec![]);

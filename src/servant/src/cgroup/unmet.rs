@@ -1,0 +1,109 @@
+//! Limits that were asked for and are not in force, and why.
+
+use crate::engine::Enforced;
+use crate::spec::Limits;
+
+/// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
+/// thousandth of one.
+pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
+    let mut missing = Vec::new();
+    let close = |asked: Option<f64>, got: Option<f64>, tolerance: f64| match (asked, got) {
+        (Some(asked), Some(got)) => (asked - got).abs() <= tolerance,
+        (Some(_), None) => false,
+        (None, _) => true,
+    };
+    let number = |value: Option<u64>| value.map(|value| value as f64);
+    if !close(asked.cpus, enforced.cpus, 0.001) {
+        missing.push("cpus");
+    }
+    if !close(number(asked.cpu_weight), number(enforced.cpu_weight), 1.0) {
+        missing.push("cpu_weight");
+    }
+    if !close(number(asked.memory), number(enforced.memory), 65536.0) {
+        missing.push("memory");
+    }
+    // Memory that is to be given back, like memory, comes in pages.
+    let high = (number(asked.memory_high), number(enforced.memory_high));
+    if !close(high.0, high.1, 65536.0) {
+        missing.push("memory_high");
+    }
+    if !close(number(asked.pids), number(enforced.pids), 0.0) {
+        missing.push("pids");
+    }
+    if !close(number(asked.io_read), number(enforced.io_read), 0.0) {
+        missing.push("io_read");
+    }
+    if !close(number(asked.io_write), number(enforced.io_write), 0.0) {
+        missing.push("io_write");
+    }
+    if asked.cpuset.is_some() && asked.cpuset != enforced.cpuset {
+        missing.push("cpuset");
+    }
+    missing
+}
+
+/// The same in words, each with the reason.
+pub fn unmet(asked: &Limits, enforced: &Enforced) -> Vec<String> {
+    let why = |name| match (enforced.cgroup_version, name) {
+        (0, _) => "no cgroup controller can be used here",
+        (1, "memory_high") => {
+            "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes slows nobody down"
+        }
+        (1, "cpuset") => {
+            "the cpuset controller must be mounted, and cgroup v1 takes cores only of a servant that was given some at \
+             its start"
+        }
+        (1, "io_read" | "io_write") => {
+            "cgroup v1 takes it only of a servant that was given one at its start and whose layers lie on a disk"
+        }
+        (_, "io_read" | "io_write") => "its layers lie on no disk that can be limited",
+        _ => "the kernel did not take it",
+    };
+    missing(asked, &enforced.limits)
+        .into_iter()
+        .map(|name| format!("{name} ({})", why(name)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_that_is_not_in_force_is_named() {
+        let asked = Limits {
+            cpus: Some(1.5),
+            memory: Some(100_000_000),
+            pids: Some(10),
+            ..Limits::default()
+        };
+        let got = Limits {
+            memory: Some(99_999_744),
+            pids: None,
+            ..asked
+        };
+        assert_eq!(missing(&asked, &got), ["pids"]);
+        assert_eq!(missing(&Limits::default(), &got), [""; 0]);
+    }
+
+    #[test]
+    fn what_cgroup_v1_does_not_have_is_said() {
+        let asked = Limits {
+            memory_high: Some(1 << 26),
+            ..Limits::default()
+        };
+        let enforced = |cgroup_version| Enforced {
+            cgroup_version,
+            ..Enforced::default()
+        };
+        let on_v1 = unmet(&asked, &enforced(1));
+        assert!(
+            on_v1[0].starts_with("memory_high (cgroup v1 has no memory.high"),
+            "{on_v1:?}"
+        );
+        assert_eq!(
+            unmet(&asked, &enforced(2)),
+            ["memory_high (the kernel did not take it)"]
+        );
+    }
+}
