@@ -127,3 +127,7 @@ deb: build ## make a Debian package below target/debian
 .PHONY: install
 install: build ## install binaries, units and the example configuration below PREFIX
 	@scripts/install "$(CARGO_TARGET_DIR)/release" "$(DESTDIR)" "$(PREFIX)"
+
+.PHONY: uninstall
+uninstall: ## end every servant and remove what `make install` put below PREFIX; state and configuration stay
+	@scripts/uninstall "$(PREFIX)"

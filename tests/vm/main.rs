@@ -5,7 +5,7 @@
 //!   boot 1   install the package ─▶ stories ─▶ first cut's beginning ─▶ power off
 //!   boot 2   what is left of the first cut ─▶ second cut's beginning ─▶ power off
 //!   …
-//!   last     what is left of the last cut ─▶ remove the package
+//!   last     what is left of the last cut ─▶ remove the package ─▶ make install ─▶ make uninstall
 //! ```
 
 use std::process::ExitCode;
@@ -13,6 +13,8 @@ use std::time::Instant;
 
 use support::Told;
 
+#[path = "stories/confinement.rs"]
+mod confinement;
 #[path = "stories/cuts.rs"]
 mod cuts;
 #[path = "stories/installation.rs"]
@@ -65,6 +67,12 @@ fn main() -> ExitCode {
             who_takes_too_much_memory_is_told_so,
             a_fork_bomb_ends_when_its_servant_does,
         ],
+        stories![confinement:
+            no_attempt_to_break_out_succeeds,
+            nothing_of_the_host_is_reached,
+            neighbours_are_not_reached,
+            a_service_is_given_what_its_operator_allows,
+        ],
         stories![restarts:
             a_killed_daemon_is_started_again_and_finds_its_servants,
             a_restart_loses_nothing,
@@ -104,10 +112,14 @@ fn main() -> ExitCode {
             Err(error) => told(cut.name, move || Err(error)),
         }
     }
-    if chosen("installation::removal_leaves_the_state_alone") {
+    const REMOVAL: &str = "installation::removal_leaves_the_state_alone";
+    const BY_MAKE: &str = "installation::what_make_install_puts_there_runs_and_goes_again";
+    // The second takes over what the first leaves.
+    if chosen(REMOVAL) || chosen(BY_MAKE) {
+        told(REMOVAL, installation::removes);
         told(
-            "installation::removal_leaves_the_state_alone",
-            installation::removes,
+            BY_MAKE,
+            installation::installs_and_removes_without_a_package,
         );
     }
     machine::verdict()

@@ -39,7 +39,7 @@ fn all_is_well() -> Told {
         .filter_map(|service| service["name"].as_str())
         .collect();
     ensure!(
-        names == ["adder_py", "burglar_cpp", "greeter_cpp", "small"],
+        names == ["adder_py", "burglar_cpp", "granted", "greeter_cpp", "small"],
         "{names:?}"
     );
     let mut robot = daemon.robot("greeter_cpp?robot=after")?;

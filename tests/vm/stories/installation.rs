@@ -4,8 +4,10 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use serde_json::json;
+use support::robot::Robot;
 use support::{Told, leftovers, procfs};
 
+use crate::confinement;
 use crate::machine::{HOME, SERVANTS, daemon, main_pid, property, types};
 
 /// A clean machine, a package, a running service that has everything it needs.
@@ -21,7 +23,12 @@ pub fn installs() -> Told {
     let configuration = "/etc/cloudroid/cloudroid.toml";
     let text = std::fs::read_to_string(configuration)?;
     ensure!(text.contains("#: spares = 8"), "{text}");
-    std::fs::write(configuration, text.replace("#: spares = 8", "spares = 0"))?;
+    let text = text.replace("#: spares = 8", "spares = 0");
+    let text = text.replace(
+        "[allow]\n",
+        &format!("[allow]\n{}\n", confinement::allowed()),
+    );
+    std::fs::write(configuration, text)?;
     types("systemctl", &["restart", "cloudroid"])?;
     ensure!(property("cloudroid.service", "Type")? == "notify");
     ensure!(property("cloudroid.service", "WatchdogUSec")? != "0");
@@ -47,14 +54,60 @@ pub fn removes() -> Told {
         .robot("greeter_cpp?robot=last")?
         .calls("/greeter/count", json!({}))?;
     let id = daemon.servant_of("greeter_cpp", "last")?["id"].clone();
+    // As a build would leave them, for the story after this one.
+    types(
+        "sh",
+        &[
+            "-c",
+            &format!("mkdir {BUILT} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT}"),
+        ],
+    )?;
     let log = types("dpkg", &["--purge", "cloudroid"])?;
-    ensure!(!Path::new(SERVANTS).exists(), "its cgroup is there: {log}");
+    nothing_but_the_state_is_left(id.as_str().context("an id")?).context(log)
+}
+
+/// Programs as a build leaves them.
+const BUILT: &str = "/var/built";
+
+/// What `make install` runs once it has built, and `make uninstall`.
+pub fn installs_and_removes_without_a_package() -> Told {
+    let script = |name: &str| format!("/stage/source/scripts/{name}");
+    let said = types(&script("install"), &[BUILT, "", "/usr/local"])?;
+    ensure!(said.contains("installed and running"), "{said}");
+    ensure!(property("cloudroid.service", "ActiveState")? == "active");
+    ensure!(
+        property("cloudroid.service", "FragmentPath")?.starts_with("/usr/local/"),
+        "another unit runs"
+    );
+    // The programs are elsewhere now, and so is what the stories call.
+    let asks = |arguments: &[&str]| -> anyhow::Result<serde_json::Value> {
+        let begin = ["--home", HOME, "--format", "json"];
+        let told = types(
+            "/usr/local/bin/cloudroidctl",
+            &[&begin[..], arguments].concat(),
+        )?;
+        Ok(serde_json::from_str(&told)?)
+    };
+    let status = asks(&["status", "--wait"])?;
+    ensure!(status["pid"] == main_pid()?, "{status:#}");
+    let address = status["listen"].as_str().context("an address")?;
+    let mut robot = Robot::connect(&format!("ws://{address}/greeter_cpp?robot=made"))?;
+    ensure!(robot.calls("/greeter/count", json!({}))?["result"] == true);
+    let servants = asks(&["servants"])?;
+    let id = servants[0]["id"].as_str().context("an id")?.to_owned();
+    let said = types(&script("uninstall"), &["/usr/local"])?;
+    types("rm", &["-r", BUILT, "/etc/cloudroid"])?;
+    nothing_but_the_state_is_left(&id).context(said)
+}
+
+fn nothing_but_the_state_is_left(id: &str) -> Told {
+    ensure!(!Path::new(SERVANTS).exists(), "its cgroup is there");
     for pid in procfs::pids() {
         let command = procfs::command_line(pid).unwrap_or_default();
         ensure!(!command.contains("cloudroid"), "{pid}: {command}");
     }
     ensure!(
-        leftovers::cgroups(&[id.as_str().context("an id")?.to_owned()]).is_empty(),
+        leftovers::cgroups(&[id.to_owned()]).is_empty(),
         "cgroups of servants are left"
     );
     let found = types(
@@ -73,7 +126,10 @@ pub fn removes() -> Told {
     let left: Vec<&str> = found
         .lines()
         .filter(|path| {
-            *path != HOME && !path.starts_with("/var/lib/dpkg/") && !path.starts_with("/var/log/")
+            *path != HOME
+                && !path.starts_with("/var/lib/dpkg/")
+                && !path.starts_with("/var/log/")
+                && !path.starts_with(BUILT)
         })
         .collect();
     ensure!(left.is_empty(), "{left:#?}");
