@@ -81,10 +81,9 @@ pub fn installs_and_removes_without_a_package() -> Told {
     );
     // The programs are elsewhere now, and so is what the stories call.
     let asks = |arguments: &[&str]| -> anyhow::Result<serde_json::Value> {
-        let begin = ["--home", HOME, "--format", "json"];
         let told = types(
             "/usr/local/bin/cloudroidctl",
-            &[&begin[..], arguments].concat(),
+            &[&["--format", "json"], arguments].concat(),
         )?;
         Ok(serde_json::from_str(&told)?)
     };

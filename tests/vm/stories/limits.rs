@@ -134,13 +134,16 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Told {
     let mut promised = daemon.robot("burglar_cpp?robot=burner")?;
     let id = id(&daemon, "burglar_cpp", "burner")?;
     set(&daemon, &id, &["--cpus", "1", "--cpu-weight", "100"])?;
+    // The best of some, each time: whatever else the machine below this one does only adds.
     let mut work = || -> anyhow::Result<f64> {
-        Ok(tries(&mut promised, "work", "20000000")?
-            .report
-            .parse::<f64>()?
-            / 1e6)
+        let mut best = f64::INFINITY;
+        for _ in 0..4 {
+            let took = tries(&mut promised, "work", "20000000")?.report;
+            best = best.min(took.parse::<f64>()? / 1e6);
+        }
+        Ok(best)
     };
-    let alone = work()?.min(work()?);
+    let alone = work()?;
     let mut neighbours = Vec::new();
     for number in 0..4 {
         let mut neighbour = daemon.robot(&format!("burglar_cpp?robot=greedy{number}"))?;
