@@ -12,6 +12,8 @@ mod answer;
 mod burglary;
 #[path = "stories/clients.rs"]
 mod clients;
+#[path = "stories/failover.rs"]
+mod failover;
 #[path = "stories/grants.rs"]
 mod grants;
 #[path = "stories/house.rs"]
@@ -65,6 +67,9 @@ fn main() -> ExitCode {
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
             neighbours_are_not_reached,
+        ],
+        stories![failover:
+            a_slow_network_costs_few_requests,
         ],
         stories![grants:
             a_service_is_given_what_its_operator_allows,

@@ -4,6 +4,7 @@
 pub mod binaries;
 pub mod burglar;
 pub mod burglary;
+pub mod cable;
 pub mod daemon;
 pub mod deployer;
 pub mod grants;
@@ -11,6 +12,7 @@ pub mod leftovers;
 pub mod machine;
 pub mod procfs;
 pub mod robot;
+pub mod shaper;
 pub mod site;
 pub mod world;
 

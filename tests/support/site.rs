@@ -193,6 +193,18 @@ impl Site {
         executable: &str,
         argv: &[&str],
     ) -> anyhow::Result<Running> {
+        self.stub_among(&[], toml, package, executable, argv)
+    }
+
+    /// The same, with these variables in its environment.
+    pub fn stub_among(
+        &self,
+        environment: &[(&str, &str)],
+        toml: &str,
+        package: &str,
+        executable: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
         let overlay = tempfile::Builder::new()
             .prefix("stub")
             .tempdir_in(self.place.path())?
@@ -205,7 +217,8 @@ impl Site {
             .args(["run", "--package", package, "--node", executable, "--share"])
             .arg(&share)
             .arg("--")
-            .args(argv);
+            .args(argv)
+            .envs(environment.iter().copied());
         self.start(command, &overlay.join("log"))
     }
 
@@ -255,6 +268,40 @@ impl Site {
         program: &str,
         argv: &[&str],
     ) -> anyhow::Result<Running> {
+        let script = self.in_image(daemon, service)?;
+        let mut command = Command::new("unshare");
+        command
+            .args(["--mount", "sh", "-c", &script, "sh", program])
+            .args(argv);
+        command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
+        self.start(command, &self.place.path().join("original.log"))
+    }
+
+    /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, whose
+    /// program becomes the original in the image's root file system.
+    pub fn installs(
+        &self,
+        daemon: &Daemon,
+        service: &str,
+        (package, executable): (&str, &str),
+        program: &str,
+    ) -> anyhow::Result<PathBuf> {
+        let prefix = self.place.path().join("installed").join(package);
+        let launcher = prefix.join("lib").join(package).join(executable);
+        std::fs::create_dir_all(launcher.parent().context("a directory")?)?;
+        std::fs::write(prefix.join(".catkin"), "")?;
+        let script = self.in_image(daemon, service)?;
+        let text = format!(
+            "#!/bin/sh\nexport HOME=/root\nexec unshare --mount sh -c '{script}' sh {program} \"$@\"\n"
+        );
+        std::fs::write(&launcher, text)?;
+        let executable = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+        std::fs::set_permissions(&launcher, executable)?;
+        Ok(prefix)
+    }
+
+    /// A shell's commands that execute their arguments in a service's root file system.
+    fn in_image(&self, daemon: &Daemon, service: &str) -> anyhow::Result<String> {
         let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
         let config = manifest["config"]["digest"].as_str().context("a config")?;
         let config = daemon.get_json(&format!("/v2/{service}/blobs/{config}"))?;
@@ -269,17 +316,11 @@ impl Site {
             .iter()
             .map(|layer| layer.display().to_string())
             .collect();
-        let script = format!(
+        Ok(format!(
             "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
             lowers.join(":"),
             root = root.display(),
-        );
-        let mut command = Command::new("unshare");
-        command
-            .args(["--mount", "sh", "-c", &script, "sh", program])
-            .args(argv);
-        command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
-        self.start(command, &self.place.path().join("original.log"))
+        ))
     }
 
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {

@@ -9,10 +9,12 @@
 //! Registrations outlive a lost link: the robot's other nodes see one node that lives on.
 
 mod calls;
+pub mod diagnostics;
 mod inputs;
 mod outputs;
 mod parameters;
 pub mod promise;
+mod reports;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock};
@@ -105,11 +107,19 @@ impl Mirror {
 impl Handler for Mirror {
     fn record(&self, record: Record, arrived: i64) {
         match record {
-            Record::Data(data) => self.outputs.take(self.keeper(), data, arrived),
-            Record::Answer { id, response } => self.calls.answered(self.keeper(), id, response),
+            Record::Data(data) => self.outputs.take(self, data, arrived),
+            Record::Answer {
+                id,
+                taken,
+                given,
+                response,
+            } => {
+                let way = (taken, given, arrived);
+                self.calls.answered(self, id, way, response);
+            }
             Record::Call { id, .. } => {
                 let reason = "the robot serves nothing to its own node".to_owned();
-                self.session().answer(id, Err(reason));
+                self.session().answer(id, arrived, Err(reason));
             }
             Record::Control(json) => match serde_json::from_slice(&json) {
                 Ok(Control::Line { error: true, text }) => eprintln!("{text}"),

@@ -30,6 +30,7 @@ use ws::WebSocket;
 use crate::config::{self, Config, Local};
 use crate::connect;
 use crate::local::{Program, Setting};
+use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::resolver::RobotSockets;
@@ -83,15 +84,20 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
 async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> anyhow::Result<End> {
     let mut stopping = stopping()?;
     let bus = tokio::select! {
-        bus = join(robot) => bus?,
+        bus = join(robot, &robot.node) => bus?,
         () = stopped(&mut stopping) => return Ok(End::Asked),
     };
     let config = with_parameters(config, &*bus, &robot.node).await?;
     let mut shutdown = bus.shutdown_requested();
     let session = Arc::new(Session::new(session_options(&config)));
     let mirror = Mirror::start(bus.clone(), session);
+    let mut watcher: Option<Arc<dyn Bus>> = None;
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
-        mirror.promise(sla, local_original(asked, robot)).await?;
+        let bus: Arc<dyn Bus> = join(robot, &format!("{}_cloudroid", robot.node)).await?;
+        let diagnostics = Diagnostics::new(&bus, &robot.node, &config.robot()).await?;
+        watcher = Some(bus);
+        let original = local_original(asked, robot);
+        mirror.promise(sla, original, diagnostics).await?;
     }
     let parameters = mirror.parameters().await;
     let mut hello = Hello {
@@ -130,6 +136,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     // In good order: the cloud ends what is left of the node at once.
     mirror.session().end(1000, "the robot's node ended");
     bus.close().await;
+    if let Some(watcher) = watcher {
+        watcher.close().await;
+    }
     let mut up = mirror.session().up();
     let _ = timeout(Duration::from_millis(500), up.wait_for(|up| !up)).await;
     Ok(end)
@@ -147,15 +156,15 @@ fn node_end(exit: &Result<watch::Ref<'_, Option<Exit>>, watch::error::RecvError>
     }
 }
 
-/// Joins the robot's ROS; waits for its Master as every node does.
-async fn join(robot: &Robot) -> anyhow::Result<Arc<Ros1Bus>> {
+/// Joins the robot's ROS as a node of this name; waits for its Master as every node does.
+async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<Ros1Bus>> {
     let mut told = false;
     loop {
         let joined = async {
             let master = RobotSockets
                 .resolve(&robot.master_host, robot.master_port)
                 .await?;
-            let mut options = Ros1Options::new(master, &robot.node);
+            let mut options = Ros1Options::new(master, node);
             options.host = robot.host.clone();
             anyhow::Ok(Ros1Bus::connect_with(Arc::new(RobotSockets), options).await?)
         };

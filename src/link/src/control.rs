@@ -271,6 +271,8 @@ pub struct Served {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Request {
+    /// Counts the robot's requests; told again, it is the same one.
+    pub id: u64,
     /// The input, service or action.
     pub name: String,
     /// From asked to answered; none when the cloud did not answer.

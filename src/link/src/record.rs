@@ -3,9 +3,9 @@
 //! | first byte | then |
 //! |---|---|
 //! | 0 control | JSON, a [`Control`](crate::control::Control) |
-//! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · [answered: born i64 · taken i64 · given i64] · message |
+//! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · [answered: born i64 · serialise u32 · left i64 · taken i64 · given i64] · message |
 //! | 2 call | id u32 · service u32 · request |
-//! | 3 answer | id u32 · ok u8 · response, or why not |
+//! | 3 answer | id u32 · ok u8 · taken i64 · given i64 · response, or why not |
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 
@@ -42,6 +42,10 @@ pub enum Record {
     Answer {
         /// The call's.
         id: u32,
+        /// When the call had arrived, on the answering end's clock.
+        taken: i64,
+        /// When the answer was there, on the same clock.
+        given: i64,
         /// The serialized response, or why there is none.
         response: Result<Bytes, String>,
     },
@@ -73,6 +77,10 @@ pub struct Data {
 pub struct Answered {
     /// The input's own `born`, on the robot's clock: which one it was.
     pub born: i64,
+    /// Microseconds that the robot spent encoding it.
+    pub serialise: u32,
+    /// When its first byte was given to the socket, on the robot's clock.
+    pub left: i64,
     /// When it had arrived as a whole, on the cloud's clock.
     pub taken: i64,
     /// When it was given to the node, on the cloud's clock.
@@ -100,6 +108,8 @@ impl Record {
                 head.put_u32_le(data.serialise);
                 if let Some(answered) = &data.answered {
                     head.put_i64_le(answered.born);
+                    head.put_u32_le(answered.serialise);
+                    head.put_i64_le(answered.left);
                     head.put_i64_le(answered.taken);
                     head.put_i64_le(answered.given);
                 }
@@ -115,10 +125,17 @@ impl Record {
                 head.put_u32_le(*service);
                 request.clone()
             }
-            Record::Answer { id, response } => {
+            Record::Answer {
+                id,
+                taken,
+                given,
+                response,
+            } => {
                 head.put_u8(ANSWER);
                 head.put_u32_le(*id);
                 head.put_u8(u8::from(response.is_ok()));
+                head.put_i64_le(*taken);
+                head.put_i64_le(*given);
                 match response {
                     Ok(response) => response.clone(),
                     Err(reason) => Bytes::copy_from_slice(reason.as_bytes()),
@@ -137,10 +154,10 @@ impl Record {
         let flags = bytes.get(5).copied().unwrap_or_default();
         let head = match kind {
             CONTROL => 1,
-            DATA if flags & ANSWERED != 0 => 50,
+            DATA if flags & ANSWERED != 0 => 62,
             DATA => 26,
             CALL => 9,
-            ANSWER => 6,
+            ANSWER => 22,
             _ => return Err(Error::Protocol("a record of unknown kind")),
         };
         if bytes.len() < head {
@@ -161,6 +178,8 @@ impl Record {
                     serialise: bytes.get_u32_le(),
                     answered: (flags & ANSWERED != 0).then(|| Answered {
                         born: bytes.get_i64_le(),
+                        serialise: bytes.get_u32_le(),
+                        left: bytes.get_i64_le(),
                         taken: bytes.get_i64_le(),
                         given: bytes.get_i64_le(),
                     }),
@@ -177,6 +196,8 @@ impl Record {
                 let ok = bytes.get_u8() != 0;
                 Record::Answer {
                     id,
+                    taken: bytes.get_i64_le(),
+                    given: bytes.get_i64_le(),
                     response: if ok {
                         Ok(bytes)
                     } else {
@@ -209,6 +230,8 @@ mod tests {
             latching: true,
             answered: Some(Answered {
                 born: 1,
+                serialise: 4,
+                left: 5,
                 taken: 2,
                 given: 3,
             }),
@@ -225,10 +248,14 @@ mod tests {
             },
             Record::Answer {
                 id: 1,
+                taken: 2,
+                given: 3,
                 response: Ok(Bytes::from_static(b"x")),
             },
             Record::Answer {
                 id: 1,
+                taken: 2,
+                given: 3,
                 response: Err("no".into()),
             },
         ] {

@@ -174,9 +174,15 @@ impl Session {
         id
     }
 
-    /// Answers a call.
-    pub fn answer(&self, id: u32, response: Result<Bytes, String>) {
-        self.push(&Record::Answer { id, response }, Quality::Each);
+    /// Answers a call that had arrived at `taken` (nanoseconds since 1970).
+    pub fn answer(&self, id: u32, taken: i64, response: Result<Bytes, String>) {
+        let answer = Record::Answer {
+            id,
+            taken,
+            given: now(),
+            response,
+        };
+        self.push(&answer, Quality::Each);
     }
 
     fn push(&self, record: &Record, quality: Quality) {

@@ -1,6 +1,6 @@
 //! For each request: who was asked, who answered first, what is a late duplicate.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -25,6 +25,9 @@ impl Default for Limits {
         }
     }
 }
+
+/// Inputs kept beyond their T_max, for a local original that has time for them.
+const STRAGGLERS: usize = 8;
 
 /// What to do with an answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,6 +60,8 @@ pub struct Arbiter<P> {
     requests: BTreeMap<RequestId, Record<P>>,
     /// One for each request that still awaits its T_max or its end.
     timers: BTreeSet<(Instant, RequestId)>,
+    /// Inputs that nobody answered by T_max, the oldest first.
+    stragglers: VecDeque<RequestId>,
 }
 
 #[derive(Debug)]
@@ -75,7 +80,13 @@ pub(crate) struct Record<P> {
     /// T_max has passed.
     pub(crate) overdue: bool,
     /// The cloud's time has counted, or that it had none.
-    judged: bool,
+    pub(crate) judged: bool,
+    /// When the local original was asked.
+    pub(crate) local_asked: Option<Instant>,
+    /// The cloud's time, once it has answered.
+    pub(crate) cloud_time: Option<Duration>,
+    /// The time of the first answer.
+    pub(crate) answer_time: Option<Duration>,
 }
 
 impl<P> Record<P> {
@@ -114,6 +125,7 @@ impl<P: Clone> Arbiter<P> {
             next: 0,
             requests: BTreeMap::new(),
             timers: BTreeSet::new(),
+            stragglers: VecDeque::new(),
         }
     }
 
@@ -152,6 +164,9 @@ impl<P: Clone> Arbiter<P> {
             failed: false,
             overdue: false,
             judged: false,
+            local_asked: None,
+            cloud_time: None,
+            answer_time: None,
         };
         // At T_max it is still in time.
         let passed = record.deadline + Duration::from_nanos(1);
@@ -161,31 +176,46 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// Marks `side` as asked and gives what to ask, unless it was asked already or the request needs nobody.
-    pub fn ask(&mut self, id: RequestId, side: Side) -> Option<P> {
+    pub fn ask(&mut self, now: Instant, id: RequestId, side: Side) -> Option<P> {
         let record = self.requests.get_mut(&id)?;
         if !record.is_open() || !matches!(record.leg(side), Leg::NotAsked) {
             return None;
         }
         let payload = record.payload.clone()?;
         *record.leg(side) = Leg::Asked;
+        if side == Side::Local {
+            record.local_asked = Some(now);
+        }
         Some(payload)
     }
 
     /// `side` gave the result of a call, or the answering output of an input.
-    pub fn answer(&mut self, id: RequestId, side: Side) -> Verdict {
-        self.answer_with(id, side, 0)
+    pub fn answer(&mut self, now: Instant, id: RequestId, side: Side) -> Verdict {
+        let verdict = self.answer_with(now, id, side, 0);
+        self.close_call(id);
+        verdict
     }
 
     /// `side` gave output number `output`. The side that is first with it keeps it: a node that answers one input
-    /// with several messages on a topic is passed as it is.
-    pub(crate) fn answer_with(&mut self, id: RequestId, side: Side, output: usize) -> Verdict {
+    /// with several messages on a topic is passed as it is. A call is remembered until it is closed.
+    pub(crate) fn answer_with(
+        &mut self,
+        now: Instant,
+        id: RequestId,
+        side: Side,
+        output: usize,
+    ) -> Verdict {
         // The pair may have got further outputs since the request was made.
         let known = |record: &&mut Record<P>| output < record.owners.len();
         let Some(record) = self.requests.get_mut(&id).filter(known) else {
             return Verdict::Drop;
         };
+        let took = now.saturating_duration_since(record.asked_at);
         if output == 0 {
             *record.leg(side) = Leg::Answered;
+            if side == Side::Cloud {
+                record.cloud_time.get_or_insert(took);
+            }
         }
         let call = record.is_call();
         let failed = record.failed;
@@ -201,8 +231,8 @@ impl<P: Clone> Arbiter<P> {
         }
         if record.answered().is_some() {
             record.payload = None;
+            record.answer_time.get_or_insert(took);
         }
-        self.close_call(id);
         verdict
     }
 
@@ -234,7 +264,7 @@ impl<P: Clone> Arbiter<P> {
 
     /// A call is over when everybody who was asked has spoken; inputs stay until their patience ends, because
     /// further outputs may come.
-    fn close_call(&mut self, id: RequestId) {
+    pub(crate) fn close_call(&mut self, id: RequestId) {
         let over =
             |record: &Record<P>| record.is_call() && !record.is_open() && record.awaits_nobody();
         if self.requests.get(&id).is_some_and(over) {
@@ -243,10 +273,11 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// Notes that the cloud's time counts now. True for the first time only.
-    pub(crate) fn judge(&mut self, id: RequestId) -> bool {
-        self.requests
-            .get_mut(&id)
-            .is_some_and(|record| !std::mem::replace(&mut record.judged, true))
+    pub(crate) fn judge(&mut self, id: RequestId, time: Option<Duration>) -> bool {
+        self.requests.get_mut(&id).is_some_and(|record| {
+            record.cloud_time = record.cloud_time.or(time);
+            !std::mem::replace(&mut record.judged, true)
+        })
     }
 
     pub(crate) fn get(&self, id: RequestId) -> Option<&Record<P>> {
@@ -274,6 +305,20 @@ impl<P: Clone> Arbiter<P> {
         turned
     }
 
+    /// The oldest input that nobody answered by T_max and that the local original was not asked for.
+    pub(crate) fn straggler(&mut self) -> Option<RequestId> {
+        while let Some(id) = self.stragglers.front().copied() {
+            let waits = |record: &Record<P>| {
+                record.is_open() && record.payload.is_some() && record.local == Leg::NotAsked
+            };
+            if self.requests.get(&id).is_some_and(waits) {
+                return Some(id);
+            }
+            self.stragglers.pop_front();
+        }
+        None
+    }
+
     /// When [`expire`](Self::expire) has something to say.
     pub fn deadline(&self) -> Option<Instant> {
         self.timers.first().map(|(at, _)| *at)
@@ -294,8 +339,8 @@ impl<P: Clone> Arbiter<P> {
             };
             if !record.overdue {
                 record.overdue = true;
-                if !record.is_call() {
-                    record.payload = None;
+                if !record.is_call() && record.payload.is_some() {
+                    self.stragglers.push_back(id);
                 }
                 overdue.push(id);
                 self.timers.insert((at + self.limits.patience, id));
@@ -305,6 +350,12 @@ impl<P: Clone> Arbiter<P> {
                 self.timers.insert((now + self.limits.patience, id));
             } else if let Some(record) = self.requests.remove(&id) {
                 forgotten.push((id, record));
+            }
+        }
+        while self.stragglers.len() > STRAGGLERS {
+            let oldest = self.stragglers.pop_front();
+            if let Some(record) = oldest.and_then(|id| self.requests.get_mut(&id)) {
+                record.payload = None;
             }
         }
         if self.is_crowded() {
@@ -338,24 +389,24 @@ mod tests {
     fn the_first_result_wins_and_the_second_is_dropped() {
         let (mut arbiter, name, now) = arbiter();
         let id = arbiter.call(now, MAX, &name, 7);
-        assert_eq!(arbiter.ask(id, Side::Cloud), Some(7));
-        assert_eq!(arbiter.ask(id, Side::Cloud), None, "asked once");
-        assert_eq!(arbiter.ask(id, Side::Local), Some(7));
-        assert_eq!(arbiter.answer(id, Side::Local), Verdict::Deliver);
-        assert_eq!(arbiter.answer(id, Side::Local), Verdict::Drop);
-        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+        assert_eq!(arbiter.ask(now, id, Side::Cloud), Some(7));
+        assert_eq!(arbiter.ask(now, id, Side::Cloud), None, "asked once");
+        assert_eq!(arbiter.ask(now, id, Side::Local), Some(7));
+        assert_eq!(arbiter.answer(now, id, Side::Local), Verdict::Deliver);
+        assert_eq!(arbiter.answer(now, id, Side::Local), Verdict::Drop);
+        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
         assert!(arbiter.get(id).is_none(), "both have spoken: it is over");
-        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
     }
 
     #[test]
     fn an_answer_after_the_failure_is_dropped() {
         let (mut arbiter, name, now) = arbiter();
         let id = arbiter.call(now, MAX, &name, 7);
-        arbiter.ask(id, Side::Cloud);
+        arbiter.ask(now, id, Side::Cloud);
         assert!(arbiter.fail(id));
         assert!(!arbiter.fail(id));
-        assert_eq!(arbiter.answer(id, Side::Cloud), Verdict::Drop);
+        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
         assert!(arbiter.requests.is_empty());
     }
 
@@ -368,13 +419,22 @@ mod tests {
             outputs: 2,
         };
         let id = arbiter.open(now, MAX, kind, 7);
-        arbiter.ask(id, Side::Cloud);
-        arbiter.ask(id, Side::Local);
-        assert_eq!(arbiter.answer_with(id, Side::Local, 1), Verdict::Deliver);
-        assert_eq!(arbiter.answer_with(id, Side::Cloud, 1), Verdict::Drop);
-        assert_eq!(arbiter.answer_with(id, Side::Cloud, 0), Verdict::Deliver);
-        assert_eq!(arbiter.answer_with(id, Side::Cloud, 0), Verdict::Deliver);
-        assert_eq!(arbiter.answer_with(id, Side::Local, 0), Verdict::Drop);
+        arbiter.ask(now, id, Side::Cloud);
+        arbiter.ask(now, id, Side::Local);
+        assert_eq!(
+            arbiter.answer_with(now, id, Side::Local, 1),
+            Verdict::Deliver
+        );
+        assert_eq!(arbiter.answer_with(now, id, Side::Cloud, 1), Verdict::Drop);
+        assert_eq!(
+            arbiter.answer_with(now, id, Side::Cloud, 0),
+            Verdict::Deliver
+        );
+        assert_eq!(
+            arbiter.answer_with(now, id, Side::Cloud, 0),
+            Verdict::Deliver
+        );
+        assert_eq!(arbiter.answer_with(now, id, Side::Local, 0), Verdict::Drop);
     }
 
     #[test]

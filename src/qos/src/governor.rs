@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use crate::arbiter::{Arbiter, Kind, Limits, Record, Verdict};
 use crate::decider::{Decider, Event, LocalState};
 use crate::measure::Meter;
+use crate::outcome::Outcome;
 use crate::pair::{Correlation, Pair};
 use crate::phases::{PhaseBook, Phases};
 use crate::report::{Counts, Report, TimedEvent};
@@ -18,6 +19,9 @@ use crate::sla::{Local, Measure, Mode, Sla};
 const EVENTS: usize = 32;
 /// So many stamped outputs of which none carries the stamp of an input show that the node does not copy it.
 const UNMATCHED: u32 = 8;
+
+/// Clocks of two machines are known that well; phases that add up to something else are of another request.
+const PHASES_APART: Duration = Duration::from_millis(20);
 
 /// Where a message goes to or came from.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -53,6 +57,8 @@ pub enum Effect<P> {
     },
     /// Publish the SLA's safe-stop message: nobody has answered in time.
     SafeStop,
+    /// The cloud's time of a request has counted, or more is known of one whose has.
+    Outcome(Outcome),
     /// A decision about the local original.
     Event(Event),
 }
@@ -73,6 +79,8 @@ pub struct Governor<P> {
     link: bool,
     counts: Counts,
     phases: PhaseBook,
+    /// How long the local original took for its last answer.
+    local_time: Option<Duration>,
     events: VecDeque<(Instant, Event)>,
     effects: VecDeque<Effect<P>>,
 }
@@ -117,6 +125,7 @@ impl<P: Clone> Governor<P> {
             link: false,
             counts: Counts::default(),
             phases: PhaseBook::default(),
+            local_time: None,
             events: VecDeque::new(),
             effects: VecDeque::new(),
             sla,
@@ -239,6 +248,9 @@ impl<P: Clone> Governor<P> {
         if side == Side::Cloud {
             let t = matches!(failure, Failure::Refused(_)).then(|| now - record.asked_at);
             self.judge(id, t);
+            if t.is_some() {
+                self.tell(id);
+            }
         }
         self.arbiter.failed(id, side, failure.text());
         self.decide(now);
@@ -317,7 +329,7 @@ impl<P: Clone> Governor<P> {
             }
         }
         self.decide(now);
-        self.give_waiting(Side::Cloud);
+        self.give_waiting(now, Side::Cloud);
     }
 
     /// The link is down: what is in flight counts as late, and goes to the local original if that runs.
@@ -344,7 +356,7 @@ impl<P: Clone> Governor<P> {
         }
         self.decide(now);
         if self.decider.state() != LocalState::Ready {
-            self.local_lost();
+            self.local_lost(now);
             // Some waited for it to come.
             for id in self.arbiter.select(Record::is_open) {
                 self.fail_if_hopeless(id);
@@ -359,9 +371,29 @@ impl<P: Clone> Governor<P> {
         self.local(now, LocalState::Starting);
     }
 
-    /// Where the time of a request went.
+    /// Where the time went of the request that the cloud has just answered, if it was that one: the sum must be what
+    /// the request took.
     pub fn phases(&mut self, phases: &Phases) {
+        let answered = |effect: &mut Effect<P>| match effect {
+            Effect::Outcome(outcome) if outcome.cloud.is_some() => Some(outcome.clone()),
+            _ => None,
+        };
+        let newest = self.effects.iter_mut().rev().find_map(answered);
+        let Some((outcome, t)) = newest.and_then(|outcome| outcome.cloud.map(|t| (outcome, t)))
+        else {
+            return;
+        };
+        if t.abs_diff(phases.total()) > PHASES_APART.max(t / 5) {
+            return;
+        }
         self.phases.record(phases);
+        for effect in &mut self.effects {
+            if let Effect::Outcome(told) = effect {
+                if told.request == outcome.request {
+                    told.phases = Some(*phases);
+                }
+            }
+        }
     }
 
     /// Time has passed.
@@ -467,7 +499,7 @@ impl<P: Clone> Governor<P> {
     fn asked(&mut self, now: Instant, id: RequestId) {
         self.counts.requests += 1;
         for side in self.asked_sides() {
-            self.ask(id, side);
+            self.ask(now, id, side);
         }
         if !self.link {
             // The cloud cannot have it, so its time is beyond any T_max already now.
@@ -486,8 +518,8 @@ impl<P: Clone> Governor<P> {
             .collect()
     }
 
-    fn ask(&mut self, id: RequestId, side: Side) {
-        let Some(payload) = self.arbiter.ask(id, side) else {
+    fn ask(&mut self, now: Instant, id: RequestId, side: Side) {
+        let Some(payload) = self.arbiter.ask(now, id, side) else {
             return;
         };
         let Some(record) = self.arbiter.get(id) else {
@@ -521,9 +553,38 @@ impl<P: Clone> Governor<P> {
     }
 
     /// Who can answer now is asked for what still waits: calls always, inputs while they are fresh.
-    fn give_waiting(&mut self, side: Side) {
-        for id in self.arbiter.select(Record::is_open) {
-            self.ask(id, side);
+    fn give_waiting(&mut self, now: Instant, side: Side) {
+        let wanted = |record: &Record<P>| record.is_open() && (record.is_call() || !record.overdue);
+        for id in self.arbiter.select(wanted) {
+            self.ask(now, id, side);
+        }
+    }
+
+    /// An input that is late already is given to the local original when that has nothing else to do, and is quick
+    /// enough that a fresh one that comes meanwhile is still in time.
+    fn give_straggler(&mut self, now: Instant) {
+        if !self.decider.is_fed() {
+            return;
+        }
+        let Some(id) = self.arbiter.straggler() else {
+            return;
+        };
+        let Some(Kind::Input {
+            pair,
+            stamp: Some(_),
+            ..
+        }) = self.arbiter.get(id).map(|record| &record.kind)
+        else {
+            return;
+        };
+        let t_max = self.sla.times(&self.pairs[*pair].input).t_max;
+        let quick = self.local_time.is_none_or(|time| 2 * time <= t_max);
+        let busy = |record: &Record<P>| {
+            record.local == Leg::Asked
+                && record.local_asked.is_some_and(|asked| now < asked + t_max)
+        };
+        if quick && self.arbiter.select(busy).is_empty() {
+            self.ask(now, id, Side::Local);
         }
     }
 
@@ -563,12 +624,28 @@ impl<P: Clone> Governor<P> {
     }
 
     fn completed(&mut self, now: Instant, side: Side, id: RequestId, output: usize) -> Verdict {
-        if let Some(asked_at) = self.arbiter.get(id).map(|record| record.asked_at) {
-            if side == Side::Cloud && output == 0 {
-                self.judge(id, Some(now.saturating_duration_since(asked_at)));
+        let answers = output == 0
+            && self.arbiter.get(id).is_some_and(|record| match side {
+                Side::Cloud => record.cloud != Leg::Answered,
+                Side::Local => record.local != Leg::Answered,
+            });
+        if let Some(record) = self.arbiter.get(id).filter(|_| answers) {
+            match (side, record.local_asked) {
+                (Side::Cloud, _) => {
+                    let t = now.saturating_duration_since(record.asked_at);
+                    self.judge(id, Some(t));
+                }
+                (Side::Local, Some(asked)) => {
+                    self.local_time = Some(now.saturating_duration_since(asked));
+                }
+                (Side::Local, None) => {}
             }
         }
-        let verdict = self.arbiter.answer_with(id, side, output);
+        let verdict = self.arbiter.answer_with(now, id, side, output);
+        if answers && (side == Side::Cloud || verdict == Verdict::Deliver) {
+            self.tell(id);
+        }
+        self.arbiter.close_call(id);
         match (verdict, side) {
             (Verdict::Deliver, _) if output > 0 => {}
             (Verdict::Deliver, Side::Cloud) => self.counts.from_cloud += 1,
@@ -579,11 +656,21 @@ impl<P: Clone> Governor<P> {
         verdict
     }
 
-    /// Counts the cloud's time of a request, once.
+    /// Counts the cloud's time of a request, once. Without one the outcome is told at once; else when it is known
+    /// whose answer is taken.
     fn judge(&mut self, id: RequestId, t: Option<Duration>) {
-        if !self.arbiter.judge(id) || self.sla.measure != Measure::Rrt {
+        if !self.arbiter.judge(id, t) {
             return;
         }
+        if self.sla.measure == Measure::Rrt {
+            self.count(id, t);
+        }
+        if t.is_none() {
+            self.tell(id);
+        }
+    }
+
+    fn count(&mut self, id: RequestId, t: Option<Duration>) {
         let Some(record) = self.arbiter.get(id) else {
             return;
         };
@@ -592,6 +679,27 @@ impl<P: Clone> Governor<P> {
             Kind::Input { pair, .. } => self.sla.times(&self.pairs[*pair].input),
         };
         self.observe(t, times.t_desire, times.t_max);
+    }
+
+    /// Tells the outcome of a request that was judged.
+    fn tell(&mut self, id: RequestId) {
+        let Some(record) = self.arbiter.get(id).filter(|record| record.judged) else {
+            return;
+        };
+        let stamp = match record.kind {
+            Kind::Input { stamp, .. } => stamp,
+            Kind::Call(_) => None,
+        };
+        let outcome = Outcome {
+            request: id,
+            channel: self.channel(&record.kind),
+            stamp,
+            cloud: record.cloud_time,
+            answer: record.answered().zip(record.answer_time),
+            phases: None,
+            q: self.satisfaction.q(),
+        };
+        self.effects.push_back(Effect::Outcome(outcome));
     }
 
     fn measure(&mut self, now: Instant, topic: &str, age: Duration) {
@@ -623,12 +731,13 @@ impl<P: Clone> Governor<P> {
             );
             self.say(now, event);
             if feed {
-                self.give_waiting(Side::Local);
+                self.give_waiting(now, Side::Local);
             }
             if stop {
-                self.local_lost();
+                self.local_lost(now);
             }
         }
+        self.give_straggler(now);
         for index in 0..self.pairs.len() {
             let stream = &mut self.pairs[index];
             if stream.by == Correlation::Stamp && stream.unmatched.is_some_and(|n| n >= UNMATCHED) {
@@ -648,7 +757,7 @@ impl<P: Clone> Governor<P> {
     }
 
     /// The local original is gone with what it was asked; the cloud is asked where it was not.
-    fn local_lost(&mut self) {
+    fn local_lost(&mut self, now: Instant) {
         let reason = Leg::Failed("the local original ended".into());
         let lost = self.arbiter.turn(Side::Local, &Leg::Asked, &reason);
         for stream in &mut self.pairs {
@@ -657,7 +766,7 @@ impl<P: Clone> Governor<P> {
         }
         for id in lost {
             if self.link {
-                self.ask(id, Side::Cloud);
+                self.ask(now, id, Side::Cloud);
             }
             self.fail_if_hopeless(id);
         }

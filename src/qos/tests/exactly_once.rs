@@ -131,7 +131,7 @@ impl World {
                     }
                 }
                 Effect::Event(Event::Stop(_)) => self.given[Side::Local as usize].clear(),
-                Effect::Event(_) | Effect::SafeStop => {}
+                Effect::Event(_) | Effect::SafeStop | Effect::Outcome(_) => {}
             }
         }
         let q = self.governor.satisfaction().q();

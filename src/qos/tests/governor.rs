@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, RequestId, Side, Sla, Stamp,
-    Verdict, Why,
+    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Phases, RequestId,
+    Side, Sla, Stamp, Verdict, Why,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -13,6 +13,7 @@ const MS: Duration = Duration::from_millis(1);
 struct Robot {
     governor: Governor<&'static str>,
     now: Instant,
+    outcomes: Vec<Outcome>,
 }
 
 impl Robot {
@@ -31,7 +32,11 @@ impl Robot {
         let now = Instant::now();
         governor.link_up(now, false);
         governor.begin(now);
-        Self { governor, now }
+        Self {
+            governor,
+            now,
+            outcomes: Vec::new(),
+        }
     }
 
     /// Time passes, deadlines are met; what was to be done since the last look, in words.
@@ -57,6 +62,10 @@ impl Robot {
                 Effect::Event(Event::StopFeeding(_)) => "stop feeding".into(),
                 Effect::Event(Event::Stop(_)) => "stop".into(),
                 Effect::Event(event) => format!("{event:?}"),
+                Effect::Outcome(outcome) => {
+                    self.outcomes.push(outcome);
+                    continue;
+                }
             });
         }
         words
@@ -117,10 +126,50 @@ fn pictures_under_way_go_to_a_warm_original_as_soon_as_it_is_fed() {
     robot.after(60);
     assert_eq!(robot.found(Side::Local, 3), Verdict::Deliver);
     robot.image(4, "fourth");
-    assert_eq!(robot.effects(), ["fourth to Cloud", "fourth to Local"]);
+    // It has time for the first one between fresh ones.
+    assert_eq!(
+        robot.effects(),
+        ["first to Local", "fourth to Cloud", "fourth to Local"]
+    );
     // What the cloud answers late is delivered where nobody has answered, and dropped where somebody has.
     assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
     assert_eq!(robot.found(Side::Cloud, 3), Verdict::Drop);
+}
+
+#[test]
+fn each_request_s_outcome_is_told_and_told_again_when_more_is_known() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.image(1, "picture");
+    robot.after(100);
+    assert_eq!(robot.found(Side::Local, 1), Verdict::Deliver);
+    robot.effects();
+    assert!(
+        robot.outcomes.is_empty(),
+        "the cloud's time has not counted"
+    );
+    robot.after(201);
+    let local = Some((Side::Local, 100 * MS));
+    let told = robot.outcomes.pop().unwrap();
+    assert_eq!((told.cloud, told.answer, told.q), (None, local, 1.5));
+    robot.after(99);
+    let phases = |up: u32| Phases {
+        up: up * MS,
+        compute: 100 * MS,
+        ..Phases::default()
+    };
+    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Drop);
+    // Those of another request add up to something else.
+    robot.governor.phases(&phases(50));
+    robot.governor.phases(&phases(300));
+    robot.effects();
+    let again = robot.outcomes.pop().unwrap();
+    assert_eq!(again.request, told.request);
+    assert_eq!((again.cloud, again.answer), (Some(400 * MS), local));
+    assert_eq!(again.phases, Some(phases(300)));
+    assert!(robot.outcomes.is_empty());
+    let median = &robot.governor.report(robot.now).phases[1];
+    assert_eq!((&*median.phase, median.p50), ("up", 300.0));
 }
 
 #[test]

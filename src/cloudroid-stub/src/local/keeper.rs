@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Pair, RequestId, SafeStop, Side,
-    Sla, Verdict,
+    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Pair, Phases,
+    RequestId, SafeStop, Side, Sla, Verdict,
 };
 use ros::bus::{BusError, Message, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -37,6 +37,8 @@ pub trait Application: Send + Sync + 'static {
     fn safe_stop(&self, stop: &SafeStop);
     /// A decision about the local original.
     fn decided(&self, event: &Event);
+    /// How a request went.
+    fn told(&self, outcome: &Outcome);
 }
 
 /// What a request carries.
@@ -143,13 +145,18 @@ impl Keeper {
     }
 
     /// The cloud answered a call.
-    pub fn cloud_answered(&self, id: RequestId, result: Result<Bytes, Failure>) {
-        self.answered(Side::Cloud, id, result);
+    pub fn cloud_answered(
+        &self,
+        id: RequestId,
+        result: Result<Bytes, Failure>,
+        phases: Option<Phases>,
+    ) {
+        self.answered(Side::Cloud, id, result, phases);
     }
 
     /// The servant's node published. True where the application is to have it.
-    pub fn cloud_output(&self, topic: &str, message: &Message) -> bool {
-        self.output(Side::Cloud, topic, message)
+    pub fn cloud_output(&self, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
+        self.output(Side::Cloud, topic, message, phases)
     }
 
     /// The link is up; `resumed`: what was sent will be answered yet.
@@ -163,28 +170,42 @@ impl Keeper {
     }
 
     /// How it stands.
-    #[cfg(test)]
     pub fn report(&self) -> qos::Report {
         self.state.lock().governor.report(Instant::now())
     }
 
-    fn output(&self, side: Side, topic: &str, message: &Message) -> bool {
+    fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
         let verdict = self.with(|state, now| {
             let stamp = state.stamps.of(message);
             let age = stamp.map(age).unwrap_or_default();
-            state.governor.output(now, side, topic, stamp, age)
+            let verdict = state.governor.output(now, side, topic, stamp, age);
+            if let Some(phases) = phases {
+                state.governor.phases(&phases);
+            }
+            verdict
         });
         verdict == Verdict::Deliver
     }
 
-    fn answered(&self, side: Side, id: RequestId, result: Result<Bytes, Failure>) {
-        self.with(|state, now| match result {
-            Ok(bytes) => {
-                if state.governor.answered(now, side, id) == Verdict::Deliver {
-                    state.reply(id, Ok(bytes));
+    fn answered(
+        &self,
+        side: Side,
+        id: RequestId,
+        result: Result<Bytes, Failure>,
+        phases: Option<Phases>,
+    ) {
+        self.with(|state, now| {
+            match result {
+                Ok(bytes) => {
+                    if state.governor.answered(now, side, id) == Verdict::Deliver {
+                        state.reply(id, Ok(bytes));
+                    }
                 }
+                Err(failure) => state.governor.failed(now, side, id, &failure),
             }
-            Err(failure) => state.governor.failed(now, side, id, &failure),
+            if let Some(phases) = phases {
+                state.governor.phases(&phases);
+            }
         });
     }
 
@@ -249,6 +270,7 @@ impl Keeper {
                     self.robot.safe_stop(stop);
                 }
             }
+            Effect::Outcome(outcome) => self.robot.told(&outcome),
             Effect::Event(event) => {
                 match (&event, &self.original) {
                     (Event::Start(_), Some(original)) => original.start(),
@@ -277,7 +299,7 @@ impl Keeper {
                         other => Failure::Unreachable(other.to_string()),
                     });
                     if let Some(keeper) = keeper.upgrade() {
-                        keeper.answered(Side::Local, id, result);
+                        keeper.answered(Side::Local, id, result, None);
                     }
                 });
             }
@@ -339,7 +361,7 @@ async fn listen(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<News>) {
                 keeper.with(|state, now| state.governor.local_crashed(now, &reason))
             }
             News::Output(topic, message) => {
-                if keeper.output(Side::Local, &topic, &message) {
+                if keeper.output(Side::Local, &topic, &message, None) {
                     keeper.robot.deliver(&topic, message);
                 }
             }

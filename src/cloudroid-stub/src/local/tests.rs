@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use qos::{Event, LocalState, RequestId, SafeStop, Sla};
+use qos::{Event, LocalState, Outcome, RequestId, SafeStop, Sla};
 use ros::bus::{Bus, Message, ParamValue, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
@@ -242,6 +242,8 @@ impl Application for Listener {
         let name = name.split('(').next().unwrap();
         let _ = self.0.send(name.to_lowercase());
     }
+
+    fn told(&self, _: &Outcome) {}
 }
 
 #[tokio::test]
@@ -280,7 +282,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     // The cloud answers again, in time, until Q is above its threshold.
     while heard != "stop" {
         keeper.input(&topic, string("x"));
-        keeper.cloud_output("/absolute/out", &string("cloud"));
+        keeper.cloud_output("/absolute/out", &string("cloud"), None);
         heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
     }
     let report = keeper.report();
@@ -317,7 +319,7 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
     let answer = timeout(SOON, call).await.unwrap().unwrap();
     assert_eq!(answer, Ok(Bytes::from_static(b"request")));
     let id = cloud.calls.lock()[0];
-    keeper.cloud_answered(id, Ok(Bytes::from_static(b"late")));
+    keeper.cloud_answered(id, Ok(Bytes::from_static(b"late")), None);
     assert_eq!(keeper.report().counts.from_local, 1);
 }
 

@@ -5,13 +5,14 @@ use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use bytes::Bytes;
+use link::clock::now;
 use link::control::Served;
 use parking_lot::Mutex;
 use qos::{Failure, RequestId};
 use ros::bus::{ServiceHandler, ServiceType};
 use tokio::sync::oneshot;
 
-use super::Mirror;
+use super::{Mirror, reports};
 use crate::local::Keeper;
 
 /// Services by name, and calls under way.
@@ -20,7 +21,7 @@ pub struct Calls {
     services: Mutex<HashMap<String, Service>>,
     waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, String>>>>,
     /// Calls that the keeper has made: the link's id → the keeper's.
-    kept: Mutex<HashMap<u32, RequestId>>,
+    kept: Mutex<HashMap<u32, (RequestId, i64)>>,
 }
 
 struct Service {
@@ -31,10 +32,19 @@ struct Service {
 
 impl Calls {
     /// The cloud has answered.
-    pub fn answered(&self, keeper: Option<&Arc<Keeper>>, id: u32, response: Result<Bytes, String>) {
+    pub fn answered(
+        &self,
+        mirror: &Mirror,
+        id: u32,
+        (taken, given, arrived): (i64, i64, i64),
+        response: Result<Bytes, String>,
+    ) {
         let kept = self.kept.lock().remove(&id);
-        if let (Some(keeper), Some(request)) = (keeper, kept) {
-            keeper.cloud_answered(request, response.map_err(Failure::Refused));
+        if let (Some(keeper), Some((request, asked))) = (mirror.keeper(), kept) {
+            let clock = mirror.session().clock();
+            let phases =
+                clock.map(|clock| reports::of_call([asked, taken, given, arrived], clock.offset));
+            keeper.cloud_answered(request, response.map_err(Failure::Refused), phases);
             return;
         }
         if let Some(caller) = self.waiting.lock().remove(&id) {
@@ -46,8 +56,9 @@ impl Calls {
     pub fn fail(&self, keeper: Option<&Arc<Keeper>>, reason: &str) {
         let kept = std::mem::take(&mut *self.kept.lock());
         if let Some(keeper) = keeper {
-            for request in kept.into_values() {
-                keeper.cloud_answered(request, Err(Failure::Unreachable(reason.to_owned())));
+            for (request, _) in kept.into_values() {
+                let failure = Failure::Unreachable(reason.to_owned());
+                keeper.cloud_answered(request, Err(failure), None);
             }
         }
         for (_, caller) in self.waiting.lock().drain() {
@@ -64,7 +75,7 @@ impl Calls {
         };
         let mut kept = self.kept.lock();
         let id = mirror.session().call(channel, bytes);
-        kept.insert(id, request);
+        kept.insert(id, (request, now()));
     }
 
     /// Serves what is new and takes back what is gone.

@@ -10,8 +10,7 @@ use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use super::Mirror;
-use crate::local::Keeper;
+use super::{Mirror, reports};
 
 /// Messages kept for a slow subscriber.
 const QUEUE: usize = 256;
@@ -57,18 +56,22 @@ impl Drop for Topic {
 
 impl Outputs {
     /// Publishes a message of the cloud.
-    pub fn take(&self, keeper: Option<&Arc<Keeper>>, data: Data, _arrived: i64) {
+    pub fn take(&self, mirror: &Mirror, data: Data, arrived: i64) {
         let Some(topic) = self.channels.lock().get(&data.channel).cloned() else {
             return;
         };
-        if let Some(keeper) = keeper {
+        if let Some(keeper) = mirror.keeper() {
             let message = Message {
                 bytes: data.message.clone(),
                 wire_type: topic.wire_type.clone(),
                 publisher: topic.cloud.clone(),
                 latching: data.latching,
             };
-            if !keeper.cloud_output(&topic.name, &message) {
+            let phases = mirror
+                .session()
+                .clock()
+                .and_then(|clock| reports::of_output(&data, arrived, clock.offset));
+            if !keeper.cloud_output(&topic.name, &message, phases) {
                 return;
             }
         }

@@ -8,11 +8,13 @@ use bytes::Bytes;
 use link::Session;
 use link::control::Graph;
 use parking_lot::Mutex;
-use qos::{Event, Local, Mode, Pair, RequestId, SafeStop, Sla, SlaError, Topic};
+use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, SlaError, Topic};
 use ros::bus::{Message, WireType};
 use ros::schema::MessageType;
 
 use super::Mirror;
+use super::diagnostics::Diagnostics;
+use super::reports::{self, Reports};
 use crate::config::{self, Config};
 use crate::local::{self, Application, Cloud, Keeper, Original, Setting};
 
@@ -67,8 +69,14 @@ pub fn sla(config: &Config) -> Result<Option<Sla>, SlaError> {
 }
 
 impl Mirror {
-    /// Keeps the promise of `sla` from now on, with the local original that `setting` tells of.
-    pub async fn promise(self: &Arc<Self>, sla: Sla, setting: Setting) -> anyhow::Result<()> {
+    /// Keeps the promise of `sla` from now on, with the local original that `setting` tells of; how it stands is
+    /// shown by `diagnostics`.
+    pub async fn promise(
+        self: &Arc<Self>,
+        sla: Sla,
+        setting: Setting,
+        diagnostics: Diagnostics,
+    ) -> anyhow::Result<()> {
         let original = match sla.local {
             Local::None => None,
             _ => {
@@ -84,9 +92,11 @@ impl Mirror {
             keeper: keeper.clone(),
             answers,
             known: Mutex::default(),
+            reports: Reports::default(),
         });
         let mirror = Arc::downgrade(self);
-        tokio::spawn(follow(mirror, keeper));
+        tokio::spawn(follow(mirror.clone(), keeper));
+        tokio::spawn(reports::tell(mirror, diagnostics));
         Ok(())
     }
 
@@ -159,6 +169,14 @@ pub struct Promise {
     keeper: Arc<Keeper>,
     answers: Option<Vec<Pair>>,
     known: Mutex<Known>,
+    pub(super) reports: Reports,
+}
+
+impl Promise {
+    /// Who keeps it.
+    pub fn keeper(&self) -> &Arc<Keeper> {
+        &self.keeper
+    }
 }
 
 fn topics(known: &BTreeMap<String, WireType>) -> Vec<Topic> {
@@ -227,6 +245,17 @@ impl Application for Way {
             }
             Some(Err(reason)) => tracing::error!("no safe stop on {}: {reason}", stop.topic),
             None => tracing::error!("no safe stop: {} is no output of this node", stop.topic),
+        }
+    }
+
+    fn told(&self, outcome: &Outcome) {
+        if let Some(promise) = self
+            .0
+            .upgrade()
+            .as_ref()
+            .and_then(|mirror| mirror.promise.get())
+        {
+            promise.reports.note(outcome);
         }
     }
 

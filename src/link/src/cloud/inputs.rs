@@ -18,6 +18,16 @@ const QUEUE: usize = 100;
 /// Messages, and bytes, that wait until the topic is advertised and the node connected.
 const WAITING: (usize, usize) = (256, 32 << 20);
 
+/// Where types that begin with a header have their stamp. Those that do not have something there, too; it tells no
+/// worse than nothing which input an output answers.
+pub(super) type Mark = Option<[u8; 8]>;
+
+/// The mark of a message as the node sees it.
+pub(super) fn mark(message: &[u8]) -> Mark {
+    let mark = message.get(4..12)?.try_into().ok()?;
+    (mark != [0; 8]).then_some(mark)
+}
+
 /// Channels by number.
 #[derive(Default)]
 pub(super) struct Inputs {
@@ -45,8 +55,8 @@ impl Inputs {
         self.channels.lock().insert(channel, fresh);
     }
 
-    /// Publishes a message; says when.
-    pub(super) fn take(&self, data: &Data, arrived: i64) -> Option<Answered> {
+    /// Publishes a message; says when, and by what its answer may be known.
+    pub(super) fn take(&self, data: &Data, arrived: i64) -> Option<(Mark, Answered)> {
         let mut channels = self.channels.lock();
         let channel = channels.get_mut(&data.channel)?;
         let message = if data.encoded {
@@ -59,6 +69,7 @@ impl Inputs {
         } else {
             data.message.clone()
         };
+        let mark = mark(&message);
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
             State::Waiting(waiting) => {
@@ -69,11 +80,14 @@ impl Inputs {
                 }
             }
         }
-        Some(Answered {
+        let answered = Answered {
             born: data.born,
+            serialise: data.serialise,
+            left: data.left,
             taken: arrived,
             given: now(),
-        })
+        };
+        Some((mark, answered))
     }
 
     /// Advertises, and lets messages through once the node has connected.

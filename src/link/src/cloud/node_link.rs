@@ -146,11 +146,11 @@ impl NodeLink {
             .collect()
     }
 
-    fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes) {
+    fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes, taken: i64) {
         let name = self.services.lock().get(&service).cloned();
         let (Some(name), Some(hub)) = (name, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
-            return self.session.answer(id, Err(gone));
+            return self.session.answer(id, taken, Err(gone));
         };
         let link = Arc::clone(self);
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
@@ -159,6 +159,7 @@ impl NodeLink {
             let called = hub.bus.call(&name, request, patience).await;
             link.session.answer(
                 id,
+                taken,
                 called.map_err(|error| match error {
                     ros::bus::BusError::CallFailed { reason, .. } => reason,
                     other => other.to_string(),
@@ -191,15 +192,15 @@ impl NodeLink {
     fn take(&self, this: &Arc<Self>, record: Record, arrived: i64) {
         match record {
             Record::Data(data) => {
-                if let Some(answered) = self.inputs.take(&data, arrived) {
-                    self.outputs.note(answered);
+                if let Some(given) = self.inputs.take(&data, arrived) {
+                    self.outputs.note(given);
                 }
             }
             Record::Call {
                 id,
                 service,
                 request,
-            } => this.call(id, service, request),
+            } => this.call(id, service, request, arrived),
             Record::Answer { .. } => {}
             Record::Control(json) => match serde_json::from_slice(&json) {
                 Ok(control) => {
@@ -234,7 +235,13 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
             }
             Control::Requests(requests) => {
                 let mut kept = link.requests.lock();
-                kept.extend(requests);
+                for request in requests {
+                    // What was late is told again when its answer has come after all.
+                    match kept.iter_mut().find(|known| known.id == request.id) {
+                        Some(known) => *known = request,
+                        None => kept.push_back(request),
+                    }
+                }
                 let surplus = kept.len().saturating_sub(REQUESTS);
                 kept.drain(..surplus);
             }

@@ -10,6 +10,7 @@ use ros::bus::SubscribeOptions;
 use tokio::task::AbortHandle;
 
 use super::Hub;
+use super::inputs::{Mark, mark};
 use super::node_link::NodeLink;
 use crate::Quality;
 use crate::clock::now;
@@ -24,7 +25,7 @@ const RECENT: usize = 16;
 #[derive(Default)]
 pub(super) struct Outputs {
     channels: Mutex<HashMap<u32, Channel>>,
-    recent: Mutex<VecDeque<Answered>>,
+    recent: Mutex<VecDeque<(Mark, Answered)>>,
 }
 
 struct Channel {
@@ -59,12 +60,12 @@ impl Outputs {
     }
 
     /// An input was given to the node.
-    pub(super) fn note(&self, answered: Answered) {
+    pub(super) fn note(&self, given: (Mark, Answered)) {
         let mut recent = self.recent.lock();
         if recent.len() == RECENT {
             recent.pop_front();
         }
-        recent.push_back(answered);
+        recent.push_back(given);
     }
 
     /// So many listen on the robot now.
@@ -120,10 +121,15 @@ impl Outputs {
         }
     }
 
-    /// The input that a message may answer: the one of the same stamp, where there are several, is the robot's to
-    /// find; here it is the newest.
-    fn answered(&self) -> Option<Answered> {
-        self.recent.lock().back().copied()
+    /// The input that a message may answer: the one of the same stamp, else the newest.
+    fn answered(&self, message: &[u8]) -> Option<Answered> {
+        let recent = self.recent.lock();
+        let mark = mark(message);
+        let same = recent
+            .iter()
+            .rev()
+            .find(|(given, _)| mark.is_some() && *given == mark);
+        same.or(recent.back()).map(|(_, answered)| *answered)
     }
 }
 
@@ -136,7 +142,7 @@ impl NodeLink {
             born: now(),
             left: 0,
             serialise: 0,
-            answered: self.outputs.answered(),
+            answered: self.outputs.answered(&message),
             message,
         };
         let quality = if latching {

@@ -65,7 +65,7 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
     tokio::spawn(async move {
         while let Some(record) = calls.recv().await {
             if let Record::Call { id, request, .. } = record {
-                serving.answer(id, Ok(request));
+                serving.answer(id, 0, Ok(request));
             }
         }
     });
