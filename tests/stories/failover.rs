@@ -49,7 +49,7 @@ impl Scene {
         let cable = Cable::new(&daemon.address)?;
         let site = Site::new()?;
         let people = ("opencv_apps", "people_detect");
-        let workspace = site.installs(&daemon, PEOPLE.name, people, PROGRAM)?;
+        let workspace = site.installs_original(&daemon, PEOPLE.name, people, PROGRAM)?;
         let toml = format!(
             "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{robot}\"\nthreshold = 4.0\ninitial = 15.0\n{more}",
             cable.server, PEOPLE.name

@@ -279,7 +279,7 @@ impl Site {
 
     /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, whose
     /// program becomes the original in the image's root file system.
-    pub fn installs(
+    pub fn installs_original(
         &self,
         daemon: &Daemon,
         service: &str,

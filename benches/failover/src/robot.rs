@@ -130,7 +130,7 @@ fn start(site: &Site, daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Run
         return site.original(daemon, service, PROGRAM, &ARGUMENTS);
     }
     let people = ("opencv_apps", "people_detect");
-    let workspace = site.installs(daemon, service, people, PROGRAM)?;
+    let workspace = site.installs_original(daemon, service, people, PROGRAM)?;
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"failover-{}\"\nlocal = \"{}\"\n\
          desire = {:?}\nmax = {:?}\nthreshold = 4.0\ninitial = 15.0\n",
