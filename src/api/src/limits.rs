@@ -30,7 +30,7 @@ pub struct Limits {
     /// Bytes a second written to it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub io_write: Option<Size>,
-    /// The cores it may run on, such as `0-3,6` (cgroup v2 only).
+    /// The cores it may run on, such as `0-3,6`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpuset: Option<CpuSet>,
 }
@@ -65,7 +65,7 @@ pub struct Usage {
     /// Microseconds so far in which it wanted to run and had used its cores up.
     #[serde(default)]
     pub throttled_usec: u64,
-    /// How much it waits for what others use; none on cgroup v1.
+    /// How much it waits for what others use; none where the kernel does not tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pressure: Option<Pressure>,
 }

@@ -11,7 +11,7 @@ pub struct LimitFlags {
     /// Its share when cores are scarce, 1 to 10000; 100 by default.
     #[arg(long, value_name = "N")]
     cpu_weight: Option<u64>,
-    /// The cores it may run on, such as 0-3,6 (cgroup v2).
+    /// The cores it may run on, such as 0-3,6; on cgroup v1 only a servant that starts with some.
     #[arg(long, value_name = "CORES")]
     cpuset: Option<CpuSet>,
     /// Memory that a servant may use, and is promised, such as 512M.

@@ -38,8 +38,8 @@ use output::Format;
     propagate_version = true
 )]
 struct Arguments {
-    /// The daemon: http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME,
-    /// or http://127.0.0.1:9090 where there is none.
+    /// The daemon: http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME, that of
+    /// your own or of the installed daemon, or http://127.0.0.1:9090 where there is none.
     #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
     server: Option<String>,
     /// Bearer token; needed beyond this machine.

@@ -290,7 +290,7 @@ impl Choreographer {
         self.inner.state.set_servant_limits(id, &wanted)?;
         let message = format!(
             "servant {id}: limits changed to {}",
-            in_words(&handle.limits())
+            in_words(&limits_of(&container.enforced().limits))
         );
         self.inner
             .journal
@@ -528,16 +528,22 @@ pub async fn describe(handle: &Handle) -> api::Servant {
     }
 }
 
-/// Limits for people.
+/// Limits for people, by the names of the flags that set them.
 fn in_words(limits: &api::Limits) -> String {
-    match serde_json::to_value(limits) {
-        Ok(serde_json::Value::Object(set)) => set
-            .iter()
-            .map(|(name, value)| format!("{name} {value}"))
-            .collect::<Vec<_>>()
-            .join(", "),
-        _ => String::new(),
-    }
+    let named = [
+        ("cpus", limits.cpus.map(|cpus| cpus.to_string())),
+        ("cpu-weight", limits.cpu_weight.map(|n| n.to_string())),
+        ("cpuset", limits.cpuset.map(|cores| cores.to_string())),
+        ("memory", limits.memory.map(|bytes| bytes.to_string())),
+        ("memory-high", limits.memory_high.map(|n| n.to_string())),
+        ("pids", limits.pids.map(|pids| pids.to_string())),
+        ("io-read", limits.io_read.map(|bytes| bytes.to_string())),
+        ("io-write", limits.io_write.map(|bytes| bytes.to_string())),
+    ];
+    let set = named
+        .into_iter()
+        .filter_map(|(name, value)| Some(format!("{name} {}", value?)));
+    set.collect::<Vec<_>>().join(", ")
 }
 
 fn limits_of(limits: &servant::spec::Limits) -> api::Limits {

@@ -112,7 +112,7 @@ pub struct Usage {
     pub oom_kills: u64,
     /// Microseconds so far in which it wanted to run and had used its cores up.
     pub throttled_usec: u64,
-    /// How much of the last ten seconds some of it waited for what others used; none on cgroup v1.
+    /// How much of the last ten seconds some of it waited for what others used; none where the kernel does not tell.
     pub pressure: Option<Pressure>,
 }
 

@@ -132,6 +132,7 @@ pub fn cores_are_shared_out_as_asked() -> Told {
 pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Told {
     let daemon = daemon()?;
     let mut promised = daemon.robot("burglar_cpp?robot=burner")?;
+    tries(&mut promised, "rest", "")?;
     let id = id(&daemon, "burglar_cpp", "burner")?;
     set(&daemon, &id, &["--cpus", "1", "--cpu-weight", "100"])?;
     // The best of some, each time: whatever else the machine below this one does only adds.

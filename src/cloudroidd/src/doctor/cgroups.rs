@@ -27,6 +27,9 @@ pub fn check() -> Check {
             "no controller can be used, servants are not limited: {}",
             found.why
         ),
+        (1, true) => {
+            "version 1: cpu, memory and pids can be limited; it has no memory.high".to_owned()
+        }
         (version, true) => format!("version {version}: cpu, memory and pids can be limited"),
         (version, false) => format!(
             "version {version}, without {}: {}",

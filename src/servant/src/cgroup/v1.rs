@@ -4,7 +4,7 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use super::files::{read_field, read_number};
+use super::files::{read_field, read_number, read_pressures};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
 use crate::spec::Limits;
@@ -106,13 +106,11 @@ fn is_empty(directory: &Path) -> bool {
     })
 }
 
-/// Processor time and memory.
+/// Processor time, memory and, where a v2 hierarchy is mounted beside, pressure.
 pub(super) fn usage(cgroup: &Cgroup) -> Usage {
     let number = |controller, name| read_number(&cgroup.file(controller, name)?);
-    let beside = || {
-        let unified = cgroup.leaves.iter().find(|leaf| leaf.unified)?;
-        read_field(&unified.directory.join("cpu.stat"), "usage_usec")
-    };
+    let unified = cgroup.leaves.iter().find(|leaf| leaf.unified);
+    let beside = || read_field(&unified?.directory.join("cpu.stat"), "usage_usec");
     let cpu = number("cpuacct", "cpuacct.usage").map(|nanoseconds| nanoseconds / 1000);
     let memory = number("memory", "memory.usage_in_bytes");
     let throttled = cgroup
@@ -122,6 +120,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         cpu_usec: cpu.or_else(beside).unwrap_or(0),
         throttled_usec: throttled.unwrap_or(0) / 1000,
         memory: memory.unwrap_or(0),
+        pressure: unified.and_then(|leaf| read_pressures(&leaf.directory)),
         ..Usage::default()
     }
 }

@@ -2,9 +2,9 @@
 
 use std::fs;
 
-use super::files::{read_field, read_number, read_of_device, read_pressure};
+use super::files::{read_field, read_number, read_of_device, read_pressures};
 use super::{Cgroup, cores};
-use crate::engine::{Pressure, Usage};
+use crate::engine::Usage;
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
@@ -79,10 +79,9 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
 
 /// Processor time, memory and pressure.
 pub(super) fn usage(cgroup: &Cgroup) -> Usage {
-    // cpu.stat and the pressure files are there even where a controller is not enabled.
+    // There even where its controller is not enabled.
     let plain = |name: &str| Some(cgroup.leaves.first()?.directory.join(name));
     let stat = |field| read_field(&plain("cpu.stat")?, field);
-    let pressure = |name| read_pressure(&plain(name)?);
     let memory = cgroup
         .file("memory", "memory.current")
         .and_then(|file| read_number(&file));
@@ -90,12 +89,10 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         cpu_usec: stat("usage_usec").unwrap_or(0),
         throttled_usec: stat("throttled_usec").unwrap_or(0),
         memory: memory.unwrap_or(0),
-        // A kernel may be built or booted without.
-        pressure: pressure("cpu.pressure").map(|cpu| Pressure {
-            cpu,
-            memory: pressure("memory.pressure").unwrap_or(0.0),
-            io: pressure("io.pressure").unwrap_or(0.0),
-        }),
+        pressure: cgroup
+            .leaves
+            .first()
+            .and_then(|leaf| read_pressures(&leaf.directory)),
         ..Usage::default()
     }
 }

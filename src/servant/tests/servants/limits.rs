@@ -121,6 +121,10 @@ async fn limits_are_read_back_and_changed_while_it_runs() {
     processes(&*servant, 1).await;
     let usage = servant.usage().await.unwrap();
     assert!(usage.memory > 0 && usage.pids >= 2, "{usage:?}");
+    // Where a v2 hierarchy is mounted, alone or beside v1, and the kernel counts it.
+    let unified = std::fs::read_to_string("/proc/self/mounts").unwrap();
+    let told = unified.contains(" cgroup2 ") && std::path::Path::new("/proc/pressure").exists();
+    assert_eq!(usage.pressure.is_some(), told, "{usage:?}");
     world.stop(servant).await;
 }
 
