@@ -106,6 +106,8 @@ fn main() -> ExitCode {
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
             two_nodes_share_a_servant,
             what_a_stub_cannot_do_is_said,
+            the_robot_s_graph_is_the_original_s,
+            a_lost_link_is_taken_up_again,
             the_robot_s_master_starts_again,
         ],
         stories![mishaps:

@@ -1,16 +1,20 @@
 //! A robot's node in the cloud: the robot's side cannot tell it from the original.
 
 use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
 use ros::bus::{Bus, Graph, ParamValue};
+use ros::ros1::Ros1Bus;
 use support::Told;
+use support::robot::PATIENCE;
 use support::site::{Running, Site, registered, string};
-use support::world::{ADDER, GREETER, world};
+use support::world::{ADDER, GREETER, PEOPLE, world};
 
 const THE_GREETER: (&str, &str, &str) = ("greeter_cpp", "greeter_cpp", "greeter");
 const THE_ADDER: (&str, &str, &str) = ("adder_py", "adder_py", "adder.py");
+const PEOPLE_DETECT: (&str, &str, &str) = ("opencv_apps", "opencv_apps", "people_detect");
 
 fn serves(service: &str) -> impl Fn(&Graph) -> bool {
     let service = service.to_owned();
@@ -86,6 +90,103 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Told {
     Ok(())
 }
 
+/// What a robot's user is told of a node: its registrations with their types, and its parameters with their values.
+fn told_of(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String> {
+    let graph = watcher.graph().borrow().clone();
+    let mut lines = registered(&graph, node);
+    let services = graph.services.iter().filter(|(_, server)| *server == node);
+    for (service, _) in services {
+        if let Ok(kind) = site.runtime.block_on(watcher.service_type(service)) {
+            lines.insert(format!("{service} is a {} {}", kind.name, kind.md5));
+        }
+    }
+    if let Ok(ParamValue::Map(all)) = site.runtime.block_on(watcher.get_param(node)) {
+        lines.extend(
+            all.iter()
+                .map(|(name, value)| format!("sets {name} to {value:?}")),
+        );
+    }
+    lines
+}
+
+/// Waits until what is told of a node satisfies `wanted`; what it was at last.
+fn comes_to(
+    site: &Site,
+    watcher: &Ros1Bus,
+    node: &str,
+    wanted: impl Fn(&BTreeSet<String>) -> bool,
+) -> BTreeSet<String> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let lines = told_of(site, watcher, node);
+        if wanted(&lines) || Instant::now() > deadline {
+            return lines;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// What is told of people_detect in three states: nobody listens, one does, it has left. In each, `arrived` decides
+/// whether it has come about.
+fn states(
+    site: &Site,
+    arrived: impl Fn(usize, &BTreeSet<String>) -> bool,
+) -> anyhow::Result<Vec<BTreeSet<String>>> {
+    let node = "/people_detect";
+    let watcher = site.node("/watcher")?;
+    let mut states = vec![comes_to(site, &watcher, node, |lines| arrived(0, lines))];
+    let listener = site.node("/listener")?;
+    let found = site.hears(&listener, &format!("{node}/found"))?;
+    states.push(comes_to(site, &watcher, node, |lines| arrived(1, lines)));
+    drop(found);
+    states.push(comes_to(site, &watcher, node, |lines| arrived(2, lines)));
+    Ok(states)
+}
+
+pub fn the_robot_s_graph_is_the_original_s() -> Told {
+    let daemon = world().with(PEOPLE)?;
+    let argv = ["__name:=people_detect", "_debug_view:=false"];
+    // What is always there, and the lazy input: so much is known of it without looking.
+    let (outputs, services, parameters) = (5, 6, 8);
+    let original = {
+        let site = Site::new()?;
+        let program = "/usr/lib/opencv_apps/people_detect";
+        let node = site.original(&daemon, "opencv_apps", program, &argv)?;
+        let states = states(&site, |state, lines| {
+            let count = |word: &str| lines.iter().filter(|line| line.starts_with(word)).count();
+            count("publishes") == outputs
+                && count("serves") == services
+                && count("sets") == parameters
+                && count("subscribes") == usize::from(state == 1)
+        });
+        let states = with_log(states, &node)?;
+        let lazy = "subscribes /image [sensor_msgs/Image]";
+        for (state, lines) in states.iter().enumerate() {
+            ensure!(
+                lines.contains(lazy) == (state == 1) && lines.len() >= 25,
+                "the original itself is not as it should be in state {state}: {lines:#?}"
+            );
+        }
+        states
+    };
+    let site = Site::new()?;
+    let stub = site.stub(&daemon, PEOPLE_DETECT, "linked-people", &argv)?;
+    let linked = states(&site, |state, lines| *lines == original[state]);
+    let linked = with_log(linked, &stub)?;
+    for (state, (theirs, ours)) in ["idle", "busy", "left"]
+        .iter()
+        .zip(original.iter().zip(&linked))
+    {
+        let missing: Vec<_> = theirs.difference(ours).collect();
+        let extra: Vec<_> = ours.difference(theirs).collect();
+        ensure!(
+            missing.is_empty() && extra.is_empty(),
+            "{state}: the stub lacks {missing:#?} and has {extra:#?} too much"
+        );
+    }
+    Ok(())
+}
+
 pub fn two_nodes_share_a_servant() -> Told {
     let daemon = world().with(GREETER)?;
     let site = Site::new()?;
@@ -114,6 +215,60 @@ pub fn two_nodes_share_a_servant() -> Told {
         let count = site.calls(&app, service, &[0])?;
         ensure!(count[0] == 1, "{service}: {count:?}");
     }
+    Ok(())
+}
+
+pub fn a_lost_link_is_taken_up_again() -> Told {
+    // Of its own: its end is the story.
+    let home = world().home("link-restarted");
+    let setup = world().own("link-restarted");
+    let daemon = setup.start()?;
+    daemon
+        .deployer()
+        .pushes("greeter_cpp", GREETER.arguments)?
+        .succeeded()?;
+    let address = daemon.address.clone();
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let stub = site.stub(
+        &daemon,
+        THE_GREETER,
+        "linked-again",
+        &["__name:=greeter", "~name:=/who"],
+    )?;
+    with_log(
+        site.until(&app, "the service", serves("/greeter/count")),
+        &stub,
+    )?;
+    let names = site.says(&app, "/who", false)?;
+    site.connected(&*names, 1)?;
+    let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    names.publish(string("first"));
+    site.next(&mut greetings)?;
+    let before = registered(&app.graph().borrow(), "/greeter");
+    // The daemon goes and comes back; the servant lives on, and the node with all it knows.
+    daemon.is_killed()?;
+    let daemon = setup.listen(&address).start()?;
+    ensure!(daemon.home == home);
+    // A call made meanwhile is answered, or fails with a reason; the next one is answered.
+    if let Err(error) = site.calls(&app, "/greeter/count", &[0]) {
+        ensure!(
+            format!("{error:#}").contains("forgotten this call"),
+            "{error:#}"
+        );
+    }
+    let count = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?;
+    ensure!(count[0] == 1, "it has forgotten what it did: {count:?}");
+    ensure!(registered(&app.graph().borrow(), "/greeter") == before);
+    names.publish(string("second"));
+    let greeting = with_log(site.next(&mut greetings), &stub)?;
+    ensure!(
+        text(&greeting.bytes).contains("second") || text(&greeting.bytes).contains("first"),
+        "{greeting:?}"
+    );
+    drop(stub);
+    daemon.deployer().types(&["stop", "--all"])?;
+    daemon.ends()?;
     Ok(())
 }
 
@@ -193,7 +348,7 @@ pub fn the_robot_s_master_starts_again() -> Told {
             &stub,
         )?;
         site.until(&app, "all of it", |graph| {
-            registered(graph, "/greeter").len() >= 5
+            registered(graph, "/greeter").len() == 6
         })?;
         registered(&app.graph().borrow(), "/greeter")
             .union(&registered(&graph, "/greeter"))

@@ -87,6 +87,7 @@ impl Mirror {
     /// Another session takes the place of the one that was lost: calls under way have failed, and what the node
     /// listens to is opened again.
     pub fn renew(&self, session: Arc<Session>) {
+        self.calls.renew();
         *self.session.write() = session;
         self.calls.fail(
             self.keeper(),

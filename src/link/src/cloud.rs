@@ -297,6 +297,10 @@ impl Hub {
         }
         let link = NodeLink::begin(self, hello, session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
+        let untold = self.parameters.untold();
+        if !untold.is_empty() {
+            link.session.tell(&Control::Parameters(untold));
+        }
         // What the node has set before there was a link to tell.
         if let Ok(ParamValue::Map(set)) = self.bus.get_param(node).await {
             let set = set

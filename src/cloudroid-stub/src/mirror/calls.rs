@@ -10,7 +10,7 @@ use link::control::Served;
 use parking_lot::Mutex;
 use qos::{Failure, RequestId};
 use ros::bus::{ServiceHandler, ServiceType};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
 use super::{Mirror, reports};
 use crate::local::Keeper;
@@ -22,11 +22,14 @@ pub struct Calls {
     waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, String>>>>,
     /// Calls that the keeper has made: the link's id → the keeper's.
     kept: Mutex<HashMap<u32, (RequestId, i64)>>,
+    /// Calls of the keeper that wait for their service's channel.
+    early: Mutex<Vec<(RequestId, String, Bytes)>>,
 }
 
 struct Service {
     md5: String,
-    channel: Arc<Mutex<u32>>,
+    /// Its number in this session; none until the cloud has told it.
+    channel: Arc<watch::Sender<Option<u32>>>,
     _serving: Box<dyn Send + Sync>,
 }
 
@@ -52,11 +55,20 @@ impl Calls {
         }
     }
 
+    /// Another session begins: its channels are not known yet, and the numbers of the last one may mean other services.
+    pub fn renew(&self) {
+        for service in self.services.lock().values() {
+            service.channel.send_replace(None);
+        }
+    }
+
     /// All calls under way have failed.
     pub fn fail(&self, keeper: Option<&Arc<Keeper>>, reason: &str) {
         let kept = std::mem::take(&mut *self.kept.lock());
+        let early = std::mem::take(&mut *self.early.lock());
         if let Some(keeper) = keeper {
-            for (request, _) in kept.into_values() {
+            let kept = kept.into_values().map(|(request, _)| request);
+            for request in kept.chain(early.into_iter().map(|(request, ..)| request)) {
                 let failure = Failure::Unreachable(reason.to_owned());
                 keeper.cloud_answered(request, Err(failure), None);
             }
@@ -69,8 +81,13 @@ impl Calls {
     /// Calls on behalf of the keeper.
     pub fn kept(&self, mirror: &Mirror, request: RequestId, service: &str, bytes: Bytes) {
         let services = self.services.lock();
-        let Some(channel) = services.get(service).map(|service| *service.channel.lock()) else {
+        let Some(known) = services.get(service) else {
             // It was taken back meanwhile.
+            return;
+        };
+        let Some(channel) = *known.channel.borrow() else {
+            let early = (request, service.to_owned(), bytes);
+            self.early.lock().push(early);
             return;
         };
         let mut kept = self.kept.lock();
@@ -86,10 +103,10 @@ impl Calls {
         });
         for served in services {
             if let Some(known) = self.services.lock().get(&served.name) {
-                *known.channel.lock() = served.channel;
+                known.channel.send_replace(Some(served.channel));
                 continue;
             }
-            let channel = Arc::new(Mutex::new(served.channel));
+            let channel = Arc::new(watch::Sender::new(Some(served.channel)));
             let handler = Arc::new(Forward {
                 mirror: Arc::downgrade(mirror),
                 name: served.name.as_str().into(),
@@ -113,6 +130,9 @@ impl Calls {
                 }
             }
         }
+        for (request, service, bytes) in std::mem::take(&mut *self.early.lock()) {
+            self.kept(mirror, request, &service, bytes);
+        }
     }
 }
 
@@ -120,7 +140,7 @@ impl Calls {
 struct Forward {
     mirror: Weak<Mirror>,
     name: Arc<str>,
-    channel: Arc<Mutex<u32>>,
+    channel: Arc<watch::Sender<Option<u32>>>,
 }
 
 #[async_trait]
@@ -131,14 +151,22 @@ impl ServiceHandler for Forward {
         if let Some(keeper) = mirror.keeper() {
             return keeper.call(&self.name, request).await;
         }
-        let channel = *self.channel.lock();
         let (sender, answer) = oneshot::channel();
-        let id = {
-            // The answer may come at once: it must find its caller.
+        let id = loop {
+            let mut channels = self.channel.subscribe();
+            let known = channels
+                .wait_for(Option::is_some)
+                .await
+                .map_err(|_| ended())?;
+            drop(known);
+            // The answer may come at once: it must find its caller. A session that begins now fails all that wait.
             let mut waiting = mirror.calls.waiting.lock();
+            let Some(channel) = *self.channel.borrow() else {
+                continue;
+            };
             let id = mirror.session().call(channel, request);
             waiting.insert(id, sender);
-            id
+            break id;
         };
         let abandoned = Abandoned {
             mirror: &mirror,

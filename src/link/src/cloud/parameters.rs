@@ -23,6 +23,8 @@ const OWN: [&str; 5] = [
 #[derive(Default)]
 pub(super) struct Known {
     set: Mutex<BTreeMap<String, ParamValue>>,
+    /// Set by a node before there was a link to tell it.
+    untold: Mutex<BTreeMap<String, Option<ParamValue>>>,
     watching: Mutex<Option<AbortHandle>>,
 }
 
@@ -103,9 +105,17 @@ impl Known {
         self.set.lock().remove(&key);
         let links = hub.links.lock();
         let owner = links.values().find(|link| key.starts_with(&link.node));
-        if let Some(link) = owner.or_else(|| links.values().next()) {
-            link.session.tell(&Control::Parameters(vec![(key, value)]));
+        match owner.or_else(|| links.values().next()) {
+            Some(link) => link.session.tell(&Control::Parameters(vec![(key, value)])),
+            None => drop(self.untold.lock().insert(key, value)),
         }
+    }
+
+    /// What a node has set before there was a link to tell.
+    pub(super) fn untold(&self) -> Vec<(String, Option<ParamValue>)> {
+        std::mem::take(&mut *self.untold.lock())
+            .into_iter()
+            .collect()
     }
 }
 
