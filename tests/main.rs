@@ -44,6 +44,8 @@ mod spares;
 mod strangers;
 #[path = "stories/survival.rs"]
 mod survival;
+#[path = "stories/tls.rs"]
+mod tls;
 
 /// A story under its function's name.
 fn story(name: &str, tell: fn() -> Told) -> Trial {
@@ -169,6 +171,10 @@ fn main() -> ExitCode {
             nodes_end_as_ros_users_know_it,
             a_locked_database_is_named_and_waited_for,
             a_full_disk_is_named_and_robots_at_work_stay,
+        ],
+        stories![tls:
+            a_robot_works_through_tls,
+            what_stands_against_tls_is_said,
         ],
         stories![shadowing:
             on_debians_layout_every_tool_finds_the_stub,

@@ -14,6 +14,7 @@ pub mod procfs;
 pub mod robot;
 pub mod shaper;
 pub mod site;
+pub mod tls;
 pub mod world;
 
 /// What a story ends with: an error is told with all its causes.

@@ -1,8 +1,9 @@
 //! `stub.toml`, which stands beside `interface.toml` in the stub's share directory, and what overrides it.
 //!
 //! ```toml
-//! server = "ws://cloud.example:9090"   # the portal
+//! server = "ws://cloud.example:9090"   # the portal; wss:// where TLS is spoken
 //! service = "opencv_apps"              # what was published
+//! ca_file = "/path/ca.pem"             # for wss://: whom to trust, PEM; by default the system's authorities
 //! token_file = "~/.config/cloudroid/token"   # holds the bearer token; none is needed where the portal asks for none
 //! robot = "rover1"                     # this robot's id; by default its host name
 //!
@@ -33,6 +34,8 @@ use ros::bus::ParamValue;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+use crate::address::Address;
+
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
 
@@ -43,7 +46,7 @@ const MOST: f64 = 1e6;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// The portal: `ws://host:port`.
+    /// The portal: `ws://host:port` or `wss://host:port`.
     pub server: String,
     /// The service's name.
     pub service: String,
@@ -53,6 +56,9 @@ pub struct Config {
     /// A file that holds it.
     #[serde(default)]
     pub token_file: Option<PathBuf>,
+    /// For `wss://`: a PEM file with the certificates to trust; the system's where absent.
+    #[serde(default)]
+    pub ca_file: Option<PathBuf>,
     /// This robot's id; its host name where absent.
     #[serde(default)]
     pub robot: Option<String>,
@@ -108,6 +114,16 @@ impl Config {
             .unwrap_or_else(|| "robot".to_owned())
     }
 
+    /// The portal's address.
+    pub fn address(&self) -> Result<Address, String> {
+        Address::parse(&self.server)
+    }
+
+    /// Where the certificates to trust are, if they are not the system's.
+    pub fn authorities(&self) -> Option<PathBuf> {
+        self.ca_file.as_deref().map(at_home)
+    }
+
     /// The bearer token.
     pub fn token(&self) -> anyhow::Result<Option<String>> {
         if let Some(token) = &self.token {
@@ -116,11 +132,7 @@ impl Config {
         let Some(path) = &self.token_file else {
             return Ok(None);
         };
-        let home = std::env::var_os("HOME").map(PathBuf::from);
-        let path = match (path.strip_prefix("~"), home) {
-            (Ok(below), Some(home)) => home.join(below),
-            _ => path.clone(),
-        };
+        let path = at_home(path);
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("cannot read the token in {}", path.display()))?;
         Ok(Some(text.trim().to_owned()))
@@ -133,6 +145,15 @@ impl Config {
             table.insert(key.clone(), Value::try_from(value)?);
         }
         with(table, std::iter::empty())
+    }
+}
+
+/// A path with `~` for the user's own directory.
+fn at_home(path: &Path) -> PathBuf {
+    let home = std::env::var_os("HOME").map(PathBuf::from);
+    match (path.strip_prefix("~"), home) {
+        (Ok(below), Some(home)) => home.join(below),
+        _ => path.to_owned(),
     }
 }
 
@@ -189,11 +210,12 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 16] = [
+pub const KEYS: [&str; 17] = [
     "server",
     "service",
     "token",
     "token_file",
+    "ca_file",
     "robot",
     "desire",
     "max",
@@ -221,15 +243,7 @@ fn with(
     while config.server.ends_with('/') {
         config.server.pop();
     }
-    if !["ws://", "wss://"]
-        .iter()
-        .any(|scheme| config.server.starts_with(scheme))
-    {
-        bail!(
-            "server is {:?}; it should look like ws://host:9090",
-            config.server
-        );
-    }
+    Address::parse(&config.server).map_err(anyhow::Error::msg)?;
     for (key, value) in [
         ("desire", config.desire),
         ("max", config.max),

@@ -1,5 +1,6 @@
 //! Opens a WebSocket to the portal (RFC 6455, section 4.1).
 
+use std::path::Path;
 use std::time::Duration;
 
 use base64::Engine as _;
@@ -10,7 +11,10 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 use ws::WebSocket;
 
+use crate::address::Address;
+use crate::config::Config;
 use crate::resolver;
+use crate::stream::Stream;
 
 /// The longest answer to the handshake.
 const MAX_HEAD: usize = 64 * 1024;
@@ -29,52 +33,47 @@ pub enum Error {
     Refused(String),
 }
 
-/// Connects to `path` of the portal at `server` (`ws://host:port`).
+/// Connects to `path` of the portal.
 pub async fn open(
-    server: &str,
+    config: &Config,
     path: &str,
     token: Option<&str>,
     patience: Duration,
-) -> Result<WebSocket<TcpStream>, Error> {
-    let Some(authority) = server.strip_prefix("ws://") else {
-        return Err(Error::Refused(format!(
-            "{server} is not reached: this stub speaks ws:// only"
-        )));
-    };
-    let opening = handshake(authority, path, token);
+) -> Result<WebSocket<Stream>, Error> {
+    let address = config.address().map_err(Error::Refused)?;
+    let authorities = config.authorities();
+    let opening = handshake(&address, authorities.as_deref(), path, token);
     match timeout(patience, opening).await {
         Ok(opened) => opened,
         Err(_) => Err(Error::Unreachable(format!(
-            "{server} did not answer within {patience:?}"
+            "{} did not answer within {patience:?}",
+            config.server
         ))),
     }
 }
 
 async fn handshake(
-    authority: &str,
+    address: &Address,
+    authorities: Option<&Path>,
     path: &str,
     token: Option<&str>,
-) -> Result<WebSocket<TcpStream>, Error> {
+) -> Result<WebSocket<Stream>, Error> {
+    let authority = &address.authority;
     let unreachable = |what: &str, error: std::io::Error| {
         Error::Unreachable(format!("{what} {authority}: {error}"))
     };
-    let (host, port) = match authority.rsplit_once(':') {
-        Some((host, port)) if !port.contains(']') => (
-            host,
-            port.parse()
-                .map_err(|_| Error::Refused(format!("{authority:?} has no port such as 9090")))?,
-        ),
-        _ => (authority, 80),
-    };
-    let ip = resolver::resolve(host)
+    let ip = resolver::resolve(&address.host)
         .await
         .map_err(|error| unreachable("cannot find", error))?;
-    let mut stream = TcpStream::connect((ip, port))
+    let stream = TcpStream::connect((ip, address.port))
         .await
         .map_err(|error| unreachable("cannot connect to", error))?;
     let socket = socket2::SockRef::from(&stream);
     let _ = socket.set_tcp_nodelay(true);
     let _ = socket.set_tcp_notsent_lowat(UNSENT);
+    let mut stream = Stream::over(stream, address, authorities)
+        .await
+        .map_err(|error| unreachable("no TLS with", error))?;
     let key = STANDARD.encode(rand::random::<[u8; 16]>());
     let mut request = format!(
         "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: {}\r\nUser-Agent: cloudroid-stub/{}\r\n",
@@ -147,7 +146,7 @@ async fn handshake(
 }
 
 /// What a problem document says, or the text as it is.
-async fn body(stream: &mut TcpStream, head: &str, mut begun: Vec<u8>) -> String {
+async fn body(stream: &mut Stream, head: &str, mut begun: Vec<u8>) -> String {
     let length = header(head, "content-length")
         .and_then(|text| text.parse().ok())
         .unwrap_or(0_usize);
@@ -191,8 +190,10 @@ mod tests {
     ) -> Error {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let server = format!("ws://{}", listener.local_addr().unwrap());
+        let settings = format!("server = {server:?}\nservice = 'any'");
+        let config: Config = toml::from_str(&settings).unwrap();
         let opened = tokio::spawn(async move {
-            open(&server, "/any", None, Duration::from_secs(20))
+            open(&config, "/any", None, Duration::from_secs(20))
                 .await
                 .err()
         });

@@ -13,6 +13,7 @@
 
 #![deny(unsafe_code)]
 
+mod address;
 mod arguments;
 mod config;
 mod connect;
@@ -25,6 +26,7 @@ mod resolver;
 mod revision;
 mod robot;
 mod run;
+mod stream;
 
 use std::process::ExitCode;
 

@@ -21,7 +21,6 @@ use nix::unistd::Pid;
 use ros::bus::Bus;
 use ros::net::Sockets;
 use ros::ros1::{Ros1Bus, Ros1Options};
-use tokio::net::TcpStream;
 use tokio::signal::unix::{SignalKind, signal as signals};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
@@ -35,6 +34,7 @@ use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::resolver::RobotSockets;
 use crate::robot::{Robot, usual_name};
+use crate::stream::Stream;
 
 /// For the portal to accept a connection; a first one waits until the servant runs.
 const CONNECT: Duration = Duration::from_secs(10);
@@ -266,7 +266,7 @@ async fn link_once(
     let token = config
         .token()
         .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
-    let mut socket = connect::open(&config.server, &path, token.as_deref(), CONNECT).await?;
+    let mut socket = connect::open(config, &path, token.as_deref(), CONNECT).await?;
     if resume.is_none() && hello.parameters.is_empty() {
         hello.parameters = mirror.parameters().await;
     }
@@ -315,7 +315,7 @@ async fn link_once(
     }
 }
 
-async fn greet(socket: &mut WebSocket<TcpStream>, hello: &Hello) -> Result<Welcome, Lost> {
+async fn greet(socket: &mut WebSocket<Stream>, hello: &Hello) -> Result<Welcome, Lost> {
     send_open(socket, hello).await?;
     receive_open(socket, "welcome").await
 }

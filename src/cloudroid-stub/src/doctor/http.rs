@@ -1,12 +1,16 @@
 //! One GET over a connection of its own: what the doctor asks the portal, before there is a link.
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::IpAddr;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use nix::sys::socket::{getsockopt, sockopt::IpMtu};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+
+use crate::address::Address;
+use crate::stream::Stream;
 
 /// For all of one answer.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -25,14 +29,19 @@ pub struct Answer {
     pub mtu: Option<i32>,
 }
 
-/// `GET path` from `authority` at `address`.
-pub async fn get(
-    address: SocketAddr,
-    authority: &str,
-    path: &str,
-    token: Option<&str>,
-) -> io::Result<Answer> {
-    tokio::time::timeout(PATIENCE, exchange(address, authority, path, token))
+/// Whom to ask.
+pub struct Server {
+    /// As written.
+    pub address: Address,
+    /// As found.
+    pub ip: IpAddr,
+    /// Whom to trust, where that is not the system's to say.
+    pub authorities: Option<PathBuf>,
+}
+
+/// `GET path`.
+pub async fn get(server: &Server, path: &str, token: Option<&str>) -> io::Result<Answer> {
+    tokio::time::timeout(PATIENCE, exchange(server, path, token))
         .await
         .unwrap_or_else(|_| {
             let words = format!("no whole answer to GET {path} within {PATIENCE:?}");
@@ -40,14 +49,11 @@ pub async fn get(
         })
 }
 
-async fn exchange(
-    address: SocketAddr,
-    authority: &str,
-    path: &str,
-    token: Option<&str>,
-) -> io::Result<Answer> {
-    let mut stream = TcpStream::connect(address).await?;
+async fn exchange(server: &Server, path: &str, token: Option<&str>) -> io::Result<Answer> {
+    let authority = &server.address.authority;
+    let stream = TcpStream::connect((server.ip, server.address.port)).await?;
     stream.set_nodelay(true)?;
+    let mut stream = Stream::over(stream, &server.address, server.authorities.as_deref()).await?;
     let mut request = format!(
         "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\nUser-Agent: cloudroid-stub/{}\r\n",
         env!("CARGO_PKG_VERSION")
@@ -61,9 +67,14 @@ async fn exchange(
     let mut first = [0; 1];
     stream.read_exact(&mut first).await?;
     let waited = began.elapsed();
-    let mtu = getsockopt(&stream, IpMtu).ok();
+    let mtu = getsockopt(stream.tcp(), IpMtu).ok();
     let mut answer = first.to_vec();
-    stream.take(LONGEST).read_to_end(&mut answer).await?;
+    match stream.take(LONGEST).read_to_end(&mut answer).await {
+        Ok(_) => {}
+        // Many servers of TLS end without saying so; what has come is judged by its length.
+        Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {}
+        Err(error) => return Err(error),
+    }
     let (status, body) = understood(&answer)
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "this is no HTTP answer"))?;
     Ok(Answer {

@@ -1,7 +1,6 @@
 //! The server's side: is it reached, does it know the token and the service, does its clock agree, do big answers
 //! come through.
 
-use std::net::SocketAddr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde_json::Value;
@@ -47,8 +46,7 @@ pub async fn checks(config: &Config, place: &Place) -> Vec<Check> {
 }
 
 struct Portal {
-    address: SocketAddr,
-    authority: String,
+    server: http::Server,
     token: Option<String>,
     installer: String,
 }
@@ -57,34 +55,42 @@ impl Portal {
     async fn find(config: &Config, place: &Place) -> Result<Portal, Box<Check>> {
         let installer = place.installer();
         let mend = format!("{installer} --server ws://HOST:9090");
-        let authority = config
-            .server
-            .split_once("://")
-            .map_or(config.server.as_str(), |(_, rest)| rest)
-            .trim_end_matches('/')
-            .to_owned();
+        let bad = |found: String, mend: String| Box::new(Check::bad("server", found, mend));
+        let address = match config.address() {
+            Ok(address) => address,
+            Err(words) => return Err(bad(words, mend)),
+        };
         let token = config.token().map_err(|error| {
             let mend = format!("{installer} --token TOKEN");
             Box::new(Check::bad("token", format!("{error:#}"), mend))
         })?;
         let token = token.filter(|token| !token.is_empty());
-        let (host, port) = parts(&authority);
-        match resolver::resolve(host).await {
+        match resolver::resolve(&address.host).await {
             Ok(ip) => Ok(Portal {
-                address: SocketAddr::new(ip, port),
-                authority,
+                server: http::Server {
+                    address,
+                    ip,
+                    authorities: config.authorities(),
+                },
                 token,
                 installer,
             }),
-            Err(error) => {
-                let found = format!("{host} is not found: {error}");
-                Err(Box::new(Check::bad("server", found, mend)))
-            }
+            Err(error) => Err(bad(format!("{} is not found: {error}", address.host), mend)),
         }
     }
 
     async fn get(&self, path: &str) -> std::io::Result<http::Answer> {
-        http::get(self.address, &self.authority, path, self.token.as_deref()).await
+        http::get(&self.server, path, self.token.as_deref()).await
+    }
+
+    /// An address for people.
+    fn link(&self, path: &str) -> String {
+        let scheme = if self.server.address.secure {
+            "https"
+        } else {
+            "http"
+        };
+        format!("{scheme}://{}{path}", self.server.address.authority)
     }
 
     fn other_server(&self) -> String {
@@ -126,8 +132,8 @@ impl Portal {
                 "service",
                 format!("{name} is at revision {there}, this stub is of revision {here}"),
                 format!(
-                    "fetch it again: http://{}/stubs/{name}.tar.gz",
-                    self.authority
+                    "fetch it again: {}",
+                    self.link(&format!("/stubs/{name}.tar.gz"))
                 ),
             ),
             _ => Check::good("service", format!("{name} is published, the token is good")),
@@ -193,15 +199,6 @@ impl Portal {
     }
 }
 
-/// Host and port; 9090 where none is said.
-fn parts(authority: &str) -> (&str, u16) {
-    let (host, port) = match authority.rsplit_once(':') {
-        Some((host, port)) if !port.contains(']') => (host, port.parse().unwrap_or(9090)),
-        _ => (authority, 9090),
-    };
-    (host.trim_matches(['[', ']']), port)
-}
-
 fn now() -> f64 {
     SystemTime::now()
         .duration_since(UNIX_EPOCH)
@@ -210,17 +207,4 @@ fn now() -> f64 {
 
 fn millis(time: Duration) -> f64 {
     time.as_secs_f64() * 1000.0
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn addresses_are_taken_apart() {
-        assert_eq!(parts("robots.local:80"), ("robots.local", 80));
-        assert_eq!(parts("server"), ("server", 9090));
-        assert_eq!(parts("[::1]:81"), ("::1", 81));
-        assert_eq!(parts("[::1]"), ("::1", 9090));
-    }
 }

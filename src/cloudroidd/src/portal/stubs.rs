@@ -83,10 +83,35 @@ fn server(app: &App, caller: &Caller, headers: &HeaderMap) -> String {
         .and_then(|host| host.to_str().ok())
         .filter(|host| stubs::is_authority(host));
     match (caller.peer, host) {
-        (Peer::Tcp(_), Some(host)) => format!("ws://{host}"),
+        (Peer::Tcp(_), Some(host)) => format!("{}://{host}", scheme(headers)),
         _ => {
             let address = app.address("");
             address.trim_end_matches('/').to_owned()
         }
+    }
+}
+
+/// A proxy in front of the portal speaks TLS in its place, and says so.
+fn scheme(headers: &HeaderMap) -> &'static str {
+    let forwarded = headers.get("x-forwarded-proto");
+    match forwarded.and_then(|protocol| protocol.to_str().ok()) {
+        Some("https" | "wss") => "wss",
+        _ => "ws",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stub_fetched_through_tls_is_linked_through_tls() {
+        let mut headers = HeaderMap::new();
+        assert_eq!(scheme(&headers), "ws");
+        headers.insert(
+            "x-forwarded-proto",
+            header::HeaderValue::from_static("https"),
+        );
+        assert_eq!(scheme(&headers), "wss");
     }
 }

@@ -28,6 +28,7 @@ pub(super) fn stub(about: &About<'_>) -> String {
 
 const SETTINGS: &str = r#"
 # robot = "rover1"         # this robot's id; by default its host name
+# ca_file = "/path.pem"    # for a server of wss://: whom to trust, where that is not the system's to say
 # token_file = "/path"     # holds the token, where the server asks for one
 # desire = 0.1             # T_desire: the response time that is wished for, seconds
 # max = 0.3                # T_max: the longest that is acceptable, seconds

@@ -1,9 +1,10 @@
 #!/bin/sh
 # Installs the stub of @PACKAGE@ on this robot, as an overlay in front of its other ROS packages, or takes it away.
 #
-#   sh install.sh [--prefix DIR] [--server URL] [--token TOKEN] [--robot NAME] [--force]
+#   sh install.sh [--prefix DIR] [--server URL] [--ca FILE] [--token TOKEN] [--robot NAME] [--force]
 #   sh install.sh --uninstall [--prefix DIR]
 #
+# --ca: for a server of wss://, the certificate of the authority to trust, where the system does not.
 # Without --prefix: /opt/cloudroid for root, ~/.cloudroid for anybody else. Several stubs share one overlay.
 set -eu
 
@@ -20,7 +21,7 @@ usage() {
   sed -n '2,/^set -eu/{/^#/s/^# \{0,1\}//p;}' "$here/install.sh"
 }
 
-uninstall=false force=false prefix='' server='' token='' robot=''
+uninstall=false force=false prefix='' server='' ca='' token='' robot=''
 # Installed, it stands in the overlay's share/PKG; in the archive, at its top.
 if [ ! -e "$here/.catkin" ]; then
   prefix=$(cd "$here/../.." && pwd)
@@ -29,11 +30,12 @@ while [ $# -gt 0 ]; do
   case $1 in
     --uninstall) uninstall=true ;;
     --force) force=true ;;
-    --prefix | --server | --token | --robot)
+    --prefix | --server | --ca | --token | --robot)
       [ $# -gt 1 ] || complain "$1 needs a value"
       case $1 in
         --prefix) prefix=$2 ;;
         --server) server=$2 ;;
+        --ca) ca=$2 ;;
         --token) token=$2 ;;
         --robot) robot=$2 ;;
       esac
@@ -94,6 +96,12 @@ set_key() {
 }
 if [ -n "$robot" ]; then set_key robot "$robot"; fi
 if [ -n "$server" ]; then set_key server "$server"; fi
+if [ -n "$ca" ]; then
+  [ -r "$ca" ] || complain "cannot read $ca; --ca names a PEM file"
+  set_key ca_file "$share/ca.pem"
+elif [ -e "$share/ca.pem" ]; then
+  ca=$share/ca.pem
+fi
 if [ -n "$token" ]; then
   printf '%s\n' "$token" > "$secret"
   set_key token_file "$share/token"
@@ -110,6 +118,12 @@ if [ -s "$secret" ]; then
   CLOUDROID_TOKEN_FILE=$secret
   export CLOUDROID_TOKEN_FILE
 fi
+if [ -n "$ca" ]; then
+  cat "$ca" > "$trial/ca.pem"
+  ca=$trial/ca.pem
+  CLOUDROID_CA_FILE=$ca
+  export CLOUDROID_CA_FILE
+fi
 if ! "$stub" doctor --share "$trial" --package "$package" --only server; then
   $force || complain "nothing was installed: mend this, or install all the same with --force"
 fi
@@ -124,6 +138,7 @@ cat "$settings" > "$share/stub.toml"
 if [ -s "$secret" ]; then
   (umask 077 && cat "$secret" > "$share/token")
 fi
+if [ -n "$ca" ]; then cat "$ca" > "$share/ca.pem"; fi
 rm -rf "$share.old"
 for file in setup.bash setup.zsh .catkin; do cp "$here/$file" "$prefix/$file"; done
 sed "s|^_cloudroid_installed=.*|_cloudroid_installed='$prefix'|" "$here/setup.sh" > "$prefix/setup.sh.new"

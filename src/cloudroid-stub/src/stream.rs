@@ -1,0 +1,178 @@
+//! A connection to the portal: TCP, or TLS over it (TLS 1.2 and 1.3, by rustls).
+
+use std::io;
+use std::path::Path;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
+use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
+
+use crate::address::Address;
+
+/// Either.
+pub enum Stream {
+    /// As it is.
+    Plain(TcpStream),
+    /// Encrypted, and the portal has shown who it is.
+    Tls(Box<TlsStream<TcpStream>>),
+}
+
+impl Stream {
+    /// Over a connection that stands. `authorities` is a PEM file with the certificates to trust, the system's where
+    /// there is none.
+    pub async fn over(
+        tcp: TcpStream,
+        address: &Address,
+        authorities: Option<&Path>,
+    ) -> io::Result<Self> {
+        if !address.secure {
+            return Ok(Self::Plain(tcp));
+        }
+        let name = ServerName::try_from(address.host.clone()).map_err(io::Error::other)?;
+        let connector = TlsConnector::from(Arc::new(configuration(authorities)?));
+        let connected = connector.connect(name, tcp).await;
+        Ok(Self::Tls(Box::new(connected.map_err(explained)?)))
+    }
+
+    /// What it goes over.
+    pub fn tcp(&self) -> &TcpStream {
+        match self {
+            Self::Plain(tcp) => tcp,
+            Self::Tls(tls) => tls.get_ref().0,
+        }
+    }
+}
+
+fn configuration(authorities: Option<&Path>) -> io::Result<ClientConfig> {
+    let mut trusted = RootCertStore::empty();
+    match authorities {
+        Some(path) => {
+            let unreadable = |error: &dyn std::fmt::Display| {
+                io::Error::other(format!(
+                    "ca_file {} holds no certificate: {error}; it should be a PEM file",
+                    path.display()
+                ))
+            };
+            let certificates =
+                CertificateDer::pem_file_iter(path).map_err(|error| unreadable(&error))?;
+            for certificate in certificates {
+                let certificate = certificate.map_err(|error| unreadable(&error))?;
+                trusted
+                    .add(certificate)
+                    .map_err(|error| unreadable(&error))?;
+            }
+            if trusted.is_empty() {
+                return Err(unreadable(&"it has no BEGIN CERTIFICATE"));
+            }
+        }
+        None => {
+            // One of many that is not understood is no reason to trust none.
+            trusted.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
+            if trusted.is_empty() {
+                return Err(io::Error::other(
+                    "this robot trusts nobody yet: sudo apt install ca-certificates, or name the server's authority by ca_file in stub.toml",
+                ));
+            }
+        }
+    }
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let begun = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
+    let begun = begun.map_err(io::Error::other)?;
+    Ok(begun.with_root_certificates(trusted).with_no_client_auth())
+}
+
+/// With what to do, where it is known.
+fn explained(error: io::Error) -> io::Error {
+    use rustls::CertificateError as Certificate;
+    let inner = error
+        .get_ref()
+        .and_then(|inner| inner.downcast_ref::<rustls::Error>());
+    let next = match inner {
+        Some(rustls::Error::InvalidCertificate(reason)) => match reason {
+            // The second is another authority of the same name.
+            Certificate::UnknownIssuer | Certificate::BadSignature => {
+                "nobody whom this robot trusts has signed it; put the authority's certificate into a file and name it: install.sh --ca FILE"
+            }
+            Certificate::NotValidForName | Certificate::NotValidForNameContext { .. } => {
+                "it is another server's; correct the address: install.sh --server"
+            }
+            Certificate::Expired
+            | Certificate::ExpiredContext { .. }
+            | Certificate::NotValidYet
+            | Certificate::NotValidYetContext { .. } => {
+                "look at this robot's clock (date) first, then at the certificate"
+            }
+            Certificate::Other(reason) if reason.to_string().contains("CaUsedAsEndEntity") => {
+                "it is an authority's own, which servers must not show; have it sign one for the server"
+            }
+            _ => "have it made anew",
+        },
+        Some(rustls::Error::InvalidMessage(_)) => {
+            "the server does not speak TLS there; try ws:// in place of wss://"
+        }
+        _ => return error,
+    };
+    io::Error::other(format!("{error}: {next}"))
+}
+
+impl AsyncRead for Stream {
+    fn poll_read(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(tcp) => Pin::new(tcp).poll_read(cx, buffer),
+            Self::Tls(tls) => Pin::new(tls).poll_read(cx, buffer),
+        }
+    }
+}
+
+impl AsyncWrite for Stream {
+    fn poll_write(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        match self.get_mut() {
+            Self::Plain(tcp) => Pin::new(tcp).poll_write(cx, bytes),
+            Self::Tls(tls) => Pin::new(tls).poll_write(cx, bytes),
+        }
+    }
+
+    fn poll_write_vectored(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        match self.get_mut() {
+            Self::Plain(tcp) => Pin::new(tcp).poll_write_vectored(cx, slices),
+            Self::Tls(tls) => Pin::new(tls).poll_write_vectored(cx, slices),
+        }
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        true
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(tcp) => Pin::new(tcp).poll_flush(cx),
+            Self::Tls(tls) => Pin::new(tls).poll_flush(cx),
+        }
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(tcp) => Pin::new(tcp).poll_shutdown(cx),
+            Self::Tls(tls) => Pin::new(tls).poll_shutdown(cx),
+        }
+    }
+}

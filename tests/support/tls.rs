@@ -1,0 +1,80 @@
+//! A proxy that speaks TLS in front of a portal, with an authority of its own, as a robot's owner might have.
+
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+
+use anyhow::ensure;
+use tempfile::TempDir;
+
+use crate::deployer::run;
+use crate::machine::free_port;
+use crate::world::world;
+
+/// Both, made by openssl and socat.
+pub struct Proxy {
+    /// Where it listens.
+    pub port: u16,
+    place: TempDir,
+    serving: Child,
+}
+
+const CERTIFICATES: &str = r#"
+new="-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
+openssl req -x509 $new -keyout ca.key -out ca.pem -days 2 -subj /CN=authority -addext keyUsage=keyCertSign
+openssl req $new -keyout server.key -out server.csr -subj /CN=server
+echo 'subjectAltName=DNS:localhost,IP:127.0.0.1' > names
+openssl x509 -req -in server.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names -out server.pem
+"#;
+
+impl Proxy {
+    /// In front of the portal at `address`, under the names `localhost` and 127.0.0.1.
+    pub fn of(address: &str) -> anyhow::Result<Self> {
+        Self::showing("server", address)
+    }
+
+    /// One that shows its authority's own certificate.
+    pub fn of_authority(address: &str) -> anyhow::Result<Self> {
+        Self::showing("ca", address)
+    }
+
+    fn showing(certificate: &str, address: &str) -> anyhow::Result<Self> {
+        let place = world().directory("tls")?;
+        let made = run(Command::new("sh")
+            .args(["-euc", CERTIFICATES])
+            .current_dir(place.path()))?;
+        ensure!(made.status == 0, "{}", made.said());
+        let port = free_port()?;
+        let listen = format!(
+            "OPENSSL-LISTEN:{port},bind=0.0.0.0,reuseaddr,fork,cert={certificate}.pem,key={certificate}.key,verify=0"
+        );
+        let serving = Command::new("socat")
+            .args([&listen, &format!("TCP:{address}")])
+            .current_dir(place.path())
+            .stdin(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()?;
+        let mut proxy = Self {
+            port,
+            place,
+            serving,
+        };
+        // It listens as soon as it is reached.
+        while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
+            let ended = proxy.serving.try_wait()?;
+            ensure!(ended.is_none(), "socat ended: {ended:?}");
+        }
+        Ok(proxy)
+    }
+
+    /// The authority's certificate.
+    pub fn authority(&self) -> PathBuf {
+        self.place.path().join("ca.pem")
+    }
+}
+
+impl Drop for Proxy {
+    fn drop(&mut self) {
+        let _ = self.serving.kill();
+        let _ = self.serving.wait();
+    }
+}
