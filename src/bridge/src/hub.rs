@@ -114,6 +114,12 @@ impl Hub {
         })
     }
 
+    /// Who came last of those who listen now; no two listeners of any hub have the same number.
+    pub(crate) fn newest_listener(&self) -> Option<u64> {
+        let state = self.state.lock();
+        state.listeners.last().map(|(number, _)| *number)
+    }
+
     pub(crate) fn is_internal(&self) -> bool {
         self.pump.get().is_none()
     }

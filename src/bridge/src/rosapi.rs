@@ -69,6 +69,14 @@ impl Service {
         format!("rosapi/{}", self.srv)
     }
 
+    /// Whether its answer is about what nodes have registered.
+    pub(crate) fn shows_graph(self) -> bool {
+        !matches!(self.name, "get_time" | "get_ros_version")
+            && !self.name.contains("param")
+            && !self.name.ends_with("_details")
+            || self.name == "node_details"
+    }
+
     /// Its definition.
     pub(crate) fn definition(self) -> Result<Arc<ServiceDef>, String> {
         definitions::registry()

@@ -107,8 +107,13 @@ impl Client {
             .borrow()
             .services
             .contains_key(&call.service);
-        if !served && let Some(answer) = self.answer_ourselves(call).await {
-            return answer;
+        if !served {
+            if let Some(answer) = self.answer_ourselves(call).await {
+                return answer;
+            }
+            if self.services.lock().serves(&call.service) {
+                self.is_registered().await;
+            }
         }
         let service_type = self
             .shared
@@ -151,9 +156,31 @@ impl Client {
         self.response_frame(call, def.as_deref().ok(), &response)
     }
 
+    /// Waits until what this client advertised before is known to ROS: its own operations are carried out in order, as it
+    /// sees them. Not for long; what cannot be registered is told by a status.
+    async fn is_registered(&self) {
+        let topics: Vec<String> = self.outlets.lock().topics().map(str::to_owned).collect();
+        let services: Vec<String> = self.services.lock().names().map(str::to_owned).collect();
+        let mut graph = self.shared.bus.graph();
+        let known = graph.wait_for(|graph| {
+            let published = |topic: &String| {
+                let nodes = graph.topics.get(topic);
+                nodes.is_some_and(|nodes| !nodes.publishers.is_empty())
+            };
+            topics.iter().all(published)
+                && services
+                    .iter()
+                    .all(|name| graph.services.contains_key(name))
+        });
+        let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
+    }
+
     /// Answers for the bridge itself, where the call is for it.
     async fn answer_ourselves(&self, call: &Call) -> Option<Result<Frame, String>> {
         if let Some(api) = rosapi::Service::find(&call.service) {
+            if api.shows_graph() {
+                self.is_registered().await;
+            }
             let answer = async {
                 let def = api.definition()?;
                 let args = self.own_args(call, &def)?;

@@ -29,6 +29,13 @@ pub(super) struct Outlets {
     untyped: HashMap<String, Vec<Untyped>>,
 }
 
+impl Outlets {
+    /// Names of the topics advertised.
+    pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
+        self.open.keys().map(String::as_str)
+    }
+}
+
 /// A message whose topic's type is being asked for.
 struct Untyped {
     format: Format,

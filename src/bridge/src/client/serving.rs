@@ -27,6 +27,14 @@ impl Services {
     pub(super) fn len(&self) -> usize {
         self.served.len()
     }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.served.keys().map(String::as_str)
+    }
+
+    pub(super) fn serves(&self, service: &str) -> bool {
+        self.served.contains_key(service)
+    }
 }
 
 struct Served {

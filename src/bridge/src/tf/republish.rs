@@ -153,6 +153,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
+            topic.clone(),
             stop,
             deliver,
         ));
@@ -235,6 +236,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
+            FEEDBACK_TOPIC.to_owned(),
             stop,
             deliver,
         ));
@@ -336,11 +338,13 @@ impl Listener for Goals {
     }
 }
 
-/// Gives `deliver` what has changed, at the rate asked for, until that says no or `stop` is cancelled.
+/// Gives `deliver` what has changed for those who listen to `topic`, at the rate asked for, until that says no or `stop`
+/// is cancelled.
 async fn send(
     shared: Weak<Shared>,
     buffer: Arc<Buffer>,
     wanted: Wanted,
+    topic: String,
     stop: CancellationToken,
     mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
 ) {
@@ -353,6 +357,7 @@ async fn send(
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let target = buffer::plain(&wanted.target_frame);
     let mut sent: HashMap<&str, Transform> = HashMap::new();
+    let mut heard_by = None;
     loop {
         tokio::select! {
             () = stop.cancelled() => return,
@@ -361,6 +366,20 @@ async fn send(
         let Some(shared) = shared.upgrade() else {
             return;
         };
+        // Callers learn the topic's name from the answer and listen only then; whoever comes late wants to hear all.
+        let newest = shared
+            .live_hub(&topic)
+            .and_then(|hub| hub.newest_listener());
+        if newest != heard_by {
+            heard_by = newest;
+            sent.clear();
+        }
+        if heard_by.is_none() {
+            if !deliver(&shared, None) {
+                return;
+            }
+            continue;
+        }
         let mut changed = Vec::new();
         for source in wanted
             .source_frames

@@ -243,6 +243,39 @@ async fn a_service_of_another_definition_is_not_called() {
 }
 
 #[tokio::test]
+async fn what_a_client_has_advertised_is_there_for_what_it_asks_next() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    for round in 0..20 {
+        let (topic, service) = (format!("/topic{round}"), format!("/service{round}"));
+        client
+            .send(json!({"op": "advertise", "topic": topic, "type": "std_msgs/String"}))
+            .await;
+        client
+            .send(json!({"op": "call_service", "id": "topics", "service": "/rosapi/topics"}))
+            .await;
+        let answer = client.json().await;
+        let topics = answer["values"]["topics"].as_array().unwrap();
+        assert!(topics.contains(&json!(topic)), "{answer}");
+        client
+            .send(json!({"op": "advertise_service", "service": service, "type": "x_msgs/Add"}))
+            .await;
+        client
+            .send(json!({"op": "call_service", "id": "own", "service": service, "args": [1, 2]}))
+            .await;
+        let request = client.json().await;
+        assert_eq!(request["op"], "call_service", "{request}");
+        client
+            .send(
+                json!({"op": "service_response", "id": request["id"], "service": service,
+                "values": {"sum": 3}, "result": true}),
+            )
+            .await;
+        assert_eq!(client.json().await["values"], json!({"sum": 3}));
+    }
+}
+
+#[tokio::test]
 async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
     let world = World::new().await;
     let _served = serves(&world, "/add", None).await;

@@ -76,6 +76,29 @@ async fn a_topic_made_for_the_caller_says_what_has_moved() {
 }
 
 #[tokio::test]
+async fn what_does_not_move_is_told_to_who_listens_late_and_to_who_listens_again() {
+    let world = World::new().await;
+    let publisher = tf_publisher(&world).await;
+    let mut client = world.client().await;
+    client.send(json!({"op": "call_service", "service": "/republish_tfs", "type": "tf2_web_republisher/RepublishTFs", "args": wanted("turtle")})).await;
+    let topic = client.json().await["values"]["topic_name"].clone();
+    connected(publisher.as_ref(), 1).await;
+    moved(&world, publisher.as_ref(), "turtle", 1.0);
+    // The rate is 100 per second: it has been looked at when this has passed.
+    tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    for _ in 0..2 {
+        client
+            .send(json!({"op": "subscribe", "topic": topic, "type": "tf2_web_republisher/TFArray"}))
+            .await;
+        assert_eq!(x_of(&client.json().await["msg"]["transforms"]), 1.0);
+        client
+            .send(json!({"op": "unsubscribe", "topic": topic}))
+            .await;
+        client.settled().await;
+    }
+}
+
+#[tokio::test]
 async fn a_goal_carries_transforms_as_feedback_until_it_is_cancelled() {
     let world = World::new().await;
     let publisher = tf_publisher(&world).await;
