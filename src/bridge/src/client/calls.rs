@@ -100,6 +100,7 @@ impl Client {
     }
 
     async fn answer(&self, call: &Call) -> Result<Frame, String> {
+        self.serves_itself(&call.service).await;
         let served = self
             .shared
             .bus
@@ -107,13 +108,8 @@ impl Client {
             .borrow()
             .services
             .contains_key(&call.service);
-        if !served {
-            if let Some(answer) = self.answer_ourselves(call).await {
-                return answer;
-            }
-            if self.services.lock().serves(&call.service) {
-                self.is_registered().await;
-            }
+        if !served && let Some(answer) = self.answer_ourselves(call).await {
+            return answer;
         }
         let service_type = self
             .shared
@@ -154,6 +150,15 @@ impl Client {
             .await
             .map_err(|error| error.to_string())?;
         self.response_frame(call, def.as_deref().ok(), &response)
+    }
+
+    /// Waits for the registration of a service that this client has advertised and calls itself.
+    async fn serves_itself(&self, service: &str) {
+        let registered = self.services.lock().registered(service);
+        if let Some(mut registered) = registered {
+            let known = registered.wait_for(|registered| *registered);
+            let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
+        }
     }
 
     /// Waits until what this client advertised before is known to ROS: its own operations are carried out in order, as it

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use ros::schema::ServiceDef;
 use rosbridge::{AdvertiseService, Compression, Id, ServiceResponse, UnadvertiseService, Writer};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::publishing::decode_args;
@@ -32,15 +32,18 @@ impl Services {
         self.served.keys().map(String::as_str)
     }
 
-    pub(super) fn serves(&self, service: &str) -> bool {
-        self.served.contains_key(service)
+    /// Whether a service of this client is registered by now, and when it will be.
+    pub(super) fn registered(&self, service: &str) -> Option<watch::Receiver<bool>> {
+        Some(self.served.get(service)?.registered.clone())
     }
 }
 
 struct Served {
     number: u64,
+    /// Closed without having been true where that failed.
+    registered: watch::Receiver<bool>,
     /// Ends the task that holds the registration.
-    _registered: DropGuard,
+    _stop: DropGuard,
 }
 
 struct Request {
@@ -154,9 +157,11 @@ impl Client {
                 "this client serves {limit} services already; unadvertise one"
             ));
         }
+        let (now_registered, registered) = watch::channel(false);
         let served = Served {
             number,
-            _registered: stop.clone().drop_guard(),
+            registered,
+            _stop: stop.clone().drop_guard(),
         };
         let earlier = services.served.insert(service.clone(), served);
         drop(services);
@@ -206,6 +211,7 @@ impl Client {
             }
             match shared.bus.serve(&service, service_type, handler).await {
                 Ok(registered) => {
+                    now_registered.send_replace(true);
                     if let Some(client) = client.upgrade() {
                         client.info(&reply, &format!("advertise_service: advertised {service}"));
                     }

@@ -247,7 +247,8 @@ async fn what_a_client_has_advertised_is_there_for_what_it_asks_next() {
     let world = World::new().await;
     let mut client = world.client().await;
     for round in 0..20 {
-        let (topic, service) = (format!("/topic{round}"), format!("/service{round}"));
+        // Each service twice: taken back and advertised anew, as clients do between their tests.
+        let (topic, service) = (format!("/topic{round}"), format!("/service{}", round / 2));
         client
             .send(json!({"op": "advertise", "topic": topic, "type": "std_msgs/String"}))
             .await;
@@ -272,6 +273,9 @@ async fn what_a_client_has_advertised_is_there_for_what_it_asks_next() {
             )
             .await;
         assert_eq!(client.json().await["values"], json!({"sum": 3}));
+        client
+            .send(json!({"op": "unadvertise_service", "service": service}))
+            .await;
     }
 }
 
