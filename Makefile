@@ -56,6 +56,12 @@ stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it 
 	@scripts/deps run
 	@scripts/stub-cross "$(CACHE)" "$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/debug"
 
+.PHONY: test-cross
+test-cross: stub-cross build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
+	@scripts/deps build run test cross
+	@echo "== stories of other architectures"
+	@CLOUDROID_CROSS=1 cargo test --locked -p stories --test stories -- cross::
+
 .PHONY: build
 build: ## build the daemon, the command line tool and the servants' init, optimised
 	@scripts/deps build

@@ -12,6 +12,8 @@ mod answer;
 mod burglary;
 #[path = "stories/clients.rs"]
 mod clients;
+#[path = "stories/cross.rs"]
+mod cross;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/grants.rs"]
@@ -46,6 +48,8 @@ mod strangers;
 mod survival;
 #[path = "stories/tls.rs"]
 mod tls;
+#[path = "stories/trying.rs"]
+mod trying;
 
 /// A story under its function's name.
 fn story(name: &str, tell: fn() -> Told) -> Trial {
@@ -63,7 +67,13 @@ macro_rules! stories {
 
 fn main() -> ExitCode {
     let arguments = Arguments::from_args();
+    // Their programs take minutes to build: make test-cross does, and says so.
+    let cross = match std::env::var_os("CLOUDROID_CROSS") {
+        Some(_) => stories![cross: an_aarch64_robot_works, an_armv7_robot_works],
+        None => Vec::new(),
+    };
     let trials: Vec<Trial> = [
+        cross,
         stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
         stories![burglary:
             no_attempt_to_break_out_succeeds,
@@ -103,6 +113,7 @@ fn main() -> ExitCode {
         ],
         stories![launched:
             roslaunch_cannot_tell_the_stub_from_the_original,
+            rosrun_gives_the_node_the_name_that_the_original_has,
         ],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
@@ -175,6 +186,11 @@ fn main() -> ExitCode {
         stories![tls:
             a_robot_works_through_tls,
             what_stands_against_tls_is_said,
+        ],
+        stories![trying:
+            a_packaged_node_is_tried_on_a_picture,
+            a_source_package_is_tried_on_a_recording,
+            a_robot_is_explained,
         ],
         stories![shadowing:
             on_debians_layout_every_tool_finds_the_stub,

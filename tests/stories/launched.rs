@@ -118,3 +118,26 @@ pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Told {
     }
     Ok(())
 }
+
+pub fn rosrun_gives_the_node_the_name_that_the_original_has() -> Told {
+    let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
+    let script = format!(
+        r#"{}
+sh teller_py-stub/install.sh --robot launched-name > /dev/null
+printf '[nodes]\n"teller.py" = "usual_name"\n' >> /opt/cloudroid/share/teller_py/stub.toml
+. /opt/cloudroid/setup.sh
+rosmaster --core -p ${{ROS_MASTER_URI##*:}} > /dev/null 2>&1 & master=$!
+until rosparam list > /dev/null 2>&1; do kill -0 $master || exit 1; sleep 0.1; done
+CLOUDROID_LOCAL=none rosrun teller_py teller.py > said 2>&1 &
+timeout 60 rostopic echo -n 1 -p /usual_name/told || cat said
+"#,
+        prelude(free_port()?, "")
+    );
+    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    ensure!(
+        outcome.stdout.contains("life 1 of /usual_name in"),
+        "{}",
+        outcome.said()
+    );
+    Ok(())
+}

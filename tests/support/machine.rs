@@ -63,13 +63,17 @@ impl Machine {
         Ok(machine)
     }
 
-    /// Copies a file of this machine to an absolute path, with this mode.
-    pub fn puts(&self, file: &Path, to: &str, mode: u32) -> anyhow::Result<()> {
-        let to = self
-            .own
+    /// Where a file that was written in it is, seen from here.
+    pub fn written(&self, path: &str) -> PathBuf {
+        self.own
             .path()
             .join("upper")
-            .join(to.trim_start_matches('/'));
+            .join(path.trim_start_matches('/'))
+    }
+
+    /// Copies a file of this machine to an absolute path, with this mode.
+    pub fn puts(&self, file: &Path, to: &str, mode: u32) -> anyhow::Result<()> {
+        let to = self.written(to);
         std::fs::create_dir_all(to.parent().context("a directory")?)?;
         std::fs::copy(file, &to)?;
         Ok(std::fs::set_permissions(

@@ -229,11 +229,23 @@ impl Site {
         service: &str,
         settings: &str,
     ) -> anyhow::Result<PathBuf> {
+        self.installs_for(daemon, service, std::env::consts::ARCH, settings)
+    }
+
+    /// The same for another architecture.
+    pub fn installs_for(
+        &self,
+        daemon: &Daemon,
+        service: &str,
+        architecture: &str,
+        settings: &str,
+    ) -> anyhow::Result<PathBuf> {
         let place = tempfile::Builder::new()
             .prefix("installed")
             .tempdir_in(self.place.path())?
             .keep();
-        let words = ["stub", service, "-o", path_str(&place)];
+        let directory = path_str(&place);
+        let words = ["stub", service, "--arch", architecture, "-o", directory];
         daemon.deployer().types(&words)?.succeeded()?;
         let archive = File::open(place.join(format!("{service}.tar.gz")))?;
         tar::Archive::new(flate2::read::GzDecoder::new(archive)).unpack(&place)?;
@@ -256,6 +268,26 @@ impl Site {
     ) -> anyhow::Result<Running> {
         let mut command = Command::new(overlay.join("lib").join(package).join(executable));
         command.args(argv);
+        let log = tempfile::Builder::new().tempfile_in(self.place.path())?;
+        self.start(command, &log.into_temp_path().keep()?)
+    }
+
+    /// The same by an emulator, which has to be told what a launcher would.
+    pub fn emulates(
+        &self,
+        emulator: &str,
+        overlay: &Path,
+        package: &str,
+        executable: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
+        let mut command = Command::new(emulator);
+        command
+            .arg(overlay.join("lib").join(package).join("cloudroid-stub"))
+            .args(["run", "--package", package, "--node", executable, "--share"])
+            .arg(overlay.join("share").join(package))
+            .arg("--")
+            .args(argv);
         let log = tempfile::Builder::new().tempfile_in(self.place.path())?;
         self.start(command, &log.into_temp_path().keep()?)
     }

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Tells on ~told how it was started: arguments, name, namespace, directory, parameters, and the how manieth life this is.
 
-A life ends with the exit code in ~code when its number comes on ~end.
+A life ends with the exit code in ~code when its number comes on ~end. What comes on ~say is said on ~said.
 """
 import os
 import sys
@@ -42,6 +42,8 @@ told.publish(
         "there" if os.path.exists(rospy.get_param("~file", "")) else "missing",
     )
 )
+said = rospy.Publisher("~said", String, queue_size=10)
+rospy.Subscriber("~say", String, said.publish)
 rospy.Subscriber("~end", Int32, end)
 rospy.on_shutdown(lambda: print("told to end", flush=True))
 rospy.spin()
