@@ -4,6 +4,7 @@
 //! again, or is forgotten with its registrations.
 
 use std::collections::{HashMap, VecDeque};
+use std::io::ErrorKind;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -175,6 +176,13 @@ async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
                 if master.is_known(&api) {
                     notifier.retry(notice);
                 }
+            }
+            Err(Error::Io { source, .. })
+                if notice.subject == Subject::Shutdown
+                    && source.kind() == ErrorKind::ConnectionRefused =>
+            {
+                // Nobody is left who could register once more: a successor may be given the same port.
+                master.state.lock().registry.address_is_free(&api);
             }
             Err(error) => {
                 // Nobody is there (process_exited will see to that), or it does not want to know.

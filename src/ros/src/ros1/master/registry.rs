@@ -223,6 +223,13 @@ impl Registry {
         }
     }
 
+    /// Nobody is at this address any more, so that whoever registers with it next is a newcomer.
+    pub(super) fn address_is_free(&mut self, api: &str) {
+        for node in self.nodes.values_mut() {
+            node.replaced.retain(|old| old != api);
+        }
+    }
+
     fn holds(&self, kind: Kind, name: &str, node: &str) -> bool {
         self.nodes.get(node).is_some_and(|found| match kind {
             Kind::Publisher => found.publishes.contains(name),

@@ -209,6 +209,26 @@ async fn a_name_belongs_to_who_came_last() {
 }
 
 #[tokio::test]
+async fn a_successor_may_have_the_address_of_one_who_is_dead() {
+    let master = TestMaster::start().await;
+    let new = TestNode::start().await;
+    let register = async |api: &str| {
+        let registration = args(["/n", "/t", "a/B", api]);
+        master.call("registerPublisher", &registration).await.0
+    };
+    // A bridge is killed, the next has another port, is killed too, and the one after that has the first one's port.
+    assert_eq!(register(NOWHERE).await, 1);
+    assert_eq!(register(&new.uri).await, 1);
+    tokio::time::timeout(LONG, async {
+        while register(NOWHERE).await != 1 {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await
+    .expect("taken for the dead one for ever");
+}
+
+#[tokio::test]
 async fn the_dead_are_dropped_and_the_living_stay() {
     let master = TestMaster::start().await;
     let mut living = TestNode::start().await;
