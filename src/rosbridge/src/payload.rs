@@ -73,6 +73,12 @@ impl<'a> Payload<'a> {
         }
     }
 
+    /// The names of an object's fields; `None` where it is no object, or has more than any message.
+    pub fn keys(&self) -> Option<Vec<String>> {
+        let fields = Fields::of(*self).ok()?;
+        Some(fields.names().map(str::to_owned).collect())
+    }
+
     /// Whether it is `null`, which stands for nothing.
     pub fn is_null(&self) -> bool {
         match self.format {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::MessageType;
-use rosbridge::{Advertise, Compression, Format, Payload, Publish, Unadvertise};
+use rosbridge::{Advertise, Compression, Format, Level, Payload, Publish, Unadvertise};
 
 use super::{Client, Reply};
 use crate::names::{plain_type, resolve};
@@ -169,7 +169,33 @@ impl Client {
         let bytes = decode(&outlet.message_type, op.msg, op.compression, source)
             .map_err(|reason| format!("topic {topic}: {reason}"))?;
         outlet.publish(bytes);
+        if op.compression != Compression::CborRaw && self.hears(Level::Info) {
+            self.tell_defaults(&topic, &outlet.message_type, op.msg, reply);
+        }
         Ok(())
+    }
+
+    /// Names the message's own fields that were left out.
+    fn tell_defaults(
+        &self,
+        topic: &str,
+        message_type: &MessageType,
+        msg: Payload<'_>,
+        reply: &Reply,
+    ) {
+        let Some(given) = msg.keys() else { return };
+        let fields = message_type.fields().iter().map(|field| &field.name);
+        let missing: Vec<_> = fields
+            .filter(|name| !given.contains(name))
+            .map(|name| format!("{name:?}"))
+            .collect();
+        if !missing.is_empty() {
+            let missing = missing.join(", ");
+            self.info(
+                reply,
+                &format!("publish: topic {topic}: defaults stand for {missing}"),
+            );
+        }
     }
 
     /// What to publish as without having advertised: the type said, or the topic's.

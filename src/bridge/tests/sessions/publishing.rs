@@ -49,6 +49,18 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
         (&json!(2.0), &json!([]), &json!([]))
     );
     assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
+    // Who wants to know is told.
+    client
+        .send(json!({"op": "set_level", "level": "info"}))
+        .await;
+    client
+        .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": {"x": 2, "near": []}}))
+        .await;
+    assert_eq!(
+        client.json().await,
+        json!({"op": "status", "id": "p", "level": "info",
+            "msg": "publish: topic /place: defaults stand for \"header\", \"tags\""})
+    );
 }
 
 #[tokio::test]
