@@ -218,8 +218,17 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Told {
         .runs("sh", "cat /root/mine/share/opencv_apps/stub.toml; stat -c %a /root/mine/share/opencv_apps/token")?
         .succeeded()?
         .stdout;
+    let sets = |key: &str| {
+        let of = |line: &&str| line.starts_with(key);
+        settings.lines().filter(of).collect::<Vec<_>>()
+    };
     ensure!(
-        settings.contains("robot = \"rover\"") && settings.ends_with("600\n"),
+        sets("robot") == ["robot = \"rover\""] && settings.ends_with("600\n"),
+        "{settings}"
+    );
+    // In the place where they are explained.
+    ensure!(
+        settings.starts_with("# How this robot uses") && !settings.contains("# robot"),
         "{settings}"
     );
     // What the owner sets outlives another installation.

@@ -33,6 +33,7 @@ const SETTINGS: &str = r#"
 # desire = 0.1             # T_desire: the response time that is wished for, seconds
 # max = 0.3                # T_max: the longest that is acceptable, seconds
 # local = "cold"           # the local original: "cold", "warm" or "none"
+# nodes = { "talk.py" = "talker" }   # what an executable's node is called by default, where that is not its own name
 "#;
 
 /// What the archive was made of.

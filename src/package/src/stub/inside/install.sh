@@ -87,10 +87,20 @@ settings=$(mktemp)
 secret=$(mktemp)
 trap 'rm -f "$settings" "$secret"' EXIT
 if [ -e "$share/stub.toml" ]; then cat "$share/stub.toml" > "$settings"; else cat "$here/share/$package/stub.toml" > "$settings"; fi
-# KEY VALUE: before all tables, in place of a line that sets it.
+# KEY VALUE: in place of the line that sets it or shows how to, else before all tables.
 set_key() {
-  printf '%s = "%s"\n' "$1" "$2" > "$settings.new"
-  sed "/^$1 *=/d" "$settings" >> "$settings.new"
+  key=$1 value=$2 awk '
+    BEGIN {
+      key = ENVIRON["key"]; value = ENVIRON["value"]
+      gsub(/[\\"]/, "\\\\&", value)
+      line = key " = \"" value "\""
+    }
+    $0 ~ "^(# *)?" key " *=" && !done { print line; done = 1; next }
+    $0 ~ "^" key " *=" { next }
+    /^\[/ && !done { print line; done = 1 }
+    { print }
+    END { if (!done) print line }
+  ' "$settings" > "$settings.new"
   cat "$settings.new" > "$settings"
   rm -f "$settings.new"
 }
