@@ -388,7 +388,7 @@ pub fn a_locked_database_is_named_and_waited_for() -> Told {
     locker.wait()?;
     ensure!(words.contains("database"), "{words}");
     event(&daemon, "state-writable", &["can be written again"])?;
-    ensure!(!warnings(&daemon)?.contains("locked"));
+    ensure!(!warnings(&daemon)?.contains("another program has locked it"));
     is_in_the_database(&daemon, &unwritable)?;
     let mut robot = daemon.robot("greeter_cpp?robot=after")?;
     ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
