@@ -16,6 +16,7 @@ rospy.init_node("slow")
 server.sendall(b"registered\n")
 if server.recv(1) != b"2":
     sys.exit("the model was not served")
-answers = rospy.Publisher("answers", String, queue_size=10)
+# Latched: whoever asks may be heard before they hear.
+answers = rospy.Publisher("answers", String, queue_size=10, latch=True)
 rospy.Subscriber("questions", String, lambda question: answers.publish("you asked " + question.data))
 rospy.spin()
