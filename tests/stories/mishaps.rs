@@ -281,13 +281,14 @@ stub=$(pgrep -f '[c]loudroid-stub run')
 echo "same group: $([ $(ps -o pgid= $first) = $(ps -o pgid= $stub) ] && echo yes)"
 echo "namespace: $(tr '\0' '\n' < /proc/$first/environ | grep ^ROS_NAMESPACE)"
 tr '\0' '\n' < /proc/$first/environ | grep -q "^ROS_MASTER_URI=$ROS_MASTER_URI" || echo "a Master of its own"
-rosnode list | grep -c teller
+rosnode list | grep teller | grep -v _cloudroid # which tells diagnostics
 kill -9 $first
 until original | grep -qv "^$first$"; do kill -0 $stub; sleep 0.1; done
 echo "another runs"
 kill -INT $launched; wait $launched || true
 pgrep -fa '[p]ython3 /usr/lib/teller_py|[c]loudroid-stub run' || echo "none is left"
 grep 'the local original ended' log
+echo "crashes: $(grep -c 'the local original ended' log)"
 "#;
 
 pub fn a_local_original_that_crashes_is_told_and_started_again() -> Told {
@@ -300,9 +301,11 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Told {
         "life 1 of /front/teller",
         "same group: yes",
         "namespace: ROS_NAMESPACE=/front/",
-        "a Master of its own\n1\n",
+        "a Master of its own\n/front/teller\nanother",
         "another runs\nnone is left\n",
         "signal: 9",
+        // That it ends with the launch is none.
+        "crashes: 1\n",
     ] {
         ensure!(
             outcome.stdout.contains(words),

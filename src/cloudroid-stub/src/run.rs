@@ -118,6 +118,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
             ended = exit.wait_for(Option::is_some) => node_end(&ended),
             signal = asked_to_stop(&mut stopping, &mut shutdown) => {
                 tracing::debug!(signal, "asked to end");
+                if let Some(keeper) = mirror.keeper() {
+                    keeper.end();
+                }
                 mirror.session().tell(&Control::Signal { signal });
                 let up = *mirror.session().up().borrow();
                 let patience = if up { FAREWELL } else { Duration::ZERO };

@@ -2,6 +2,7 @@
 //! the application.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
@@ -57,6 +58,7 @@ pub struct Keeper {
     robot: Arc<dyn Application>,
     original: Option<Arc<Original>>,
     safe_stop: Option<SafeStop>,
+    ending: AtomicBool,
     /// The next deadline may have changed.
     wake: Arc<Notify>,
     this: Weak<Self>,
@@ -90,6 +92,7 @@ impl Keeper {
             robot,
             original: original.map(Arc::new),
             safe_stop,
+            ending: AtomicBool::new(false),
             wake: Arc::default(),
             this: this.clone(),
         });
@@ -167,6 +170,15 @@ impl Keeper {
     /// The link is down.
     pub fn link_down(&self) {
         self.with(|state, now| state.governor.link_down(now));
+    }
+
+    /// The node is ending: the local original ends, too, and is not started again. roslaunch's signal has reached it
+    /// already, so its end is no crash.
+    pub fn end(&self) {
+        self.ending.store(true, Ordering::Relaxed);
+        if let Some(original) = &self.original {
+            original.stop();
+        }
     }
 
     /// How it stands.
@@ -271,6 +283,7 @@ impl Keeper {
                 }
             }
             Effect::Outcome(outcome) => self.robot.told(&outcome),
+            Effect::Event(_) if self.ending.load(Ordering::Relaxed) => {}
             Effect::Event(event) => {
                 match (&event, &self.original) {
                     (Event::Start(_), Some(original)) => original.start(),
