@@ -14,6 +14,8 @@ mod burglary;
 mod clients;
 #[path = "stories/cross.rs"]
 mod cross;
+#[path = "stories/crossing.rs"]
+mod crossing;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/grants.rs"]
@@ -114,6 +116,14 @@ fn main() -> ExitCode {
         stories![launched:
             roslaunch_cannot_tell_the_stub_from_the_original,
             rosrun_gives_the_node_the_name_that_the_original_has,
+        ],
+        stories![crossing:
+            stamps_mean_the_same_where_clocks_differ,
+            simulated_time_is_the_robot_s,
+            transforms_of_all_publishers_arrive,
+            an_action_is_carried_out_in_the_cloud,
+            settings_are_changed_through_dynamic_reconfigure,
+            pictures_are_made_smaller_where_the_link_is_slow,
         ],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,

@@ -128,6 +128,16 @@ impl Cable {
         }
     }
 
+    /// Bytes that have left for the server so far, and that came from there.
+    pub fn carried(&self) -> anyhow::Result<(u64, u64)> {
+        let count = |what: &str| -> anyhow::Result<u64> {
+            let path = format!("/sys/class/net/{}/statistics/{what}_bytes", self.ends[0]);
+            let text = std::fs::read_to_string(&path).context(path)?;
+            Ok(text.trim().parse()?)
+        };
+        Ok((count("tx")?, count("rx")?))
+    }
+
     /// Makes it bad, both ways.
     pub fn degrade(&self, badness: Badness) -> anyhow::Result<()> {
         match &self.shaper {

@@ -68,6 +68,13 @@ pub const TELLER: Service = Service {
     arguments: &["--node", "teller.py"],
 };
 
+/// What has to cross between a robot and its servant.
+pub const CROSSING: Service = Service {
+    name: "crossing_py",
+    package: Some("crossing_py"),
+    arguments: &["--node", "crossing.py"],
+};
+
 /// Our hostile package.
 pub const BURGLAR: Service = Service {
     name: "burglar_cpp",

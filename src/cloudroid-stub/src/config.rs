@@ -20,6 +20,7 @@
 //! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time
 //! # The name that an executable's node has when none is given, where that is not the executable's.
 //! nodes = { "listener.py" = "listener" }
+//! stamps = "rewrite"   # "rewrite" to the cloud's clock and back, or "keep"
 //! codec = "auto"       # "none", "auto" (lossless), or "video" (lossy pictures allowed)
 //! ```
 //!
@@ -92,6 +93,9 @@ pub struct Config {
     /// An output on which a message of zeros is published when neither side answers in time.
     #[serde(default)]
     pub safe_stop: Option<String>,
+    /// What becomes of stamps while the clocks of robot and cloud differ.
+    #[serde(default)]
+    pub stamps: Stamps,
     /// How messages are made smaller on the link.
     #[serde(default)]
     pub codec: Codec,
@@ -170,6 +174,17 @@ pub enum Local {
     None,
 }
 
+/// What becomes of stamps while the clocks of robot and cloud differ.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stamps {
+    /// The node has them in its own clock's time, the robot in its.
+    #[default]
+    Rewrite,
+    /// They cross as they are.
+    Keep,
+}
+
 /// How messages are made smaller.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -210,7 +225,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 17] = [
+pub const KEYS: [&str; 18] = [
     "server",
     "service",
     "token",
@@ -227,6 +242,7 @@ pub const KEYS: [&str; 17] = [
     "local",
     "stateful",
     "safe_stop",
+    "stamps",
     "codec",
 ];
 

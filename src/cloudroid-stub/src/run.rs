@@ -106,6 +106,12 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         machine: machine(),
         node: robot.for_the_cloud(&asked.node.package, &asked.node.node, &asked.node.share),
         sla: sla(&config),
+        codecs: match config.codec {
+            config::Codec::None => Vec::new(),
+            config::Codec::Auto => link::packing::decoded_here(false),
+            config::Codec::Video => link::packing::decoded_here(true),
+        },
+        keep_stamps: config.stamps == config::Stamps::Keep,
         parameters,
         ..Hello::default()
     };
@@ -302,6 +308,7 @@ async fn link_once(
             received,
             ahead,
             next,
+            codecs,
             servant,
         } => {
             if !resumed && resume.is_some() {
@@ -312,6 +319,9 @@ async fn link_once(
             *resume = Some(session);
             tracing::info!(servant, resumed, "linked to {}", config.server);
             let session = mirror.session();
+            if config.codec != config::Codec::None {
+                session.peer_decodes(&codecs);
+            }
             session.reconnect(received, &ahead, next);
             Ok(session.run(&mut socket, &**mirror).await)
         }

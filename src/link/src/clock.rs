@@ -2,17 +2,29 @@
 //! the shortest round trip is believed.
 
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Samples believed in.
 const SAMPLES: usize = 16;
 
+/// Exchanges disagree when they differ by more than their ways allow, and what clocks drift meanwhile: 5 ms.
+const DRIFT: i64 = 5_000_000;
+
+static SHIFT: AtomicI64 = AtomicI64::new(0);
+
 /// Nanoseconds since 1970.
 pub fn now() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    since.map_or(0, |since| {
+    let now = since.map_or(0, |since| {
         i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
-    })
+    });
+    now.saturating_add(SHIFT.load(Ordering::Relaxed))
+}
+
+/// Makes this process's clock differ from the machine's by so many nanoseconds: for tests that have one machine only.
+pub fn shift(nanoseconds: i64) {
+    SHIFT.store(nanoseconds, Ordering::Relaxed);
 }
 
 /// One exchange.
@@ -45,6 +57,14 @@ pub struct Clock {
 impl Clock {
     /// Takes in one exchange.
     pub fn add(&mut self, sample: Sample) {
+        let disagree = |best: Sample| {
+            let apart = sample.offset.saturating_sub(best.offset).saturating_abs();
+            apart > sample.delay / 2 + best.delay / 2 + DRIFT
+        };
+        // One of the clocks was set.
+        if self.best().is_some_and(disagree) {
+            self.samples.clear();
+        }
         if self.samples.len() == SAMPLES {
             self.samples.pop_front();
         }
@@ -94,5 +114,16 @@ mod tests {
             });
         }
         assert_eq!(clock.best().unwrap().offset, 1, "old samples are forgotten");
+    }
+
+    #[test]
+    fn a_clock_that_was_set_is_believed_at_once() {
+        let mut clock = Clock::default();
+        let sample = |offset, delay| Sample { offset, delay };
+        clock.add(sample(0, MS));
+        clock.add(sample(20 * MS, 40 * MS));
+        assert_eq!(clock.best().unwrap().offset, 0, "they agree");
+        clock.add(sample(3_600_000 * MS, 40 * MS));
+        assert_eq!(clock.best().unwrap().offset, 3_600_000 * MS);
     }
 }

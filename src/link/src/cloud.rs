@@ -30,7 +30,9 @@ use tokio::time::timeout;
 use ws::WebSocket;
 
 use crate::control::{Control, Exit, Hello, Node, Request, Sla, Welcome};
+use crate::packing::decoded_here;
 use crate::session::{Lost, SessionOptions, receive_open, send_open};
+use crate::skew::Skew;
 use crate::{MAX_FRAME, MAX_RECORD};
 
 use node_link::NodeLink;
@@ -99,6 +101,8 @@ pub struct Hub {
     /// One begins at a time: the second finds what the first left.
     beginning: tokio::sync::Mutex<()>,
     parameters: parameters::Known,
+    /// The robot's clock against ours.
+    skew: Skew,
     closed: watch::Sender<Option<String>>,
 }
 
@@ -144,6 +148,7 @@ impl Hub {
             changes: watch::Sender::new(0),
             beginning: tokio::sync::Mutex::default(),
             parameters: parameters::Known::default(),
+            skew: Skew::default(),
             closed: watch::Sender::new(None),
         })
     }
@@ -208,6 +213,7 @@ impl Hub {
             received,
             ahead,
             next,
+            codecs: decoded_here(hello.codecs.iter().any(|codec| codec == "video")),
             servant: self.servant.clone(),
         };
         let (theirs, theirs_ahead) = hello
@@ -215,6 +221,7 @@ impl Hub {
             .as_ref()
             .filter(|_| resumed)
             .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
+        link.session.peer_decodes(&hello.codecs);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
         if let Err(lost) = send_open(&mut socket, &welcome).await {
             return lost;

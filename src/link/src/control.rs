@@ -24,6 +24,10 @@ pub struct Hello {
     pub node: Node,
     /// What the robot's application promises itself.
     pub sla: Sla,
+    /// Codecs that the robot decodes; none: messages come as they are.
+    pub codecs: Vec<String>,
+    /// Stamps stay as they are, whatever the clocks say.
+    pub keep_stamps: bool,
     /// All parameters of the robot, as a tree of values.
     #[serde(with = "crate::values::tree")]
     pub parameters: BTreeMap<String, ParamValue>,
@@ -97,6 +101,9 @@ pub enum Welcome {
         ahead: Vec<u32>,
         /// The first number that the cloud will use on this connection.
         next: u32,
+        /// Codecs that the cloud decodes.
+        #[serde(default)]
+        codecs: Vec<String>,
         /// The servant, for logs.
         servant: String,
     },

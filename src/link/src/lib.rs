@@ -25,8 +25,11 @@ pub mod control;
 pub mod frame;
 mod incoming;
 mod outgoing;
+pub mod packing;
 pub mod record;
 pub mod session;
+pub mod skew;
+pub mod stamps;
 mod values;
 
 pub use outgoing::{Dropped, Quality};

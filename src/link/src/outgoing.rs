@@ -9,12 +9,13 @@
 //! Deciding late is the point: the socket is given little at a time, so a newer picture can still replace one that
 //! waits, and a small message never waits for more than a piece.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
 
 use bytes::{BufMut, Bytes, BytesMut};
 
 use crate::frame::Frame;
-use crate::record::{LEFT_AT, Record};
+use crate::record::{ENCODED, FLAGS_AT, LEFT_AT, Record, SERIALISE_AT};
 
 /// Records up to this size go in one piece, and are kept until the peer has them.
 pub(crate) const SMALL: usize = 32 * 1024;
@@ -34,6 +35,8 @@ const KEPT: (usize, usize) = (2048, 4 << 20);
 /// Urgent records that may wait and be kept: beyond, the session is given up.
 const MAX_URGENT: usize = 65_536;
 const MAX_URGENT_BYTES: usize = 512 << 20;
+/// Smaller messages are not worth encoding.
+const WORTH_PACKING: usize = 1024;
 
 /// How a message may be treated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,7 +56,7 @@ pub struct Dropped {
     pub stale: u64,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Out {
     head: BytesMut,
     payload: Bytes,
@@ -104,6 +107,12 @@ pub(crate) struct Outgoing {
     kept: VecDeque<(u32, Out)>,
     kept_bytes: usize,
     in_a_row: u32,
+    /// Messages of these topics are encoded before they are sent, while `packs`.
+    packable: BTreeSet<u32>,
+    packs: bool,
+    /// The message that is being encoded, and whether someone has taken that on.
+    packing: Option<(Out, bool)>,
+    packed: Option<Out>,
     piece: usize,
     max_age: Option<i64>,
     pub(crate) dropped: Dropped,
@@ -124,6 +133,10 @@ impl Outgoing {
             kept: VecDeque::new(),
             kept_bytes: 0,
             in_a_row: 0,
+            packable: BTreeSet::new(),
+            packs: false,
+            packing: None,
+            packed: None,
             piece: FIRST_PIECE,
             max_age,
             dropped: Dropped::default(),
@@ -179,25 +192,105 @@ impl Outgoing {
     }
 
     fn is_under_way(&self, channel: u32) -> bool {
-        let mut sending = self.sending.iter();
-        sending.any(|sending| sending.out.channel == Some(channel))
+        let sending = self.sending.iter().map(|sending| &sending.out);
+        let packing = self.packing.iter().map(|(out, _)| out);
+        sending
+            .chain(packing)
+            .chain(&self.packed)
+            .any(|out| out.channel == Some(channel))
+    }
+
+    /// Messages of this topic may be encoded.
+    pub(crate) fn set_packable(&mut self, channel: u32) {
+        self.packable.insert(channel);
+    }
+
+    /// Whether encoding pays.
+    pub(crate) fn set_packs(&mut self, packs: bool) {
+        self.packs = packs;
+    }
+
+    fn to_be_packed(&self, out: &Out) -> bool {
+        self.packs
+            && out.payload.len() >= WORTH_PACKING
+            && out
+                .head
+                .get(FLAGS_AT)
+                .is_some_and(|flags| flags & ENCODED == 0)
+            && out
+                .channel
+                .is_some_and(|channel| self.packable.contains(&channel))
+    }
+
+    /// A message to be encoded now: its channel, itself, and whether it must be understood alone.
+    pub(crate) fn take_to_pack(&mut self) -> Option<(u32, Bytes, bool)> {
+        let (out, taken) = self.packing.as_mut().filter(|(_, taken)| !taken)?;
+        *taken = true;
+        Some((out.channel?, out.payload.clone(), out.each))
+    }
+
+    /// It was encoded; none: it goes as it is.
+    pub(crate) fn packed(&mut self, frame: Option<(Bytes, Duration)>) {
+        let Some((mut out, _)) = self.packing.take() else {
+            return;
+        };
+        match frame {
+            Some((frame, took)) => {
+                out.head[FLAGS_AT] |= ENCODED;
+                let took = u32::try_from(took.as_micros()).unwrap_or(u32::MAX);
+                out.head[SERIALISE_AT..SERIALISE_AT + 4].copy_from_slice(&took.to_le_bytes());
+                out.payload = frame;
+            }
+            None => {
+                if let Some(channel) = out.channel {
+                    self.packable.remove(&channel);
+                }
+            }
+        }
+        self.packed = Some(out);
+    }
+
+    /// Whether the socket has all there is for it.
+    pub(crate) fn is_idle(&self) -> bool {
+        self.urgent.is_empty()
+            && self.sending.is_empty()
+            && self.packed.is_none()
+            && (self.turns.is_empty() || self.packing.is_some())
     }
 
     /// Forgets what waits on a channel.
     pub(crate) fn forget(&mut self, channel: u32) {
         self.topics.remove(&channel);
+        self.packable.remove(&channel);
+        if self
+            .packed
+            .as_ref()
+            .is_some_and(|out| out.channel == Some(channel))
+        {
+            self.packed = None;
+        }
         self.turns.retain(|turn| *turn != channel);
     }
 
     /// Whether anything waits.
     pub(crate) fn is_empty(&self) -> bool {
-        self.urgent.is_empty() && self.turns.is_empty() && self.sending.is_empty()
+        self.urgent.is_empty()
+            && self.turns.is_empty()
+            && self.sending.is_empty()
+            && self.packing.is_none()
+            && self.packed.is_none()
     }
 
     /// The next frame.
     pub(crate) fn next(&mut self, now: i64) -> Option<Frame> {
         if let Some(out) = self.urgent.pop_front() {
             self.urgent_bytes -= out.len();
+            return Some(self.start(out, now));
+        }
+        if let Some(out) = self.packed.take() {
+            if out.len() <= SMALL {
+                self.turn_after(&out);
+            }
             return Some(self.start(out, now));
         }
         let turn_for_big = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
@@ -216,7 +309,14 @@ impl Outgoing {
 
     /// The next message in turn, without those that have become too old.
     fn next_message(&mut self, now: i64) -> Option<Out> {
-        let channel = self.turns.pop_front()?;
+        // One is encoded at a time; the others wait for it.
+        let busy = self.packing.is_some();
+        let ready = |channel: &u32| {
+            let first = self.topics.get(channel).and_then(VecDeque::front);
+            !busy || first.is_none_or(|first| !self.to_be_packed(first))
+        };
+        let at = self.turns.iter().position(ready)?;
+        let channel = self.turns.remove(at)?;
         let topic = self.topics.get_mut(&channel)?;
         let stale =
             |first: &Out| !first.each && self.max_age.is_some_and(|age| now - first.born > age);
@@ -225,11 +325,30 @@ impl Outgoing {
             self.dropped.stale += 1;
         }
         let out = topic.pop_front()?;
+        if self.to_be_packed(&out) {
+            if !busy {
+                self.packing = Some((out, false));
+            } else if let Some(topic) = self.topics.get_mut(&channel) {
+                // The one before it had grown too old.
+                topic.push_front(out);
+                self.turns.push_back(channel);
+            }
+            return None;
+        }
         // After a big one the topic waits until that is through.
-        if !topic.is_empty() && out.len() <= SMALL {
-            self.turns.push_back(channel);
+        if out.len() <= SMALL {
+            self.turn_after(&out);
         }
         Some(out)
+    }
+
+    /// The topic of a message that has left has its next turn.
+    fn turn_after(&mut self, out: &Out) {
+        let waiting = out.channel.filter(|channel| {
+            let topic = self.topics.get(channel);
+            topic.is_some_and(|topic| !topic.is_empty())
+        });
+        self.turns.extend(waiting);
     }
 
     fn start(&mut self, mut out: Out, now: i64) -> Frame {
@@ -293,11 +412,7 @@ impl Outgoing {
         if sending.at < sending.out.len() {
             self.sending.push_back(sending);
         } else {
-            let waiting = sending.out.channel.filter(|channel| {
-                let topic = self.topics.get(channel);
-                topic.is_some_and(|topic| !topic.is_empty())
-            });
-            self.turns.extend(waiting);
+            self.turn_after(&sending.out);
             self.keep(sending.number, sending.out);
         }
         Some(Frame::More { stream, bytes })
@@ -331,6 +446,17 @@ impl Outgoing {
     /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
     /// in order. Big messages that were under way are lost unless each one counts.
     pub(crate) fn reconnect(&mut self, received: u32, ahead: &[u32]) {
+        let packing = self.packing.take().map(|(out, _)| out);
+        for out in packing.into_iter().chain(self.packed.take()) {
+            if let Some(channel) = out.channel {
+                let topic = self.topics.entry(channel).or_default();
+                if out.each || topic.is_empty() {
+                    topic.push_front(out);
+                } else {
+                    self.dropped.replaced += 1;
+                }
+            }
+        }
         for sending in std::mem::take(&mut self.sending) {
             if sending.number != 0 {
                 self.keep(sending.number, sending.out);

@@ -16,11 +16,14 @@ const DATA: u8 = 1;
 const CALL: u8 = 2;
 const ANSWER: u8 = 3;
 
-const ENCODED: u8 = 1;
+pub(crate) const ENCODED: u8 = 1;
 const ANSWERED: u8 = 2;
 const LATCHING: u8 = 4;
 /// Where `left` stands in a data record's head.
 pub(crate) const LEFT_AT: usize = 14;
+/// And `flags`, and `serialise`.
+pub(crate) const FLAGS_AT: usize = 5;
+pub(crate) const SERIALISE_AT: usize = 22;
 
 /// One thing told.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -1,17 +1,19 @@
 //! A session and the connections that carry it, one at a time.
 
-use std::future::poll_fn;
-use std::pin::pin;
+use std::future::{Future, poll_fn};
+use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::task::Poll;
 use std::time::Duration;
 
 use bytes::Bytes;
+use codec::Answer;
 use parking_lot::Mutex;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{Notify, watch};
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, Sleep, sleep_until};
 use ws::{Message, WebSocket, WsError, frame as opcode};
 
@@ -21,14 +23,17 @@ use crate::control::Control;
 use crate::frame::{Frame, Received};
 use crate::incoming::Incoming;
 use crate::outgoing::{Dropped, Outgoing, Quality};
+use crate::packing::{Packed, Packing};
 use crate::record::{Data, Record};
 
 /// The socket is given more only when it holds less than this: what is decided later is decided better.
 const LOW_WATER: usize = 24 * 1024;
 /// Acknowledged at the latest after so many records, and bytes.
-const ACK_AFTER: (u32, u64) = (64, 256 * 1024);
+const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
 /// Exchanges made at once on a new connection, to know the peer's clock.
 const FIRST_PINGS: u32 = 6;
+/// So many measurements make a first estimate.
+const FIRST_RATES: usize = 3;
 /// The weight of a new measurement of the link's throughput.
 const NEWEST: f64 = 0.25;
 
@@ -77,6 +82,10 @@ pub enum Lost {
 pub trait Handler: Sync {
     /// A record, and when it had come as a whole (nanoseconds since 1970). Must not block.
     fn record(&self, record: Record, arrived: i64);
+    /// The peer's clock was compared with ours once more; `best` is what is believed.
+    fn clock(&self, best: Sample) {
+        let _ = best;
+    }
 }
 
 /// What two ends know of each other, whichever connection carries it.
@@ -92,9 +101,10 @@ struct State {
     out: Outgoing,
     incoming: Incoming,
     clock: Clock,
+    packing: Packing,
     throughput: Option<f64>,
-    /// When the peer last said how much had come, how much that was, and whether all had been sent then.
-    measured: Option<(Instant, u64, bool)>,
+    first_rates: Vec<f64>,
+    measured: Option<Told>,
     ending: Option<(u16, String)>,
 }
 
@@ -110,7 +120,9 @@ impl Session {
                 out: Outgoing::new(age),
                 incoming: Incoming::default(),
                 clock: Clock::default(),
+                packing: Packing::default(),
                 throughput: None,
+                first_rates: Vec::new(),
                 measured: None,
                 ending: None,
             }),
@@ -185,6 +197,21 @@ impl Session {
         self.push(&answer, Quality::Each);
     }
 
+    /// Messages of this channel may be made smaller, by what is known of their type.
+    pub fn packs(&self, channel: u32, schema: codec::Schema) {
+        let mut state = self.state.lock();
+        state.packing.add(channel, schema);
+        state.out.set_packable(channel);
+    }
+
+    /// The peer decodes these, as its opening frame says.
+    pub fn peer_decodes(&self, codecs: &[String]) {
+        let mut state = self.state.lock();
+        state.packing.peer_decodes(codecs);
+        let pays = state.packing.pays(state.throughput);
+        state.out.set_packs(pays);
+    }
+
     fn push(&self, record: &Record, quality: Quality) {
         self.state.lock().out.push(record, quality);
         self.wake.notify_one();
@@ -192,7 +219,9 @@ impl Session {
 
     /// Forgets what waits on a channel that is gone.
     pub fn forget(&self, channel: u32) {
-        self.state.lock().out.forget(channel);
+        let mut state = self.state.lock();
+        state.out.forget(channel);
+        state.packing.remove(channel);
     }
 
     /// Ends the connection, once what waits was sent.
@@ -219,6 +248,7 @@ impl Session {
         let mut state = self.state.lock();
         state.out.reconnect(received, ahead);
         state.incoming.reconnect(next);
+        state.packing.reconnect();
         state.measured = None;
     }
 
@@ -256,6 +286,7 @@ impl Session {
         H: Handler + ?Sized,
     {
         let mut connection = Connection::new(&self.options);
+        let mut job: Option<JoinHandle<Packed>> = None;
         let mut tick = pin!(sleep_until(connection.next_tick()));
         connection.ping(self, socket);
         self.up.send_if_modified(|up| !std::mem::replace(up, true));
@@ -264,6 +295,15 @@ impl Session {
             let event = poll_fn(|cx| {
                 loop {
                     self.fill(socket);
+                    if job.is_none() {
+                        job = self.pack();
+                    }
+                    let polled = job.as_mut().map(|job| Pin::new(job).poll(cx));
+                    if let Some(Poll::Ready(packed)) = polled {
+                        job = None;
+                        self.packed(packed.ok());
+                        continue;
+                    }
                     if socket.queued() == 0 {
                         break;
                     }
@@ -329,6 +369,74 @@ impl Session {
         }
     }
 
+    /// Begins to encode the next message that is to be, on another thread.
+    fn pack(&self) -> Option<JoinHandle<Packed>> {
+        let mut state = self.state.lock();
+        let State {
+            out,
+            packing,
+            throughput,
+            ..
+        } = &mut *state;
+        let (channel, message, alone) = out.take_to_pack()?;
+        let Some(job) = packing.job(channel, message, alone, *throughput) else {
+            out.packed(None);
+            self.wake.notify_one();
+            return None;
+        };
+        Some(tokio::task::spawn_blocking(move || job.run()))
+    }
+
+    fn packed(&self, packed: Option<Packed>) {
+        let state = &mut *self.state.lock();
+        let frame = packed.map(|packed| {
+            let took = packed.took;
+            (state.packing.done(packed), took)
+        });
+        state.out.packed(frame);
+    }
+
+    /// A message as it was before it was encoded; none where that cannot be told.
+    fn unpacked(&self, mut data: Data) -> Option<Data> {
+        if !data.encoded {
+            return Some(data);
+        }
+        let channel = data.channel;
+        let (message, answer) = self.state.lock().packing.unpack(channel, &data.message);
+        match answer {
+            Some(Answer::Acknowledge(sequence)) => {
+                self.tell(&Control::Decoded { channel, sequence })
+            }
+            Some(Answer::Keyframe) => self.tell(&Control::Keyframe { channel }),
+            None => {}
+        }
+        match message {
+            Ok(message) => {
+                data.message = message;
+                data.encoded = false;
+                Some(data)
+            }
+            Err(error) => {
+                tracing::debug!(channel, %error, "a message cannot be decoded");
+                None
+            }
+        }
+    }
+
+    /// What the peer says of frames that it was sent; others are the handler's.
+    fn is_answer(&self, json: &[u8]) -> bool {
+        if !json.starts_with(b"{\"decoded\"") && !json.starts_with(b"{\"keyframe\"") {
+            return false;
+        }
+        let (channel, answer) = match serde_json::from_slice(json) {
+            Ok(Control::Decoded { channel, sequence }) => (channel, Answer::Acknowledge(sequence)),
+            Ok(Control::Keyframe { channel }) => (channel, Answer::Keyframe),
+            _ => return false,
+        };
+        self.state.lock().packing.answered(channel, answer);
+        true
+    }
+
     fn has_ended(&self) -> bool {
         let state = self.state.lock();
         state.ending.is_some() && state.out.is_empty()
@@ -374,7 +482,12 @@ impl Session {
                 let incoming = &mut self.state.lock().incoming;
                 incoming.begin(stream, number, total, &bytes)?
             }
-            Frame::More { stream, bytes } => self.state.lock().incoming.more(stream, &bytes)?,
+            Frame::More { stream, bytes } => {
+                let whole = self.state.lock().incoming.more(stream, &bytes)?;
+                // The end of a big one tells how fast the link is.
+                connection.big_came = whole.is_some();
+                whole
+            }
             Frame::Ping { sent, received } => {
                 self.acknowledged(received);
                 let received = self.received(connection);
@@ -395,7 +508,14 @@ impl Session {
             } => {
                 self.acknowledged(received);
                 let sample = Sample::new(sent, there, left, arrived);
-                self.state.lock().clock.add(sample);
+                let best = {
+                    let clock = &mut self.state.lock().clock;
+                    clock.add(sample);
+                    clock.best()
+                };
+                if let Some(best) = best {
+                    handler.clock(best);
+                }
                 connection.pongs += 1;
                 if connection.pongs < FIRST_PINGS {
                     connection.ping(self, socket);
@@ -409,10 +529,19 @@ impl Session {
             Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
         };
         if let Some(record) = record {
-            handler.record(Record::decode(record)?, arrived);
+            match Record::decode(record)? {
+                Record::Data(data) => {
+                    if let Some(data) = self.unpacked(data) {
+                        handler.record(Record::Data(data), arrived);
+                    }
+                }
+                Record::Control(json) if self.is_answer(&json) => {}
+                record => handler.record(record, arrived),
+            }
         }
         let come = self.state.lock().incoming.received().bytes;
-        if connection.unacknowledged >= ACK_AFTER.0
+        if std::mem::take(&mut connection.big_came)
+            || connection.unacknowledged >= ACK_AFTER.0
             || come - connection.acknowledged_bytes >= ACK_AFTER.1
         {
             let ack = Frame::Ack(self.received(connection));
@@ -433,21 +562,58 @@ impl Session {
         let mut state = self.state.lock();
         state.out.acknowledge(received.number);
         let at = Instant::now();
-        let idle = state.out.is_empty();
-        if let Some((before, bytes, was_idle)) = state.measured {
-            let seconds = at.duration_since(before).as_secs_f64();
-            let rate = received.bytes.saturating_sub(bytes) as f64 / seconds.max(1e-6);
-            let known = state.throughput;
-            // With nothing to send a link is not slow.
-            let counts = !idle && !was_idle && seconds > 0.001;
-            if counts || known.is_some_and(|known| rate > known) {
-                let known = known.unwrap_or(rate);
-                let now = known + NEWEST * (rate - known);
-                state.throughput = Some(now);
-                state.out.set_throughput(now);
+        let idle = state.out.is_idle();
+        let sent = state.out.sent;
+        if let Some(before) = &state.measured {
+            let seconds = at.duration_since(before.at).as_secs_f64();
+            let rate = received.bytes.saturating_sub(before.bytes) as f64 / seconds.max(1e-6);
+            // With nothing to send a link is not slow: all of it had been sent by then, or there was more all the time.
+            let busy = before.sent >= received.bytes || (!idle && !before.idle);
+            let counts = busy && seconds > 0.001 && received.bytes > before.bytes;
+            if counts || state.throughput.is_some_and(|known| rate > known) {
+                state.measure(rate);
             }
         }
-        state.measured = Some((at, received.bytes, idle));
+        state.measured = Some(Told {
+            at,
+            bytes: received.bytes,
+            sent,
+            idle,
+        });
+    }
+}
+
+/// What the peer last said of how much had come.
+#[derive(Debug, Clone, Copy)]
+struct Told {
+    at: Instant,
+    bytes: u64,
+    /// How much had been sent then.
+    sent: u64,
+    /// That was all there was.
+    idle: bool,
+}
+
+impl State {
+    /// The link carried so many bytes per second for a while. What disturbs a measurement makes it smaller, so the
+    /// first ones count by the greatest among them.
+    fn measure(&mut self, rate: f64) {
+        let Some(known) = self.throughput else {
+            self.first_rates.push(rate);
+            if self.first_rates.len() == FIRST_RATES {
+                let greatest = self.first_rates.drain(..).fold(0.0, f64::max);
+                self.set_throughput(greatest);
+            }
+            return;
+        };
+        self.set_throughput(known + NEWEST * (rate - known));
+    }
+
+    fn set_throughput(&mut self, rate: f64) {
+        self.throughput = Some(rate);
+        self.out.set_throughput(rate);
+        let pays = self.packing.pays(Some(rate));
+        self.out.set_packs(pays);
     }
 }
 
@@ -465,6 +631,7 @@ struct Connection {
     pongs: u32,
     unacknowledged: u32,
     acknowledged_bytes: u64,
+    big_came: bool,
 }
 
 impl Connection {
@@ -475,6 +642,7 @@ impl Connection {
             pongs: 0,
             unacknowledged: 0,
             acknowledged_bytes: 0,
+            big_came: false,
         }
     }
 

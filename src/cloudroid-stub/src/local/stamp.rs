@@ -62,9 +62,7 @@ pub fn is_stamped(wire_type: &WireType) -> bool {
 
 /// How long ago a stamp was, by this machine's clock; zero for stamps of the future.
 pub fn age(stamp: Stamp) -> Duration {
-    let now = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)
-        .unwrap_or_default();
+    let now = Duration::from_nanos(u64::try_from(link::clock::now()).unwrap_or_default());
     now.saturating_sub(Duration::new(
         u64::from(stamp.secs),
         stamp.nsecs.min(999_999_999),

@@ -160,6 +160,9 @@ impl Channels {
                 definition: message.wire_type.definition.clone(),
                 latching: message.latching,
             }));
+            let of = &message.wire_type;
+            let schema = codec::Schema::of(&of.name, &of.md5);
+            mirror.session().packs(channel, schema);
             channel
         })
     }

@@ -6,12 +6,15 @@ use std::sync::Arc;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{AdvertiseOptions, Publisher, WireType};
+use ros::schema::MessageType;
 
 use super::Hub;
 use super::node_link::within;
 use crate::clock::now;
 use crate::control::Input;
 use crate::record::{Answered, Data};
+use crate::skew::{Skew, Way};
+use crate::stamps::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 100;
@@ -35,7 +38,7 @@ pub(super) struct Inputs {
 }
 
 struct Channel {
-    decoder: codec::Decoder,
+    stamps: Stamps,
     state: State,
 }
 
@@ -47,29 +50,22 @@ enum State {
 
 impl Inputs {
     /// Messages of this channel may come before it is open.
-    pub(super) fn expect(&self, channel: u32) {
+    pub(super) fn expect(&self, input: &Input) {
         let fresh = Channel {
-            decoder: codec::Decoder::new(crate::MAX_RECORD),
+            stamps: stamps(input),
             state: State::Waiting(VecDeque::new()),
         };
-        self.channels.lock().insert(channel, fresh);
+        self.channels.lock().insert(input.channel, fresh);
     }
 
     /// Publishes a message; says when, and by what its answer may be known.
-    pub(super) fn take(&self, data: &Data, arrived: i64) -> Option<(Mark, Answered)> {
+    pub(super) fn take(&self, skew: &Skew, data: Data, arrived: i64) -> Option<(Mark, Answered)> {
         let mut channels = self.channels.lock();
         let channel = channels.get_mut(&data.channel)?;
-        let message = if data.encoded {
-            let mut message = Vec::new();
-            if let Err(error) = channel.decoder.decode(&data.message, &mut message) {
-                tracing::warn!(channel = data.channel, %error, "a message cannot be decoded");
-                return None;
-            }
-            Bytes::from(message)
-        } else {
-            data.message.clone()
-        };
+        let message = data.message;
+        // By the robot's stamp: outputs are looked at when theirs are the robot's again.
         let mark = mark(&message);
+        let message = skew.apply(Way::In, &channel.stamps, message);
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
             State::Waiting(waiting) => {
@@ -136,5 +132,19 @@ impl Inputs {
 
     pub(super) fn clear(&self) {
         self.channels.lock().clear();
+    }
+}
+
+/// Where the stamps of an input stand. `/clock` tells simulated time.
+fn stamps(input: &Input) -> Stamps {
+    if input.topic == "/clock" {
+        return Stamps::default();
+    }
+    match MessageType::from_full_text(&input.type_name, &input.definition) {
+        Ok(message) => Stamps::of(&message),
+        Err(error) => {
+            tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
+            Stamps::default()
+        }
     }
 }

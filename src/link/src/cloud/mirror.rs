@@ -4,10 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ros::bus::{ServiceType, WireType};
+use ros::schema::MessageType;
 
 use super::Hub;
-use super::node_link::NodeLink;
+use super::node_link::{NodeLink, Service};
 use crate::control::{Control, Graph, Output, Served, Wanted};
+use crate::stamps::Stamps;
 
 /// What was told so far.
 #[derive(Default)]
@@ -59,7 +61,7 @@ impl Told {
                 None
             };
             if let Some(wire_type) = wire_type {
-                let channel = self.channel(link, topic);
+                let channel = self.channel(link, topic, &wire_type);
                 graph.outputs.push(Output {
                     channel,
                     topic: topic.clone(),
@@ -119,13 +121,17 @@ impl Told {
         Some(wire_type)
     }
 
-    fn channel(&mut self, link: &NodeLink, topic: &str) -> u32 {
+    fn channel(&mut self, link: &NodeLink, topic: &str, wire_type: &WireType) -> u32 {
         if let Some(channel) = self.channels.get(topic) {
             return *channel;
         }
         self.next += 1;
         self.channels.insert(topic.to_owned(), self.next);
-        link.outputs.add(self.next, topic);
+        let of = MessageType::from_full_text(&wire_type.name, &wire_type.definition);
+        let stamps = of.map(|of| Stamps::of(&of)).unwrap_or_default();
+        link.outputs.add(self.next, topic, stamps);
+        let schema = codec::Schema::of(&wire_type.name, &wire_type.md5);
+        link.session.packs(self.next, schema);
         self.next
     }
 
@@ -137,7 +143,19 @@ impl Told {
                 self.next += 1;
                 let entry = (self.next, service_type);
                 self.services.insert(name.to_owned(), entry.clone());
-                link.services.lock().insert(entry.0, name.to_owned());
+                let stamps = hub.registry.service(&entry.1.name).ok();
+                let stamps = stamps.filter(|known| known.md5 == entry.1.md5);
+                let service = Service {
+                    name: name.to_owned(),
+                    request: stamps
+                        .as_ref()
+                        .map(|of| Stamps::of(&of.request))
+                        .unwrap_or_default(),
+                    response: stamps
+                        .map(|of| Stamps::of(&of.response))
+                        .unwrap_or_default(),
+                };
+                link.services.lock().insert(entry.0, Arc::new(service));
                 entry
             }
         };

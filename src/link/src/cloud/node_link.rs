@@ -12,9 +12,12 @@ use tokio::task::AbortHandle;
 use super::inputs::Inputs;
 use super::outputs::Outputs;
 use super::{Hub, LinkStatus, mirror};
+use crate::clock::Sample;
 use crate::control::{Control, Hello, Request, Sla};
 use crate::record::Record;
 use crate::session::{Handler, Session, SessionOptions};
+use crate::skew::Way;
+use crate::stamps::Stamps;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;
@@ -34,12 +37,19 @@ pub(super) struct NodeLink {
     pub(super) hub: Weak<Hub>,
     pub(super) inputs: Inputs,
     pub(super) outputs: Outputs,
-    pub(super) services: Mutex<HashMap<u32, String>>,
+    pub(super) services: Mutex<HashMap<u32, Arc<Service>>>,
     pub(super) listening: Mutex<BTreeSet<String>>,
     sla: Sla,
     requests: Mutex<VecDeque<Request>>,
     orders: mpsc::UnboundedSender<Control>,
     tasks: Mutex<Vec<AbortHandle>>,
+}
+
+/// What the node serves.
+pub(super) struct Service {
+    pub(super) name: String,
+    pub(super) request: Stamps,
+    pub(super) response: Stamps,
 }
 
 impl NodeLink {
@@ -147,8 +157,8 @@ impl NodeLink {
     }
 
     fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes, taken: i64) {
-        let name = self.services.lock().get(&service).cloned();
-        let (Some(name), Some(hub)) = (name, self.hub.upgrade()) else {
+        let known = self.services.lock().get(&service).cloned();
+        let (Some(service), Some(hub)) = (known, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
             return self.session.answer(id, taken, Err(gone));
         };
@@ -156,7 +166,10 @@ impl NodeLink {
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
         tokio::spawn(async move {
             let patience = hub.options.call_timeout;
-            let called = hub.bus.call(&name, request, patience).await;
+            let request = hub.skew.apply(Way::In, &service.request, request);
+            let called = hub.bus.call(&service.name, request, patience).await;
+            let called =
+                called.map(|response| hub.skew.apply(Way::Out, &service.response, response));
             link.session.answer(
                 id,
                 taken,
@@ -173,6 +186,10 @@ impl Handler for Arc<NodeLink> {
     fn record(&self, record: Record, arrived: i64) {
         (**self).take(self, record, arrived);
     }
+
+    fn clock(&self, best: Sample) {
+        (**self).clock(best);
+    }
 }
 
 impl Handler for NodeLink {
@@ -186,13 +203,22 @@ impl Handler for NodeLink {
             self.take(&link, record, arrived);
         }
     }
+
+    fn clock(&self, best: Sample) {
+        if let Some(hub) = self.hub.upgrade() {
+            hub.skew.measured(best);
+        }
+    }
 }
 
 impl NodeLink {
     fn take(&self, this: &Arc<Self>, record: Record, arrived: i64) {
         match record {
             Record::Data(data) => {
-                if let Some(given) = self.inputs.take(&data, arrived) {
+                let Some(hub) = self.hub.upgrade() else {
+                    return;
+                };
+                if let Some(given) = self.inputs.take(&hub.skew, data, arrived) {
                     self.outputs.note(given);
                 }
             }
@@ -206,7 +232,7 @@ impl NodeLink {
                 Ok(control) => {
                     // Data may follow in the same breath.
                     if let Control::Open(input) = &control {
-                        self.inputs.expect(input.channel);
+                        self.inputs.expect(input);
                     }
                     let _ = self.orders.send(control);
                 }

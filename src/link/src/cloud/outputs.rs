@@ -15,6 +15,8 @@ use super::node_link::NodeLink;
 use crate::Quality;
 use crate::clock::now;
 use crate::record::{Answered, Data};
+use crate::skew::Way;
+use crate::stamps::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;
@@ -30,6 +32,7 @@ pub(super) struct Outputs {
 
 struct Channel {
     topic: String,
+    stamps: Stamps,
     reading: Option<AbortHandle>,
 }
 
@@ -43,9 +46,10 @@ impl Drop for Channel {
 
 impl Outputs {
     /// The robot is told of this output.
-    pub(super) fn add(&self, channel: u32, topic: &str) {
+    pub(super) fn add(&self, channel: u32, topic: &str, stamps: Stamps) {
         let fresh = Channel {
             topic: topic.to_owned(),
+            stamps,
             reading: None,
         };
         self.channels.lock().insert(channel, fresh);
@@ -76,7 +80,7 @@ impl Outputs {
         channel: u32,
         count: usize,
     ) {
-        let topic = {
+        let (topic, stamps) = {
             let mut channels = self.channels.lock();
             let Some(known) = channels.get_mut(&channel) else {
                 return;
@@ -88,7 +92,7 @@ impl Outputs {
                     }
                     return;
                 }
-                (None, 1..) => known.topic.clone(),
+                (None, 1..) => (known.topic.clone(), known.stamps.clone()),
                 _ => return,
             }
         };
@@ -103,14 +107,16 @@ impl Outputs {
                 return;
             }
         };
-        let reader = Arc::clone(link);
+        let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = tokio::spawn(async move {
             // All of it, or its guard would stay behind and end the subscription.
             let subscription = &mut { subscription };
             while let Some(message) = subscription.messages.recv().await {
                 // Other nodes of the servant have links of their own.
                 if *message.publisher == *reader.node {
-                    reader.send(channel, message.bytes, message.latching);
+                    let Some(hub) = hub.upgrade() else { return };
+                    let bytes = hub.skew.apply(Way::Out, &stamps, message.bytes);
+                    reader.send(channel, bytes, message.latching);
                 }
             }
         });

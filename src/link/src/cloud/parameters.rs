@@ -19,6 +19,9 @@ const OWN: [&str; 5] = [
     "cloudroid_runs",
 ];
 
+/// Stamps are simulated time.
+const SIMULATED: &str = "use_sim_time";
+
 /// What was set here in the robot's name: it does not go back.
 #[derive(Default)]
 pub(super) struct Known {
@@ -39,6 +42,8 @@ impl Drop for Known {
 impl Known {
     /// Takes over all of the robot's parameters, those that the deployer gave last.
     pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
+        let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
+        hub.skew.leave(hello.keep_stamps || simulated);
         let there = match hub.bus.get_param("/").await {
             Ok(ParamValue::Map(there)) => there,
             _ => BTreeMap::new(),
@@ -58,6 +63,9 @@ impl Known {
     /// Parameters that changed on the robot.
     pub(super) async fn change(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
         for (key, value) in changes {
+            if key.trim_start_matches('/') == SIMULATED {
+                hub.skew.leave(value == Some(ParamValue::Bool(true)));
+            }
             match value {
                 Some(value) => self.set(hub, key, value).await,
                 None => {

@@ -145,3 +145,81 @@ proptest! {
         prop_assert_eq!(messages, expected);
     }
 }
+
+fn packs() -> Outgoing {
+    let mut out = Outgoing::new(None);
+    out.set_packable(1);
+    out.set_packs(true);
+    out
+}
+
+#[test]
+fn what_is_encoded_is_the_newest() {
+    let (mut out, mut incoming) = (packs(), Incoming::default());
+    for born in 1..=3 {
+        out.push(&data(1, born, 50_000), Quality::Newest);
+    }
+    assert_eq!(out.next(0), None, "it is to be encoded first");
+    let (channel, message, alone) = out.take_to_pack().unwrap();
+    assert_eq!((channel, message[0], alone), (1, 3, false));
+    assert_eq!(out.take_to_pack(), None, "once");
+    // Meanwhile others pass, and newer ones wait.
+    out.push(&data(2, 9, 10), Quality::Newest);
+    out.push(&data(1, 4, 50_000), Quality::Newest);
+    let next = out.next(0).unwrap();
+    assert_eq!(born(deliver(&mut incoming, next)), Some(9));
+    assert_eq!(out.next(0), None);
+    assert!(out.is_idle() && !out.is_empty());
+    out.packed(Some((
+        Bytes::from_static(b"frame"),
+        Duration::from_micros(7),
+    )));
+    let frame = out.next(0).unwrap();
+    let Some(Record::Data(sent)) = deliver(&mut incoming, frame) else {
+        panic!("a message");
+    };
+    assert_eq!(
+        (sent.born, sent.encoded, sent.serialise, &sent.message[..]),
+        (3, true, 7, &b"frame"[..])
+    );
+    assert_eq!(out.next(0), None);
+    assert_eq!(out.take_to_pack().unwrap().1[0], 4, "the next in turn");
+    out.packed(None);
+    let mut whole = None;
+    while let Some(frame) = out.next(0) {
+        whole = deliver(&mut incoming, frame).or(whole);
+    }
+    assert_eq!(born(whole), Some(4), "as it is, where it cannot be encoded");
+    assert!(out.is_empty());
+}
+
+#[test]
+fn a_message_that_was_being_encoded_when_the_connection_was_lost_is_not() {
+    let (mut out, mut incoming) = (packs(), Incoming::default());
+    out.push(&data(1, 1, 50_000), Quality::Each);
+    assert_eq!(out.next(0), None);
+    assert!(out.take_to_pack().unwrap().2, "it must be understood alone");
+    out.reconnect(0, &[]);
+    assert_eq!(out.next(0), None);
+    assert_eq!(out.take_to_pack().unwrap().1[0], 1);
+    out.packed(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
+    let frame = out.next(0).unwrap();
+    assert_eq!(born(deliver(&mut incoming, frame)), Some(1));
+    // Encoded once: sent again as it is.
+    out.reconnect(0, &[]);
+    let frame = out.next(0).unwrap();
+    assert!(
+        matches!(frame, Frame::Whole { number: 1.., .. }),
+        "{frame:?}"
+    );
+    assert_eq!(out.take_to_pack(), None);
+}
+
+#[test]
+fn small_messages_and_other_topics_are_not_encoded() {
+    let mut out = packs();
+    out.push(&data(1, 1, 100), Quality::Newest);
+    out.push(&data(2, 2, 50_000), Quality::Newest);
+    assert!(out.next(0).is_some() && out.next(0).is_some());
+    assert_eq!(out.take_to_pack(), None);
+}

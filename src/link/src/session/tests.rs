@@ -148,3 +148,76 @@ async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
     );
     drop(peer.await.unwrap());
 }
+
+/// A picture with something to save in it.
+fn picture(number: u8) -> Bytes {
+    let mut message = vec![number, 0, 0, 0];
+    message.extend([0; 8]);
+    message.extend([0; 4]);
+    for word in [120_u32, 160] {
+        message.extend(word.to_le_bytes());
+    }
+    message.extend(4_u32.to_le_bytes());
+    message.extend(b"rgb8");
+    message.push(0);
+    message.extend(480_u32.to_le_bytes());
+    message.extend(57_600_u32.to_le_bytes());
+    message.extend((0..57_600_u32).map(|at| (at / 480) as u8 ^ number));
+    message.into()
+}
+
+#[tokio::test]
+async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
+    let (robot, cloud) = (session(), session());
+    let codecs = crate::packing::decoded_here(false);
+    robot.peer_decodes(&codecs);
+    cloud.peer_decodes(&codecs);
+    robot.packs(1, codec::Schema::Image);
+    open(&robot, &cloud);
+    let (near, mut slow) = duplex(1 << 12);
+    let (mut slower, far) = duplex(1 << 12);
+    let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);
+    let mut at_cloud = WebSocket::new(far, b"", MAX_FRAME, MAX_RECORD);
+    // Some MB/s: what is in the pipe passes every millisecond.
+    tokio::spawn(async move {
+        let (mut up, mut down) = tokio::io::split(&mut slow);
+        let (mut from, mut to) = tokio::io::split(&mut slower);
+        let upwards = async {
+            let mut buffer = vec![0; 4096];
+            loop {
+                let read = tokio::io::AsyncReadExt::read(&mut up, &mut buffer).await?;
+                tokio::time::sleep(Duration::from_millis(1)).await;
+                tokio::io::AsyncWriteExt::write_all(&mut to, &buffer[..read]).await?;
+            }
+        };
+        let back = tokio::io::copy(&mut from, &mut down);
+        let _: (std::io::Result<()>, _) = tokio::join!(upwards, back);
+    });
+    let (to_robot, _records) = mpsc::unbounded_channel();
+    let (to_cloud, mut records) = mpsc::unbounded_channel();
+    let (to_robot, to_cloud) = (To(to_robot), To(to_cloud));
+    let sending = async {
+        let mut encoded = 0;
+        for number in 0..=255 {
+            let mut picture_data = data(1, 0);
+            picture_data.message = picture(number);
+            let before = robot.traffic().0;
+            robot.publish(picture_data, Quality::Newest);
+            let Some(Record::Data(came)) = records.recv().await else {
+                panic!("a picture should come");
+            };
+            assert_eq!(came.message, picture(number));
+            assert!(!came.encoded, "the handler has messages, not frames");
+            encoded += u32::from(robot.traffic().0 - before < 57_600 / 4);
+            if encoded > 3 {
+                return;
+            }
+        }
+        panic!("no picture was made smaller");
+    };
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &to_robot) => panic!("{lost}"),
+        lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
+        () = sending => {}
+    }
+}

@@ -1,0 +1,58 @@
+#!/usr/bin/env python3
+"""Minds what many nodes mind: how old its input is, which transforms it was told, what time it is."""
+import actionlib
+import rospy
+from actionlib.msg import TestAction, TestFeedback, TestResult
+from geometry_msgs.msg import PointStamped
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger, TriggerResponse
+from tf2_msgs.msg import TFMessage
+
+rospy.init_node("crossing")
+seen = rospy.Publisher("~seen", PointStamped, queue_size=10)
+refused = rospy.Publisher("~refused", String, queue_size=10)
+frames = rospy.Publisher("~frames", String, queue_size=10, latch=True)
+mirrored = rospy.Publisher("~mirrored", Image, queue_size=2)
+known = {"fixed": set(), "moving": set()}
+
+
+def look(point):
+    age = (rospy.Time.now() - point.header.stamp).to_sec()
+    if abs(age) < 10.0:
+        seen.publish(point)
+    else:
+        refused.publish("%.1f s old" % age)
+
+
+def learn(kind):
+    def told(message):
+        known[kind].update(transform.child_frame_id for transform in message.transforms)
+        frames.publish(" ".join(kind + ":" + frame for kind in sorted(known) for frame in sorted(known[kind])))
+
+    return told
+
+
+def act(goal):
+    for step in range(goal.goal):
+        if server.is_preempt_requested():
+            return server.set_preempted(TestResult(-step))
+        server.publish_feedback(TestFeedback(step))
+        rospy.sleep(0.01)
+    server.set_succeeded(TestResult(goal.goal))
+
+
+def ask(_):
+    answer = rospy.ServiceProxy("/robot/secret", Trigger)()
+    return TriggerResponse(answer.success, "the robot says " + answer.message)
+
+
+rospy.Subscriber("~point", PointStamped, look)
+rospy.Subscriber("~picture", Image, mirrored.publish, queue_size=1, buff_size=1 << 22)
+rospy.Subscriber("/tf", TFMessage, learn("moving"))
+rospy.Subscriber("/tf_static", TFMessage, learn("fixed"))
+rospy.Service("~now", Trigger, lambda _: TriggerResponse(True, str(rospy.Time.now().to_nsec())))
+rospy.Service("~ask", Trigger, ask)
+server = actionlib.SimpleActionServer("~act", TestAction, act, auto_start=False)
+server.start()
+rospy.spin()
