@@ -109,7 +109,7 @@ impl Rules<'_> {
                 "the request is addressed to {host:?}, but this portal serves this machine alone"
             ),
             next:
-                "use 127.0.0.1 or localhost, or let the portal listen beyond loopback with a token"
+                "use 127.0.0.1 or localhost, or show a token of the configuration, where a proxy passes requests on"
                     .to_owned(),
         })
     }
