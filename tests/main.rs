@@ -84,6 +84,9 @@ fn main() -> ExitCode {
         ],
         stories![failover:
             a_slow_network_costs_few_requests,
+            a_lost_link_hands_over_and_back,
+            frames_that_stay_away_stop_the_robot_and_wake_its_original,
+            explain_says_why,
         ],
         stories![grants:
             a_service_is_given_what_its_operator_allows,

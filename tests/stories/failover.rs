@@ -141,6 +141,32 @@ impl Scene {
         Ok(())
     }
 
+    /// Waits until `explain` names this.
+    fn explains(&self, words: &str) -> Told {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let explained = self.explained()?;
+            let causes = explained["causes"].to_string();
+            if causes.contains(words) {
+                return Ok(());
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "it should name {words:?}: {explained:#}"
+            );
+        }
+    }
+
+    /// Waits until the robot's diagnostics say this.
+    fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Told {
+        loop {
+            let message = self.site.next(diagnostics)?;
+            if String::from_utf8_lossy(&message.bytes).contains(words) {
+                return Ok(());
+            }
+        }
+    }
+
     fn explained(&self) -> anyhow::Result<serde_json::Value> {
         self.daemon.deployer().asks(&["explain", &self.robot])
     }
@@ -190,6 +216,106 @@ pub fn a_slow_network_costs_few_requests() -> Told {
         scene.stub.said()
     );
     Ok(())
+}
+
+pub fn a_lost_link_hands_over_and_back() -> Told {
+    let more = format!("local = \"warm\"\nstateful = true\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
+    let mut scene = Scene::new("failover-lost", &more)?;
+    let watcher = scene.site.node("/watcher")?;
+    let mut diagnostics = scene.site.hears(&watcher, "/diagnostics")?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    for round in 1..=2 {
+        scene.cable.degrade(SILENT)?;
+        scene.says("the local original answers, too why=LinkDown", round)?;
+        let number = scene.asks();
+        scene.hears(number)?;
+        scene.diagnosed(&mut diagnostics, "the link is down")?;
+        scene.explains("is down")?;
+        scene.cable.restore()?;
+        scene.says("the cloud answers alone why=LinkUp", round)?;
+        let number = scene.asks();
+        scene.hears(number)?;
+        scene.diagnosed(&mut diagnostics, "the cloud answers")?;
+    }
+    ensure!(
+        scene.answers.values().all(|times| *times == 1),
+        "{:?}",
+        scene.answers
+    );
+    Ok(())
+}
+
+pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Told {
+    let rate = 1.0 / T_MAX;
+    let more = format!(
+        "local = \"cold\"\nframes_per_second = {rate}\n\
+         safe_stop = {{ topic = \"/cmd_vel\", type = \"geometry_msgs/Twist\", message = {{ linear = {{ x = -0.5 }} }} }}"
+    );
+    let mut scene = Scene::new("failover-frames", &more)?;
+    let wheels = scene.site.node("/wheels")?;
+    let mut commands = scene.site.hears(&wheels, "/cmd_vel")?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    scene.cable.degrade(SILENT)?;
+    // Nobody shows a picture, or nobody could answer: no frame comes in time.
+    let command = scene.site.next(&mut commands)?;
+    ensure!(
+        command.wire_type.name == "geometry_msgs/Twist"
+            && command.bytes.len() == 48
+            && command.bytes[..8] == (-0.5_f64).to_le_bytes(),
+        "{command:?}"
+    );
+    scene.says("the local original answers, too", 1)?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    scene.cable.restore()?;
+    scene.asks_until("the local original is stopped", 1)
+}
+
+pub fn explain_says_why() -> Told {
+    let more = format!("local = \"none\"\ndesire = 0.001\nmax = {T_MAX:?}");
+    let mut scene = Scene::new("failover-why", &more)?;
+    for _ in 0..3 {
+        let number = scene.asks();
+        scene.hears(number)?;
+    }
+    // Where the time went has been told.
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let explained = scene.explained()?;
+        let link = &explained["servants"][0]["links"][0];
+        let phases = link["phases"].as_array().map_or(0, Vec::len);
+        if link["requests"] == 3 && phases == 6 {
+            ensure!(link["max"] == T_MAX * 1e3, "the SLA is known: {link:#}");
+            break;
+        }
+        ensure!(
+            Instant::now() < deadline,
+            "{explained:#}\n{}",
+            scene.stub.said()
+        );
+    }
+    // A topic that is named otherwise than it is published.
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
+        scene.daemon.address, PEOPLE.name, scene.robot
+    );
+    let argv = ["__name:=astray", "image:=/nowhere"];
+    let _astray = scene
+        .site
+        .stub_with(&toml, "opencv_apps", "people_detect", &argv)?;
+    let _listener = scene.site.hears(&scene.app, "/astray/found")?;
+    scene.explains("/nowhere, which nobody on the robot publishes")?;
+    // Less of a core than it needs.
+    let servant = scene.daemon.servant_of(PEOPLE.name, &scene.robot)?;
+    let id = servant["id"].as_str().context("an id")?;
+    let less = ["set", id, "--cpus", "0.05"];
+    scene.daemon.deployer().types(&less)?.succeeded()?;
+    for _ in 0..50 {
+        scene.asks();
+    }
+    scene.explains("held back by its CPU limit")
 }
 
 /// A `sensor_msgs/Image` of 160x120, black.

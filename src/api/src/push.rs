@@ -52,6 +52,9 @@ pub struct PushOptions {
     /// What a servant is given beyond its container.
     #[serde(skip_serializing_if = "Grants::is_empty")]
     pub grants: Grants,
+    /// Answers depend on earlier requests: robots' local originals answer only while there is no link.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub stateful: bool,
     /// What was pushed, in words, kept with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,

@@ -11,13 +11,15 @@
 //! max = 0.30           # T_max, seconds: the longest that is acceptable
 //! threshold = 10       # Q_t: below it the local original is started
 //! initial = 10         # Q at the beginning; Q_t where absent
-//! frames_per_second = 5.0   # instead, or as well: least rate of an output
-//! age = 0.5            # instead, or as well, seconds: greatest age of an output
+//! frames_per_second = 5.0   # instead of desire and max: least rate of an output
+//! age = 0.5            # instead of desire and max, seconds: greatest age that an output reaches
+//! output = "/people"   # which output those two are about; the one that answers the node's requests where absent
 //! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
 //!
 //! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed, "none"
 //! stateful = false     # the local original takes over only while the link is down
-//! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time
+//! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time, or
+//! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
 //! # The name that an executable's node has when none is given, where that is not the executable's.
 //! nodes = { "listener.py" = "listener" }
 //! stamps = "rewrite"   # "rewrite" to the cloud's clock and back, or "keep"
@@ -81,6 +83,9 @@ pub struct Config {
     /// Greatest age of an output in seconds.
     #[serde(default)]
     pub age: Option<f64>,
+    /// What those two are about.
+    #[serde(default)]
+    pub output: Option<String>,
     /// `auto`, or `INPUT -> OUTPUT`.
     #[serde(default)]
     pub request: Option<String>,
@@ -90,9 +95,9 @@ pub struct Config {
     /// The local original takes over only while the link is down.
     #[serde(default)]
     pub stateful: bool,
-    /// An output on which a message of zeros is published when neither side answers in time.
+    /// What is published when neither side answers in time.
     #[serde(default)]
-    pub safe_stop: Option<String>,
+    pub safe_stop: Option<SafeStop>,
     /// What becomes of stamps while the clocks of robot and cloud differ.
     #[serde(default)]
     pub stamps: Stamps,
@@ -105,6 +110,12 @@ pub struct Config {
 }
 
 impl Config {
+    /// After so many seconds without an answer, or a frame, the promise is broken.
+    pub fn longest(&self) -> Option<f64> {
+        let interval = self.frames_per_second.map(|rate| 1.0 / rate);
+        self.max.or(interval).or(self.age)
+    }
+
     /// This robot's id.
     pub fn robot(&self) -> String {
         let host = || {
@@ -159,6 +170,16 @@ fn at_home(path: &Path) -> PathBuf {
         (Ok(below), Some(home)) => home.join(below),
         _ => path.to_owned(),
     }
+}
+
+/// What brings the robot to rest.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum SafeStop {
+    /// Zeros on an output of the node.
+    Output(String),
+    /// A message on any topic.
+    Message(qos::SafeStop),
 }
 
 /// When the local original runs.
@@ -238,6 +259,7 @@ pub const KEYS: [&str; 18] = [
     "initial",
     "frames_per_second",
     "age",
+    "output",
     "request",
     "local",
     "stateful",

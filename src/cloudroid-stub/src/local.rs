@@ -20,4 +20,4 @@ mod tests;
 pub use keeper::{Application, Cloud, Keeper};
 pub use original::{Original, Setting};
 pub use process::Program;
-pub use stamp::is_stamped;
+pub use stamp::{is_of_action, is_stamped};

@@ -15,6 +15,7 @@ mod outputs;
 mod parameters;
 pub mod promise;
 mod reports;
+mod safe_stop;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock};

@@ -95,9 +95,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
         let bus: Arc<dyn Bus> = join(robot, &format!("{}_cloudroid", robot.node)).await?;
         let diagnostics = Diagnostics::new(&bus, &robot.node, &config.robot()).await?;
-        watcher = Some(bus);
         let original = local_original(asked, robot);
-        mirror.promise(sla, original, diagnostics).await?;
+        mirror.promise(sla, original, diagnostics, &bus).await?;
+        watcher = Some(bus);
     }
     let parameters = mirror.parameters().await;
     let mut hello = Hello {
@@ -219,7 +219,9 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
 }
 
 fn session_options(config: &Config) -> SessionOptions {
-    let max = config.max.map(Duration::from_secs_f64);
+    let max = config
+        .longest()
+        .and_then(|max| Duration::try_from_secs_f64(max).ok());
     // A ping is out, and its pong awaited, within T_max.
     let silent = max.unwrap_or(SILENT).max(Duration::from_millis(50));
     SessionOptions {

@@ -61,6 +61,10 @@ pub struct Push {
     /// Debian package to add; may be given several times.
     #[arg(long = "with", value_name = "DEB")]
     with: Vec<String>,
+    /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
+    /// down, and hands back. Without this, both may be asked and the first answer is taken.
+    #[arg(long)]
+    stateful: bool,
     #[command(flatten)]
     limits: LimitFlags,
     /// Device by its name in the machine's CDI specifications, such as nvidia.com/gpu=0; may be given several times.
@@ -180,6 +184,7 @@ impl Push {
                 volumes: self.volumes.clone(),
                 egress: self.egress.clone(),
             },
+            stateful: self.stateful,
             source,
         })
     }

@@ -299,6 +299,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
         grants: options.grants.clone(),
         // A launch file says itself which nodes come again.
         restart: options.launch.is_none(),
+        stateful: options.stateful,
     }
 }
 

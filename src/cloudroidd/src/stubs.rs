@@ -131,6 +131,7 @@ pub fn files(
         architecture,
         outsourced: &outsourced(revision),
         interface: &revision.interface,
+        stateful: revision.plan.stateful,
     };
     compose(&about, contents.map_err(no_stub)?).map_err(no_stub)
 }

@@ -50,6 +50,8 @@ pub struct About<'a> {
     pub outsourced: &'a BTreeSet<String>,
     /// What the package shows.
     pub interface: &'a Interface,
+    /// Answers depend on earlier requests, as the deployer says.
+    pub stateful: bool,
 }
 
 /// The files of a stub, by path in the install space.

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::request::{Leg, RequestId, Side, Stamp};
+use crate::request::{Key, Leg, RequestId, Side};
 
 /// What is kept, and for how long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,7 +46,7 @@ pub(crate) enum Kind {
     /// An input of the pair with this index.
     Input {
         pair: usize,
-        stamp: Option<Stamp>,
+        key: Option<Key>,
         /// Outputs that answer it; the first one is the answer.
         outputs: usize,
     },
@@ -415,7 +415,7 @@ mod tests {
         let (mut arbiter, _, now) = arbiter();
         let kind = Kind::Input {
             pair: 0,
-            stamp: None,
+            key: None,
             outputs: 2,
         };
         let id = arbiter.open(now, MAX, kind, 7);
@@ -449,7 +449,7 @@ mod tests {
         for _ in 0..1000 {
             let kind = Kind::Input {
                 pair: 0,
-                stamp: None,
+                key: None,
                 outputs: 1,
             };
             arbiter.open(now, MAX, kind, 7);

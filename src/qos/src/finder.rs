@@ -135,7 +135,48 @@ fn written(inputs: &[Topic], outputs: &[Topic], pairs: &[Pair]) -> Result<Found,
     Ok(found)
 }
 
+/// What an action server's topics are called (actionlib), below the action's name.
+const OF_ACTIONS: [&str; 5] = ["/goal", "/cancel", "/status", "/result", "/feedback"];
+
+/// Each action is a pair: its goal, and the result and feedback that carry the goal's id.
+fn actions(inputs: &[Topic], outputs: &[Topic]) -> Vec<Pair> {
+    let goals = inputs.iter().filter_map(|input| {
+        let action = input.name.strip_suffix("/goal")?;
+        input.type_name.strip_suffix("ActionGoal")?;
+        let has = |name: &String| outputs.iter().any(|output| output.name == *name);
+        let answers = ["result", "feedback"].map(|end| format!("{action}/{end}"));
+        has(&answers[0]).then(|| Pair {
+            input: input.name.clone(),
+            outputs: answers.into_iter().filter(has).collect(),
+            by: Some(Correlation::Goal),
+        })
+    });
+    goals.collect()
+}
+
 fn guessed(inputs: &[Topic], outputs: &[Topic]) -> Found {
+    let actions = actions(inputs, outputs);
+    let of_action = |topic: &Topic| {
+        actions.iter().any(|pair| {
+            let action = pair.input.strip_suffix("goal").unwrap_or_default();
+            let end = topic.name.strip_prefix(action.trim_end_matches('/'));
+            end.is_some_and(|end| OF_ACTIONS.contains(&end))
+        })
+    };
+    let others = |topics: &[Topic]| -> Vec<Topic> {
+        topics
+            .iter()
+            .filter(|topic| !of_action(topic))
+            .cloned()
+            .collect()
+    };
+    let mut found = triggered(&others(inputs), &others(outputs));
+    found.pairs.extend(actions);
+    found
+}
+
+/// The trigger among what belongs to no action, and what answers it.
+fn triggered(inputs: &[Topic], outputs: &[Topic]) -> Found {
     let mut found = Found::default();
     let mut triggers: Vec<&Topic> = inputs
         .iter()
@@ -273,6 +314,24 @@ mod tests {
             ("/tf", "tf2_msgs/TFMessage", false),
         ];
         assert_eq!(pairs(&inputs, &outputs), ["/scan -> /map by stamp"]);
+    }
+
+    #[test]
+    fn the_goal_of_an_action_is_answered_by_its_result() {
+        let inputs = [
+            ("/walk/goal", "p/WalkActionGoal", true),
+            ("/walk/cancel", "actionlib_msgs/GoalID", false),
+            ("/scan", "sensor_msgs/LaserScan", true),
+        ];
+        let outputs = [
+            ("/walk/status", "actionlib_msgs/GoalStatusArray", true),
+            ("/walk/result", "p/WalkActionResult", true),
+            ("/walk/feedback", "p/WalkActionFeedback", true),
+        ];
+        assert_eq!(
+            pairs(&inputs, &outputs),
+            ["/walk/goal -> /walk/result, /walk/feedback by goal"]
+        );
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! All parts together, for one node of the package.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ use crate::outcome::Outcome;
 use crate::pair::{Correlation, Pair};
 use crate::phases::{PhaseBook, Phases};
 use crate::report::{Counts, Report, TimedEvent};
-use crate::request::{Failure, Leg, RequestId, Side, Sides, Stamp};
+use crate::request::{Failure, Key, Leg, RequestId, Side, Sides};
 use crate::satisfaction::{Satisfaction, Step};
 use crate::sla::{Local, Measure, Mode, Sla};
 
@@ -81,6 +81,8 @@ pub struct Governor<P> {
     phases: PhaseBook,
     /// How long the local original took for its last answer.
     local_time: Option<Duration>,
+    /// Outputs that somebody listens to.
+    listened: BTreeSet<String>,
     events: VecDeque<(Instant, Event)>,
     effects: VecDeque<Effect<P>>,
 }
@@ -99,7 +101,7 @@ struct Stream {
     pair: Pair,
     input: Arc<str>,
     by: Correlation,
-    stamps: HashMap<Stamp, RequestId>,
+    keys: HashMap<Key, RequestId>,
     /// By arrival: what each side has to answer next.
     outstanding: [Option<RequestId>; 2],
     /// By arrival: what each side did not answer by T_max; if it does yet, it must not be taken for more.
@@ -126,6 +128,7 @@ impl<P: Clone> Governor<P> {
             counts: Counts::default(),
             phases: PhaseBook::default(),
             local_time: None,
+            listened: BTreeSet::new(),
             events: VecDeque::new(),
             effects: VecDeque::new(),
             sla,
@@ -164,7 +167,13 @@ impl<P: Clone> Governor<P> {
     }
 
     /// More of the interface has become known: pairs of new inputs, further outputs of known ones.
-    pub fn learn(&mut self, pairs: Vec<Pair>) {
+    pub fn learn(&mut self, now: Instant, pairs: Vec<Pair>) {
+        if let Some(meter) = &mut self.meter {
+            if let Some(first) = pairs.first().filter(|_| meter.output.is_empty()) {
+                meter.output = first.outputs[0].clone();
+            }
+        }
+        self.await_frames(now);
         for pair in pairs {
             match self
                 .pairs
@@ -192,8 +201,8 @@ impl<P: Clone> Governor<P> {
         self.arbiter.cancel(id);
     }
 
-    /// The application publishes an input; `stamp` is that of its header, where it has one.
-    pub fn input(&mut self, now: Instant, topic: &Arc<str>, stamp: Option<Stamp>, payload: P) {
+    /// The application publishes an input; its answer is recognised by `key`, where it has one.
+    pub fn input(&mut self, now: Instant, topic: &Arc<str>, key: Option<Key>, payload: P) {
         self.tick(now);
         let Some(index) = self
             .pairs
@@ -206,10 +215,12 @@ impl<P: Clone> Governor<P> {
             return;
         };
         let stream = &mut self.pairs[index];
-        let stamp = stamp.filter(|stamp| stream.by == Correlation::Stamp && !stamp.is_zero());
+        let key = key.filter(|key| stream.by.takes(key));
         let free = |side: Side| stream.outstanding[side.index()].is_none();
-        let busy = match stamp {
-            Some(stamp) => stream.stamps.contains_key(&stamp),
+        let busy = match &key {
+            Some(key) => stream.keys.contains_key(key),
+            // Its server makes up the id: nothing tells which result is its own.
+            None if stream.by == Correlation::Goal => true,
             None => !(free(Side::Cloud) || self.decider.is_fed() && free(Side::Local)),
         };
         if busy {
@@ -221,13 +232,13 @@ impl<P: Clone> Governor<P> {
         }
         let kind = Kind::Input {
             pair: index,
-            stamp,
+            key: key.clone(),
             outputs: stream.pair.outputs.len(),
         };
         let t_max = self.sla.times(topic).t_max;
         let id = self.arbiter.open(now, t_max, kind, payload);
-        if let Some(stamp) = stamp {
-            self.pairs[index].stamps.insert(stamp, id);
+        if let Some(key) = key {
+            self.pairs[index].keys.insert(key, id);
         }
         self.asked(now, id);
     }
@@ -257,22 +268,22 @@ impl<P: Clone> Governor<P> {
         self.fail_if_hopeless(id);
     }
 
-    /// A side publishes an output; `stamp` is that of its header, where it has one, as the application wrote it in
-    /// the input; `age` is the time since that stamp, zero where it is not known.
+    /// A side publishes an output; `key` tells which input it answers, where it has one, as the application wrote it;
+    /// `age` is the time since that stamp, zero where it is not known.
     #[must_use]
     pub fn output(
         &mut self,
         now: Instant,
         side: Side,
         topic: &str,
-        stamp: Option<Stamp>,
+        key: Option<Key>,
         age: Duration,
     ) -> Verdict {
         self.tick(now);
         if side == Side::Cloud {
             self.measure(now, topic, age);
         }
-        let verdict = match self.request_of(side, topic, stamp) {
+        let verdict = match self.request_of(side, topic, key) {
             Some((id, output)) => self.completed(now, side, id, output),
             // Nobody asked for it: only who speaks for the node at the moment is heard.
             None => {
@@ -297,11 +308,21 @@ impl<P: Clone> Governor<P> {
         verdict
     }
 
-    /// Somebody waits for the outputs of the node, or nobody does: frames that nobody wants are not missed.
-    pub fn wanted(&mut self, now: Instant, wanted: bool) {
+    /// Somebody listens to an output, or nobody does: frames that nobody wants are not missed.
+    pub fn wanted(&mut self, now: Instant, output: &str, wanted: bool) {
         self.tick(now);
-        if let Some(meter) = &mut self.meter {
-            for meter in [&mut meter.cloud, &mut meter.delivered] {
+        if wanted {
+            self.listened.insert(output.to_owned());
+        } else {
+            self.listened.remove(output);
+        }
+        self.await_frames(now);
+    }
+
+    fn await_frames(&mut self, now: Instant) {
+        if let Some(metered) = &mut self.meter {
+            let wanted = self.listened.contains(&metered.output);
+            for meter in [&mut metered.cloud, &mut metered.delivered] {
                 if wanted {
                     meter.start(now)
                 } else {
@@ -526,7 +547,7 @@ impl<P: Clone> Governor<P> {
             return;
         };
         if let Kind::Input {
-            pair, stamp: None, ..
+            pair, key: None, ..
         } = record.kind
         {
             let slot = &mut self.pairs[pair].outstanding[side.index()];
@@ -570,9 +591,7 @@ impl<P: Clone> Governor<P> {
             return;
         };
         let Some(Kind::Input {
-            pair,
-            stamp: Some(_),
-            ..
+            pair, key: Some(_), ..
         }) = self.arbiter.get(id).map(|record| &record.kind)
         else {
             return;
@@ -593,18 +612,21 @@ impl<P: Clone> Governor<P> {
         &mut self,
         side: Side,
         topic: &str,
-        stamp: Option<Stamp>,
+        key: Option<Key>,
     ) -> Option<(RequestId, usize)> {
         for stream in &mut self.pairs {
             let Some(output) = stream.pair.outputs.iter().position(|name| name == topic) else {
                 continue;
             };
+            if let Some(id) = key.as_ref().and_then(|key| stream.keys.get(key)) {
+                stream.unmatched = None;
+                return Some((*id, output));
+            }
+            if stream.by == Correlation::Goal {
+                return None;
+            }
             if stream.by == Correlation::Stamp {
-                if let Some(id) = stamp.and_then(|stamp| stream.stamps.get(&stamp)) {
-                    stream.unmatched = None;
-                    return Some((*id, output));
-                }
-                if stream.stamps.is_empty() && stream.outstanding == [None; 2] {
+                if stream.keys.is_empty() && stream.outstanding == [None; 2] {
                     return None;
                 }
                 if let Some(unmatched) = stream.unmatched.as_mut().filter(|_| output == 0) {
@@ -687,8 +709,11 @@ impl<P: Clone> Governor<P> {
             return;
         };
         let stamp = match record.kind {
-            Kind::Input { stamp, .. } => stamp,
-            Kind::Call(_) => None,
+            Kind::Input {
+                key: Some(Key::Stamp(stamp)),
+                ..
+            } => Some(stamp),
+            _ => None,
         };
         let outcome = Outcome {
             request: id,
@@ -818,10 +843,10 @@ impl<P: Clone> Governor<P> {
 
     fn forget(&mut self, request: RequestId, record: Record<P>) {
         let channel = self.channel(&record.kind);
-        if let Kind::Input { pair, stamp, .. } = &record.kind {
+        if let Kind::Input { pair, key, .. } = &record.kind {
             let stream = &mut self.pairs[*pair];
-            if let Some(stamp) = stamp {
-                stream.stamps.remove(stamp);
+            if let Some(key) = key {
+                stream.keys.remove(key);
             }
             for slot in stream.outstanding.iter_mut().chain(&mut stream.owed) {
                 if *slot == Some(request) {
@@ -847,7 +872,7 @@ impl Stream {
             input: pair.input.as_str().into(),
             by: pair.by.unwrap_or(Correlation::Arrival),
             pair,
-            stamps: HashMap::new(),
+            keys: HashMap::new(),
             outstanding: [None; 2],
             owed: [None; 2],
             unmatched: Some(0),

@@ -48,7 +48,7 @@ pub use outcome::Outcome;
 pub use pair::{Correlation, Pair};
 pub use phases::{PhaseBook, Phases, Quantiles};
 pub use report::{Counts, Report, TimedEvent};
-pub use request::{Failure, Leg, RequestId, Side, Sides, Stamp};
+pub use request::{Failure, Key, Leg, RequestId, Side, Sides, Stamp};
 pub use satisfaction::{Satisfaction, Step};
 pub use sla::{Local, Measure, Mode, SafeStop, Sla, Warm};
 pub use sla_error::SlaError;

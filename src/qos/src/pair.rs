@@ -5,12 +5,16 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::request::Key;
+
 /// How an output finds the input it answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Correlation {
     /// Both carry `header.stamp`, and the node copies it.
     Stamp,
+    /// The goal of an action and its result: both carry the goal's id.
+    Goal,
     /// One outstanding request per side: the next output answers it; forgotten at T_max.
     Arrival,
 }
@@ -27,11 +31,23 @@ pub struct Pair {
     pub by: Option<Correlation>,
 }
 
+impl Correlation {
+    /// Whether answers are recognised by this key.
+    pub(crate) fn takes(self, key: &Key) -> bool {
+        match (self, key) {
+            (Self::Stamp, Key::Stamp(stamp)) => !stamp.is_zero(),
+            (Self::Goal, Key::Goal(id)) => !id.is_empty(),
+            _ => false,
+        }
+    }
+}
+
 impl fmt::Display for Pair {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{} -> {}", self.input, self.outputs.join(", "))?;
         match self.by {
             Some(Correlation::Stamp) => out.write_str(" by stamp"),
+            Some(Correlation::Goal) => out.write_str(" by goal"),
             Some(Correlation::Arrival) => out.write_str(" by arrival"),
             None => Ok(()),
         }
@@ -52,10 +68,11 @@ impl FromStr for Pair {
             None => (rest, None),
             Some((outputs, by)) => match by.trim() {
                 "stamp" => (outputs, Some(Correlation::Stamp)),
+                "goal" => (outputs, Some(Correlation::Goal)),
                 "arrival" => (outputs, Some(Correlation::Arrival)),
                 other => {
                     return Err(refuse(&format!(
-                        "correlates by {other:?}, which is neither stamp nor arrival"
+                        "correlates by {other:?}, which is neither stamp nor goal nor arrival"
                     )));
                 }
             },

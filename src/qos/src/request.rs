@@ -1,5 +1,7 @@
 //! Words about requests that all parts share.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
 /// Names one request within one node.
@@ -19,6 +21,21 @@ impl Stamp {
     /// Nobody set it: it tells nothing.
     pub fn is_zero(self) -> bool {
         self.secs == 0 && self.nsecs == 0
+    }
+}
+
+/// By what an answer is recognised.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Key {
+    /// The input's stamp, which the node copies.
+    Stamp(Stamp),
+    /// The id of an action's goal (actionlib_msgs/GoalID), which its result and feedback carry.
+    Goal(Arc<str>),
+}
+
+impl From<Stamp> for Key {
+    fn from(stamp: Stamp) -> Self {
+        Self::Stamp(stamp)
     }
 }
 

@@ -106,14 +106,14 @@ pub enum Measure {
     Rrt,
     /// The mean interval of the last frames of an output; T_desire and T_max are the inverse rates.
     FramesPerSecond {
-        /// The output topic.
+        /// The output topic; empty: the one that answers the first request that is found.
         output: String,
         /// Frames over which the mean is taken.
         over: usize,
     },
     /// How old an output has become when the next one comes, counted from its `header.stamp` where it has one.
     Age {
-        /// The output topic.
+        /// The output topic; empty: the one that answers the first request that is found.
         output: String,
     },
 }
@@ -199,6 +199,7 @@ enum WrittenMeasure {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WrittenRate {
+    #[serde(default)]
     output: String,
     desire: f64,
     min: f64,
@@ -209,6 +210,7 @@ struct WrittenRate {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WrittenAge {
+    #[serde(default)]
     output: String,
     desire: Span,
     max: Span,
@@ -300,7 +302,7 @@ impl WrittenMeasure {
         match self {
             Self::Rrt => unreachable!("the caller took it"),
             Self::FramesPerSecond(rate) => {
-                absolute("measure.frames_per_second.output", &rate.output)?;
+                absolute_or_none("measure.frames_per_second.output", &rate.output)?;
                 positive("measure.frames_per_second.desire", rate.desire)?;
                 positive("measure.frames_per_second.min", rate.min)?;
                 if rate.min > rate.desire {
@@ -326,7 +328,7 @@ impl WrittenMeasure {
                 Ok((measure, times))
             }
             Self::Age(age) => {
-                absolute("measure.age.output", &age.output)?;
+                absolute_or_none("measure.age.output", &age.output)?;
                 let desire = age.desire.check("measure.age.desire")?;
                 let max = age.max.check("measure.age.max")?;
                 if max < desire {
@@ -441,6 +443,14 @@ fn absolute(field: &str, topic: &str) -> Result<(), SlaError> {
         field,
         format!("{topic:?} is not an absolute topic name; begin it with a slash"),
     ))
+}
+
+/// Not given, it is the output that answers the first request that is found.
+fn absolute_or_none(field: &str, topic: &str) -> Result<(), SlaError> {
+    if topic.is_empty() {
+        return Ok(());
+    }
+    absolute(field, topic)
 }
 
 fn seconds<S: serde::Serializer>(time: &Duration, out: S) -> Result<S::Ok, S::Error> {

@@ -146,9 +146,13 @@ impl World {
                 }
             }
             Given::Input(stamp) => {
-                let verdict =
-                    self.governor
-                        .output(self.now, side, "/found", Some(stamp), Duration::ZERO);
+                let verdict = self.governor.output(
+                    self.now,
+                    side,
+                    "/found",
+                    Some(stamp.into()),
+                    Duration::ZERO,
+                );
                 if verdict == Verdict::Deliver {
                     let counts = self.inputs.get_mut(&stamp).expect("it was made");
                     // Each side may say several things to one input, but only one side is heard.
@@ -175,7 +179,7 @@ impl World {
         self.inputs.entry(stamp).or_default();
         let name = self.input_name.clone();
         self.governor
-            .input(self.now, &name, Some(stamp), Some(stamp));
+            .input(self.now, &name, Some(stamp.into()), Some(stamp));
     }
 
     fn apply(&mut self, op: Op) {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Phases, RequestId,
+    Channel, Effect, Event, Failure, Governor, Key, Limits, LocalState, Outcome, Phases, RequestId,
     Side, Sla, Stamp, Verdict, Why,
 };
 
@@ -27,6 +27,9 @@ impl Robot {
         let pairs = vec![
             "/image -> /found by stamp".parse().unwrap(),
             "/in -> /out by arrival".parse().unwrap(),
+            "/walk/goal -> /walk/result, /walk/feedback by goal"
+                .parse()
+                .unwrap(),
         ];
         let mut governor = Governor::new(Sla::parse(sla).unwrap(), pairs, Limits::default());
         let now = Instant::now();
@@ -78,8 +81,12 @@ impl Robot {
 
     fn image(&mut self, secs: u32, payload: &'static str) {
         let name: Arc<str> = "/image".into();
-        self.governor
-            .input(self.now, &name, Some(Stamp { secs, nsecs: 0 }), payload);
+        self.governor.input(
+            self.now,
+            &name,
+            Some(Stamp { secs, nsecs: 0 }.into()),
+            payload,
+        );
     }
 
     fn input(&mut self, payload: &'static str) {
@@ -88,7 +95,7 @@ impl Robot {
     }
 
     fn found(&mut self, side: Side, secs: u32) -> Verdict {
-        let stamp = Some(Stamp { secs, nsecs: 0 });
+        let stamp = Some(Stamp { secs, nsecs: 0 }.into());
         self.governor
             .output(self.now, side, "/found", stamp, Duration::ZERO)
     }
@@ -170,6 +177,45 @@ fn each_request_s_outcome_is_told_and_told_again_when_more_is_known() {
     assert!(robot.outcomes.is_empty());
     let median = &robot.governor.report(robot.now).phases[1];
     assert_eq!((&*median.phase, median.p50), ("up", 300.0));
+}
+
+#[test]
+fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
+    robot.governor.local(robot.now, LocalState::Ready);
+    robot.effects();
+    let goal: Arc<str> = "/walk/goal".into();
+    let id = |id: &str| Some(Key::Goal(id.into()));
+    for (name, payload) in [("one", "first"), ("two", "second")] {
+        robot.governor.input(robot.now, &goal, id(name), payload);
+    }
+    assert_eq!(
+        robot.effects(),
+        [
+            "first to Cloud",
+            "first to Local",
+            "second to Cloud",
+            "second to Local"
+        ]
+    );
+    let mut output = |side, end: &str, name| {
+        let topic = format!("/walk/{end}");
+        robot
+            .governor
+            .output(robot.now, side, &topic, id(name), Duration::ZERO)
+    };
+    // Feedback of the side that was first with it; results likewise, in whatever order.
+    assert_eq!(output(Side::Cloud, "feedback", "two"), Verdict::Deliver);
+    assert_eq!(output(Side::Local, "feedback", "two"), Verdict::Drop);
+    assert_eq!(output(Side::Local, "result", "two"), Verdict::Deliver);
+    assert_eq!(output(Side::Cloud, "result", "two"), Verdict::Drop);
+    assert_eq!(output(Side::Cloud, "result", "one"), Verdict::Deliver);
+    let counts = robot.governor.report(robot.now).counts;
+    assert_eq!((counts.from_cloud, counts.from_local), (1, 1));
+    // Without an id its server makes one up: it is passed on, and no request.
+    robot.governor.input(robot.now, &goal, id(""), "third");
+    assert_eq!(robot.effects(), ["third to Cloud", "third to Local"]);
+    assert_eq!(robot.governor.report(robot.now).counts.requests, 2);
 }
 
 #[test]
@@ -392,7 +438,7 @@ fn frames_per_second_start_the_local_original_and_stop_the_robot() {
         r#"{"measure": {"frames_per_second": {"output": "/found", "desire": 10, "min": 4, "over": 2}},
             "local": "cold", "initial": 5, "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#,
     ));
-    robot.governor.wanted(robot.now, true);
+    robot.governor.wanted(robot.now, "/found", true);
     for _ in 0..3 {
         robot.after(100);
         assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);

@@ -112,20 +112,25 @@ impl Keeper {
         inputs: BTreeMap<String, WireType>,
         outputs: Vec<String>,
     ) -> anyhow::Result<()> {
-        self.with(|state, _| state.governor.learn(pairs));
+        self.with(|state, now| state.governor.learn(now, pairs));
         match &self.original {
             Some(original) => original.adapt(inputs, outputs).await,
             None => Ok(()),
         }
     }
 
+    /// Somebody on the robot listens to an output, or nobody does.
+    pub fn wanted(&self, output: &str, wanted: bool) {
+        self.with(|state, now| state.governor.wanted(now, output, wanted));
+    }
+
     /// The application published an input.
     pub fn input(&self, topic: &Arc<str>, message: Message) {
         self.with(|state, now| {
-            let stamp = state.stamps.of(&message);
+            let key = state.stamps.key(&message);
             state
                 .governor
-                .input(now, topic, stamp, Payload::Input(message));
+                .input(now, topic, key, Payload::Input(message));
         });
     }
 
@@ -188,9 +193,9 @@ impl Keeper {
 
     fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
         let verdict = self.with(|state, now| {
-            let stamp = state.stamps.of(message);
-            let age = stamp.map(age).unwrap_or_default();
-            let verdict = state.governor.output(now, side, topic, stamp, age);
+            let age = state.stamps.of(message).map(age).unwrap_or_default();
+            let key = state.stamps.key(message);
+            let verdict = state.governor.output(now, side, topic, key, age);
             if let Some(phases) = phases {
                 state.governor.phases(&phases);
             }

@@ -13,6 +13,7 @@ use ros::bus::{Message, SubscribeOptions, WireType};
 use tokio::task::AbortHandle;
 
 use super::Mirror;
+use crate::local;
 
 /// Messages that the bus keeps while the link is busy.
 const QUEUE: usize = 256;
@@ -79,7 +80,10 @@ impl Inputs {
             };
             channels.of(mirror, topic, message)
         };
-        let quality = if message.latching {
+        // Goals and what cancels them are no stream of which the newest would do.
+        let of_action = local::is_of_action(&message.wire_type.name)
+            || message.wire_type.name == "actionlib_msgs/GoalID";
+        let quality = if message.latching || of_action {
             Quality::Each
         } else {
             Quality::Newest

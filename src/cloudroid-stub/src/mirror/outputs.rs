@@ -184,6 +184,9 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
                     .count();
                 if told != Some(count) {
                     told = Some(count);
+                    if let Some(keeper) = mirror.keeper() {
+                        keeper.wanted(&topic.name, count > 0);
+                    }
                     if count == 0 {
                         *topic.latched.lock() = Latched::Not;
                     }

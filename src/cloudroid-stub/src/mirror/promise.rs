@@ -3,18 +3,19 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Weak};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use bytes::Bytes;
 use link::Session;
 use link::control::Graph;
 use parking_lot::Mutex;
-use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, SlaError, Topic};
-use ros::bus::{Message, WireType};
-use ros::schema::MessageType;
+use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, Topic};
+use ros::bus::{Bus, Message, WireType};
+use serde_json::json;
 
 use super::Mirror;
 use super::diagnostics::Diagnostics;
 use super::reports::{self, Reports};
+use super::safe_stop::{self, Stop};
 use crate::config::{self, Config};
 use crate::local::{self, Application, Cloud, Keeper, Original, Setting};
 
@@ -27,13 +28,32 @@ pub struct Known {
 }
 
 /// The SLA that a configuration states; none where it states no times.
-pub fn sla(config: &Config) -> Result<Option<Sla>, SlaError> {
+pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
     let mut sla = serde_json::Map::new();
-    let (Some(desire), Some(max)) = (config.desire, config.max) else {
-        return Ok(None);
-    };
-    sla.insert("t_desire".into(), desire.into());
-    sla.insert("t_max".into(), max.into());
+    let output = config.output.clone().unwrap_or_default();
+    match (config.frames_per_second, config.age) {
+        (None, None) => {
+            let (Some(desire), Some(max)) = (config.desire, config.max) else {
+                return Ok(None);
+            };
+            sla.insert("t_desire".into(), desire.into());
+            sla.insert("t_max".into(), max.into());
+        }
+        (Some(_), Some(_)) => bail!("frames_per_second and age are both given; remove one"),
+        _ if config.desire.or(config.max).is_some() => {
+            bail!(
+                "desire and max are about response times; remove them, or frames_per_second and age"
+            )
+        }
+        (Some(least), None) => {
+            let measure = json!({"output": output, "desire": least, "min": least});
+            sla.insert("measure".into(), json!({"frames_per_second": measure}));
+        }
+        (None, Some(age)) => {
+            let measure = json!({"output": output, "desire": age, "max": age});
+            sla.insert("measure".into(), json!({"age": measure}));
+        }
+    }
     for (name, value) in [("threshold", config.threshold), ("initial", config.initial)] {
         if let Some(value) = value {
             sla.insert(name.into(), value.into());
@@ -49,33 +69,37 @@ pub fn sla(config: &Config) -> Result<Option<Sla>, SlaError> {
         config::Local::Warm => Local::Warm,
         config::Local::None => Local::None,
     };
-    sla.insert("mode".into(), serde_json::json!(mode));
-    sla.insert("local".into(), serde_json::json!(local));
+    sla.insert("mode".into(), json!(mode));
+    sla.insert("local".into(), json!(local));
     if let Some(request) = config
         .request
         .as_deref()
         .filter(|request| *request != "auto")
     {
-        sla.insert("answers".into(), serde_json::json!([request]));
+        sla.insert("answers".into(), json!([request]));
     }
     let mut sla = Sla::parse(serde_json::Value::Object(sla))?;
-    // Its type is known once the node has advertised it.
-    sla.safe_stop = config.safe_stop.as_ref().map(|topic| SafeStop {
-        topic: topic.clone(),
-        type_name: String::new(),
-        message: serde_json::Map::new(),
+    sla.safe_stop = config.safe_stop.as_ref().map(|stop| match stop {
+        config::SafeStop::Message(stop) => stop.clone(),
+        // Its type is known once the node has advertised it.
+        config::SafeStop::Output(topic) => SafeStop {
+            topic: topic.clone(),
+            type_name: String::new(),
+            message: serde_json::Map::new(),
+        },
     });
     Ok(Some(sla))
 }
 
 impl Mirror {
     /// Keeps the promise of `sla` from now on, with the local original that `setting` tells of; how it stands is
-    /// shown by `diagnostics`.
+    /// shown by `diagnostics`. A safe stop of a declared type is published by `watcher`.
     pub async fn promise(
         self: &Arc<Self>,
         sla: Sla,
         setting: Setting,
         diagnostics: Diagnostics,
+        watcher: &Arc<dyn Bus>,
     ) -> anyhow::Result<()> {
         let original = match sla.local {
             Local::None => None,
@@ -87,12 +111,18 @@ impl Mirror {
         };
         let way = Arc::new(Way(Arc::downgrade(self)));
         let answers = sla.answers.clone();
+        let sla_stop = sla.safe_stop.clone();
         let keeper = Keeper::start(sla, Vec::new(), original, way.clone(), way);
+        let stop = match sla_stop {
+            Some(stop) if !stop.type_name.is_empty() => Some(Stop::new(&stop, watcher).await?),
+            _ => None,
+        };
         let _ = self.promise.set(Promise {
             keeper: keeper.clone(),
             answers,
             known: Mutex::default(),
             reports: Reports::default(),
+            stop,
         });
         let mirror = Arc::downgrade(self);
         tokio::spawn(follow(mirror.clone(), keeper));
@@ -170,6 +200,8 @@ pub struct Promise {
     answers: Option<Vec<Pair>>,
     known: Mutex<Known>,
     pub(super) reports: Reports,
+    /// Ready to be published; none where it is zeros on an output of the node.
+    stop: Option<Stop>,
 }
 
 impl Promise {
@@ -238,7 +270,19 @@ impl Application for Way {
         let Some(mirror) = self.0.upgrade() else {
             return;
         };
-        match mirror.outputs.wire_type(&stop.topic).map(|of| zeros(&of)) {
+        let ready = mirror
+            .promise
+            .get()
+            .and_then(|promise| promise.stop.as_ref());
+        if let Some(ready) = ready {
+            tracing::warn!("nobody answered in time: safe stop on {}", stop.topic);
+            return ready.publish();
+        }
+        match mirror
+            .outputs
+            .wire_type(&stop.topic)
+            .map(|of| safe_stop::zeros(&of))
+        {
             Some(Ok(bytes)) => {
                 tracing::warn!("nobody answered in time: safe stop on {}", stop.topic);
                 mirror.outputs.publish(&stop.topic, bytes);
@@ -278,9 +322,48 @@ impl Application for Way {
     }
 }
 
-/// A message of zeros.
-fn zeros(wire_type: &WireType) -> Result<Bytes, String> {
-    let of = MessageType::from_full_text(&wire_type.name, &wire_type.definition);
-    let of = of.map_err(|error| error.to_string())?;
-    Ok(vec![0; of.min_size()].into())
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qos::Measure;
+
+    fn promised(lines: &str) -> anyhow::Result<Option<Sla>> {
+        let file = format!("server = 'ws://here'\nservice = 's'\n{lines}");
+        sla(&toml::from_str(&file)?)
+    }
+
+    #[test]
+    fn a_promise_is_about_times_or_frames_or_age() {
+        assert_eq!(promised("desire = 0.1").unwrap(), None);
+        let times = promised("desire = 0.1\nmax = 0.3\nstateful = true")
+            .unwrap()
+            .unwrap();
+        assert_eq!((times.measure, times.mode), (Measure::Rrt, Mode::Stateful));
+        let frames = promised("frames_per_second = 4.0").unwrap().unwrap();
+        assert_eq!(frames.t_max.as_millis(), 250);
+        let age = promised("age = 2.0\noutput = '/map'").unwrap().unwrap();
+        let output = "/map".to_owned();
+        assert_eq!(age.measure, Measure::Age { output });
+        for (lines, named) in [
+            ("age = 2.0\nfps = 1", "fps"),
+            ("age = 2.0\nframes_per_second = 1.0", "both"),
+            ("age = 2.0\nmax = 1.0", "response times"),
+            ("age = 2.0\noutput = 'map'", "slash"),
+        ] {
+            let error = format!("{:#}", promised(lines).unwrap_err());
+            assert!(error.contains(named), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_safe_stop_is_an_output_or_any_message() {
+        let lines = "desire = 1.0\nmax = 1.0\nsafe_stop =";
+        let stop = |text: &str| {
+            let sla = promised(&format!("{lines} {text}")).unwrap().unwrap();
+            sla.safe_stop.unwrap()
+        };
+        assert_eq!(stop("'/cmd_vel'").type_name, "");
+        let twist = stop("{ topic = '/cmd_vel', type = 'geometry_msgs/Twist' }");
+        assert_eq!(twist.type_name, "geometry_msgs/Twist");
+    }
 }

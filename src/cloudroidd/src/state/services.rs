@@ -65,6 +65,9 @@ pub struct Plan {
     /// Start a node again when it fails, though it asked for no respawn: nobody else will.
     #[serde(default)]
     pub restart: bool,
+    /// Answers depend on earlier requests: stubs are told.
+    #[serde(default)]
+    pub stateful: bool,
 }
 
 impl State {

@@ -12,12 +12,14 @@ pub(super) fn stub(about: &About<'_>) -> String {
     struct Where<'a> {
         server: &'a str,
         service: &'a str,
+        stateful: bool,
     }
     let known = Where {
         server: about.server,
         service: about.service,
+        stateful: about.stateful,
     };
-    let known = toml::to_string(&known).expect("two texts are TOML");
+    let known = toml::to_string(&known).expect("texts and a word are TOML");
     format!(
         "# How this robot uses the service {}. Each key can also be given by the environment (CLOUDROID_MAX=0.3) or by\n\
          # a private parameter of the node (~cloudroid/max). `rosrun {} cloudroid-stub doctor` checks it.\n\

@@ -69,6 +69,7 @@ fn composed(outsourced: &[&str]) -> Files {
         architecture: "x86_64",
         outsourced: &outsourced,
         interface: &interface,
+        stateful: true,
     };
     compose(&about, contents()).expect("a stub")
 }
@@ -143,6 +144,7 @@ fn settings_and_origin_are_told_in_toml() {
     let stub: toml::Table = text(&files["share/p/stub.toml"]).parse().expect("TOML");
     assert_eq!(stub["server"].as_str(), Some("ws://here:9090"));
     assert_eq!(stub["service"].as_str(), Some("serves"));
+    assert_eq!(stub["stateful"].as_bool(), Some(true));
     let revision: toml::Table = text(&files["share/p/revision.toml"]).parse().expect("TOML");
     assert_eq!(revision["revision"].as_integer(), Some(3));
     assert_eq!(revision["outsourced"][0].as_str(), Some("node"));
@@ -197,6 +199,7 @@ fn without_a_manifest_there_is_no_stub() {
         architecture: "x86_64",
         outsourced: &BTreeSet::new(),
         interface: &interface,
+        stateful: true,
     };
     let error = compose(&about, Contents::default()).expect_err("refused");
     assert!(error.to_string().contains("no package.xml of p"), "{error}");
