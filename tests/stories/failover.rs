@@ -55,7 +55,7 @@ impl Scene {
             cable.server, PEOPLE.name
         );
         let workspace = workspace.to_string_lossy().into_owned();
-        let environment = [("CMAKE_PREFIX_PATH", workspace.as_str())];
+        let environment = [("CMAKE_PREFIX_PATH", workspace.as_str()), ("NO_COLOR", "1")];
         let stub = site.stub_among(&environment, &toml, people.0, people.1, &ARGUMENTS)?;
         let app = site.node("/camera")?;
         let found = site.hears(&app, "/people_detect/found")?;

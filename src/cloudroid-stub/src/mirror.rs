@@ -94,7 +94,7 @@ impl Mirror {
             self.keeper(),
             "the cloud has forgotten this call: its daemon or servant was restarted",
         );
-        self.inputs.clear();
+        self.inputs.renew();
     }
 
     async fn apply(self: &Arc<Self>, graph: Graph) {

@@ -365,7 +365,8 @@ impl Outgoing {
         }
         let stream = self.next_stream;
         self.next_stream = self.next_stream.wrapping_add(1);
-        let bytes = out.piece(0, self.piece);
+        // On a quick link a piece may be longer than the record; the rest must not be empty.
+        let bytes = out.piece(0, self.piece.min(length - 1));
         self.sent += bytes.len() as u64;
         let total = u32::try_from(length).unwrap_or(u32::MAX);
         let at = bytes.len();

@@ -119,6 +119,11 @@ impl Keeper {
         }
     }
 
+    /// The local original is given messages, too.
+    pub fn is_local_fed(&self) -> bool {
+        self.state.lock().governor.sides().local
+    }
+
     /// Somebody on the robot listens to an output, or nobody does.
     pub fn wanted(&self, output: &str, wanted: bool) {
         self.with(|state, now| state.governor.wanted(now, output, wanted));

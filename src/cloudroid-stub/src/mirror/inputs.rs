@@ -41,10 +41,12 @@ impl Drop for Topic {
 impl Inputs {
     /// Subscribes to what is new and takes back what is gone.
     pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[Wanted]) {
+        // A new servant's node registers its inputs one by one; meanwhile the local original must not become deaf.
+        let others_need = mirror.keeper().is_some_and(|keeper| keeper.is_local_fed());
         let mut topics = self.topics.lock();
         topics.retain(|name, topic| {
-            let same = |wanted: &&Wanted| wanted.topic == *name && wanted.md5 == topic.wanted.md5;
-            inputs.iter().any(|wanted| same(&wanted))
+            let listed = inputs.iter().find(|wanted| wanted.topic == *name);
+            listed.map_or(others_need, |wanted| wanted.md5 == topic.wanted.md5)
         });
         // Subscribed to anew, a topic gets new channels.
         self.channels
@@ -52,7 +54,10 @@ impl Inputs {
             .retain(|name, _| topics.contains_key(name));
         for wanted in inputs {
             let feed = match topics.get(&wanted.topic) {
-                Some(topic) => topic.feed.clone(),
+                Some(topic) => {
+                    self.send_latched(mirror, &wanted.topic);
+                    topic.feed.clone()
+                }
                 None => {
                     let feed = Arc::new(AtomicBool::new(wanted.feed));
                     let reading = read(Arc::downgrade(mirror), wanted.clone(), feed.clone());
@@ -69,6 +74,17 @@ impl Inputs {
         }
     }
 
+    /// Gives a new servant what publishers have latched: they do not send it again.
+    fn send_latched(&self, mirror: &Mirror, topic: &str) {
+        let kept = match self.channels.lock().get_mut(topic) {
+            Some(channels) => std::mem::take(&mut channels.to_send_again),
+            None => return,
+        };
+        for message in kept.into_values() {
+            self.send(mirror, topic, &message);
+        }
+    }
+
     /// Sends a message up.
     pub fn send(&self, mirror: &Mirror, topic: &str, message: &Message) {
         let born = now();
@@ -78,6 +94,10 @@ impl Inputs {
                 Some(channels) => channels,
                 None => channels.entry(topic.to_owned()).or_default(),
             };
+            if message.latching {
+                let publisher = message.publisher.clone();
+                channels.latched.insert(publisher, message.clone());
+            }
             channels.of(mirror, topic, message)
         };
         // Goals and what cancels them are no stream of which the newest would do.
@@ -101,10 +121,13 @@ impl Inputs {
         mirror.session().publish(data, quality);
     }
 
-    /// Takes everything back.
-    pub fn clear(&self) {
-        self.channels.lock().clear();
-        self.topics.lock().clear();
+    /// Another session begins: the cloud knows no channel any more. What is subscribed to on the robot stays so, or
+    /// the local original would miss messages.
+    pub fn renew(&self) {
+        for channels in self.channels.lock().values_mut() {
+            channels.by_publisher.clear();
+            channels.to_send_again = channels.latched.clone();
+        }
     }
 }
 
@@ -148,6 +171,10 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
 #[derive(Default)]
 struct Channels {
     by_publisher: HashMap<(Option<Arc<str>>, String), u32>,
+    /// What each publisher has latched last.
+    latched: HashMap<Arc<str>, Message>,
+    /// Of that, what a new servant was not given yet.
+    to_send_again: HashMap<Arc<str>, Message>,
 }
 
 impl Channels {

@@ -48,6 +48,20 @@ fn born(record: Option<Record>) -> Option<i64> {
 }
 
 #[test]
+fn a_message_shorter_than_a_piece_comes_once_and_whole() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    out.set_throughput(1e9);
+    let mut came = Vec::new();
+    for number in 1..=3 {
+        out.push(&data(1, number, SMALL + 1000), Quality::Newest);
+        while let Some(frame) = out.next(0) {
+            came.extend(born(deliver(&mut incoming, frame)));
+        }
+    }
+    assert_eq!(came, [1, 2, 3]);
+}
+
+#[test]
 fn a_big_message_does_not_hold_up_small_ones() {
     let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
     out.push(&data(1, 1, 1 << 20), Quality::Newest);
