@@ -246,7 +246,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 18] = [
+pub const KEYS: [&str; 19] = [
     "server",
     "service",
     "token",
