@@ -183,7 +183,7 @@ impl Hub {
             Err(_) => return Lost::Silent(HELLO),
         };
         let name = hello.node.name.clone();
-        let (link, resumed) = match self.attach(&hello).await {
+        let (link, resumed, turn) = match self.attach(&hello).await {
             Ok(attached) => attached,
             Err(refusal) => {
                 tracing::info!(
@@ -205,7 +205,14 @@ impl Hub {
                 };
             }
         };
-        let _seat = link.seat.lock().await;
+        // Whoever comes later than this one takes its place, while it waits for the seat, too.
+        let mut kicked = link.kick.subscribe();
+        let replaced = kicked.wait_for(|kicks| *kicks != turn);
+        let _seat = tokio::select! {
+            biased;
+            _ = replaced => return replaced_by_another(),
+            seat = link.seat.lock() => seat,
+        };
         let (received, ahead, next) = link.session.position();
         let welcome = Welcome::Accepted {
             session: link.id.clone(),
@@ -224,6 +231,7 @@ impl Hub {
         link.session.peer_decodes(&hello.codecs);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
         if let Err(lost) = send_open(&mut socket, &welcome).await {
+            self.expire(&link, turn);
             return lost;
         }
         tracing::info!(
@@ -232,10 +240,9 @@ impl Hub {
             resumed,
             "a robot's node is linked"
         );
-        let kicked = link.kick.subscribe();
         let lost = tokio::select! {
             lost = link.session.run(&mut socket, &*link) => lost,
-            () = changed(kicked) => Lost::Closed { code: 1012, reason: "the robot came back on another connection".into() },
+            _ = kicked.wait_for(|kicks| *kicks != turn) => return replaced_by_another(),
         };
         let for_good = matches!(
             lost,
@@ -244,13 +251,16 @@ impl Hub {
         if for_good {
             self.end(&link).await;
         } else {
-            self.expire(&link);
+            self.expire(&link, turn);
         }
         lost
     }
 
-    /// The link that the hello means, begun if need be; whether it goes on.
-    async fn attach(self: &Arc<Self>, hello: &Hello) -> Result<(Arc<NodeLink>, bool), Refusal> {
+    /// The link that the hello means, begun if need be; whether it goes on; and the turn of this connection.
+    async fn attach(
+        self: &Arc<Self>,
+        hello: &Hello,
+    ) -> Result<(Arc<NodeLink>, bool, u64), Refusal> {
         let node = &hello.node.name;
         if !ros::ros1::names::is_global(node) {
             return Err(Refusal::final_(format!(
@@ -270,7 +280,8 @@ impl Hub {
             let asked = hello.resume.as_ref().map(|resume| resume.session.as_str());
             if same && asked == Some(&link.id) {
                 link.kick.send_modify(|kicks| *kicks += 1);
-                return Ok((link, true));
+                let turn = *link.kick.borrow();
+                return Ok((link, true, turn));
             }
             let alive = *link.session.up().borrow();
             if !same && alive && link.machine != hello.machine {
@@ -316,7 +327,8 @@ impl Hub {
             link.session.tell(&Control::Parameters(set.collect()));
         }
         self.changed();
-        Ok((link, false))
+        let turn = *link.kick.borrow();
+        Ok((link, false, turn))
     }
 
     fn changed(&self) {
@@ -367,11 +379,12 @@ impl Hub {
     }
 
     /// Ends the link unless its robot comes back within the grace time.
-    fn expire(self: &Arc<Self>, link: &Arc<NodeLink>) {
+    fn expire(self: &Arc<Self>, link: &Arc<NodeLink>, turn: u64) {
         let (hub, link) = (Arc::clone(self), Arc::clone(link));
         let mut kicked = link.kick.subscribe();
         tokio::spawn(async move {
-            if timeout(hub.options.grace, kicked.changed()).await.is_err() {
+            let back = kicked.wait_for(|kicks| *kicks != turn);
+            if timeout(hub.options.grace, back).await.is_err() {
                 hub.end(&link).await;
             }
         });
@@ -404,8 +417,11 @@ impl Refusal {
     }
 }
 
-async fn changed(mut watched: watch::Receiver<u64>) {
-    let _ = watched.changed().await;
+fn replaced_by_another() -> Lost {
+    Lost::Closed {
+        code: 1012,
+        reason: "the robot came back on another connection".into(),
+    }
 }
 
 /// How the cloud watches a link: the robot pings often, so the cloud need not.

@@ -21,6 +21,8 @@ const READ_AHEAD: usize = 4 << 20;
 pub(crate) struct Incoming {
     number: u32,
     ahead: BTreeSet<u32>,
+    /// The first number on this connection, until the peer shows by using it that it knows what has come.
+    next: Option<u32>,
     bytes: u64,
     streams: HashMap<u32, Partial>,
     partial: usize,
@@ -46,12 +48,13 @@ impl Incoming {
         }
     }
 
-    /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again.
+    /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again: the peer
+    /// sends it under new numbers, once it has heard what came. The connection may be lost before that, so what came is
+    /// not forgotten yet.
     pub(crate) fn reconnect(&mut self, next: u32) {
         self.streams.clear();
         self.partial = 0;
-        self.ahead.clear();
-        self.number = next.wrapping_sub(1);
+        self.next = Some(next);
     }
 
     /// Takes a record in one piece; `None` if it had come before.
@@ -119,6 +122,10 @@ impl Incoming {
     fn note(&mut self, number: u32) -> Result<bool, Error> {
         if number == 0 {
             return Ok(true);
+        }
+        if let Some(next) = self.next.take() {
+            self.ahead.clear();
+            self.number = next.wrapping_sub(1);
         }
         if number <= self.number || self.ahead.contains(&number) {
             return Ok(false);

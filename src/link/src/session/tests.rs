@@ -149,6 +149,32 @@ async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
     drop(peer.await.unwrap());
 }
 
+#[tokio::test]
+async fn a_call_is_not_lost_when_a_welcome_is() {
+    let (robot, cloud) = (session(), session());
+    let (to_robot, _answers) = mpsc::unbounded_channel();
+    let (to_cloud, mut calls) = mpsc::unbounded_channel();
+    let (to_robot, to_cloud) = (To(to_robot), To(to_cloud));
+    robot.call(1, Bytes::from_static(b"asked"));
+    // It leaves and does not arrive.
+    open(&robot, &cloud);
+    let (mut at_robot, at_cloud) = sockets();
+    let gone = robot.run(&mut at_robot, &to_robot);
+    let _ = tokio::time::timeout(Duration::from_millis(20), gone).await;
+    drop(at_cloud);
+    // The cloud hears a hello, and its welcome is lost; the next one is not.
+    let (has, ahead, next) = robot.position();
+    cloud.reconnect(has, &ahead, next);
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &to_robot) => panic!("{lost}"),
+        lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
+        call = calls.recv() => assert!(matches!(call, Some(Record::Call { .. })), "{call:?}"),
+        () = tokio::time::sleep(Duration::from_secs(5)) => panic!("the call was lost"),
+    }
+}
+
 /// A picture with something to save in it.
 fn picture(number: u8) -> Bytes {
     let mut message = vec![number, 0, 0, 0];
