@@ -16,6 +16,8 @@ mod clients;
 mod cross;
 #[path = "stories/crossing.rs"]
 mod crossing;
+#[path = "stories/cuts.rs"]
+mod cuts;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/grants.rs"]
@@ -128,6 +130,7 @@ fn main() -> ExitCode {
             settings_are_changed_through_dynamic_reconfigure,
             pictures_are_made_smaller_where_the_link_is_slow,
         ],
+        stories![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
             two_nodes_share_a_servant,

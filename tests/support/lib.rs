@@ -5,6 +5,7 @@ pub mod binaries;
 pub mod burglar;
 pub mod burglary;
 pub mod cable;
+pub mod cutter;
 pub mod daemon;
 pub mod deployer;
 pub mod grants;

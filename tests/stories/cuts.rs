@@ -1,0 +1,236 @@
+//! A link that is cut again and again while requests are under way.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, AtomicU32, AtomicUsize, Ordering};
+
+use anyhow::{Context, ensure};
+use bytes::Bytes;
+use ros::bus::{Bus, Graph};
+use support::Told;
+use support::cutter::Cutter;
+use support::robot::PATIENCE;
+use support::site::{Running, Site, string};
+use support::world::{ADDER, GREETER, world};
+
+/// Callers at the same time.
+const CALLERS: usize = 4;
+/// The longest stretch between two cuts, bytes: some hundred calls. Many are in the midst of a handshake.
+const STRETCH: usize = 20_000;
+
+/// What a process holds: descriptors, threads, resident memory in kB.
+fn holds(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
+    let count = |what: &str| -> anyhow::Result<usize> {
+        Ok(std::fs::read_dir(format!("/proc/{pid}/{what}"))?.count())
+    };
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
+    let resident = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))
+        .and_then(|rest| rest.split_whitespace().next()?.parse().ok());
+    Ok((count("fd")?, count("task")?, resident.context("VmRSS")?))
+}
+
+pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> Told {
+    // A thousand: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
+    let cuts = std::env::var("CLOUDROID_CUTS")
+        .ok()
+        .and_then(|cuts| cuts.parse().ok())
+        .unwrap_or(60);
+    // Of its own: what it holds is looked at.
+    let daemon = world().own("cuts").start()?;
+    for service in [ADDER, GREETER] {
+        daemon
+            .deployer()
+            .pushes(service.name, service.arguments)?
+            .succeeded()?;
+    }
+    let cutter = Cutter::new(&daemon.address, cuts, STRETCH, 0x5eed)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let stub = |service: &str, node: &str, argv: &[&str]| -> anyhow::Result<Running> {
+        let toml = format!(
+            "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"cut-{service}\"\nlocal = \"none\"\n",
+            cutter.server
+        );
+        site.stub_with(&toml, service, node, argv)
+    };
+    let adder = stub("adder_py", "adder.py", &["__name:=adder"])?;
+    let greeter = stub(
+        "greeter_cpp",
+        "greeter",
+        &["__name:=greeter", "~name:=/who"],
+    )?;
+    let said = || {
+        format!(
+            "the adder's:\n{}\nthe greeter's:\n{}",
+            adder.said(),
+            greeter.said()
+        )
+    };
+    let is_there = |graph: &Graph| {
+        graph.services.contains_key("/add_two") && graph.services.contains_key("/greeter/count")
+    };
+    site.until(&app, "both", is_there).with_context(said)?;
+    let names = site.says(&app, "/who", false)?;
+    site.connected(&*names, 1)?;
+    let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    let mut sums = site.hears(&app, "/sums")?;
+    // Both outputs are heard from here on.
+    let next = Arc::new(AtomicI64::new(1));
+    let add = |number: i64| {
+        let request = [number.to_le_bytes(), 0_i64.to_le_bytes()].concat();
+        (
+            Bytes::from(request),
+            Bytes::copy_from_slice(&number.to_le_bytes()),
+        )
+    };
+    loop {
+        let (request, _) = add(0);
+        site.calls(&app, "/add_two", &request)?;
+        let heard = site.runtime.block_on(async {
+            let patience = std::time::Duration::from_millis(200);
+            tokio::time::timeout(patience, sums.messages.recv()).await
+        });
+        if heard.is_ok() {
+            break;
+        }
+    }
+    names.publish(string("0"));
+    site.next(&mut greetings).with_context(said)?;
+    let before = [
+        holds(adder.pid())?,
+        holds(greeter.pid())?,
+        holds(daemon.pid().unsigned_abs())?,
+    ];
+    cutter.begin();
+    let over = || cutter.cuts() >= cuts;
+    let (answered, failed) = (AtomicU32::new(0), AtomicU32::new(0));
+    let done = AtomicUsize::new(0);
+    let (executed, greeted) = site
+        .runtime
+        .block_on(async {
+            let call = async || {
+                while !over() {
+                    let (request, sum) = add(next.fetch_add(1, Ordering::Relaxed));
+                    match app.call("/add_two", request, PATIENCE).await {
+                        Ok(response) => {
+                            ensure!(response == sum, "{response:?} is not {sum:?}");
+                            answered.fetch_add(1, Ordering::Relaxed);
+                        }
+                        // A reason is an answer; silence is none.
+                        Err(ros::bus::BusError::CallFailed { .. }) => {
+                            failed.fetch_add(1, Ordering::Relaxed);
+                        }
+                        Err(error) => anyhow::bail!("a call was lost: {error}"),
+                    }
+                }
+                done.fetch_add(1, Ordering::Relaxed);
+                Ok(())
+            };
+            let calls = async {
+                let calls: [_; CALLERS] = std::array::from_fn(|_| call());
+                let [one, two, three, four] = calls;
+                tokio::try_join!(one, two, three, four).map(drop)
+            };
+            let greet = async {
+                let mut count = 0_u32;
+                while !over() {
+                    count += 1;
+                    names.publish(string(&count.to_string()));
+                    let greeting = tokio::time::timeout(PATIENCE, greetings.messages.recv()).await;
+                    let greeting = greeting
+                        .ok()
+                        .flatten()
+                        .with_context(|| format!("name {count} was lost"))?;
+                    let text = format!("hi {count}");
+                    ensure!(
+                        greeting
+                            .bytes
+                            .windows(text.len())
+                            .any(|part| part == text.as_bytes()),
+                        "not the answer to {count}, or one twice: {greeting:?}"
+                    );
+                }
+                anyhow::Ok(count)
+            };
+            let hear = async {
+                let mut executed = BTreeSet::new();
+                // Each is heard in order: once a call that came after all others is heard, so were those.
+                let mut fence = None;
+                loop {
+                    if over() && done.load(Ordering::Relaxed) == CALLERS {
+                        let (request, _) = add(next.fetch_add(1, Ordering::Relaxed));
+                        fence.get_or_insert_with(|| next.load(Ordering::Relaxed) - 1);
+                        app.call("/add_two", request, PATIENCE).await?;
+                    }
+                    let pause = std::time::Duration::from_millis(200);
+                    while let Ok(Some(sum)) =
+                        tokio::time::timeout(pause, sums.messages.recv()).await
+                    {
+                        let sum = String::from_utf8_lossy(&sum.bytes[4..]).into_owned();
+                        let number: i64 = sum.parse()?;
+                        if fence.is_some_and(|fence| number >= fence) {
+                            return anyhow::Ok(executed);
+                        }
+                        ensure!(
+                            number == 0 || executed.insert(number),
+                            "{number} was added twice"
+                        );
+                    }
+                }
+            };
+            let all = async { tokio::try_join!(calls, greet, hear) };
+            let patience = PATIENCE * u32::try_from(cuts / 60 + 1).unwrap_or(1);
+            let ((), greeted, executed) =
+                tokio::time::timeout(patience, all)
+                    .await
+                    .with_context(|| {
+                        let cuts = cutter.cuts();
+                        format!("after {cuts} cuts {done:?} callers are done, {answered:?} answers")
+                    })??;
+            anyhow::Ok((executed.len(), greeted))
+        })
+        .with_context(said)?;
+    let after = [
+        holds(adder.pid())?,
+        holds(greeter.pid())?,
+        holds(daemon.pid().unsigned_abs())?,
+    ];
+    let (answered, failed) = (answered.into_inner(), failed.into_inner());
+    println!(
+        "{cuts} cuts: {answered} calls answered, {failed} failed with a reason, {executed} executed, {greeted} names greeted; descriptors, threads, kB before {before:?}, after {after:?}"
+    );
+    ensure!(
+        answered > 0 && greeted > 0 && executed >= answered as usize,
+        "{answered} answers, {executed} sums, {greeted} greetings"
+    );
+    for ((fds, threads, memory), (fds_after, threads_after, memory_after)) in
+        before.iter().zip(&after)
+    {
+        ensure!(
+            fds_after <= &(fds + 8) && threads_after <= &(threads + 8),
+            "they grow: {before:?}, {after:?}"
+        );
+        ensure!(
+            *memory_after < memory + 12_000,
+            "memory grows: {before:?}, {after:?}"
+        );
+    }
+    // The same nodes in the same servants.
+    let servants = daemon.deployer().asks(&["servants"])?;
+    let ours = servants
+        .as_array()
+        .context("a list")?
+        .iter()
+        .filter(|servant| {
+            servant["robot"]
+                .as_str()
+                .is_some_and(|robot| robot.starts_with("cut-"))
+        });
+    ensure!(ours.count() == 2, "{servants:#}");
+    drop((adder, greeter));
+    daemon.deployer().types(&["stop", "--all"])?;
+    daemon.ends()?;
+    Ok(())
+}
