@@ -212,9 +212,11 @@ fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
     assert_eq!(output(Side::Cloud, "result", "one"), Verdict::Deliver);
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.from_cloud, counts.from_local), (1, 1));
+    // The cloud was fast twice: its original is fed no more.
+    assert_eq!(robot.effects(), ["stop feeding"]);
     // Without an id its server makes one up: it is passed on, and no request.
     robot.governor.input(robot.now, &goal, id(""), "third");
-    assert_eq!(robot.effects(), ["third to Cloud", "third to Local"]);
+    assert_eq!(robot.effects(), ["third to Cloud"]);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 2);
 }
 
