@@ -11,7 +11,11 @@ const HEIGHT: f64 = 170.0;
 const Q_HEIGHT: f64 = 40.0;
 const Q_MAX: f64 = 16.0;
 const Q_T: f64 = 4.0;
-const LEFT: f64 = 64.0;
+const LEFT: f64 = 44.0;
+/// For the names of what was promised, beside the panels.
+const RIGHT: f64 = 60.0;
+/// Where those names begin.
+const BESIDE: f64 = LEFT + WIDTH + 6.0;
 const STEP: f64 = HEIGHT + Q_HEIGHT + 56.0;
 /// Of the logarithmic axis, seconds.
 const RANGE: (f64, f64) = (0.05, 12.0);
@@ -26,7 +30,7 @@ pub fn draw(runs: &[(String, Outcome)]) -> String {
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{}\" height=\"{}\" font-family=\"sans-serif\" font-size=\"12\">\n\
          <rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n",
-        WIDTH + LEFT + 20.0,
+        LEFT + WIDTH + RIGHT,
         STEP * runs.len() as f64 + 40.0
     );
     for (index, (colour, what)) in COLOURS.iter().enumerate() {
@@ -76,14 +80,14 @@ fn panel(out: &mut String, top: f64, name: &str, outcome: &Outcome) {
             ),
         );
     }
+    for (seconds, label) in [(0.1, "0.1 s"), (1.0, "1 s"), (10.0, "10 s")] {
+        line(out, y(seconds), (4.0, label), "#ccc");
+    }
     for (seconds, label, colour) in [
         (outcome.times.0, "T_desire", "#2a9d4a"),
         (outcome.times.1, "T_max", "#c1121f"),
-        (0.1, "0.1 s", "#ccc"),
-        (1.0, "1 s", "#ccc"),
-        (10.0, "10 s", "#ccc"),
     ] {
-        line(out, y(seconds), label, colour);
+        line(out, y(seconds), (BESIDE, label), colour);
     }
     for (index, answer) in outcome.answers.iter().enumerate() {
         let at = answer.after.map_or(top, y);
@@ -110,8 +114,8 @@ fn satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &Ou
     if points.is_empty() {
         return;
     }
-    line(out, y(Q_T), "Q_t", "#999");
-    line(out, y(0.0), "Q 0", "#ccc");
+    line(out, y(Q_T), (BESIDE, "Q_t"), "#999");
+    line(out, y(0.0), (4.0, "Q = 0"), "#ccc");
     put(
         out,
         format_args!(
@@ -121,11 +125,12 @@ fn satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &Ou
     );
 }
 
-fn line(out: &mut String, at: f64, label: &str, colour: &str) {
+/// Across the panel, with a label that begins at its x.
+fn line(out: &mut String, at: f64, (x, label): (f64, &str), colour: &str) {
     put(
         out,
         format_args!(
-            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"{colour}\"/><text x=\"4\" y=\"{:.1}\">{label}</text>",
+            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"{colour}\"/><text x=\"{x}\" y=\"{:.1}\">{label}</text>",
             LEFT + WIDTH,
             at + 4.0
         ),

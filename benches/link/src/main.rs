@@ -1,0 +1,50 @@
+//! `make bench ONLY=link`: a robot's node through stub, link, daemon and servant, beside the same node on the robot and
+//! beside a client of the portal, in turns; and what a stub takes of memory and processor. Needs root.
+//! `CLOUDROID_BENCH_FULL=1` measures longer.
+
+#![forbid(unsafe_code)]
+
+mod idle;
+mod people;
+mod strings;
+
+use anyhow::Result;
+use bench_report::Report;
+use support::daemon::Setup;
+use support::world::{FIXTURE, PEOPLE};
+
+/// Longer measurements are wanted.
+fn full() -> bool {
+    std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| value == "1")
+}
+
+fn main() -> Result<()> {
+    let place = tempfile::Builder::new()
+        .prefix("cloudroid-bench-")
+        .tempdir()?;
+    let daemon = Setup::new(&place.path().join("home")).start()?;
+    eprintln!("pushing people_detect and a relay: what they need is made now, if it is not cached");
+    let deployer = daemon.deployer();
+    deployer
+        .types(&[&["push"], PEOPLE.arguments].concat())?
+        .succeeded()?;
+    let relay = ["--name", "meter", "--node", "rosbridge_fixture/meter"];
+    deployer
+        .pushes(FIXTURE.package.unwrap_or_default(), &relay)?
+        .succeeded()?;
+    let mut report = Report::new("link");
+    people::measure(&mut report, &daemon)?;
+    strings::measure(&mut report, &daemon)?;
+    report.finish()?;
+    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    daemon.ends()?;
+    Ok(())
+}
+
+/// The middle one.
+fn median(times: &mut [std::time::Duration]) -> f64 {
+    times.sort_unstable();
+    times
+        .get(times.len() / 2)
+        .map_or(f64::NAN, std::time::Duration::as_secs_f64)
+}

@@ -1,0 +1,155 @@
+//! people_detect: a picture in, `found` out.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use bench_report::{Report, Target};
+use bytes::Bytes;
+use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::ros1::Ros1Bus;
+use support::daemon::Daemon;
+use support::site::Site;
+
+const SIZE: (u32, u32) = (640, 480);
+const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
+    uint32 step\nuint8[] data\n\
+    ================================================================================\n\
+    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
+
+/// One of the two.
+struct Way {
+    pictures: Box<dyn Publisher>,
+    found: Subscription,
+    times: Vec<Duration>,
+    asked: u32,
+}
+
+impl Way {
+    fn new(site: &Site, app: &Ros1Bus, node: &str) -> Result<Self> {
+        let found = site.hears(app, &format!("/{node}/found"))?;
+        let image = AdvertiseOptions {
+            wire_type: WireType {
+                name: "sensor_msgs/Image".into(),
+                md5: "060021388200f6f0f447d0fcd9c64743".into(),
+                definition: IMAGE.into(),
+            },
+            latch: false,
+            queue: 10,
+        };
+        let topic = format!("/{node}_camera");
+        let pictures = site.runtime.block_on(app.advertise(&topic, image))?;
+        site.connected(&*pictures, 1)?;
+        Ok(Self {
+            pictures,
+            found,
+            times: Vec::new(),
+            asked: 0,
+        })
+    }
+
+    /// One picture, and the time until its answer.
+    fn ask(&mut self, site: &Site) -> Result<Duration> {
+        self.asked += 1;
+        let stamp = self.asked;
+        let picture = picture(stamp);
+        let begun = Instant::now();
+        self.pictures.publish(picture);
+        loop {
+            let found = site.next(&mut self.found).context("found")?;
+            if found.bytes.get(4..8) == Some(&stamp.to_le_bytes()) {
+                return Ok(begun.elapsed());
+            }
+        }
+    }
+}
+
+/// Like a camera's: shapes with noise on them.
+fn picture(stamp: u32) -> Bytes {
+    let mut out = Vec::new();
+    let word = |out: &mut Vec<u8>, word: u32| out.extend(word.to_le_bytes());
+    for part in [stamp, stamp, 0] {
+        word(&mut out, part);
+    }
+    word(&mut out, 6);
+    out.extend(b"camera");
+    word(&mut out, SIZE.1);
+    word(&mut out, SIZE.0);
+    word(&mut out, 4);
+    out.extend(b"bgr8");
+    out.push(0);
+    word(&mut out, SIZE.0 * 3);
+    word(&mut out, SIZE.0 * SIZE.1 * 3);
+    let mut noise = stamp.wrapping_mul(2_654_435_761) | 1;
+    for at in 0..SIZE.0 * SIZE.1 * 3 {
+        noise ^= noise << 13;
+        noise ^= noise >> 17;
+        noise ^= noise << 5;
+        let shape = ((at / 3 % SIZE.0) / 40 + at / (SIZE.0 * 3) / 60) % 2 * 90;
+        out.push((shape + (noise & 15) + 60) as u8);
+    }
+    out.into()
+}
+
+/// Response times in turns, and what the stub takes.
+pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
+    let rounds = if crate::full() { 300 } else { 60 };
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let native = site.original(
+        daemon,
+        "opencv_apps",
+        "/usr/lib/opencv_apps/people_detect",
+        &[
+            "__name:=native",
+            "_debug_view:=false",
+            "image:=/native_camera",
+        ],
+    )?;
+    let stub = site.stub(
+        daemon,
+        ("opencv_apps", "opencv_apps", "people_detect"),
+        "bench-link",
+        &[
+            "__name:=linked",
+            "_debug_view:=false",
+            "image:=/linked_camera",
+        ],
+    )?;
+    let mut ways = [
+        Way::new(&site, &app, "native")?,
+        Way::new(&site, &app, "linked")?,
+    ];
+    for way in &mut ways {
+        // The first may be lost while all are being connected.
+        way.pictures.publish(picture(0));
+        site.next(&mut way.found)?;
+        for _ in 0..5 {
+            way.ask(&site)?;
+        }
+    }
+    for round in 0..rounds {
+        let first = round % 2;
+        for index in [first, 1 - first] {
+            let took = ways[index].ask(&site)?;
+            ways[index].times.push(took);
+        }
+    }
+    let [native_way, linked_way] = &mut ways;
+    let (alone, linked) = (
+        crate::median(&mut native_way.times) * 1e3,
+        crate::median(&mut linked_way.times) * 1e3,
+    );
+    report
+        .figure("people_detect, picture in, found out: median", "ms", linked)
+        .beside("the same on the robot", alone)
+        .reach(Target::RatioAtMost(1.05))
+        .note(format!("640x480, {rounds} pictures each, in turns"));
+    let memory = crate::idle::pss(stub.pid())?;
+    report
+        .figure("memory of its stub, after that", "MB", memory)
+        .reach(Target::AtMost(15.0))
+        .note("PSS");
+    drop((ways, native));
+    crate::idle::measure(report, &stub)?;
+    Ok(())
+}
