@@ -10,6 +10,8 @@ use support::Told;
 mod answer;
 #[path = "stories/burglary.rs"]
 mod burglary;
+#[path = "stories/calls.rs"]
+mod calls;
 #[path = "stories/clients.rs"]
 mod clients;
 #[path = "stories/cross.rs"]
@@ -83,6 +85,12 @@ fn main() -> ExitCode {
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
             neighbours_are_not_reached,
+        ],
+        stories![calls:
+            a_python_node_calls_the_robot,
+            a_cpp_node_waits_for_the_robot_and_calls_it,
+            a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link,
+            siblings_come_first_and_other_robots_are_not_asked,
         ],
         stories![failover:
             a_slow_network_costs_few_requests,

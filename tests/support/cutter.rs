@@ -15,6 +15,7 @@ pub struct Cutter {
 struct Shared {
     cuts: AtomicUsize,
     over: AtomicBool,
+    closed: AtomicBool,
     state: Mutex<State>,
 }
 
@@ -35,6 +36,7 @@ impl Cutter {
         let shared = Arc::new(Shared {
             cuts: AtomicUsize::new(0),
             over: AtomicBool::new(false),
+            closed: AtomicBool::new(false),
             state: Mutex::new(State {
                 left: None,
                 remaining: cuts,
@@ -51,6 +53,12 @@ impl Cutter {
     /// From now on it cuts.
     pub fn begin(&self) {
         self.shared.state().draw();
+    }
+
+    /// Cuts what is connected now; with `closed`, nobody gets through from now on.
+    pub fn cut(&self, closed: bool) {
+        self.shared.closed.store(closed, Ordering::Relaxed);
+        self.shared.state().cut();
     }
 
     /// Cuts so far.
@@ -123,6 +131,9 @@ fn accept(listener: &TcpListener, server: SocketAddr, portal: &str, shared: &Arc
     for robot in listener.incoming().flatten() {
         if shared.over.load(Ordering::Relaxed) {
             return;
+        }
+        if shared.closed.load(Ordering::Relaxed) {
+            continue;
         }
         let Ok(cloud) = TcpStream::connect(portal) else {
             continue;

@@ -75,6 +75,13 @@ pub const CROSSING: Service = Service {
     arguments: &["--node", "crossing.py"],
 };
 
+/// Our C++ package that calls services of others.
+pub const CALLER: Service = Service {
+    name: "caller_cpp",
+    package: Some("caller_cpp"),
+    arguments: &["--node", "caller"],
+};
+
 /// Our hostile package.
 pub const BURGLAR: Service = Service {
     name: "burglar_cpp",

@@ -10,6 +10,7 @@
 //! graph except through the [`Keeper`], and it is given no backlog. See docs/adr/015-a-master-for-the-local-original.md.
 
 mod keeper;
+mod lender;
 mod original;
 mod place;
 mod process;

@@ -5,12 +5,14 @@
 //!  Graph ─▶ outputs: advertised here ──listeners──▶ cloud          data ─▶ publish
 //!        ─▶ inputs: subscribed to here ─▶ Open, data ─▶ cloud
 //!        ─▶ services: served here ─▶ call ─▶ cloud ─▶ answer
+//!  Lookup ─▶ lent: services of the robot ◀─ call ◀─ cloud
 //! ```
 //! Registrations outlive a lost link: the robot's other nodes see one node that lives on.
 
 mod calls;
 pub mod diagnostics;
 mod inputs;
+mod lent;
 mod outputs;
 mod parameters;
 pub mod promise;
@@ -18,7 +20,7 @@ mod reports;
 mod safe_stop;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, OnceLock, Weak};
 
 use link::control::{Control, Exit, Graph};
 use link::record::Record;
@@ -29,17 +31,23 @@ use tokio::sync::{mpsc, watch};
 
 use calls::Calls;
 use inputs::Inputs;
+use lent::Lent;
 use outputs::Outputs;
 use parameters::Parameters;
 use promise::Promise;
 
 /// The node on the robot.
 pub struct Mirror {
+    /// For tasks that it starts.
+    this: Weak<Mirror>,
     bus: Arc<dyn Bus>,
+    /// By which stubs of one servant know each other.
+    label: String,
     session: RwLock<Arc<Session>>,
     inputs: Inputs,
     outputs: Outputs,
     calls: Calls,
+    lent: Lent,
     parameters: Parameters,
     promise: OnceLock<Promise>,
     /// Definitions by name and md5.
@@ -50,15 +58,18 @@ pub struct Mirror {
 }
 
 impl Mirror {
-    /// A mirror on `bus`; its task ends with it.
-    pub fn start(bus: Arc<dyn Bus>, session: Arc<Session>) -> Arc<Self> {
+    /// A mirror on `bus`, which is labelled so; its tasks end with it.
+    pub fn start(bus: Arc<dyn Bus>, label: String, session: Arc<Session>) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
-        let mirror = Arc::new(Self {
+        let mirror = Arc::new_cyclic(|this| Self {
+            this: this.clone(),
             bus,
+            label,
             session: RwLock::new(session),
             inputs: Inputs::default(),
             outputs: Outputs::default(),
             calls: Calls::default(),
+            lent: Lent::default(),
             parameters: Parameters::default(),
             promise: OnceLock::new(),
             types: Mutex::default(),
@@ -67,6 +78,7 @@ impl Mirror {
             orders,
         });
         tokio::spawn(obey(Arc::downgrade(&mirror), taken));
+        tokio::spawn(lent::follow(Arc::downgrade(&mirror)));
         mirror
     }
 
@@ -90,6 +102,7 @@ impl Mirror {
     pub fn renew(&self, session: Arc<Session>) {
         self.calls.renew();
         *self.session.write() = session;
+        self.lent.renew();
         self.calls.fail(
             self.keeper(),
             "the cloud has forgotten this call: its daemon or servant was restarted",
@@ -119,13 +132,15 @@ impl Handler for Mirror {
                 let way = (taken, given, arrived);
                 self.calls.answered(self, id, way, response);
             }
-            Record::Call { id, .. } => {
-                let reason = "the robot serves nothing to its own node".to_owned();
-                self.session().answer(id, arrived, Err(reason));
-            }
+            Record::Call {
+                id,
+                service,
+                request,
+            } => self.lent.call(self, service, request, (id, arrived)),
             Record::Control(json) => match serde_json::from_slice(&json) {
                 Ok(Control::Line { error: true, text }) => eprintln!("{text}"),
                 Ok(Control::Line { text, .. }) => println!("{text}"),
+                Ok(Control::Lookup { service }) => self.lent.look_up(self, service),
                 Ok(control) => drop(self.orders.send(control)),
                 Err(error) => tracing::debug!(%error, "the cloud tells something unknown"),
             },
@@ -134,7 +149,7 @@ impl Handler for Mirror {
 }
 
 /// Does what the cloud tells, one thing after the other.
-async fn obey(mirror: std::sync::Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<Control>) {
+async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<Control>) {
     while let Some(order) = orders.recv().await {
         let Some(mirror) = mirror.upgrade() else {
             return;

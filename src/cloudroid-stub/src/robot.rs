@@ -88,7 +88,6 @@ impl Robot {
             directory: directory.to_string_lossy().into_owned(),
             revision: made_of.revision,
             image: made_of.image,
-            calls: Vec::new(),
         }
     }
 }

@@ -90,7 +90,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     let config = with_parameters(config, &*bus, &robot.node).await?;
     let mut shutdown = bus.shutdown_requested();
     let session = Arc::new(Session::new(session_options(&config)));
-    let mirror = Mirror::start(bus.clone(), session);
+    let label = format!("{} for {}", config.service, config.robot());
+    bus.set_label(&label);
+    let mirror = Mirror::start(bus.clone(), label, session);
     let mut watcher: Option<Arc<dyn Bus>> = None;
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
         let bus: Arc<dyn Bus> = join(robot, &format!("{}_cloudroid", robot.node)).await?;
@@ -111,6 +113,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
             config::Codec::Auto => link::packing::decoded_here(false),
             config::Codec::Video => link::packing::decoded_here(true),
         },
+        lends: true,
         keep_stamps: config.stamps == config::Stamps::Keep,
         parameters,
         ..Hello::default()

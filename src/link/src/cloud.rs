@@ -4,6 +4,7 @@
 //!  stub ═ WebSocket ═ Session ─┬─ inputs ──▶ Bus.advertise, publish ──▶ the real node
 //!                              ├─ outputs ◀── Bus.subscribe ◀────────── (only while the robot has a listener)
 //!                              ├─ calls ───▶ Bus.call ────────────────▶
+//!                              ├─ lent ◀──── Bus.lend ◀──────────────── (services of the robot, when one looks for them)
 //!                              ├─ parameters ◀─▶ the servant's parameter server
 //!                              └─ Graph ◀── what the node has registered, as it changes
 //! ```
@@ -11,6 +12,7 @@
 //! link is the feeder; what nodes of one servant publish for each other stays inside.
 
 mod inputs;
+mod lent;
 mod mirror;
 mod node_link;
 mod outputs;
@@ -18,6 +20,7 @@ mod parameters;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -101,6 +104,8 @@ pub struct Hub {
     /// One begins at a time: the second finds what the first left.
     beginning: tokio::sync::Mutex<()>,
     parameters: parameters::Known,
+    /// Services of the robot are lent already.
+    lends: AtomicBool,
     /// The robot's clock against ours.
     skew: Skew,
     closed: watch::Sender<Option<String>>,
@@ -148,6 +153,7 @@ impl Hub {
             changes: watch::Sender::new(0),
             beginning: tokio::sync::Mutex::default(),
             parameters: parameters::Known::default(),
+            lends: AtomicBool::new(false),
             skew: Skew::default(),
             closed: watch::Sender::new(None),
         })
@@ -293,6 +299,7 @@ impl Hub {
             self.forget(&link);
         }
         self.parameters.watch(self).await;
+        lent::begin(self).await;
         let run_key = format!("{RUNS}/{}", node.trim_start_matches('/').replace('/', "__"));
         let running = self.nodes.is_running(node).await;
         let ours = running

@@ -28,6 +28,8 @@ pub struct Hello {
     pub codecs: Vec<String>,
     /// Stamps stay as they are, whatever the clocks say.
     pub keep_stamps: bool,
+    /// The robot answers a `Lookup`.
+    pub lends: bool,
     /// All parameters of the robot, as a tree of values.
     #[serde(with = "crate::values::tree")]
     pub parameters: BTreeMap<String, ParamValue>,
@@ -67,8 +69,6 @@ pub struct Node {
     pub revision: Option<u64>,
     /// … and the digest of its image, since another server counts otherwise.
     pub image: String,
-    /// Services of the robot that the node calls.
-    pub calls: Vec<String>,
 }
 
 /// Response times and the like, in seconds.
@@ -182,6 +182,18 @@ pub enum Control {
     },
     /// Robot: how a request went, for the cloud's statistics.
     Requests(Vec<Request>),
+    /// Cloud: a node looks for a service that nobody in the servant serves.
+    Lookup {
+        /// Its name.
+        service: String,
+    },
+    /// Robot: what it has under that name. Told as an answer, and when what was there is gone.
+    Lent {
+        /// The name.
+        service: String,
+        /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
+        of: Option<Served>,
+    },
 }
 
 /// How the node ended.
@@ -263,7 +275,7 @@ pub struct Wanted {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Served {
-    /// Number of its channel, chosen by the cloud.
+    /// Number of its channel, chosen by the end that tells of it.
     pub channel: u32,
     /// The service.
     pub name: String,

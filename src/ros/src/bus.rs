@@ -28,6 +28,8 @@ pub struct Graph {
     pub nodes: BTreeMap<String, String>,
     /// Every parameter key that a node asked for or wrote, with the nodes that did.
     pub parameters: BTreeMap<String, ParameterUse>,
+    /// Services that nodes looked for when there were none, with those nodes. Told by our own Master only.
+    pub sought: BTreeMap<String, Vec<String>>,
 }
 
 /// The ends of one topic.
@@ -143,6 +145,35 @@ pub struct ServiceType {
     pub name: String,
     /// MD5 of request and response together.
     pub md5: String,
+}
+
+/// A service's server, as it told of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServiceProvider {
+    /// Its node.
+    pub node: String,
+    /// What it serves.
+    pub service_type: ServiceType,
+    /// How it [labels](crate::ros1::Ros1Bus::set_label) itself.
+    pub label: Option<String>,
+}
+
+/// A service of another ROS system.
+#[derive(Clone)]
+pub struct Lent {
+    /// As it is there.
+    pub service_type: ServiceType,
+    /// Passes calls on.
+    pub handler: Arc<dyn ServiceHandler>,
+    /// Becomes true, or loses its sender, when it can be had no more: connections end then, between two calls.
+    pub gone: watch::Receiver<bool>,
+}
+
+/// Lends nodes the services of another ROS system.
+#[async_trait]
+pub trait Lender: Send + Sync + 'static {
+    /// `node` looks for a service that nobody serves here, and waits for the answer. Later lookups ask again.
+    async fn find(&self, service: &str, node: &str) -> Option<Lent>;
 }
 
 /// A ROS parameter value. NaN equals NaN: whoever looks for what has changed would never be done otherwise.
@@ -282,8 +313,21 @@ pub trait Bus: Send + Sync + 'static {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError>;
+    /// The same, unless the server's type has meanwhile another md5 than the request was serialized by.
+    async fn call_typed(
+        &self,
+        service: &str,
+        md5: &str,
+        request: Bytes,
+        timeout: Duration,
+    ) -> Result<Bytes, BusError>;
     /// Asks a server for its type without calling it (ROS 1: `probe=1`).
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError>;
+    /// The same, and who it is.
+    async fn service_provider(&self, service: &str) -> Result<ServiceProvider, BusError>;
+    /// From now on nodes find the lender's services, too. What is served here always comes first, and what is lent
+    /// is not registered: it can be looked up, called and waited for. One lender at a time; needs our own Master.
+    async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError>;
     /// Asks a topic's peers for their type without subscribing: a publisher's header, or, for a topic that is
     /// only subscribed to, what the subscribers announce when connected to.
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError>;

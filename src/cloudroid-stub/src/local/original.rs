@@ -91,6 +91,7 @@ impl Original {
         robot: Arc<dyn Bus>,
     ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
         let place = Arc::new(Place::new().await?);
+        place.lend(&setting.node, &robot).await?;
         let (news, received) = mpsc::unbounded_channel();
         let publishers = Arc::default();
         let sources = Arc::default();

@@ -10,6 +10,7 @@ use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use tokio::task::AbortHandle;
 
+use super::lender::Robot;
 use crate::parameters;
 
 /// The stub's name in it.
@@ -59,6 +60,13 @@ impl Place {
     /// The stub's node in it.
     pub fn bus(&self) -> &Arc<Ros1Bus> {
         &self.bus
+    }
+
+    /// What `node` calls that is served elsewhere on the robot.
+    pub async fn lend(&self, node: &str, robot: &Arc<dyn Bus>) -> anyhow::Result<()> {
+        let lender = Arc::new(Robot::new(node, robot));
+        let lent = self.bus.lend(lender).await;
+        lent.context("lending services to the local original")
     }
 
     /// Takes the robot's parameters over: all of them, because a node reads those of its neighbours, too

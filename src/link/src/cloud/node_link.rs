@@ -10,6 +10,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 
 use super::inputs::Inputs;
+use super::lent::Lent;
 use super::outputs::Outputs;
 use super::{Hub, LinkStatus, mirror};
 use crate::clock::Sample;
@@ -37,6 +38,7 @@ pub(super) struct NodeLink {
     pub(super) hub: Weak<Hub>,
     pub(super) inputs: Inputs,
     pub(super) outputs: Outputs,
+    pub(super) lent: Lent,
     pub(super) services: Mutex<HashMap<u32, Arc<Service>>>,
     pub(super) listening: Mutex<BTreeSet<String>>,
     sla: Sla,
@@ -72,6 +74,7 @@ impl NodeLink {
             hub: Arc::downgrade(hub),
             inputs: Inputs::default(),
             outputs: Outputs::default(),
+            lent: Lent::new(hello.lends),
             services: Mutex::default(),
             listening: Mutex::default(),
             sla: hello.sla.clone(),
@@ -112,6 +115,7 @@ impl NodeLink {
         }
         self.inputs.clear();
         self.outputs.clear();
+        self.lent.end();
     }
 
     pub(super) fn listens_to(&self, topic: &str) -> bool {
@@ -227,14 +231,18 @@ impl NodeLink {
                 service,
                 request,
             } => this.call(id, service, request, arrived),
-            Record::Answer { .. } => {}
+            Record::Answer { id, response, .. } => self.lent.answered(id, response),
             Record::Control(json) => match serde_json::from_slice(&json) {
                 Ok(control) => {
                     // Data may follow in the same breath.
                     if let Control::Open(input) = &control {
                         self.inputs.expect(input);
                     }
-                    let _ = self.orders.send(control);
+                    match control {
+                        // A call that waits for it must not wait for other orders.
+                        Control::Lent { service, of } => this.lends(service, of),
+                        control => drop(self.orders.send(control)),
+                    }
                 }
                 Err(error) => {
                     tracing::debug!(node = self.node, %error, "the robot tells something unknown");

@@ -11,6 +11,7 @@
 //! has, so a Master that restarted, or forgot us, is told again.
 
 mod calls;
+mod lending;
 mod link;
 mod master_client;
 mod publications;
@@ -27,8 +28,8 @@ use std::fmt;
 use std::future::Future;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -39,6 +40,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 
 use self::calls::CallPool;
+use self::lending::Lending;
 use self::master_client::MasterClient;
 use self::publications::TopicOut;
 use self::registrar::Registrar;
@@ -46,8 +48,9 @@ use self::services::Served;
 use self::subscriptions::TopicIn;
 use super::{names, tcpros};
 use crate::bus::{
-    AdvertiseOptions, Bus, BusError, Graph, ParamChange, ParamChanges, ParamValue, Publisher,
-    ServiceHandler, ServiceType, SubscribeOptions, Subscription, WireType,
+    AdvertiseOptions, Bus, BusError, Graph, Lender, ParamChange, ParamChanges, ParamValue,
+    Publisher, ServiceHandler, ServiceProvider, ServiceType, SubscribeOptions, Subscription,
+    WireType,
 };
 use crate::net::Sockets;
 use crate::ros1::xmlrpc::{self, Limits, Value};
@@ -101,6 +104,8 @@ struct Inner {
     subscriptions: Mutex<HashMap<String, Arc<TopicIn>>>,
     publications: Mutex<HashMap<String, Arc<TopicOut>>>,
     services: Mutex<HashMap<String, Arc<Served>>>,
+    label: OnceLock<String>,
+    lending: Lending,
     calls: CallPool,
     graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
@@ -184,6 +189,8 @@ impl Ros1Bus {
             subscriptions: Mutex::default(),
             publications: Mutex::default(),
             services: Mutex::default(),
+            label: OnceLock::new(),
+            lending: Lending::default(),
             calls: CallPool::default(),
             graph: watch::Sender::new(Arc::default()),
             shutdown: watch::Sender::new(None),
@@ -213,6 +220,12 @@ impl Ros1Bus {
     /// The address of this node's slave API, as the Master knows it.
     pub fn uri(&self) -> &str {
         self.inner.registrar.slave_uri()
+    }
+
+    /// Is told to whoever calls or probes services of this node, by those that are served from now on: what belongs
+    /// together knows itself by it. The first one stays.
+    pub fn set_label(&self, label: &str) {
+        let _ = self.inner.label.set(label.to_owned());
     }
 
     /// Becomes the reason when someone asked this node to end (`rosnode kill`, or another node of the same
@@ -288,6 +301,7 @@ impl Inner {
         self.publications.lock().clear();
         *self.param_watcher.lock() = None;
         self.services.lock().clear();
+        self.lending.end();
         self.calls.clear();
     }
 }
@@ -323,12 +337,34 @@ impl Bus for Ros1Bus {
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
         self.inner.check_name(service)?;
-        calls::call(&self.inner, service, request, timeout).await
+        calls::call(&self.inner, service, None, request, timeout).await
+    }
+
+    async fn call_typed(
+        &self,
+        service: &str,
+        md5: &str,
+        request: Bytes,
+        timeout: Duration,
+    ) -> Result<Bytes, BusError> {
+        self.inner.check_name(service)?;
+        calls::call(&self.inner, service, Some(md5), request, timeout).await
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
+        let provider = self.service_provider(service).await?;
+        Ok(provider.service_type)
+    }
+
+    async fn service_provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
         self.inner.check_name(service)?;
         calls::probe(&self.inner, service).await
+    }
+
+    async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
+        self.inner.check_open()?;
+        self.inner.lending.begin(lender);
+        self.inner.tell_that_it_lends().await
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {

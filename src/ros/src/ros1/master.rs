@@ -6,6 +6,7 @@
 
 mod api;
 pub(crate) mod graph;
+pub(crate) mod lending;
 mod notify;
 mod params;
 mod probe;
@@ -23,6 +24,7 @@ use tokio::sync::watch;
 use crate::bus::{Graph, ParamValue, ParameterUse};
 use crate::net::{LoopbackSockets, Sockets};
 use crate::ros1::xmlrpc::{self, Limits, Value};
+use lending::Lending;
 use notify::{Notice, Notifier};
 use params::Params;
 use registry::Registry;
@@ -31,6 +33,8 @@ use registry::Registry;
 const MAX_USES: usize = 10_000;
 /// Nodes remembered per key and kind of use, at most.
 const MAX_USERS: usize = 100;
+/// Services remembered that were looked for in vain, at most.
+const MAX_SOUGHT: usize = 1000;
 
 /// What a Master starts with.
 #[derive(Debug, Clone)]
@@ -77,6 +81,7 @@ struct Inner {
     /// Grows by one with every change of what [`Master::graph`] shows.
     generation: watch::Sender<u64>,
     notifier: Notifier,
+    lending: Lending,
     sockets: OnceLock<Arc<dyn Sockets>>,
 }
 
@@ -85,6 +90,7 @@ struct State {
     registry: Registry,
     params: Params,
     uses: HashMap<String, ParameterUse>,
+    sought: BTreeMap<String, Vec<String>>,
 }
 
 impl Master {
@@ -137,6 +143,7 @@ impl Master {
                     (key, used)
                 })
                 .collect(),
+            sought: BTreeMap::new(),
         };
         Self::with(options.uri, options.limits, snapshot.run_id, state, 1)
     }
@@ -150,6 +157,7 @@ impl Master {
                 state: Mutex::new(state),
                 generation: watch::Sender::new(generation),
                 notifier: Notifier::default(),
+                lending: Lending::default(),
                 sockets: OnceLock::new(),
             }),
         }
@@ -222,6 +230,7 @@ impl Inner {
             parameters: uses
                 .map(|(key, used)| (key.clone(), used.clone()))
                 .collect(),
+            sought: state.sought.clone(),
         }
     }
 
@@ -264,6 +273,19 @@ impl Inner {
             self.grow();
         }
     }
+}
+
+/// Remembers that `node` looked for a service in vain; whether that is news.
+fn note_sought(sought: &mut BTreeMap<String, Vec<String>>, service: &str, node: &str) -> bool {
+    if sought.len() >= MAX_SOUGHT && !sought.contains_key(service) {
+        return false;
+    }
+    let nodes = sought.entry(service.to_owned()).or_default();
+    let news = nodes.len() < MAX_USERS && nodes.iter().all(|known| known != node);
+    if news {
+        nodes.push(node.to_owned());
+    }
+    news
 }
 
 /// Random enough to tell two Masters apart, in the shape of a UUID as roslaunch makes it.

@@ -47,12 +47,18 @@ def ask(_):
     return TriggerResponse(answer.success, "the robot says " + answer.message)
 
 
+def wait(_):
+    rospy.wait_for_service("/robot/late")
+    return TriggerResponse(True, "it is there")
+
+
 rospy.Subscriber("~point", PointStamped, look)
 rospy.Subscriber("~picture", Image, mirrored.publish, queue_size=1, buff_size=1 << 22)
 rospy.Subscriber("/tf", TFMessage, learn("moving"))
 rospy.Subscriber("/tf_static", TFMessage, learn("fixed"))
 rospy.Service("~now", Trigger, lambda _: TriggerResponse(True, str(rospy.Time.now().to_nsec())))
 rospy.Service("~ask", Trigger, ask)
+rospy.Service("~wait", Trigger, wait)
 server = actionlib.SimpleActionServer("~act", TestAction, act, auto_start=False)
 server.start()
 rospy.spin()

@@ -10,8 +10,9 @@ use tokio::time::timeout;
 
 use super::link::broken;
 use super::registrar::Kind;
+use super::services::LABEL;
 use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Graph, ServiceType};
+use crate::bus::{BusError, Graph, ServiceProvider, ServiceType};
 use crate::ros1::names::PeerUri;
 use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
 
@@ -64,10 +65,12 @@ impl CallPool {
     }
 }
 
-/// Calls once. Tried again only where the server had closed a kept connection before it took the request.
+/// Calls once. Tried again only where the server had closed a kept connection before it took the request. A server
+/// that says to have another md5 than this one is not asked.
 pub(super) async fn call(
     bus: &Arc<Inner>,
     service: &str,
+    md5: Option<&str>,
     request: Bytes,
     time: Duration,
 ) -> Result<Bytes, BusError> {
@@ -79,6 +82,9 @@ pub(super) async fn call(
                 Some(connection) => connection,
                 None => open(bus, service, ("persistent", "1")).await?,
             };
+            if let Some(md5) = md5 {
+                same_type(service, md5, connection.header())?;
+            }
             match connection.call(request.clone()).await {
                 Ok(answer) => {
                     bus.calls.put(service, connection);
@@ -106,20 +112,41 @@ pub(super) async fn call(
     })
 }
 
-/// Asks a server for its type.
-pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceType, BusError> {
+fn same_type(service: &str, ours: &str, header: &Header) -> Result<(), BusError> {
+    match header.get("md5sum") {
+        Some(theirs) if theirs != ours && theirs != "*" && ours != "*" => {
+            Err(BusError::TypeMismatch {
+                what: format!("service {service}"),
+                theirs: format!("{} {theirs}", header.get("type").unwrap_or("*")),
+                ours: ours.to_owned(),
+            })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Asks a server for its type, and who it is.
+pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceProvider, BusError> {
     let own = bus.services.lock().get(service).cloned();
     if let Some(served) = own {
         // Who is told the type may call: the Master must know the server by then.
         bus.registrar.sync(Kind::Service, service, false).await?;
-        return Ok(served.service_type.clone());
+        return Ok(ServiceProvider {
+            node: bus.node.clone(),
+            service_type: served.service_type.clone(),
+            label: bus.label.get().cloned(),
+        });
     }
     let connection = open(bus, service, ("probe", "1")).await?;
     let header = connection.header();
     match (header.get("type"), header.get("md5sum")) {
-        (Some(name), Some(md5)) => Ok(ServiceType {
-            name: name.to_owned(),
-            md5: md5.to_owned(),
+        (Some(name), Some(md5)) => Ok(ServiceProvider {
+            node: header.get("callerid").unwrap_or_default().to_owned(),
+            service_type: ServiceType {
+                name: name.to_owned(),
+                md5: md5.to_owned(),
+            },
+            label: header.get(LABEL).map(str::to_owned),
         }),
         _ => Err(BusError::Protocol {
             what: format!("server of {service}"),

@@ -50,6 +50,10 @@ impl Registrar {
         &self.slave_uri
     }
 
+    pub(super) fn service_uri(&self) -> &str {
+        &self.service_uri
+    }
+
     /// Says what is wanted from now on; [`Registrar::sync`] makes it so.
     pub(super) fn want(&self, kind: Kind, name: &str, type_name: Option<&str>) {
         let mut slots = self.slots.lock();

@@ -18,11 +18,21 @@ use crate::ros1::tcpros::{Error, Header, serve_calls};
 /// For a caller to take a header.
 const TAKE: Duration = Duration::from_secs(10);
 
+/// The field of a server's header in which it tells its label.
+pub(super) const LABEL: &str = "cloudroid";
+
 /// One service.
 pub(super) struct Served {
     pub(super) service_type: ServiceType,
-    handler: Arc<dyn ServiceHandler>,
-    ended: watch::Sender<bool>,
+    pub(super) handler: Arc<dyn ServiceHandler>,
+    /// True, or without its sender: served no more.
+    pub(super) ended: watch::Receiver<bool>,
+}
+
+impl Served {
+    pub(super) fn is_over(&self) -> bool {
+        *self.ended.borrow() || self.ended.has_changed().is_err()
+    }
 }
 
 /// Serves until the guard is dropped.
@@ -32,10 +42,11 @@ pub(super) async fn serve(
     service_type: ServiceType,
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
+    let (ending, ended) = watch::channel(false);
     let served = Arc::new(Served {
         service_type,
         handler,
-        ended: watch::Sender::new(false),
+        ended,
     });
     {
         let mut services = bus.services.lock();
@@ -50,6 +61,7 @@ pub(super) async fn serve(
         bus: bus.clone(),
         name: name.to_owned(),
         served,
+        ending,
     };
     bus.registrar.sync(Kind::Service, name, false).await?;
     Ok(Box::new(guard))
@@ -59,11 +71,12 @@ struct Guard {
     bus: Arc<Inner>,
     name: String,
     served: Arc<Served>,
+    ending: watch::Sender<bool>,
 }
 
 impl Drop for Guard {
     fn drop(&mut self) {
-        self.served.ended.send_replace(true);
+        self.ending.send_replace(true);
         {
             let mut services = self.bus.services.lock();
             let current = services.get(&self.name);
@@ -89,7 +102,7 @@ pub(super) async fn answer(
     buffer: BytesMut,
 ) -> Result<(), Error> {
     let served = bus.services.lock().get(name).cloned();
-    let Some(served) = served else {
+    let Some(served) = served.or_else(|| bus.lending.lent(name)) else {
         return refuse(stream, &format!("{} does not serve {name}", bus.node)).await;
     };
     let ours = &served.service_type;
@@ -101,7 +114,7 @@ pub(super) async fn answer(
         );
         return refuse(stream, &reason).await;
     }
-    let answer = Header::new([
+    let mut answer = Header::new([
         ("callerid", bus.node.as_str()),
         ("service", name),
         ("type", &ours.name),
@@ -109,6 +122,9 @@ pub(super) async fn answer(
         ("request_type", &format!("{}Request", ours.name)),
         ("response_type", &format!("{}Response", ours.name)),
     ]);
+    if let Some(label) = bus.label.get() {
+        answer = answer.with(LABEL, label);
+    }
     match timeout(TAKE, answer.write(&mut stream)).await {
         Ok(written) => written?,
         Err(_) => return Ok(()),
@@ -123,7 +139,7 @@ pub(super) async fn answer(
         (caller, header.flag("persistent")),
         &*served.handler,
         bus.max_message,
-        served.ended.subscribe(),
+        served.ended.clone(),
     )
     .await
 }

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use async_trait::async_trait;
 
 use super::Inner;
+use crate::ros1::master::lending::LEND_SERVICE;
 use crate::ros1::names;
 use crate::ros1::reply::{Args, Reply};
 use crate::ros1::xmlrpc::{Fault, Handler, Value};
@@ -29,6 +30,7 @@ impl Handler for Slave {
             "getBusStats" => Ok(self.stats()),
             "getBusInfo" => Ok(self.info()),
             "shutdown" => self.shutdown(&mut args),
+            LEND_SERVICE => self.lend_service(&mut args).await,
             _ => return Err(Fault::new(format!("method {method} is not known here"))),
         };
         Ok(answer.unwrap_or_else(|mistake| mistake).into_value())
@@ -98,6 +100,16 @@ impl Slave {
         tracing::info!(node = self.bus.node, reason, "asked to shut down");
         self.bus.shutdown.send_replace(Some(reason));
         Ok(Reply::done("", 0))
+    }
+
+    async fn lend_service(&self, args: &mut Args) -> Result<Reply, Reply> {
+        args.text("caller_id")?;
+        let service = args.text("service")?;
+        let node = args.text("node")?;
+        Ok(match self.bus.lend_service(&service, &node).await {
+            Some(api) => Reply::done("", api),
+            None => Reply::not_done(format!("{service} is not lent"), ""),
+        })
     }
 
     fn subscriptions(&self) -> Reply {

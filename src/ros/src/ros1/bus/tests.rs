@@ -1,6 +1,7 @@
 //! Two buses, or a bus and something made by hand, at a Master of their own.
 
 mod hostile;
+mod lending;
 mod services;
 mod topics;
 

@@ -100,6 +100,7 @@ impl Watcher {
     }
 
     async fn look(&mut self) -> Result<(), xmlrpc::Error> {
+        let first = self.known == -1;
         let graph = if self.waits {
             match wait(&self.bus, self.known, POLL).await {
                 Ok((graph, run_id)) => {
@@ -119,6 +120,10 @@ impl Watcher {
             ask(&self.bus).await?
         };
         self.known = wire_generation(graph.generation);
+        if first && self.waits {
+            // It may be another Master than the one that was told.
+            let _ = self.bus.tell_that_it_lends().await;
+        }
         self.take(graph).await;
         Ok(())
     }

@@ -9,6 +9,8 @@ use async_trait::async_trait;
 
 use super::Inner;
 use super::graph::{self, WAIT_GRAPH, wire_generation};
+use super::lending::LEND_SERVICES;
+use super::note_sought;
 use super::registry::{Kind, Refused};
 use crate::ros1::names;
 use crate::ros1::reply::{Args, Reply};
@@ -20,6 +22,7 @@ const MAX_MULTICALL: usize = 10_000;
 const MAX_WAIT: Duration = Duration::from_secs(300);
 
 const METHODS: &[&str] = &[
+    LEND_SERVICES,
     WAIT_GRAPH,
     "deleteParam",
     "getParam",
@@ -57,6 +60,10 @@ impl Handler for Api {
         match method {
             WAIT_GRAPH => {
                 let answer = self.wait_graph(Args::new(params)).await;
+                Ok(answer.unwrap_or_else(|mistake| mistake).into_value())
+            }
+            "lookupService" => {
+                let answer = self.find_service(Args::new(params)).await;
                 Ok(answer.unwrap_or_else(|mistake| mistake).into_value())
             }
             "system.listMethods" => Ok(Value::strings(METHODS.iter().copied())),
@@ -205,6 +212,7 @@ impl Api {
         Some(match method {
             "lookupNode" => self.lookup_node(args),
             "lookupService" => self.lookup_service(args),
+            LEND_SERVICES => self.lend_services(args),
             "getPublishedTopics" => self.published_topics(args),
             "getTopicTypes" => args.text("caller_id").map(|_| {
                 let state = self.master.state.lock();
@@ -232,14 +240,50 @@ impl Api {
         })
     }
 
+    /// Of what is registered, as in a `system.multicall`.
     fn lookup_service(&self, args: &mut Args) -> Result<Reply, Reply> {
         let caller = args.text("caller_id")?;
         let service = name(args, "service", &caller)?;
+        self.registered(&service).ok_or_else(no_provider)
+    }
+
+    /// Of what is registered, else of what is lent.
+    async fn find_service(&self, mut args: Args) -> Result<Reply, Reply> {
+        let caller = args.text("caller_id")?;
+        let service = name(&mut args, "service", &caller)?;
+        if let Some(reply) = self.registered(&service) {
+            return Ok(reply);
+        }
+        let lent = self.master.lending.find(&service, &caller).await;
+        // Whoever registered meanwhile comes first.
+        if let Some(reply) = self.registered(&service) {
+            return Ok(reply);
+        }
+        if let Some(api) = lent {
+            return Ok(served_at(&api));
+        }
+        let mut state = self.master.state.lock();
+        if note_sought(&mut state.sought, &service, &caller) {
+            self.master.grow();
+        }
+        Err(no_provider())
+    }
+
+    fn registered(&self, service: &str) -> Option<Reply> {
         let state = self.master.state.lock();
-        Ok(match state.registry.service_api(&service) {
-            Some(api) => Reply::done(format!("rosrpc URI: [{api}]"), api),
-            None => Reply::mistake("no provider", ""),
-        })
+        state.registry.service_api(service).map(served_at)
+    }
+
+    fn lend_services(&self, args: &mut Args) -> Result<Reply, Reply> {
+        let node = args.text("caller_id")?;
+        let api = args.uri("caller_api", "http")?;
+        args.end()?;
+        let lent = self
+            .master
+            .lending
+            .begin(&node, &api, self.master.sockets());
+        lent.map_err(|reason| Reply::mistake(reason, 0))?;
+        Ok(Reply::done(format!("[{node}] lends services"), 1))
     }
 
     fn published_topics(&self, args: &mut Args) -> Result<Reply, Reply> {
@@ -289,6 +333,14 @@ fn name(args: &mut Args, what: &str, node: &str) -> Result<String, Reply> {
         return Err(Reply::mistake(message, 0));
     }
     Ok(names::resolve(&text, node))
+}
+
+fn served_at(api: &str) -> Reply {
+    Reply::done(format!("rosrpc URI: [{api}]"), api)
+}
+
+fn no_provider() -> Reply {
+    Reply::mistake("no provider", "")
 }
 
 fn refusal(reason: Refused) -> Reply {

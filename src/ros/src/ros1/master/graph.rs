@@ -4,7 +4,7 @@
 //! known one, or after the time-out, with `[1, "", graph]`, a struct of
 //! - `generation` int, `run_id` string,
 //! - `topics` {name: [type, [publisher…], [subscriber…]]}, `services` {name: node}, `nodes` {name: uri},
-//! - `parameters` {key: [[reading node…], [writing node…]]}.
+//! - `parameters` {key: [[reading node…], [writing node…]]}, `sought` {service: [node…]}.
 
 use std::collections::BTreeMap;
 
@@ -35,6 +35,10 @@ pub(super) fn to_value(graph: &Graph, run_id: &str) -> Value {
         ];
         (key.clone(), Value::Array(nodes))
     });
+    let sought = graph.sought.iter().map(|(service, nodes)| {
+        let nodes = Value::strings(nodes.iter().cloned());
+        (service.clone(), nodes)
+    });
     let members = [
         ("generation", Value::Int(wire_generation(graph.generation))),
         ("run_id", Value::from(run_id)),
@@ -42,6 +46,7 @@ pub(super) fn to_value(graph: &Graph, run_id: &str) -> Value {
         ("services", text_map(&graph.services)),
         ("nodes", text_map(&graph.nodes)),
         ("parameters", Value::Struct(parameters.collect())),
+        ("sought", Value::Struct(sought.collect())),
     ];
     Value::Struct(
         members
@@ -88,6 +93,11 @@ pub(crate) fn from_value(value: &Value) -> Option<(Graph, String)> {
         };
         graph.parameters.insert(key.clone(), used);
     }
+    // A shim of an earlier version does not tell.
+    if let Some(sought) = value.get("sought").and_then(Value::as_struct) {
+        let owned = |(service, nodes): (&String, &Value)| (service.clone(), nodes.to_strings());
+        graph.sought = sought.iter().map(owned).collect();
+    }
     Some((graph, value.get("run_id")?.as_str()?.to_owned()))
 }
 
@@ -126,6 +136,7 @@ mod tests {
                 },
             )]
             .into(),
+            sought: [("/map".to_owned(), vec!["/b".to_owned()])].into(),
         };
         let (read, run_id) = from_value(&to_value(&graph, "r")).unwrap();
         assert_eq!((read, run_id.as_str()), (graph, "r"));

@@ -1,0 +1,68 @@
+//! The robot's services, for the local original: it has a Master of its own, at which the robot's nodes are not
+//! registered.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use ros::bus::{Bus, BusError, Lender, Lent, ServiceHandler};
+use tokio::sync::watch;
+
+/// Lends what is served on the robot, but by the node that is stood in for.
+pub struct Robot {
+    bus: Arc<dyn Bus>,
+    node: String,
+    /// Connections are never ended from here: a call that finds nobody fails with the reason.
+    open: watch::Sender<bool>,
+}
+
+impl Robot {
+    pub fn new(node: &str, bus: &Arc<dyn Bus>) -> Self {
+        Self {
+            bus: Arc::clone(bus),
+            node: node.to_owned(),
+            open: watch::Sender::new(false),
+        }
+    }
+}
+
+#[async_trait]
+impl Lender for Robot {
+    async fn find(&self, service: &str, _node: &str) -> Option<Lent> {
+        let provider = self.bus.service_provider(service).await.ok()?;
+        // Its own would come back to it.
+        if provider.node == self.node {
+            return None;
+        }
+        Some(Lent {
+            handler: Arc::new(Passing {
+                bus: Arc::clone(&self.bus),
+                service: service.to_owned(),
+                md5: provider.service_type.md5.clone(),
+            }),
+            service_type: provider.service_type,
+            gone: self.open.subscribe(),
+        })
+    }
+}
+
+/// Passes calls of one service to the robot.
+struct Passing {
+    bus: Arc<dyn Bus>,
+    service: String,
+    md5: String,
+}
+
+#[async_trait]
+impl ServiceHandler for Passing {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        let (service, md5) = (&self.service, &self.md5);
+        // As long as it takes, as it would without a stub.
+        let called = self.bus.call_typed(service, md5, request, Duration::MAX);
+        called.await.map_err(|error| match error {
+            BusError::CallFailed { reason, .. } => reason,
+            other => other.to_string(),
+        })
+    }
+}

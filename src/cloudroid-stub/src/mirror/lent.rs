@@ -1,0 +1,194 @@
+//! Services of the robot that nodes in the cloud call. They are looked up here when a node there looks for them, and
+//! watched from then on.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use bytes::Bytes;
+use link::Session;
+use link::control::{Control, Served};
+use parking_lot::Mutex;
+use ros::bus::{BusError, Graph, ServiceProvider};
+
+use super::Mirror;
+
+/// A service of the robot may take as long as it likes, as it may for any of its callers.
+const NO_LIMIT: Duration = Duration::MAX;
+
+/// What the cloud was told of.
+#[derive(Default)]
+pub struct Lent {
+    services: Mutex<HashMap<String, Service>>,
+    next: AtomicU32,
+}
+
+struct Service {
+    channel: u32,
+    /// The node that serves it.
+    node: String,
+    md5: String,
+}
+
+impl Lent {
+    /// Another session begins: the cloud knows of none.
+    pub fn renew(&self) {
+        self.services.lock().clear();
+    }
+
+    /// The cloud asks for a service. It is told in any case.
+    pub fn look_up(&self, mirror: &Mirror, service: String) {
+        let (this, session) = (mirror.this.clone(), mirror.session());
+        tokio::spawn(async move {
+            let Some(mirror) = this.upgrade() else { return };
+            let found = mirror.bus.service_provider(&service).await;
+            let found = found.map_err(|error| error.to_string());
+            let found = found.and_then(|provider| mirror.can_lend(&service, provider));
+            let provider = match found {
+                Ok(provider) => Some(provider),
+                Err(reason) => {
+                    tracing::debug!(service, reason, "not lent to the cloud");
+                    None
+                }
+            };
+            mirror.lent.tell(&mirror, &session, service, provider);
+        });
+    }
+
+    fn tell(
+        &self,
+        mirror: &Mirror,
+        session: &Arc<Session>,
+        service: String,
+        provider: Option<ServiceProvider>,
+    ) {
+        let mut services = self.services.lock();
+        // Another session has begun, and with it another count.
+        if !Arc::ptr_eq(session, &mirror.session()) {
+            return;
+        }
+        let of = provider.map(|provider| {
+            let served = Served {
+                channel: self.next.fetch_add(1, Ordering::Relaxed),
+                name: service.clone(),
+                type_name: provider.service_type.name,
+                md5: provider.service_type.md5,
+            };
+            let known = Service {
+                channel: served.channel,
+                node: provider.node,
+                md5: served.md5.clone(),
+            };
+            services.insert(service.clone(), known);
+            served
+        });
+        if of.is_none() {
+            services.remove(&service);
+        }
+        session.tell(&Control::Lent { service, of });
+    }
+
+    /// Calls on behalf of the cloud; `id` and `arrived` are the call's.
+    pub fn call(&self, mirror: &Mirror, channel: u32, request: Bytes, (id, arrived): (u32, i64)) {
+        let session = mirror.session();
+        let known = {
+            let services = self.services.lock();
+            let mut services = services.iter();
+            services
+                .find(|(_, service)| service.channel == channel)
+                .map(|(name, service)| (name.clone(), service.md5.clone()))
+        };
+        let Some((name, md5)) = known else {
+            let gone = "nobody on the robot serves this any more".to_owned();
+            return session.answer(id, arrived, Err(gone));
+        };
+        let this = mirror.this.clone();
+        tokio::spawn(async move {
+            let Some(mirror) = this.upgrade() else { return };
+            let called = mirror.bus.call_typed(&name, &md5, request, NO_LIMIT).await;
+            if called.as_ref().is_err_and(is_of_the_provider) {
+                mirror
+                    .lent
+                    .withdraw(&mirror, |service| service.channel == channel);
+            }
+            let called = called.map_err(|error| match error {
+                BusError::CallFailed { reason, .. } => reason,
+                other => other.to_string(),
+            });
+            // By the session that it came by: the ids of another mean other calls.
+            session.answer(id, arrived, called);
+        });
+    }
+
+    /// Tells the cloud that these are gone. When a node there looks for one again, so does the robot.
+    fn withdraw(&self, mirror: &Mirror, gone: impl Fn(&Service) -> bool) {
+        let mut services = self.services.lock();
+        services.retain(|name, service| {
+            let gone = gone(service);
+            if gone {
+                mirror.session().tell(&Control::Lent {
+                    service: name.clone(),
+                    of: None,
+                });
+            }
+            !gone
+        });
+    }
+
+    fn compare(&self, mirror: &Mirror, graph: &Graph) {
+        let services = self.services.lock();
+        let elsewhere = |(name, service): &(&String, &Service)| {
+            graph.services.get(*name) != Some(&service.node)
+        };
+        let gone: Vec<u32> = services
+            .iter()
+            .filter(elsewhere)
+            .map(|(_, service)| service.channel)
+            .collect();
+        drop(services);
+        if !gone.is_empty() {
+            self.withdraw(mirror, |service| gone.contains(&service.channel));
+        }
+    }
+}
+
+impl Mirror {
+    /// What is served by the servant itself must not come back to it.
+    fn can_lend(
+        &self,
+        service: &str,
+        provider: ServiceProvider,
+    ) -> Result<ServiceProvider, String> {
+        if provider.label.as_ref() == Some(&self.label) {
+            return Err(format!("{service} is served by this very servant"));
+        }
+        // Stubs of an earlier version do not tell.
+        if self.siblings.read().contains(&provider.node) {
+            return Err(format!(
+                "{service} is served by a sibling, {}",
+                provider.node
+            ));
+        }
+        Ok(provider)
+    }
+}
+
+/// Whether a call failed since who serves is not who did.
+fn is_of_the_provider(error: &BusError) -> bool {
+    !matches!(error, BusError::CallFailed { .. } | BusError::Closed)
+}
+
+/// Tells the cloud when a service that it was told of has gone, until the mirror ends.
+pub async fn follow(mirror: Weak<Mirror>) {
+    let Some(mut graphs) = mirror.upgrade().map(|mirror| mirror.bus.graph()) else {
+        return;
+    };
+    while graphs.changed().await.is_ok() {
+        let Some(mirror) = mirror.upgrade() else {
+            return;
+        };
+        let graph = graphs.borrow_and_update().clone();
+        mirror.lent.compare(&mirror, &graph);
+    }
+}

@@ -1,0 +1,324 @@
+//! Services of the robot, for nodes of the servant. The Master tells of a lookup that found nothing; it is passed to
+//! the robot, whose answer holds until the robot says otherwise. See docs/adr/025.
+//!
+//! ```text
+//!             Lookup                        Lent: there
+//!  unknown ───────────▶ Asked ─────────────────────────────▶ There ── calls ──▶ the robot
+//!     ▲                   │ Lent: not there                    │
+//!     │                   ▼                                    │ Lent: gone
+//!     └── in a moment ── Not there ◀───────────────────────────┘
+//! ```
+
+use std::collections::HashMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{Lender, Lent as LentService, ServiceHandler, ServiceType};
+use tokio::sync::{oneshot, watch};
+use tokio::time::{Instant as Moment, timeout_at};
+
+use super::Hub;
+use super::node_link::NodeLink;
+use crate::control::{Control, Served};
+use crate::skew::Way;
+use crate::stamps::Stamps;
+
+/// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
+const PATIENCE: Duration = Duration::from_millis(1200);
+/// "Not there" holds so long: roscpp asks fifty times a second while it waits for a service.
+const NOT_THERE: Duration = Duration::from_millis(200);
+/// Names asked for at a time, and remembered.
+const NAMES: usize = 1000;
+
+/// What one link knows of the robot's services.
+pub(super) struct Lent {
+    /// The robot's end answers lookups.
+    answers: bool,
+    names: Mutex<HashMap<String, State>>,
+    /// Grows with everything that the robot tells of them.
+    told: watch::Sender<u64>,
+    /// Calls under way.
+    calls: Mutex<Calls>,
+}
+
+enum State {
+    /// The robot was asked; a lookup may have waited for its answer in vain, and no other shall.
+    Asked {
+        in_vain: bool,
+    },
+    NotThere {
+        since: Instant,
+    },
+    There(Arc<There>),
+}
+
+/// A service that the robot has.
+struct There {
+    channel: u32,
+    service_type: ServiceType,
+    request: Stamps,
+    response: Stamps,
+    gone: watch::Sender<bool>,
+}
+
+#[derive(Default)]
+struct Calls {
+    waiting: HashMap<u32, oneshot::Sender<Result<Bytes, String>>>,
+    /// The link has ended: none is answered any more.
+    over: bool,
+}
+
+impl Lent {
+    pub(super) fn new(answers: bool) -> Self {
+        Self {
+            answers,
+            names: Mutex::default(),
+            told: watch::Sender::new(0),
+            calls: Mutex::default(),
+        }
+    }
+
+    /// The robot has answered a call.
+    pub(super) fn answered(&self, id: u32, response: Result<Bytes, String>) {
+        if let Some(caller) = self.calls.lock().waiting.remove(&id) {
+            let _ = caller.send(response);
+        }
+    }
+
+    /// The link has ended: nothing is lent any more, and calls under way have failed.
+    pub(super) fn end(&self) {
+        let mut calls = self.calls.lock();
+        calls.over = true;
+        for (_, caller) in calls.waiting.drain() {
+            let _ = caller.send(Err(lost()));
+        }
+        drop(calls);
+        for (_, state) in self.names.lock().drain() {
+            if let State::There(there) = state {
+                there.gone.send_replace(true);
+            }
+        }
+    }
+
+    fn there(&self, service: &str) -> Option<Arc<There>> {
+        match self.names.lock().get(service) {
+            Some(State::There(there)) => Some(Arc::clone(there)),
+            _ => None,
+        }
+    }
+}
+
+fn lost() -> String {
+    "the link to the robot was lost, and with it this call: the robot may or may not have done what was asked"
+        .to_owned()
+}
+
+impl NodeLink {
+    /// The robot tells what it has under a name.
+    pub(super) fn lends(&self, service: String, of: Option<Served>) {
+        let Some(hub) = self.hub.upgrade() else {
+            return;
+        };
+        let state = match of {
+            Some(served) => State::There(Arc::new(there(&hub, served))),
+            None => State::NotThere {
+                since: Instant::now(),
+            },
+        };
+        {
+            let mut names = self.lent.names.lock();
+            // What nobody asked for is not kept.
+            let Some(known) = names.get_mut(&service) else {
+                return;
+            };
+            if let State::There(there) = std::mem::replace(known, state) {
+                there.gone.send_replace(true);
+            }
+        }
+        self.lent.told.send_modify(|told| *told += 1);
+    }
+
+    /// What the robot has under a name; asks where that is not known.
+    async fn look_up(&self, service: &str) -> Option<Arc<There>> {
+        let mut told = self.lent.told.subscribe();
+        let deadline = Moment::now() + PATIENCE;
+        loop {
+            told.borrow_and_update();
+            match self.ask(service) {
+                Asked::Known(there) => return there,
+                Asked::Wait => {}
+            }
+            match timeout_at(deadline, told.changed()).await {
+                Ok(Ok(())) => {}
+                Ok(Err(_)) => return None,
+                Err(_) => {
+                    let mut names = self.lent.names.lock();
+                    if let Some(State::Asked { in_vain }) = names.get_mut(service) {
+                        *in_vain = true;
+                    }
+                    return None;
+                }
+            }
+        }
+    }
+
+    fn ask(&self, service: &str) -> Asked {
+        let mut names = self.lent.names.lock();
+        match names.get(service) {
+            Some(State::There(there)) => return Asked::Known(Some(Arc::clone(there))),
+            Some(State::NotThere { since }) if since.elapsed() < NOT_THERE => {
+                return Asked::Known(None);
+            }
+            Some(State::Asked { in_vain: true }) => return Asked::Known(None),
+            Some(State::Asked { in_vain: false }) => return Asked::Wait,
+            Some(State::NotThere { .. }) | None => {}
+        }
+        if names.len() >= NAMES && !names.contains_key(service) {
+            names.retain(|_, state| !matches!(state, State::NotThere { .. }));
+            if names.len() >= NAMES {
+                return Asked::Known(None);
+            }
+        }
+        names.insert(service.to_owned(), State::Asked { in_vain: false });
+        self.session.tell(&Control::Lookup {
+            service: service.to_owned(),
+        });
+        Asked::Wait
+    }
+
+    /// Calls a service of the robot. Over a cut the call waits; it fails with the link.
+    async fn call_robot(&self, channel: u32, request: Bytes) -> Result<Bytes, String> {
+        let (sender, answer) = oneshot::channel();
+        let id = {
+            let mut calls = self.lent.calls.lock();
+            if calls.over {
+                return Err(lost());
+            }
+            // The answer may come at once: it must find its caller.
+            let id = self.session.call(channel, request);
+            calls.waiting.insert(id, sender);
+            id
+        };
+        let _abandoned = Abandoned { link: self, id };
+        answer.await.unwrap_or_else(|_| Err(lost()))
+    }
+}
+
+enum Asked {
+    Known(Option<Arc<There>>),
+    Wait,
+}
+
+/// Forgets a call whose caller has gone.
+struct Abandoned<'a> {
+    link: &'a NodeLink,
+    id: u32,
+}
+
+impl Drop for Abandoned<'_> {
+    fn drop(&mut self) {
+        self.link.lent.calls.lock().waiting.remove(&self.id);
+    }
+}
+
+fn there(hub: &Hub, served: Served) -> There {
+    let known = hub.registry.service(&served.type_name).ok();
+    let known = known.filter(|known| known.md5 == served.md5);
+    if known.is_none() {
+        tracing::debug!(
+            service = served.name,
+            of = served.type_name,
+            "its stamps stay as they are: the image has no such definition"
+        );
+    }
+    let stamps = known.map(|known| (Stamps::of(&known.request), Stamps::of(&known.response)));
+    let (request, response) = stamps.unwrap_or_default();
+    There {
+        channel: served.channel,
+        service_type: ServiceType {
+            name: served.type_name,
+            md5: served.md5,
+        },
+        request,
+        response,
+        gone: watch::Sender::new(false),
+    }
+}
+
+/// Lends the robot's services to the servant, from the first link on.
+pub(super) async fn begin(hub: &Arc<Hub>) {
+    if hub.lends.load(Ordering::Relaxed) {
+        return;
+    }
+    let lender = Arc::new(Robot(Arc::downgrade(hub)));
+    match hub.bus.lend(lender).await {
+        Ok(()) => hub.lends.store(true, Ordering::Relaxed),
+        Err(error) => {
+            tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot");
+        }
+    }
+}
+
+impl Hub {
+    /// The link by which a node's lookups and calls go: its own, else one that is up, since all are on one robot.
+    fn way(&self, node: &str, suits: impl Fn(&NodeLink) -> bool) -> Option<Arc<NodeLink>> {
+        let links = self.links.lock();
+        let suitable = || links.values().filter(|link| suits(link));
+        let own = suitable().find(|link| link.node == node);
+        let up = || suitable().find(|link| *link.session.up().borrow());
+        own.or_else(up).or_else(|| suitable().next()).cloned()
+    }
+}
+
+/// The robot, as the servant's bus asks it.
+struct Robot(Weak<Hub>);
+
+#[async_trait]
+impl Lender for Robot {
+    async fn find(&self, service: &str, node: &str) -> Option<LentService> {
+        let hub = self.0.upgrade()?;
+        let link = hub.way(node, |link| link.lent.answers)?;
+        let there = link.look_up(service).await?;
+        Some(LentService {
+            service_type: there.service_type.clone(),
+            gone: there.gone.subscribe(),
+            handler: Arc::new(Passing {
+                hub: self.0.clone(),
+                service: service.to_owned(),
+                md5: there.service_type.md5.clone(),
+            }),
+        })
+    }
+}
+
+/// Passes calls of one service to the robot.
+struct Passing {
+    hub: Weak<Hub>,
+    service: String,
+    md5: String,
+}
+
+#[async_trait]
+impl ServiceHandler for Passing {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+        let hub = self.hub.upgrade().ok_or_else(lost)?;
+        let has = |link: &NodeLink| link.lent.there(&self.service);
+        let link = hub.way(caller, |link| has(link).is_some());
+        let found = link.and_then(|link| Some((has(&link)?, link)));
+        let (there, link) =
+            found.ok_or_else(|| format!("nobody on the robot serves {} any more", self.service))?;
+        if there.service_type.md5 != self.md5 {
+            return Err(format!(
+                "{} is served on the robot with md5sum {} now, not {} as when it was connected to",
+                self.service, there.service_type.md5, self.md5
+            ));
+        }
+        let request = hub.skew.apply(Way::Out, &there.request, request);
+        let response = link.call_robot(there.channel, request).await?;
+        Ok(hub.skew.apply(Way::In, &there.response, response))
+    }
+}
