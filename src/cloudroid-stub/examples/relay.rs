@@ -1,9 +1,11 @@
 //! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting from a sibling's parameter before it;
-//! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes.
+//! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` comes, what
+//! that service answers leaves.
 //!
 //! The tests of the local original start it in place of one.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -20,6 +22,16 @@ struct Echo;
 impl ServiceHandler for Echo {
     async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
         Ok(request)
+    }
+}
+
+async fn asked(bus: &dyn Bus, service: &str) -> String {
+    match bus
+        .call(service, Bytes::new(), Duration::from_secs(20))
+        .await
+    {
+        Ok(answer) => String::from_utf8_lossy(&answer).into_owned(),
+        Err(error) => error.to_string(),
     }
 }
 
@@ -84,7 +96,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
                 if crash == Some(text.as_str()) {
                     std::process::exit(3);
                 }
-                let text = format!("{greeting}{text}");
+                let text = match text.strip_prefix("ask ") {
+                    Some(service) => asked(&*bus, service).await,
+                    None => format!("{greeting}{text}"),
+                };
                 let length = u32::try_from(text.len())?.to_le_bytes();
                 out.publish([&length[..], text.as_bytes()].concat().into());
             }

@@ -9,7 +9,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Event, LocalState, Outcome, RequestId, SafeStop, Sla};
-use ros::bus::{Bus, Message, ParamValue, WireType};
+use ros::bus::{Bus, Message, ParamValue, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -164,6 +164,42 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
     state(&mut news, LocalState::Ready).await;
     original.feed("/ns/in", &string("again"));
     assert_eq!(output(&mut news).await, "hello again");
+}
+
+/// Answers with these words, or with this reason.
+struct Says(Result<&'static str, &'static str>);
+
+#[async_trait::async_trait]
+impl ServiceHandler for Says {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+        Ok(self.0?.into())
+    }
+}
+
+#[tokio::test]
+async fn it_calls_what_the_robot_serves() {
+    let robot = robot().await;
+    let (original, mut news) = an_original(setting(&[]), robot.clone()).await;
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    let mut served = Vec::new();
+    for (name, says) in [("/secret", Ok("42")), ("/silent", Err("it is a secret"))] {
+        let of = ServiceType {
+            name: "tests/Says".into(),
+            md5: "0123456789abcdef0123456789abcdef".into(),
+        };
+        let serving = robot.serve(name, of, Arc::new(Says(says))).await;
+        served.push(serving.unwrap());
+    }
+    for (asked, wanted) in [
+        ("ask /secret", "42"),
+        ("ask /silent", "it is a secret"),
+        ("ask /nobody", "service /nobody has no server"),
+    ] {
+        original.feed("/ns/in", &string(asked));
+        let answer = output(&mut news).await;
+        assert!(answer.contains(wanted), "{answer}");
+    }
 }
 
 #[tokio::test]

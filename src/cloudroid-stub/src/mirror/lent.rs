@@ -192,3 +192,68 @@ pub async fn follow(mirror: Weak<Mirror>) {
         mirror.lent.compare(&mirror, &graph);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use async_trait::async_trait;
+    use link::SessionOptions;
+    use ros::bus::{Bus, ServiceHandler, ServiceType};
+    use ros::net::HostSockets;
+    use ros::ros1::Ros1Bus;
+    use ros::ros1::master::{Master, MasterOptions};
+
+    use super::*;
+
+    struct Echo;
+
+    #[async_trait]
+    impl ServiceHandler for Echo {
+        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+            Ok(request)
+        }
+    }
+
+    #[tokio::test]
+    async fn what_comes_from_the_servant_is_not_lent_to_it() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let master = Master::new(MasterOptions::default());
+        tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        let join = async |name: &str, label: Option<&str>| {
+            let bus = Ros1Bus::connect(Arc::new(HostSockets), address, name).await;
+            let bus = bus.unwrap();
+            if let Some(label) = label {
+                bus.set_label(label);
+            }
+            bus
+        };
+        let own = join("/own", Some("maps for rover")).await;
+        let options = SessionOptions {
+            ping: Duration::from_secs(1),
+            silent: Duration::from_secs(2),
+            lost: Duration::from_secs(3),
+            max_age: None,
+        };
+        let session = Arc::new(Session::new(options));
+        let mirror = Mirror::start(own.clone(), "maps for rover".to_owned(), session);
+        mirror.siblings.write().insert("/unlabelled".to_owned());
+        for (node, label, lent) in [
+            ("/sibling", Some("maps for rover"), false),
+            ("/unlabelled", None, false),
+            ("/of_another_service", Some("arms for rover"), true),
+            ("/plain", None, true),
+        ] {
+            let bus = join(node, label).await;
+            let of = ServiceType {
+                name: "pkg/Do".to_owned(),
+                md5: "abcd".to_owned(),
+            };
+            let name = format!("{node}/do");
+            let _serving = bus.serve(&name, of, Arc::new(Echo)).await.unwrap();
+            let provider = own.service_provider(&name).await.unwrap();
+            assert_eq!(provider.node, node);
+            let can = mirror.can_lend(&name, provider);
+            assert_eq!(can.is_ok(), lent, "{node}: {can:?}");
+        }
+    }
+}
