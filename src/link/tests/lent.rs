@@ -1,0 +1,341 @@
+//! Services of the robot for nodes of the servant: a hub before a real Master, and a robot's end made by hand.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use link::clock::now;
+use link::cloud::{Hub, HubOptions, Nodes};
+use link::control::{Control, Exit, Hello, Node, Served, Sla, Welcome};
+use link::record::Record;
+use link::session::{receive_open, send_open};
+use link::{Handler, MAX_FRAME, MAX_RECORD, Session, SessionOptions};
+use ros::bus::{Bus, BusError, ParamValue};
+use ros::net::HostSockets;
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use ros::schema::Registry;
+use tokio::io::DuplexStream;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+use ws::WebSocket;
+
+/// Only bounds how long a failing test takes.
+const LONG: Duration = Duration::from_secs(20);
+
+/// Nodes that run whatever happens.
+struct Still;
+
+#[async_trait]
+impl Nodes for Still {
+    async fn start(&self, _: &Node, _: &Sla) -> Result<(), String> {
+        Ok(())
+    }
+    async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
+        Err("it does not run".to_owned())
+    }
+    async fn ended(&self, _: &str) -> Exit {
+        std::future::pending().await
+    }
+    async fn is_running(&self, _: &str) -> bool {
+        false
+    }
+    fn parameters(&self, _: &Node) -> Vec<(String, ParamValue)> {
+        Vec::new()
+    }
+    fn translate(&self, _: &Node, text: &str) -> String {
+        text.to_owned()
+    }
+    fn lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
+        mpsc::channel(1).1
+    }
+}
+
+/// A servant with a node in it.
+struct Servant {
+    hub: Arc<Hub>,
+    node: Arc<Ros1Bus>,
+}
+
+async fn servant() -> Servant {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions::default());
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
+    let (bus, node) = (join("/bridge").await.unwrap(), join("/node").await.unwrap());
+    let registry = Arc::new(Registry::new());
+    let options = HubOptions::default();
+    Servant {
+        hub: Hub::new("s", bus, registry, Arc::new(Still), options),
+        node,
+    }
+}
+
+/// What the robot's end is told, that is about services.
+#[derive(Debug, PartialEq)]
+enum Told {
+    Lookup(String),
+    Call(u32, u32, Bytes),
+}
+
+struct Ear(mpsc::UnboundedSender<Told>);
+
+impl Handler for Ear {
+    fn record(&self, record: Record, _arrived: i64) {
+        let told = match record {
+            Record::Call {
+                id,
+                service,
+                request,
+            } => Told::Call(id, service, request),
+            Record::Control(json) => match serde_json::from_slice(&json) {
+                Ok(Control::Lookup { service }) => Told::Lookup(service),
+                _ => return,
+            },
+            _ => return,
+        };
+        let _ = self.0.send(told);
+    }
+}
+
+/// The robot's end of a link.
+struct Robot {
+    session: Arc<Session>,
+    hello: Hello,
+    ear: mpsc::UnboundedSender<Told>,
+    told: mpsc::UnboundedReceiver<Told>,
+    running: Option<JoinHandle<()>>,
+}
+
+impl Robot {
+    fn new(lends: bool) -> Self {
+        let options = SessionOptions {
+            ping: Duration::from_secs(1),
+            silent: Duration::from_secs(2),
+            lost: Duration::from_secs(20),
+            max_age: None,
+        };
+        let (ear, told) = mpsc::unbounded_channel();
+        Self {
+            session: Arc::new(Session::new(options)),
+            hello: Hello {
+                run: "run".to_owned(),
+                node: Node {
+                    name: "/node".to_owned(),
+                    ..Node::default()
+                },
+                lends,
+                ..Hello::default()
+            },
+            ear,
+            told,
+            running: None,
+        }
+    }
+
+    /// Connects, or connects again.
+    async fn links(&mut self, servant: &Servant) {
+        let (theirs, ours) = tokio::io::duplex(1 << 16);
+        let hub = Arc::clone(&servant.hub);
+        tokio::spawn(async move { hub.serve(theirs, &[]).await });
+        let mut socket: WebSocket<DuplexStream> =
+            WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
+        let (have, ahead, next) = self.session.position();
+        self.hello.next = next;
+        if let Some(resume) = &mut self.hello.resume {
+            (resume.received, resume.ahead) = (have, ahead);
+        }
+        send_open(&mut socket, &self.hello).await.unwrap();
+        let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+        let Welcome::Accepted {
+            session,
+            received,
+            ahead,
+            next,
+            ..
+        } = welcome
+        else {
+            panic!("{welcome:?}");
+        };
+        self.hello.resume.get_or_insert_default().session = session;
+        self.session.reconnect(received, &ahead, next);
+        let (session, ear) = (Arc::clone(&self.session), Ear(self.ear.clone()));
+        self.running = Some(tokio::spawn(async move {
+            session.run(&mut socket, &ear).await;
+        }));
+    }
+
+    /// The connection is gone.
+    async fn is_cut(&mut self) {
+        if let Some(running) = self.running.take() {
+            running.abort();
+            let _ = running.await;
+        }
+    }
+
+    async fn hears(&mut self) -> Told {
+        let told = timeout(LONG, self.told.recv()).await;
+        told.expect("something should be told").unwrap()
+    }
+
+    /// Tells what it has under `/map`.
+    fn has(&self, channel: Option<u32>) {
+        let of = channel.map(|channel| Served {
+            channel,
+            name: "/map".to_owned(),
+            type_name: "nav_msgs/GetMap".to_owned(),
+            md5: "abcd".to_owned(),
+        });
+        let service = "/map".to_owned();
+        self.session.tell(&Control::Lent { service, of });
+    }
+}
+
+fn lookup() -> Told {
+    Told::Lookup("/map".to_owned())
+}
+
+/// A call of `/map` by the node, under way.
+fn calls(servant: &Servant, request: &'static str) -> JoinHandle<Result<Bytes, BusError>> {
+    let node = Arc::clone(&servant.node);
+    tokio::spawn(async move { node.call("/map", request.into(), LONG).await })
+}
+
+#[tokio::test]
+async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
+    let servant = servant().await;
+    let mut robot = Robot::new(true);
+    robot.links(&servant).await;
+    // Those who look at the same time share one question.
+    let both = [calls(&servant, "one"), calls(&servant, "one")];
+    assert_eq!(robot.hears().await, lookup());
+    robot.has(Some(5));
+    for call in both {
+        let Told::Call(id, 5, request) = robot.hears().await else {
+            panic!("a call should have come");
+        };
+        assert_eq!(request, "one");
+        robot.session.answer(id, now(), Ok("two".into()));
+        assert_eq!(call.await.unwrap().unwrap(), "two");
+    }
+    // Found once, it is not looked for again; what fails, fails with the robot's words.
+    let call = calls(&servant, "three");
+    let Told::Call(id, 5, _) = robot.hears().await else {
+        panic!("a call should have come");
+    };
+    let reason = "not today".to_owned();
+    robot.session.answer(id, now(), Err(reason));
+    let error = call.await.unwrap().unwrap_err().to_string();
+    assert!(error.contains("not today"), "{error}");
+    // Taken back, it is looked for again.
+    robot.has(None);
+    let gone = loop {
+        match calls(&servant, "four").await.unwrap() {
+            Err(BusError::NoService(gone)) => break gone,
+            // Its connection has not ended yet.
+            Err(BusError::CallFailed { reason, .. }) => {
+                assert!(reason.contains("any more"), "{reason}");
+            }
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(gone, "/map");
+    let call = async {
+        // "Not there" holds for a moment.
+        loop {
+            match calls(&servant, "five").await.unwrap() {
+                Err(BusError::NoService(_)) => {}
+                other => return other,
+            }
+        }
+    };
+    let answering = async {
+        assert_eq!(robot.hears().await, lookup());
+        robot.has(Some(6));
+        let Told::Call(id, 6, _) = robot.hears().await else {
+            panic!("a call should have come");
+        };
+        robot.session.answer(id, now(), Ok("six".into()));
+    };
+    let (called, ()) = timeout(LONG, async { tokio::join!(call, answering) })
+        .await
+        .unwrap();
+    assert_eq!(called.unwrap(), "six");
+}
+
+#[tokio::test]
+async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
+    let servant = servant().await;
+    let mut robot = Robot::new(true);
+    robot.links(&servant).await;
+    robot.is_cut().await;
+    let waits = async || {
+        let begun = Instant::now();
+        let called = calls(&servant, "x").await.unwrap();
+        assert!(matches!(called, Err(BusError::NoService(_))), "{called:?}");
+        begun.elapsed()
+    };
+    let (first, second) = (waits().await, waits().await);
+    assert!(second < first / 2, "{first:?}, then {second:?}");
+    // The question was not lost, and was asked once.
+    robot.links(&servant).await;
+    assert_eq!(robot.hears().await, lookup());
+    robot.has(Some(1));
+    let call = async {
+        loop {
+            match calls(&servant, "y").await.unwrap() {
+                Err(BusError::NoService(_)) => {}
+                other => return other,
+            }
+        }
+    };
+    let answering = async {
+        let Told::Call(id, 1, _) = robot.hears().await else {
+            panic!("a call should have come");
+        };
+        robot.session.answer(id, now(), Ok("z".into()));
+    };
+    let (called, ()) = timeout(LONG, async { tokio::join!(call, answering) })
+        .await
+        .unwrap();
+    assert_eq!(called.unwrap(), "z");
+}
+
+#[tokio::test]
+async fn a_call_outlives_a_cut_and_ends_with_the_link() {
+    let servant = servant().await;
+    let mut robot = Robot::new(true);
+    robot.links(&servant).await;
+    let call = calls(&servant, "one");
+    assert_eq!(robot.hears().await, lookup());
+    robot.has(Some(1));
+    let Told::Call(id, 1, _) = robot.hears().await else {
+        panic!("a call should have come");
+    };
+    robot.is_cut().await;
+    robot.session.answer(id, now(), Ok("two".into()));
+    robot.links(&servant).await;
+    assert_eq!(call.await.unwrap().unwrap(), "two");
+    // The robot ends its node in the midst of the next one.
+    let call = calls(&servant, "three");
+    assert!(matches!(robot.hears().await, Told::Call(..)));
+    robot.session.end(1000, "the robot's node ended");
+    let error = timeout(LONG, call).await.unwrap().unwrap().unwrap_err();
+    assert!(
+        error.to_string().contains("the link to the robot was lost"),
+        "{error}"
+    );
+}
+
+#[tokio::test]
+async fn a_robot_that_does_not_lend_is_not_asked() {
+    let servant = servant().await;
+    let mut robot = Robot::new(false);
+    robot.links(&servant).await;
+    let called = calls(&servant, "x").await.unwrap();
+    assert!(matches!(called, Err(BusError::NoService(_))), "{called:?}");
+    assert!(robot.told.try_recv().is_err());
+}
