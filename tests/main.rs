@@ -36,6 +36,8 @@ mod launched;
 mod link;
 #[path = "stories/mishaps.rs"]
 mod mishaps;
+#[path = "stories/names.rs"]
+mod names;
 #[path = "stories/portal.rs"]
 mod portal;
 #[path = "stories/push.rs"]
@@ -216,9 +218,14 @@ fn main() -> ExitCode {
             a_source_package_is_tried_on_a_recording,
             a_robot_is_explained,
         ],
+        stories![names:
+            a_server_is_found_in_the_hosts_file_and_by_dns,
+            a_server_is_found_by_multicast_dns,
+        ],
         stories![shadowing:
             on_debians_layout_every_tool_finds_the_stub,
             on_an_opt_ros_layout_every_tool_finds_the_stub,
+            on_an_opt_ros_layout_without_the_original_the_stub_stands_alone,
             without_the_original_the_stub_stands_alone,
             what_is_not_outsourced_becomes_the_original,
             the_installer_checks_before_it_writes_and_undoes_itself,

@@ -109,7 +109,10 @@ pub fn without_the_original_the_stub_stands_alone() -> Told {
     }
     let source = format!(". {OVERLAY}/setup.sh\n");
     machine
-        .runs("sh", &format!("{source}rosrun opencv_apps face_detection"))?
+        .runs(
+            "sh",
+            &format!("{source}timeout 60 rosrun opencv_apps face_detection"),
+        )?
         .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
     let doctor = machine.runs(
         "sh",
@@ -181,6 +184,44 @@ pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Told {
             &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"),
         )?
         .failed_saying(&["FAIL  shadowing", "mend it:  . /opt/cloudroid/setup.sh"])?;
+    Ok(())
+}
+
+pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Told {
+    let machine = installed()?;
+    machine.runs("bash", OPT_ROS)?.succeeded()?;
+    machine
+        .runs(
+            "sh",
+            "rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps",
+        )?
+        .succeeded()?;
+    for (shell, setup) in SHELLS {
+        let source = format!(
+            "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. {OVERLAY}/{setup}\n"
+        );
+        let found = machine.runs(shell, &format!("{source}{LOOK}"))?;
+        ensure!(
+            found.stdout == found_in(OVERLAY),
+            "{shell}: {}",
+            found.said()
+        );
+        machine
+            .runs(
+                shell,
+                &format!("{source}timeout 60 rosrun opencv_apps face_detection"),
+            )?
+            .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
+        let doctor = format!("{source}rosrun opencv_apps cloudroid-stub doctor");
+        let doctor = machine.runs(shell, &doctor)?.succeeded()?;
+        ensure!(
+            doctor.stdout.contains(
+                "people_detect is not installed on this robot: it runs in the cloud only"
+            ),
+            "{shell}: {}",
+            doctor.said()
+        );
+    }
     Ok(())
 }
 
@@ -264,7 +305,7 @@ rosrun nodelet nodelet standalone opencv_apps/people_detect || echo "standalone:
 cat > load.launch << 'END'
 <launch>
   <node pkg="nodelet" type="nodelet" name="manager" args="manager" output="screen"/>
-  <node pkg="nodelet" type="nodelet" name="people" args="load opencv_apps/people_detect manager" output="screen" required="true"/>
+  <node pkg="nodelet" type="nodelet" name="people" args="load opencv_apps/people_detect manager" output="screen" required="rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps"/>
 </launch>
 END
 timeout 60 roslaunch load.launch || echo "roslaunch: $?""#

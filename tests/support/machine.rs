@@ -14,8 +14,9 @@ use crate::daemon::Daemon;
 use crate::deployer::{Outcome, path_str, run};
 use crate::world::world;
 
-/// What robots have: the tools that find and start nodes, three shells, and a package with its original nodes.
-const PACKAGES: [&str; 15] = [
+/// What robots have: the tools that find and start nodes, three shells, a package with its original nodes, and what
+/// makes a network with names.
+const PACKAGES: [&str; 18] = [
     "python3-roslaunch",
     "python3-rosmaster",
     "rosbash",
@@ -31,6 +32,9 @@ const PACKAGES: [&str; 15] = [
     "libnodeletlib-tools",
     "ros-opencv-apps",
     "procps",
+    "iproute2",
+    "dnsmasq-base",
+    "avahi-daemon",
 ];
 /// Launch files and package.xml are in this one; its dependencies are of no use here.
 const UNPACKED: &str = "libopencv-apps-dev";
@@ -80,6 +84,13 @@ impl Machine {
             to,
             std::fs::Permissions::from_mode(mode),
         )?)
+    }
+
+    /// Writes a file of this machine.
+    pub fn puts_text(&self, to: &str, text: &str) -> anyhow::Result<()> {
+        let to = self.written(to);
+        std::fs::create_dir_all(to.parent().context("a directory")?)?;
+        Ok(std::fs::write(to, text)?)
     }
 
     /// Installs the original of `teller_py` below `/usr`.

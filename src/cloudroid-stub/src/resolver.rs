@@ -1,21 +1,27 @@
 //! Host names without the C library: a static program has no NSS. `/etc/hosts` first, then multicast DNS for `.local`
-//! (RFC 6762, one-shot queries of section 5.1), else the servers of `/etc/resolv.conf` (RFC 1035).
+//! (RFC 6762), else the servers of `/etc/resolv.conf` (RFC 1035). Nothing is remembered between two questions: robots
+//! roam, and so do the files and the answers.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use hickory_resolver::config::{LookupIpStrategy, ResolveHosts, ResolverConfig, ResolverOpts};
+use hickory_resolver::name_server::TokioConnectionProvider;
+use hickory_resolver::proto::op::Query;
+use hickory_resolver::proto::rr::{Name, RecordType};
+use hickory_resolver::system_conf::read_system_conf;
+use hickory_resolver::{Hosts, TokioResolver};
+use mdns_sd::{HostnameResolutionEvent, ServiceDaemon};
 use ros::net::{HostSockets, Sockets};
-use tokio::net::{TcpListener, TcpStream, UdpSocket};
-use tokio::time::timeout;
+use tokio::net::{TcpListener, TcpStream};
 
-const MULTICAST: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::new(224, 0, 0, 251)), 5353);
-/// For one server to answer one question.
+/// For a host of this network to answer; it is asked at 0 and 1 s.
+const MULTICAST: Duration = Duration::from_millis(1800);
+/// For one server to answer once.
 const ANSWER: Duration = Duration::from_millis(1500);
 const ATTEMPTS: usize = 3;
-const TYPE_A: u16 = 1;
-const CLASS_IN: u16 = 1;
 
 /// The robot's network with this resolver.
 #[derive(Debug, Clone, Copy, Default)]
@@ -36,7 +42,10 @@ impl Sockets for RobotSockets {
     }
 }
 
-/// The address of a host.
+/// The address of a host, IPv4 before IPv6: ROS 1 nodes listen on IPv4.
+///
+/// # Errors
+/// `NotFound` if nobody knows the name, with who was asked; otherwise why it could not be asked.
 pub async fn resolve(host: &str) -> io::Result<IpAddr> {
     let bare = host
         .strip_prefix('[')
@@ -46,245 +55,111 @@ pub async fn resolve(host: &str) -> io::Result<IpAddr> {
         return Ok(literal);
     }
     let name = bare.trim_end_matches('.').to_ascii_lowercase();
-    let hosts = std::fs::read_to_string("/etc/hosts").unwrap_or_default();
-    if let Some(known) = in_hosts(&hosts, &name) {
+    let parsed = Name::from_utf8(&name)
+        .map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, format!("{name}: {error}")))?;
+    if let Some(known) = in_hosts(&parsed) {
         return Ok(known);
     }
     if name == "localhost" || name.ends_with(".localhost") {
         return Ok(Ipv4Addr::LOCALHOST.into());
     }
     if name.ends_with(".local") {
-        return ask(&name, &[MULTICAST]).await;
+        return on_this_network(&name).await;
     }
-    let configuration = std::fs::read_to_string("/etc/resolv.conf").unwrap_or_default();
-    let (servers, search) = in_resolv_conf(&configuration);
-    let mut names: Vec<String> = search
-        .iter()
-        .map(|domain| format!("{name}.{domain}"))
-        .collect();
-    // A name with dots is first tried as it is.
-    let at = if name.contains('.') { 0 } else { names.len() };
-    names.insert(at, name.clone());
-    let mut failure = None;
-    for name in &names {
-        match ask(name, &servers).await {
-            Ok(address) => return Ok(address),
-            Err(error) => failure = Some(error),
-        }
-    }
-    Err(failure.unwrap_or_else(|| unknown(&name)))
+    by_servers(&name, parsed).await
 }
 
-fn unknown(name: &str) -> io::Error {
+fn unknown(name: &str, asked: &str) -> io::Error {
     io::Error::new(
         io::ErrorKind::NotFound,
-        format!("host {name} has no address"),
+        format!("host {name} has no address: {asked}"),
     )
 }
 
-/// The address in a hosts file, IPv4 before IPv6: ROS 1 nodes listen on IPv4.
-fn in_hosts(text: &str, name: &str) -> Option<IpAddr> {
-    let found = text.lines().filter_map(|line| {
-        let mut words = line
-            .split('#')
-            .next()
-            .unwrap_or_default()
-            .split_whitespace();
-        let address: IpAddr = words.next()?.parse().ok()?;
-        words
-            .any(|alias| alias.eq_ignore_ascii_case(name))
-            .then_some(address)
-    });
-    let mut found: Vec<IpAddr> = found.collect();
-    found.sort_by_key(|address| !address.is_ipv4());
-    found.into_iter().next()
+fn in_hosts(name: &Name) -> Option<IpAddr> {
+    let hosts = Hosts::from_system().ok()?;
+    [RecordType::A, RecordType::AAAA]
+        .into_iter()
+        .find_map(|kind| {
+            let found = hosts.lookup_static_host(&Query::query(name.clone(), kind))?;
+            found
+                .iter()
+                .find_map(hickory_resolver::proto::rr::RData::ip_addr)
+        })
 }
 
-/// Servers and search domains.
-fn in_resolv_conf(text: &str) -> (Vec<SocketAddr>, Vec<String>) {
-    let (mut servers, mut search) = (Vec::new(), Vec::new());
-    for line in text.lines() {
-        let mut words = line.split_whitespace();
-        match words.next() {
-            Some("nameserver") => servers.extend(
-                words
-                    .next()
-                    .and_then(|word| word.parse::<IpAddr>().ok())
-                    .map(|ip| SocketAddr::new(ip, 53)),
-            ),
-            Some("search" | "domain") => search = words.map(str::to_owned).collect(),
-            _ => {}
-        }
-    }
-    (servers, search)
-}
-
-async fn ask(name: &str, servers: &[SocketAddr]) -> io::Result<IpAddr> {
-    for attempt in 0..ATTEMPTS {
-        for server in servers {
-            let id = rand::random::<u16>();
-            let query = query(name, id).ok_or_else(|| unknown(name))?;
-            let any: SocketAddr = if server.is_ipv4() {
-                (Ipv4Addr::UNSPECIFIED, 0).into()
-            } else {
-                (std::net::Ipv6Addr::UNSPECIFIED, 0).into()
-            };
-            let socket = UdpSocket::bind(any).await?;
-            if socket.send_to(&query, server).await.is_err() {
-                continue;
-            }
-            let multicast = server.ip().is_multicast();
-            let answer = timeout(ANSWER, async {
-                let mut buffer = [0; 1500];
-                loop {
-                    let (length, from) = socket.recv_from(&mut buffer).await?;
-                    if !multicast && from.ip() != server.ip() {
-                        continue;
-                    }
-                    if let Some(answer) =
-                        address_in(&buffer[..length], name, (!multicast).then_some(id))
-                    {
-                        return Ok::<_, io::Error>(answer);
-                    }
-                }
-            })
-            .await;
-            match answer {
-                Ok(Ok(Some(address))) => return Ok(address),
-                // The server knows that there is none.
-                Ok(Ok(None)) => return Err(unknown(name)),
-                Ok(Err(_)) | Err(_) => tracing::debug!(name, %server, attempt, "no answer"),
-            }
-        }
-    }
-    Err(unknown(name))
-}
-
-fn query(name: &str, id: u16) -> Option<Vec<u8>> {
-    let mut out = Vec::with_capacity(64);
-    out.extend(id.to_be_bytes());
-    // Recursion desired; one question.
-    out.extend([1, 0, 0, 1, 0, 0, 0, 0, 0, 0]);
-    for label in name.split('.') {
-        let length = u8::try_from(label.len())
-            .ok()
-            .filter(|length| (1..=63).contains(length))?;
-        out.push(length);
-        out.extend(label.as_bytes());
-    }
-    out.push(0);
-    out.extend(TYPE_A.to_be_bytes());
-    out.extend(CLASS_IN.to_be_bytes());
-    Some(out)
-}
-
-/// The first IPv4 address in an answer to our question; `Some(None)` if there is none, `None` if it is another's.
-fn address_in(message: &[u8], name: &str, id: Option<u16>) -> Option<Option<IpAddr>> {
-    let number = |at: usize| {
-        Some(u16::from_be_bytes([
-            *message.get(at)?,
-            *message.get(at + 1)?,
-        ]))
+/// Asks all hosts on all of this machine's networks.
+async fn on_this_network(name: &str) -> io::Result<IpAddr> {
+    let failed = |error: mdns_sd::Error| {
+        io::Error::other(format!("cannot ask for {name} by multicast DNS: {error}"))
     };
-    let (flags, questions, answers) = (number(2)?, number(4)?, number(6)?);
-    if flags & 0x8000 == 0 || id.is_some_and(|id| number(0) != Some(id)) {
-        return None;
-    }
-    let mut at = 12;
-    for _ in 0..questions {
-        at = skip_name(message, at)? + 4;
-    }
-    let mut relevant = id.is_some();
-    for _ in 0..answers {
-        let owner = name_at(message, at)?;
-        at = skip_name(message, at)?;
-        let (kind, length) = (number(at)?, usize::from(number(at + 8)?));
-        let data = message.get(at + 10..at + 10 + length)?;
-        at += 10 + length;
-        relevant |= owner.eq_ignore_ascii_case(name);
-        // With an id the server has followed aliases for us.
-        match *data {
-            [a, b, c, d] if kind == TYPE_A && relevant => {
-                return Some(Some(Ipv4Addr::new(a, b, c, d).into()));
+    let daemon = ServiceDaemon::new().map_err(failed)?;
+    let patience = u64::try_from(MULTICAST.as_millis()).unwrap_or(u64::MAX);
+    let events = daemon
+        .resolve_hostname(&format!("{name}."), Some(patience))
+        .map_err(failed)?;
+    let mut found: Vec<IpAddr> = Vec::new();
+    while let Ok(event) = events.recv_async().await {
+        match event {
+            HostnameResolutionEvent::AddressesFound(_, addresses) => {
+                found.extend(addresses.iter().map(mdns_sd::ScopedIp::to_ip_addr));
+                if found.iter().any(IpAddr::is_ipv4) {
+                    break;
+                }
             }
+            HostnameResolutionEvent::SearchTimeout(_)
+            | HostnameResolutionEvent::SearchStopped(_) => break,
             _ => {}
         }
     }
-    relevant.then_some(None)
+    // Its thread and sockets end by this; nobody waits for that.
+    let _ = daemon.shutdown();
+    found.sort_by_key(|address| !address.is_ipv4());
+    found
+        .into_iter()
+        .next()
+        .ok_or_else(|| unknown(name, "nobody on this network answers to it (multicast DNS)"))
 }
 
-fn skip_name(message: &[u8], mut at: usize) -> Option<usize> {
-    loop {
-        let length = usize::from(*message.get(at)?);
-        match length {
-            0 => return Some(at + 1),
-            1..=63 => at += 1 + length,
-            _ => return Some(at + 2),
+async fn by_servers(name: &str, parsed: Name) -> io::Result<IpAddr> {
+    let (config, mut options): (ResolverConfig, ResolverOpts) =
+        read_system_conf().map_err(|error| {
+            unknown(
+                name,
+                &format!(
+                    "/etc/hosts does not name it, and /etc/resolv.conf cannot be used ({error})"
+                ),
+            )
+        })?;
+    options.ip_strategy = LookupIpStrategy::Ipv4thenIpv6;
+    options.use_hosts_file = ResolveHosts::Never;
+    options.timeout = options.timeout.min(ANSWER);
+    options.attempts = ATTEMPTS;
+    let servers: Vec<String> = config
+        .name_servers()
+        .iter()
+        .map(|server| server.socket_addr.ip().to_string())
+        .collect();
+    let resolver = TokioResolver::builder_with_config(config, TokioConnectionProvider::default())
+        .with_options(options)
+        .build();
+    match resolver.lookup_ip(parsed).await {
+        Ok(addresses) => addresses
+            .iter()
+            .next()
+            .ok_or_else(|| unknown(name, "its servers know no address of it")),
+        Err(error) if error.is_nx_domain() || error.is_no_records_found() => {
+            let mut servers = servers;
+            servers.dedup();
+            Err(unknown(name, &format!("asked {}", servers.join(", "))))
         }
-    }
-}
-
-fn name_at(message: &[u8], mut at: usize) -> Option<String> {
-    let mut labels = Vec::new();
-    // Each jump must go backwards, so this ends.
-    let mut least = at;
-    loop {
-        let length = usize::from(*message.get(at)?);
-        match length {
-            0 => return Some(labels.join(".")),
-            1..=63 => {
-                labels.push(
-                    String::from_utf8_lossy(message.get(at + 1..at + 1 + length)?).into_owned(),
-                );
-                at += 1 + length;
-            }
-            _ => {
-                let target = (length & 0x3f) << 8 | usize::from(*message.get(at + 1)?);
-                if target >= least {
-                    return None;
-                }
-                (at, least) = (target, target);
-            }
-        }
+        Err(error) => Err(io::Error::other(format!("cannot ask for {name}: {error}"))),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn hosts_and_resolv_conf_are_read() {
-        let hosts = "127.0.0.1 localhost\n::1 localhost brain\n# 10.0.0.9 brain\n10.0.0.2 brain.lab Brain # ours\n";
-        assert_eq!(in_hosts(hosts, "brain"), Some([10, 0, 0, 2].into()));
-        assert_eq!(in_hosts(hosts, "other"), None);
-        let (servers, search) =
-            in_resolv_conf("search lab example.org\nnameserver 10.0.0.1\nnameserver ::1\n");
-        assert_eq!(
-            servers,
-            ["10.0.0.1:53".parse().unwrap(), "[::1]:53".parse().unwrap()]
-        );
-        assert_eq!(search, ["lab", "example.org"]);
-    }
-
-    #[test]
-    fn an_answer_is_read_and_others_are_not() {
-        let mut answer = query("brain.lab", 7).unwrap();
-        answer[2] = 0x81;
-        answer[7] = 2;
-        // An alias, and the address of what it stands for.
-        answer.extend([0xc0, 12, 0, 5, 0, 1, 0, 0, 0, 9, 0, 4, 1, b'x', 0xc0, 18]);
-        answer.extend([1, b'x', 0xc0, 18, 0, 1, 0, 1, 0, 0, 0, 9, 0, 4, 10, 0, 0, 5]);
-        assert_eq!(
-            address_in(&answer, "brain.lab", Some(7)),
-            Some(Some([10, 0, 0, 5].into()))
-        );
-        assert_eq!(address_in(&answer, "brain.lab", Some(8)), None);
-        assert_eq!(address_in(&answer, "other.lab", None), None);
-        for length in 0..answer.len() {
-            let _ = address_in(&answer[..length], "brain.lab", Some(7));
-        }
-    }
 
     #[tokio::test]
     async fn names_of_this_machine_are_known_without_asking() {
@@ -293,5 +168,12 @@ mod tests {
             IpAddr::from(std::net::Ipv6Addr::LOCALHOST)
         );
         assert!(resolve("localhost").await.unwrap().is_loopback());
+        assert!(resolve("robot.localhost.").await.unwrap().is_loopback());
+    }
+
+    #[tokio::test]
+    async fn what_is_no_name_is_told() {
+        let error = resolve("a..b").await.unwrap_err();
+        assert!(error.to_string().starts_with("a..b: "), "{error}");
     }
 }
