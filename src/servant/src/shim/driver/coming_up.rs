@@ -1,0 +1,107 @@
+//! How a servant comes up: its resident, its container, its init, its nodes.
+
+use std::time::Duration;
+
+use init::Reply;
+use tokio::io::AsyncReadExt;
+use tokio::net::unix::pipe;
+
+use super::{Driver, Input};
+use crate::engine::ContainerState;
+use crate::shim::create::Creator;
+use crate::shim::{ResidentContext, memory, privileges};
+use crate::sys;
+
+/// How long libcontainer and init may take. Generous: a loaded machine is no failure.
+const CREATION: Duration = Duration::from_secs(60);
+
+impl Driver {
+    /// Resident, container, nodes.
+    pub(super) async fn come_up(&mut self) -> Result<(), String> {
+        let context = ResidentContext {
+            id: self.begun.launch.spec.id.clone(),
+            config: self.begun.launch.spec.resident.clone(),
+            directory: self.begun.directory.clone(),
+        };
+        // The creator works meanwhile, in its own process.
+        let resident = self.resident.start(&context).await;
+        let created = self.creation().await;
+        if let Ok(pid) = created {
+            // Our unreaped child, so that the number is surely its own.
+            let pidfd = sys::pidfd_open(pid).map_err(|error| format!("pidfd of init: {error}"))?;
+            self.init = Some((pid, pidfd));
+        }
+        let init = created?;
+        resident.map_err(|error| format!("its resident did not start: {error}"))?;
+        privileges::drop_all_but_kill().map_err(|error| error.to_string())?;
+        let ready = tokio::time::timeout(CREATION, self.link.receive()).await;
+        match ready {
+            Ok(Ok(Some((Reply::Ready, _)))) => {}
+            Ok(Ok(other)) => return Err(format!("init did not come up but said {other:?}")),
+            Ok(Err(error)) => return Err(format!("init did not come up: {error}")),
+            Err(_) => {
+                return Err(format!(
+                    "init did not come up within {} s",
+                    CREATION.as_secs()
+                ));
+            }
+        }
+        self.listen_to_init();
+        self.set_state(ContainerState::Running { init_pid: init });
+        for node in self.begun.launch.spec.nodes.clone() {
+            let name = node.name.clone();
+            self.nodes.add(node)?;
+            self.start_node(&name).await;
+        }
+        // What was needed to get here is not needed to stay.
+        self.begun.launch.spec.layers = Vec::new();
+        self.begun.launch.spec.nodes = Vec::new();
+        self.begun.launch.spec.resident = serde_json::Value::Null;
+        memory::give_back();
+        Ok(())
+    }
+
+    /// Waits for the creator; init's pid on the host.
+    pub(super) async fn creation(&mut self) -> Result<i32, String> {
+        let report = self
+            .begun
+            .creator
+            .report
+            .try_clone()
+            .map_err(|error| error.to_string())?;
+        let set = nix::fcntl::FcntlArg::F_SETFL(nix::fcntl::OFlag::O_NONBLOCK);
+        nix::fcntl::fcntl(&report, set).map_err(|error| error.to_string())?;
+        let mut report =
+            pipe::Receiver::from_owned_fd(report).map_err(|error| error.to_string())?;
+        let mut text = Vec::new();
+        let read = async {
+            // A complaint may be followed by others, up to its end; success is said once.
+            while !Creator::has_succeeded(&text)
+                && report
+                    .read_buf(&mut text)
+                    .await
+                    .is_ok_and(|length| length > 0)
+            {}
+        };
+        let in_time = tokio::time::timeout(CREATION, read).await.is_ok();
+        match Creator::outcome(&String::from_utf8_lossy(&text)) {
+            Err(_) if !in_time && text.is_empty() => Err(format!(
+                "it was not created within {} s",
+                CREATION.as_secs()
+            )),
+            outcome => outcome,
+        }
+    }
+
+    pub(super) fn listen_to_init(&self) {
+        let (link, inputs) = (self.link.clone(), self.inputs.clone());
+        tokio::task::spawn_local(async move {
+            // Its end is told by the kernel, as that of a child.
+            while let Ok(Some((reply, fd))) = link.receive().await {
+                if inputs.send(Input::Init(reply, fd)).is_err() {
+                    return;
+                }
+            }
+        });
+    }
+}

@@ -1,0 +1,168 @@
+//! How a servant ends: politely, then not, and what is said of it.
+
+use std::os::fd::AsFd;
+use std::time::Duration;
+
+use init::Scope;
+
+use super::{Driver, Input};
+use crate::engine::{ContainerState, NodeExit};
+use crate::launch::{self, Exit};
+use crate::shim::nodes;
+use crate::{Error, sys};
+
+/// How long a killed pid namespace may take to be gone.
+const KILLED: Duration = Duration::from_secs(5);
+/// How long the rest of the log may take once nobody can write to it.
+const DRAIN: Duration = Duration::from_secs(2);
+/// How long a cgroup may take to become empty.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The stages of a stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(in crate::shim) enum StopStage {
+    Interrupt,
+    Terminate,
+    Kill,
+    /// Killed, and yet not gone.
+    Insist,
+}
+
+impl Driver {
+    /// Begins to end the servant; a second call changes nothing.
+    pub(super) async fn stop(&mut self, reason: &str) {
+        if self.stopping.is_some() || self.init.is_none() {
+            return;
+        }
+        self.verdict.get_or_insert_with(|| ContainerState::Stopped {
+            reason: reason.into(),
+        });
+        let first = if self.nodes.alive() == (vec![], 0) {
+            StopStage::Kill
+        } else {
+            StopStage::Interrupt
+        };
+        self.enter_stage(first).await;
+    }
+
+    pub(super) async fn next_stage(&mut self) {
+        let next = match self.stopping {
+            None | Some(StopStage::Interrupt) => StopStage::Terminate,
+            Some(StopStage::Terminate) => StopStage::Kill,
+            Some(StopStage::Kill | StopStage::Insist) => StopStage::Insist,
+        };
+        self.enter_stage(next).await;
+    }
+
+    pub(super) async fn enter_stage(&mut self, stage: StopStage) {
+        if self
+            .stopping
+            .is_some_and(|now| now >= stage && now != StopStage::Insist)
+        {
+            return;
+        }
+        self.stopping = Some(stage);
+        let patience = match stage {
+            StopStage::Interrupt => {
+                for (_, pid) in self.nodes.alive().0 {
+                    let _ = self.link.signal(pid, libc::SIGINT, Scope::Group).await;
+                }
+                self.begun.launch.grace.interrupt
+            }
+            StopStage::Terminate => {
+                let _ = self.link.signal(0, libc::SIGTERM, Scope::All).await;
+                self.begun.launch.grace.terminate
+            }
+            StopStage::Kill | StopStage::Insist => {
+                self.kill();
+                KILLED
+            }
+        };
+        let inputs = self.inputs.clone();
+        tokio::task::spawn_local(async move {
+            tokio::time::sleep(patience).await;
+            let _ = inputs.send(Input::Patience(stage));
+        });
+    }
+
+    /// Kills init; the kernel then kills everything in its pid namespace, and tells us when nothing is left.
+    pub(super) fn kill(&mut self) {
+        self.stopping = self.stopping.max(Some(StopStage::Kill));
+        if let Some((_, pidfd)) = &self.init {
+            // Gone already: then its end is in the queue.
+            let _ = sys::pidfd_send_signal(pidfd.as_fd(), libc::SIGKILL);
+        }
+    }
+
+    pub(super) fn init_ended(&mut self, status: i32) {
+        let asked = self.stopping.is_some();
+        let out_of_memory = !asked && self.was_out_of_memory(status);
+        let exit = nodes::exit_of(status, out_of_memory);
+        for (_, pid) in self.nodes.alive().0 {
+            let exit = NodeExit {
+                code: None,
+                signal: Some(libc::SIGKILL),
+                out_of_memory,
+                exec_error: None,
+            };
+            if let Some((event, _)) = self.nodes.exited(pid, exit) {
+                self.tell_node(event);
+            }
+        }
+        for number in self.nodes.starting() {
+            let reason = "its init ended before it was executed".to_owned();
+            if let Some((event, _)) = self.nodes.failed(number, reason.clone()) {
+                self.tell_node(event);
+                self.answer_start(number, Err(reason));
+            }
+        }
+        let limit = self.memory_limit();
+        self.verdict.get_or_insert_with(|| {
+            let how = match exit {
+                NodeExit {
+                    out_of_memory: true,
+                    ..
+                } => format!("was killed: {limit}"),
+                NodeExit {
+                    signal: Some(signal),
+                    ..
+                } => format!("was killed by signal {signal}"),
+                NodeExit { code, .. } => format!("exited with status {}", code.unwrap_or(0)),
+            };
+            ContainerState::Failed {
+                reason: format!("its init {how}"),
+            }
+        });
+        self.init = None;
+    }
+
+    /// Leaves nothing but the directory.
+    pub(super) async fn finish(&mut self) -> Result<(), Error> {
+        // With the namespace gone nobody holds the other ends of the pipes, unless they were sent out of it.
+        let _ = tokio::time::timeout(DRAIN, self.streams.drained()).await;
+        let removed = self.begun.cgroup.destroy(PATIENCE);
+        let fallback = ContainerState::Stopped {
+            reason: "stopped".into(),
+        };
+        let mut state = self.verdict.take().unwrap_or(fallback);
+        if let Err(error) = &removed {
+            state = ContainerState::Failed {
+                reason: error.to_string(),
+            };
+        }
+        let exit = Exit {
+            state: state.clone(),
+            nodes: self.nodes.statuses(),
+        };
+        let written = launch::write(&self.begun.directory.join(launch::EXIT), &exit);
+        // A daemon that connected just now is told, too.
+        while let Ok(input) = self.queue.try_recv() {
+            if let Input::Connected(stream) = input {
+                self.clients.add(stream, &self.hello());
+            }
+        }
+        self.set_state(state);
+        let _ = tokio::time::timeout(DRAIN, self.clients.flush()).await;
+        removed.and(written)
+    }
+}
