@@ -94,6 +94,7 @@ function showDetail(service) {
   byId("interface").replaceChildren(
     ...service.interface.topics.map((topic) => row(topic.direction, name(topic.name), name(topic.type), marks(topic))),
     ...service.interface.services.map((entry) => row("service", name(entry.name), name(entry.type), "")),
+    ...service.interface.needs.map((entry) => row("needs service", name(entry.name), "", entry.nodes.join(", "))),
     ...service.interface.actions.map((entry) => row("action", name(entry.name), name(entry.type), "")),
     ...service.interface.parameters.map((entry) =>
       row("parameter", name(entry.name), "", entry.value === undefined ? "" : JSON.stringify(entry.value))),

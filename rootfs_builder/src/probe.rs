@@ -32,15 +32,17 @@ pub enum ProbeError {
     Exited(String),
     /// A node did not show up.
     #[error(
-        "{} did not register with the ROS Master within {after:?}: it may wait for something that is not there (see \
+        "{} did not register with the ROS Master within {after:?}: it may wait for something that is not there{} (see \
          its log); a parameter (--param) or an argument (--arg) may help",
-        nodes.join(", ")
+        nodes.join(", "), services(sought)
     )]
     NeverRegistered {
         /// Their names.
         nodes: Vec<String>,
         /// How long was waited.
         after: Duration,
+        /// Services that were looked for in vain.
+        sought: Vec<String>,
     },
     /// The node was compiled with another definition than the image holds.
     #[error(
@@ -68,6 +70,13 @@ pub enum ProbeError {
     /// The graph could not be watched any longer.
     #[error("the servant's ROS Master went away while its interface was looked at")]
     MasterGone,
+}
+
+fn services(sought: &[String]) -> String {
+    match sought {
+        [] => String::new(),
+        names => format!(", such as the service {}", names.join(" or ")),
+    }
 }
 
 /// How long to look.
@@ -260,6 +269,10 @@ async fn registered(
                 return Err(ProbeError::NeverRegistered {
                     nodes: missing,
                     after: options.patience,
+                    sought: {
+                        let needs = describe::needs(&watch.borrow(), &options.own_name);
+                        needs.into_iter().map(|need| need.name).collect()
+                    },
                 });
             }
         }
@@ -342,6 +355,7 @@ type Shape = (
     BTreeMap<String, String>,
     BTreeSet<String>,
     usize,
+    usize,
 );
 
 fn shape(graph: &Graph) -> Shape {
@@ -351,6 +365,7 @@ fn shape(graph: &Graph) -> Shape {
         graph.services.clone(),
         nodes,
         graph.parameters.len(),
+        graph.sought.len(),
     )
 }
 

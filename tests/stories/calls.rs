@@ -273,6 +273,13 @@ impl ServiceHandler for Scale {
 
 pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Told {
     let daemon = world().with(CALLER)?;
+    // It was seen at push that it waits.
+    let service = daemon.get_json("/api/v1/services/caller_cpp")?;
+    let needs = service["interface"]["needs"].to_string();
+    ensure!(
+        needs == r#"[{"name":"/awaited","nodes":["/caller"]}]"#,
+        "{needs}"
+    );
     let site = Site::new()?;
     let app = site.node("/app")?;
     let argv = [

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use package::interface::{Action, Direction, Interface, Parameter, Service, Topic};
+use package::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use ros::bus::{Bus, BusError, Graph, ParamValue, WireType};
 use ros::schema::{Base, MessageType, Registry};
 use tokio::time::timeout;
@@ -97,9 +97,31 @@ pub(super) async fn describe(
         services,
         actions,
         parameters,
+        needs: needs(graph, seen.own_name),
         definitions: texts.used,
     };
+    for need in &found.interface.needs {
+        let (name, nodes) = (&need.name, need.nodes.join(", "));
+        found.warnings.push(format!(
+            "{nodes} looks for the service {name}, which nobody serves here: on a robot it is looked for there"
+        ));
+    }
     Ok(found)
+}
+
+/// Services that were looked for, and are not there yet.
+pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
+    let sought = graph.sought.iter();
+    let missing = sought.filter(|(name, _)| !graph.services.contains_key(*name));
+    let needs = missing.map(|(name, nodes)| Need {
+        name: name.clone(),
+        nodes: nodes
+            .iter()
+            .filter(|node| *node != own_name)
+            .cloned()
+            .collect(),
+    });
+    needs.filter(|need| !need.nodes.is_empty()).collect()
 }
 
 async fn ask<T>(

@@ -87,6 +87,16 @@ impl Lab {
             .expect("subscribed")
     }
 
+    async fn serves(&self, service: &str) -> Box<dyn Send + Sync> {
+        let add = self.registry.service("lab/Add").expect("defined");
+        let add = ServiceType {
+            name: "lab/Add".into(),
+            md5: add.md5.clone(),
+        };
+        let serving = self.node.serve(service, add, Arc::new(Sum));
+        serving.await.expect("served")
+    }
+
     async fn probed(
         &self,
         nodes: &[&str],
@@ -131,16 +141,7 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
     let latched = lab.advertises("/latched", string.clone(), true).await;
     latched.publish(bytes::Bytes::from_static(b"\x02\0\0\0hi"));
     let output = lab.advertises("/out", string.clone(), false).await;
-    let add = lab.registry.service("lab/Add").expect("defined");
-    let add = ServiceType {
-        name: "lab/Add".into(),
-        md5: add.md5.clone(),
-    };
-    let _served = lab
-        .node
-        .serve("/add", add, Arc::new(Sum))
-        .await
-        .expect("served");
+    let _served = lab.serves("/add").await;
     lab.node
         .set_param("/package/gain", ros::bus::ParamValue::Double(0.5))
         .await
@@ -378,5 +379,33 @@ async fn a_node_that_ends_is_told_before_anything_else() {
         .expect_err("ended")
         .to_string();
     assert_eq!(error, "/package exited with 3");
+    lab.ends().await;
+}
+
+#[tokio::test]
+async fn services_that_are_missed_are_named() {
+    let lab = Lab::new().await;
+    let text = lab.wire("std_msgs/String");
+    let _topic = lab.advertises("/said", text, false).await;
+    for missing in ["/static_map", "/add"] {
+        let called = lab.node.service_type(missing).await;
+        assert!(called.is_err(), "{called:?}");
+    }
+    let never = lab.probed(&["/late"], std::future::pending()).await;
+    let error = never.expect_err("it does not come").to_string();
+    assert!(
+        error.contains("such as the service /add or /static_map"),
+        "{error}"
+    );
+    // One of them comes after all, before the end.
+    let _add = lab.serves("/add").await;
+    let found = lab.probed(&["/package"], std::future::pending()).await;
+    let found = found.expect("an interface");
+    let needs = found.interface.needs;
+    assert_eq!(needs.len(), 1, "{needs:?}");
+    assert_eq!(needs[0].name, "/static_map");
+    assert_eq!(needs[0].nodes, ["/package"]);
+    let told = |warning: &String| warning.contains("/static_map");
+    assert!(found.warnings.iter().any(told), "{:?}", found.warnings);
     lab.ends().await;
 }

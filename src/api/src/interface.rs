@@ -15,6 +15,18 @@ pub struct Interface {
     pub actions: Vec<Action>,
     /// Parameters, by name.
     pub parameters: Vec<Parameter>,
+    /// ROS services that the package calls and does not serve, by name.
+    #[serde(default)]
+    pub needs: Vec<Need>,
+}
+
+/// A ROS service that a robot should serve.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Need {
+    /// Absolute name.
+    pub name: String,
+    /// Nodes of the package that look for it.
+    pub nodes: Vec<String>,
 }
 
 /// From the package's point of view.

@@ -101,6 +101,10 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.actions {
         actions.row([entry.name.clone(), entry.type_name.clone()]);
     }
+    let mut needs = Table::new(&["NEEDS SERVICE", "CALLED BY"]);
+    for entry in &service.interface.needs {
+        needs.row([entry.name.clone(), entry.nodes.join(", ")]);
+    }
     let mut parameters = Table::new(&["PARAMETER", "VALUE"]);
     for entry in &service.interface.parameters {
         parameters.row([
@@ -122,6 +126,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
         &nodes,
         &topics,
         &services,
+        &needs,
         &actions,
         &parameters,
         &revisions,

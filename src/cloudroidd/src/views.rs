@@ -103,6 +103,14 @@ fn interface(of: &recorded::Interface) -> Interface {
                 value: parameter.value.clone(),
             })
             .collect(),
+        needs: of
+            .needs
+            .iter()
+            .map(|need| api::interface::Need {
+                name: need.name.clone(),
+                nodes: need.nodes.clone(),
+            })
+            .collect(),
     }
 }
 

@@ -226,6 +226,7 @@ mod tests {
                 node: "/n".into(),
             }],
             parameters: vec![parameter("/p", 1)],
+            needs: Vec::new(),
             definitions: [(
                 "a/action/Go".to_owned(),
                 "int32 x # goal\n---\n---\n".to_owned(),

@@ -16,6 +16,9 @@ pub struct Interface {
     pub actions: Vec<Action>,
     /// Parameters that a node read or wrote, by name.
     pub parameters: Vec<Parameter>,
+    /// Services that nodes of the package call and none of them serves, by name.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub needs: Vec<Need>,
     /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`:
     /// those used above and all they refer to.
     pub definitions: BTreeMap<String, String>,
@@ -83,6 +86,16 @@ pub struct Action {
     /// The serving node. Empty where it is not known.
     #[serde(default)]
     pub node: String,
+}
+
+/// A service that the package looks for on its robot. A lookup tells no type.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Need {
+    /// Absolute name.
+    pub name: String,
+    /// Nodes of the package that looked for it.
+    #[serde(default)]
+    pub nodes: Vec<String>,
 }
 
 /// A parameter.

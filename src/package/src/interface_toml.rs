@@ -12,7 +12,7 @@ use crate::{Error, names, read};
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Keys that may stand in each table of a file.
-const KEYS: [(&str, &[&str]); 4] = [
+const KEYS: [(&str, &[&str]); 5] = [
     (
         "topics",
         &[
@@ -28,6 +28,7 @@ const KEYS: [(&str, &[&str]); 4] = [
     ("services", &["name", "type", "md5", "node"]),
     ("actions", &["name", "type", "node"]),
     ("parameters", &["name", "value", "read_by", "written_by"]),
+    ("needs", &["name", "nodes"]),
 ];
 
 impl Interface {
@@ -86,11 +87,12 @@ impl Interface {
                 .iter()
                 .map(|action| (&action.name, Some(&action.type_name))),
         );
-        let mut named = named.chain(
+        let named = named.chain(
             self.parameters
                 .iter()
                 .map(|parameter| (&parameter.name, None)),
         );
+        let mut named = named.chain(self.needs.iter().map(|need| (&need.name, None)));
         named.find_map(|(name, of_type)| {
             if !names::is_graph_name(name) {
                 return Some((
@@ -177,7 +179,7 @@ fn wrong(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::interface::{Direction, Parameter};
+    use crate::interface::{Direction, Need, Parameter};
 
     fn parse(text: &str) -> Result<Interface, Error> {
         Interface::from_toml(text, Path::new("x.toml"))
@@ -236,6 +238,10 @@ value = 0.5
             value: None,
             read_by: vec!["/n".into()],
             written_by: vec![],
+        });
+        interface.needs.push(Need {
+            name: "/static_map".into(),
+            nodes: vec!["/n".into()],
         });
         assert_eq!(parse(&interface.to_toml()).unwrap(), interface);
     }

@@ -77,13 +77,16 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     let _second = shop.offers("beef");
     ending.send_replace(true);
     let typed = |md5: &'static str| node.call_typed("/add", md5, "2".into(), LONG);
-    let other = loop {
-        match typed("abcd").await {
-            // The kept connection has not ended yet.
-            Ok(_) => tokio::task::yield_now().await,
-            Err(error) => break error,
+    let other = async {
+        loop {
+            match typed("abcd").await {
+                // The kept connection has not ended yet.
+                Ok(_) => tokio::task::yield_now().await,
+                Err(error) => return error,
+            }
         }
     };
+    let other = tokio::time::timeout(LONG, other).await.unwrap();
     assert!(matches!(other, BusError::TypeMismatch { .. }), "{other}");
     assert_eq!(typed("beef").await.unwrap(), "2");
 }
