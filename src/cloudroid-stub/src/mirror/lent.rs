@@ -69,8 +69,12 @@ impl Lent {
             return;
         }
         let of = provider.map(|provider| {
+            let md5 = &provider.service_type.md5;
+            let same = services.get(&service);
+            let same = same.filter(|known| known.node == provider.node && known.md5 == *md5);
+            let channel = same.map(|known| known.channel);
             let served = Served {
-                channel: self.next.fetch_add(1, Ordering::Relaxed),
+                channel: channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed)),
                 name: service.clone(),
                 type_name: provider.service_type.name,
                 md5: provider.service_type.md5,

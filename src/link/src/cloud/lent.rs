@@ -1,5 +1,6 @@
 //! Services of the robot, for nodes of the servant. The Master tells of a lookup that found nothing; it is passed to
-//! the robot, whose answer holds until the robot says otherwise. See docs/adr/025.
+//! the robot, whose answer holds until the robot says otherwise; it is asked again now and then, since a server that
+//! starts anew under the same name may serve another type. See docs/adr/025.
 //!
 //! ```text
 //!             Lookup                        Lent: there
@@ -31,6 +32,8 @@ use crate::stamps::Stamps;
 const PATIENCE: Duration = Duration::from_millis(1200);
 /// "Not there" holds so long: roscpp asks fifty times a second while it waits for a service.
 const NOT_THERE: Duration = Duration::from_millis(200);
+/// "There" holds longer, but who looks after so long makes the robot look again, without waiting for it.
+const CONFIRM: Duration = Duration::from_secs(1);
 /// Names asked for at a time, and remembered.
 const NAMES: usize = 1000;
 
@@ -53,7 +56,10 @@ enum State {
     NotThere {
         since: Instant,
     },
-    There(Arc<There>),
+    There {
+        there: Arc<There>,
+        asked: Instant,
+    },
 }
 
 /// A service that the robot has.
@@ -63,6 +69,14 @@ struct There {
     request: Stamps,
     response: Stamps,
     gone: watch::Sender<bool>,
+}
+
+impl There {
+    /// Whether the robot tells of the same once more.
+    fn is(&self, served: &Served) -> bool {
+        let ours = &self.service_type;
+        self.channel == served.channel && ours.name == served.type_name && ours.md5 == served.md5
+    }
 }
 
 #[derive(Default)]
@@ -98,7 +112,7 @@ impl Lent {
         }
         drop(calls);
         for (_, state) in self.names.lock().drain() {
-            if let State::There(there) = state {
+            if let State::There { there, .. } = state {
                 there.gone.send_replace(true);
             }
         }
@@ -106,7 +120,7 @@ impl Lent {
 
     fn there(&self, service: &str) -> Option<Arc<There>> {
         match self.names.lock().get(service) {
-            Some(State::There(there)) => Some(Arc::clone(there)),
+            Some(State::There { there, .. }) => Some(Arc::clone(there)),
             _ => None,
         }
     }
@@ -123,19 +137,26 @@ impl NodeLink {
         let Some(hub) = self.hub.upgrade() else {
             return;
         };
-        let state = match of {
-            Some(served) => State::There(Arc::new(there(&hub, served))),
-            None => State::NotThere {
-                since: Instant::now(),
-            },
-        };
+        let now = Instant::now();
         {
             let mut names = self.lent.names.lock();
             // What nobody asked for is not kept.
             let Some(known) = names.get_mut(&service) else {
                 return;
             };
-            if let State::There(there) = std::mem::replace(known, state) {
+            if let (State::There { there, .. }, Some(served)) = (&*known, &of) {
+                if there.is(served) {
+                    return;
+                }
+            }
+            let state = match of {
+                Some(served) => State::There {
+                    there: Arc::new(there(&hub, served)),
+                    asked: now,
+                },
+                None => State::NotThere { since: now },
+            };
+            if let State::There { there, .. } = std::mem::replace(known, state) {
                 there.gone.send_replace(true);
             }
         }
@@ -168,8 +189,14 @@ impl NodeLink {
 
     fn ask(&self, service: &str) -> Asked {
         let mut names = self.lent.names.lock();
-        match names.get(service) {
-            Some(State::There(there)) => return Asked::Known(Some(Arc::clone(there))),
+        match names.get_mut(service) {
+            Some(State::There { there, asked }) => {
+                if asked.elapsed() > CONFIRM {
+                    *asked = Instant::now();
+                    self.tell_lookup(service);
+                }
+                return Asked::Known(Some(Arc::clone(there)));
+            }
             Some(State::NotThere { since }) if since.elapsed() < NOT_THERE => {
                 return Asked::Known(None);
             }
@@ -184,10 +211,13 @@ impl NodeLink {
             }
         }
         names.insert(service.to_owned(), State::Asked { in_vain: false });
-        self.session.tell(&Control::Lookup {
-            service: service.to_owned(),
-        });
+        self.tell_lookup(service);
         Asked::Wait
+    }
+
+    fn tell_lookup(&self, service: &str) {
+        let service = service.to_owned();
+        self.session.tell(&Control::Lookup { service });
     }
 
     /// Calls a service of the robot. Over a cut the call waits; it fails with the link.
