@@ -1,67 +1,36 @@
 //! All parts together, for one node of the package.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+mod asking;
+mod effect;
+mod frames;
+mod giving_up;
+mod judging;
+mod original;
+mod standing;
+mod stream;
+
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::arbiter::{Arbiter, Kind, Limits, Record, Verdict};
 use crate::decider::{Decider, Event, LocalState};
 use crate::measure::Meter;
-use crate::outcome::Outcome;
 use crate::pair::{Correlation, Pair};
-use crate::phases::{PhaseBook, Phases};
-use crate::report::{Counts, Report, TimedEvent};
+use crate::phases::PhaseBook;
+use crate::report::Counts;
 use crate::request::{Failure, Key, Leg, RequestId, Side, Sides};
-use crate::satisfaction::{Satisfaction, Step};
-use crate::sla::{Local, Measure, Mode, Sla};
+use crate::satisfaction::Satisfaction;
+use crate::sla::{Mode, Sla};
+
+pub use effect::{Channel, Effect};
+use frames::Metered;
+use stream::Stream;
 
 /// Events kept for the report.
 const EVENTS: usize = 32;
 /// So many stamped outputs of which none carries the stamp of an input show that the node does not copy it.
 const UNMATCHED: u32 = 8;
-
-/// Clocks of two machines are known that well; phases that add up to something else are of another request.
-const PHASES_APART: Duration = Duration::from_millis(20);
-
-/// Where a message goes to or came from.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Channel {
-    /// A service or an action, by absolute name.
-    Call(Arc<str>),
-    /// A topic, by absolute name.
-    Topic(Arc<str>),
-}
-
-/// What is to be done, in this order.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Effect<P> {
-    /// Hand this to one side.
-    Give {
-        /// Whom.
-        side: Side,
-        /// The request it belongs to; none for messages that await no answer.
-        request: Option<RequestId>,
-        /// Where it goes.
-        channel: Channel,
-        /// The message.
-        payload: P,
-    },
-    /// Tell the application that there will be no answer.
-    Fail {
-        /// Which.
-        request: RequestId,
-        /// Where it was asked.
-        channel: Channel,
-        /// Why not.
-        reason: String,
-    },
-    /// Publish the SLA's safe-stop message: nobody has answered in time.
-    SafeStop,
-    /// The cloud's time of a request has counted, or more is known of one whose has.
-    Outcome(Outcome),
-    /// A decision about the local original.
-    Event(Event),
-}
 
 /// Quality of service of one node. `P` is a message, cheap to clone.
 ///
@@ -85,29 +54,6 @@ pub struct Governor<P> {
     listened: BTreeSet<String>,
     events: VecDeque<(Instant, Event)>,
     effects: VecDeque<Effect<P>>,
-}
-
-#[derive(Debug)]
-struct Metered {
-    output: String,
-    cloud: Meter,
-    /// Of what the application got: when that stops, the robot must.
-    delivered: Meter,
-}
-
-/// A pair, and what is under way of it.
-#[derive(Debug)]
-struct Stream {
-    pair: Pair,
-    input: Arc<str>,
-    by: Correlation,
-    keys: HashMap<Key, RequestId>,
-    /// By arrival: what each side has to answer next.
-    outstanding: [Option<RequestId>; 2],
-    /// By arrival: what each side did not answer by T_max; if it does yet, it must not be taken for more.
-    owed: [Option<RequestId>; 2],
-    /// Stamped outputs in a row that no input had; none once one has matched.
-    unmatched: Option<u32>,
 }
 
 impl<P: Clone> Governor<P> {
@@ -308,30 +254,6 @@ impl<P: Clone> Governor<P> {
         verdict
     }
 
-    /// Somebody listens to an output, or nobody does: frames that nobody wants are not missed.
-    pub fn wanted(&mut self, now: Instant, output: &str, wanted: bool) {
-        self.tick(now);
-        if wanted {
-            self.listened.insert(output.to_owned());
-        } else {
-            self.listened.remove(output);
-        }
-        self.await_frames(now);
-    }
-
-    fn await_frames(&mut self, now: Instant) {
-        if let Some(metered) = &mut self.meter {
-            let wanted = self.listened.contains(&metered.output);
-            for meter in [&mut metered.cloud, &mut metered.delivered] {
-                if wanted {
-                    meter.start(now)
-                } else {
-                    meter.stop()
-                }
-            }
-        }
-    }
-
     /// The link is up. `resumed`: what was sent before and not answered will be answered yet.
     pub fn link_up(&mut self, now: Instant, resumed: bool) {
         self.tick(now);
@@ -392,31 +314,6 @@ impl<P: Clone> Governor<P> {
         self.local(now, LocalState::Starting);
     }
 
-    /// Where the time went of the request that the cloud has just answered, if it was that one: the sum must be what
-    /// the request took.
-    pub fn phases(&mut self, phases: &Phases) {
-        let answered = |effect: &mut Effect<P>| match effect {
-            Effect::Outcome(outcome) if outcome.cloud.is_some() => Some(outcome.clone()),
-            _ => None,
-        };
-        let newest = self.effects.iter_mut().rev().find_map(answered);
-        let Some((outcome, t)) = newest.and_then(|outcome| outcome.cloud.map(|t| (outcome, t)))
-        else {
-            return;
-        };
-        if t.abs_diff(phases.total()) > PHASES_APART.max(t / 5) {
-            return;
-        }
-        self.phases.record(phases);
-        for effect in &mut self.effects {
-            if let Effect::Outcome(told) = effect {
-                if told.request == outcome.request {
-                    told.phases = Some(*phases);
-                }
-            }
-        }
-    }
-
     /// Time has passed.
     pub fn tick(&mut self, now: Instant) {
         if !self.arbiter.is_crowded() && self.deadline().is_none_or(|deadline| deadline > now) {
@@ -454,436 +351,5 @@ impl<P: Clone> Governor<P> {
             self.effects.push_back(Effect::SafeStop);
         }
         self.decide(now);
-    }
-
-    /// A snapshot for diagnostics.
-    pub fn report(&self, now: Instant) -> Report {
-        let event = |(at, event): &(Instant, Event)| TimedEvent {
-            ago: now.saturating_duration_since(*at).as_secs_f64(),
-            event: event.clone(),
-        };
-        Report {
-            t_desire: self.sla.t_desire.as_secs_f64(),
-            t_max: self.sla.t_max.as_secs_f64(),
-            q: self.satisfaction.q(),
-            threshold: self.satisfaction.threshold(),
-            mode: self.sla.mode,
-            local: self.sla.local,
-            local_state: self.decider.state(),
-            fed: self.decider.is_fed(),
-            link: self.link,
-            pairs: self.pairs.iter().map(|stream| stream.shown()).collect(),
-            counts: self.counts,
-            phases: self.phases.quantiles(),
-            events: self.events.iter().map(event).collect(),
-            summary: self.summary(),
-        }
-    }
-
-    fn summary(&self) -> String {
-        let q = format!(
-            "Q {:.1} of threshold {:.1}",
-            self.satisfaction.q(),
-            self.satisfaction.threshold()
-        );
-        let who = match (self.link, self.decider.is_fed(), self.decider.state()) {
-            (true, false, _) if !self.satisfaction.wants_local() => "the cloud answers",
-            (true, false, LocalState::Missing) => {
-                "the cloud is slow, and there is no local original"
-            }
-            (true, false, _) if self.sla.local == Local::None => {
-                "the cloud is slow, and no local original is to be used"
-            }
-            (true, false, _) if self.sla.mode == Mode::Stateful => {
-                "the cloud is slow; stateful, so it answers alone"
-            }
-            (true, false, _) => "the cloud is slow, and the local original is starting",
-            (true, true, _) => "the cloud is slow, so both are asked and the first answer is taken",
-            (false, true, _) => "the link is down, the local original answers",
-            (false, false, LocalState::Missing) => {
-                "the link is down, and there is no local original: nobody answers"
-            }
-            (false, false, _) => "the link is down, and the local original does not answer yet",
-        };
-        match self.phases.dominant() {
-            Some((phase, share)) => {
-                format!(
-                    "{who} ({q}); of the cloud's time {:.0}% is {phase}",
-                    share * 100.0
-                )
-            }
-            None => format!("{who} ({q})"),
-        }
-    }
-
-    /// A request was opened: ask whom there is.
-    fn asked(&mut self, now: Instant, id: RequestId) {
-        self.counts.requests += 1;
-        for side in self.asked_sides() {
-            self.ask(now, id, side);
-        }
-        if !self.link {
-            // The cloud cannot have it, so its time is beyond any T_max already now.
-            self.judge(id, None);
-        }
-        self.decide(now);
-    }
-
-    fn asked_sides(&self) -> Vec<Side> {
-        let sides = self.sides();
-        let asked = [(sides.cloud, Side::Cloud), (sides.local, Side::Local)];
-        asked
-            .into_iter()
-            .filter(|(asked, _)| *asked)
-            .map(|(_, side)| side)
-            .collect()
-    }
-
-    fn ask(&mut self, now: Instant, id: RequestId, side: Side) {
-        let Some(payload) = self.arbiter.ask(now, id, side) else {
-            return;
-        };
-        let Some(record) = self.arbiter.get(id) else {
-            return;
-        };
-        if let Kind::Input {
-            pair, key: None, ..
-        } = record.kind
-        {
-            let slot = &mut self.pairs[pair].outstanding[side.index()];
-            slot.get_or_insert(id);
-        }
-        let channel = self.channel(&self.arbiter.get(id).expect("it was just there").kind);
-        self.give(side, Some(id), channel, payload);
-    }
-
-    fn give(&mut self, side: Side, request: Option<RequestId>, channel: Channel, payload: P) {
-        self.effects.push_back(Effect::Give {
-            side,
-            request,
-            channel,
-            payload,
-        });
-    }
-
-    fn channel(&self, kind: &Kind) -> Channel {
-        match kind {
-            Kind::Call(name) => Channel::Call(name.clone()),
-            Kind::Input { pair, .. } => Channel::Topic(self.pairs[*pair].input.clone()),
-        }
-    }
-
-    /// Who can answer now is asked for what still waits: calls always, inputs while they are fresh.
-    fn give_waiting(&mut self, now: Instant, side: Side) {
-        let wanted = |record: &Record<P>| record.is_open() && (record.is_call() || !record.overdue);
-        for id in self.arbiter.select(wanted) {
-            self.ask(now, id, side);
-        }
-    }
-
-    /// An input that is late already is given to the local original when that has nothing else to do, and is quick
-    /// enough that a fresh one that comes meanwhile is still in time.
-    fn give_straggler(&mut self, now: Instant) {
-        if !self.decider.is_fed() {
-            return;
-        }
-        let Some(id) = self.arbiter.straggler() else {
-            return;
-        };
-        let Some(Kind::Input {
-            pair, key: Some(_), ..
-        }) = self.arbiter.get(id).map(|record| &record.kind)
-        else {
-            return;
-        };
-        let t_max = self.sla.times(&self.pairs[*pair].input).t_max;
-        let quick = self.local_time.is_none_or(|time| 2 * time <= t_max);
-        let busy = |record: &Record<P>| {
-            record.local == Leg::Asked
-                && record.local_asked.is_some_and(|asked| now < asked + t_max)
-        };
-        if quick && self.arbiter.select(busy).is_empty() {
-            self.ask(now, id, Side::Local);
-        }
-    }
-
-    /// Which request an output answers, and as which of its outputs.
-    fn request_of(
-        &mut self,
-        side: Side,
-        topic: &str,
-        key: Option<Key>,
-    ) -> Option<(RequestId, usize)> {
-        for stream in &mut self.pairs {
-            let Some(output) = stream.pair.outputs.iter().position(|name| name == topic) else {
-                continue;
-            };
-            if let Some(id) = key.as_ref().and_then(|key| stream.keys.get(key)) {
-                stream.unmatched = None;
-                return Some((*id, output));
-            }
-            if stream.by == Correlation::Goal {
-                return None;
-            }
-            if stream.by == Correlation::Stamp {
-                if stream.keys.is_empty() && stream.outstanding == [None; 2] {
-                    return None;
-                }
-                if let Some(unmatched) = stream.unmatched.as_mut().filter(|_| output == 0) {
-                    *unmatched += 1;
-                }
-            }
-            if output > 0 {
-                return None;
-            }
-            let slot = side.index();
-            let id = stream.outstanding[slot]
-                .take()
-                .or_else(|| stream.owed[slot].take());
-            return id.map(|id| (id, 0));
-        }
-        None
-    }
-
-    fn completed(&mut self, now: Instant, side: Side, id: RequestId, output: usize) -> Verdict {
-        let answers = output == 0
-            && self.arbiter.get(id).is_some_and(|record| match side {
-                Side::Cloud => record.cloud != Leg::Answered,
-                Side::Local => record.local != Leg::Answered,
-            });
-        if let Some(record) = self.arbiter.get(id).filter(|_| answers) {
-            match (side, record.local_asked) {
-                (Side::Cloud, _) => {
-                    let t = now.saturating_duration_since(record.asked_at);
-                    self.judge(id, Some(t));
-                }
-                (Side::Local, Some(asked)) => {
-                    self.local_time = Some(now.saturating_duration_since(asked));
-                }
-                (Side::Local, None) => {}
-            }
-        }
-        let verdict = self.arbiter.answer_with(now, id, side, output);
-        if answers && (side == Side::Cloud || verdict == Verdict::Deliver) {
-            self.tell(id);
-        }
-        self.arbiter.close_call(id);
-        match (verdict, side) {
-            (Verdict::Deliver, _) if output > 0 => {}
-            (Verdict::Deliver, Side::Cloud) => self.counts.from_cloud += 1,
-            (Verdict::Deliver, Side::Local) => self.counts.from_local += 1,
-            (Verdict::Drop, _) => self.counts.duplicates += 1,
-        }
-        self.decide(now);
-        verdict
-    }
-
-    /// Counts the cloud's time of a request, once. Without one the outcome is told at once; else when it is known
-    /// whose answer is taken.
-    fn judge(&mut self, id: RequestId, t: Option<Duration>) {
-        if !self.arbiter.judge(id, t) {
-            return;
-        }
-        if self.sla.measure == Measure::Rrt {
-            self.count(id, t);
-        }
-        if t.is_none() {
-            self.tell(id);
-        }
-    }
-
-    fn count(&mut self, id: RequestId, t: Option<Duration>) {
-        let Some(record) = self.arbiter.get(id) else {
-            return;
-        };
-        let times = match &record.kind {
-            Kind::Call(name) => self.sla.times(name),
-            Kind::Input { pair, .. } => self.sla.times(&self.pairs[*pair].input),
-        };
-        self.observe(t, times.t_desire, times.t_max);
-    }
-
-    /// Tells the outcome of a request that was judged.
-    fn tell(&mut self, id: RequestId) {
-        let Some(record) = self.arbiter.get(id).filter(|record| record.judged) else {
-            return;
-        };
-        let stamp = match record.kind {
-            Kind::Input {
-                key: Some(Key::Stamp(stamp)),
-                ..
-            } => Some(stamp),
-            _ => None,
-        };
-        let outcome = Outcome {
-            request: id,
-            channel: self.channel(&record.kind),
-            stamp,
-            cloud: record.cloud_time,
-            answer: record.answered().zip(record.answer_time),
-            phases: None,
-            q: self.satisfaction.q(),
-        };
-        self.effects.push_back(Effect::Outcome(outcome));
-    }
-
-    fn measure(&mut self, now: Instant, topic: &str, age: Duration) {
-        let Some(meter) = self.meter.as_mut().filter(|meter| meter.output == topic) else {
-            return;
-        };
-        if let Some(t) = meter.cloud.output(now, age) {
-            self.observe(Some(t), self.sla.t_desire, self.sla.t_max);
-            self.decide(now);
-        }
-    }
-
-    fn observe(&mut self, t: Option<Duration>, t_desire: Duration, t_max: Duration) {
-        match self.satisfaction.observe(t, t_desire, t_max) {
-            Step::Desired => self.counts.desired += 1,
-            Step::Accepted => self.counts.accepted += 1,
-            Step::Late => {
-                self.counts.late += 1;
-                self.decider.late();
-            }
-        }
-    }
-
-    fn decide(&mut self, now: Instant) {
-        for event in self.decider.decide(&self.satisfaction, self.link) {
-            let (feed, stop) = (
-                matches!(event, Event::Feed(_)),
-                matches!(event, Event::Stop(_)),
-            );
-            self.say(now, event);
-            if feed {
-                self.give_waiting(now, Side::Local);
-            }
-            if stop {
-                self.local_lost(now);
-            }
-        }
-        self.give_straggler(now);
-        for index in 0..self.pairs.len() {
-            let stream = &mut self.pairs[index];
-            if stream.by == Correlation::Stamp && stream.unmatched.is_some_and(|n| n >= UNMATCHED) {
-                stream.by = Correlation::Arrival;
-                let input = stream.pair.input.clone();
-                self.say(now, Event::Uncorrelated(input));
-            }
-        }
-    }
-
-    fn say(&mut self, now: Instant, event: Event) {
-        if self.events.len() == EVENTS {
-            self.events.pop_front();
-        }
-        self.events.push_back((now, event.clone()));
-        self.effects.push_back(Effect::Event(event));
-    }
-
-    /// The local original is gone with what it was asked; the cloud is asked where it was not.
-    fn local_lost(&mut self, now: Instant) {
-        let reason = Leg::Failed("the local original ended".into());
-        let lost = self.arbiter.turn(Side::Local, &Leg::Asked, &reason);
-        for stream in &mut self.pairs {
-            stream.outstanding[Side::Local.index()] = None;
-            stream.owed[Side::Local.index()] = None;
-        }
-        for id in lost {
-            if self.link {
-                self.ask(now, id, Side::Cloud);
-            }
-            self.fail_if_hopeless(id);
-        }
-    }
-
-    /// Fails a call that nobody can answer any more. While the link is down the cloud may come back, and until its
-    /// T_max a call waits for that.
-    fn fail_if_hopeless(&mut self, id: RequestId) {
-        let Some(record) = self.arbiter.get(id) else {
-            return;
-        };
-        if !record.is_call() || !record.is_open() {
-            return;
-        }
-        let local = match &record.local {
-            Leg::Asked => return,
-            Leg::NotAsked if self.decider.is_coming() => return,
-            Leg::Failed(reason) => reason.clone(),
-            _ => match (self.sla.local, self.decider.state()) {
-                (Local::None, _) => "no local original is to be used".to_owned(),
-                (_, LocalState::Missing) => "there is no local original".to_owned(),
-                _ => "the local original does not run".to_owned(),
-            },
-        };
-        let cloud = match &record.cloud {
-            Leg::Failed(reason) => reason.clone(),
-            Leg::NotAsked | Leg::Lost if !self.link && record.overdue => {
-                format!(
-                    "the link is down and was not up again within {:?}",
-                    record.deadline - record.asked_at
-                )
-            }
-            _ => return,
-        };
-        let channel = self.channel(&record.kind);
-        self.give_up(id, channel, format!("cloud: {cloud}; local: {local}"));
-    }
-
-    fn give_up(&mut self, request: RequestId, channel: Channel, reason: String) {
-        if self.arbiter.fail(request) {
-            self.counts.failed += 1;
-            self.effects.push_back(Effect::Fail {
-                request,
-                channel,
-                reason,
-            });
-        }
-    }
-
-    fn forget(&mut self, request: RequestId, record: Record<P>) {
-        let channel = self.channel(&record.kind);
-        if let Kind::Input { pair, key, .. } = &record.kind {
-            let stream = &mut self.pairs[*pair];
-            if let Some(key) = key {
-                stream.keys.remove(key);
-            }
-            for slot in stream.outstanding.iter_mut().chain(&mut stream.owed) {
-                if *slot == Some(request) {
-                    *slot = None;
-                }
-            }
-        }
-        if record.is_open() {
-            self.counts.failed += 1;
-            let reason = "nobody answered while it was remembered".to_owned();
-            self.effects.push_back(Effect::Fail {
-                request,
-                channel,
-                reason,
-            });
-        }
-    }
-}
-
-impl Stream {
-    fn new(pair: Pair) -> Self {
-        Self {
-            input: pair.input.as_str().into(),
-            by: pair.by.unwrap_or(Correlation::Arrival),
-            pair,
-            keys: HashMap::new(),
-            outstanding: [None; 2],
-            owed: [None; 2],
-            unmatched: Some(0),
-        }
-    }
-
-    fn shown(&self) -> String {
-        Pair {
-            by: Some(self.by),
-            ..self.pair.clone()
-        }
-        .to_string()
     }
 }

@@ -1,0 +1,106 @@
+//! Who is asked.
+
+use std::time::Instant;
+
+use super::{Channel, Effect, Governor};
+use crate::arbiter::{Kind, Record};
+use crate::request::{Leg, RequestId, Side};
+
+impl<P: Clone> Governor<P> {
+    /// A request was opened: ask whom there is.
+    pub(super) fn asked(&mut self, now: Instant, id: RequestId) {
+        self.counts.requests += 1;
+        for side in self.asked_sides() {
+            self.ask(now, id, side);
+        }
+        if !self.link {
+            // The cloud cannot have it, so its time is beyond any T_max already now.
+            self.judge(id, None);
+        }
+        self.decide(now);
+    }
+
+    pub(super) fn asked_sides(&self) -> Vec<Side> {
+        let sides = self.sides();
+        let asked = [(sides.cloud, Side::Cloud), (sides.local, Side::Local)];
+        asked
+            .into_iter()
+            .filter(|(asked, _)| *asked)
+            .map(|(_, side)| side)
+            .collect()
+    }
+
+    pub(super) fn ask(&mut self, now: Instant, id: RequestId, side: Side) {
+        let Some(payload) = self.arbiter.ask(now, id, side) else {
+            return;
+        };
+        let Some(record) = self.arbiter.get(id) else {
+            return;
+        };
+        if let Kind::Input {
+            pair, key: None, ..
+        } = record.kind
+        {
+            let slot = &mut self.pairs[pair].outstanding[side.index()];
+            slot.get_or_insert(id);
+        }
+        let channel = self.channel(&self.arbiter.get(id).expect("it was just there").kind);
+        self.give(side, Some(id), channel, payload);
+    }
+
+    pub(super) fn give(
+        &mut self,
+        side: Side,
+        request: Option<RequestId>,
+        channel: Channel,
+        payload: P,
+    ) {
+        self.effects.push_back(Effect::Give {
+            side,
+            request,
+            channel,
+            payload,
+        });
+    }
+
+    pub(super) fn channel(&self, kind: &Kind) -> Channel {
+        match kind {
+            Kind::Call(name) => Channel::Call(name.clone()),
+            Kind::Input { pair, .. } => Channel::Topic(self.pairs[*pair].input.clone()),
+        }
+    }
+
+    /// Who can answer now is asked for what still waits: calls always, inputs while they are fresh.
+    pub(super) fn give_waiting(&mut self, now: Instant, side: Side) {
+        let wanted = |record: &Record<P>| record.is_open() && (record.is_call() || !record.overdue);
+        for id in self.arbiter.select(wanted) {
+            self.ask(now, id, side);
+        }
+    }
+
+    /// An input that is late already is given to the local original when that has nothing else to do, and is quick
+    /// enough that a fresh one that comes meanwhile is still in time.
+    pub(super) fn give_straggler(&mut self, now: Instant) {
+        if !self.decider.is_fed() {
+            return;
+        }
+        let Some(id) = self.arbiter.straggler() else {
+            return;
+        };
+        let Some(Kind::Input {
+            pair, key: Some(_), ..
+        }) = self.arbiter.get(id).map(|record| &record.kind)
+        else {
+            return;
+        };
+        let t_max = self.sla.times(&self.pairs[*pair].input).t_max;
+        let quick = self.local_time.is_none_or(|time| 2 * time <= t_max);
+        let busy = |record: &Record<P>| {
+            record.local == Leg::Asked
+                && record.local_asked.is_some_and(|asked| now < asked + t_max)
+        };
+        if quick && self.arbiter.select(busy).is_empty() {
+            self.ask(now, id, Side::Local);
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! What a governor wants done.
+
+use std::sync::Arc;
+
+use crate::decider::Event;
+use crate::outcome::Outcome;
+use crate::request::{RequestId, Side};
+
+/// Where a message goes to or came from.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Channel {
+    /// A service or an action, by absolute name.
+    Call(Arc<str>),
+    /// A topic, by absolute name.
+    Topic(Arc<str>),
+}
+
+/// What is to be done, in this order.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Effect<P> {
+    /// Hand this to one side.
+    Give {
+        /// Whom.
+        side: Side,
+        /// The request it belongs to; none for messages that await no answer.
+        request: Option<RequestId>,
+        /// Where it goes.
+        channel: Channel,
+        /// The message.
+        payload: P,
+    },
+    /// Tell the application that there will be no answer.
+    Fail {
+        /// Which.
+        request: RequestId,
+        /// Where it was asked.
+        channel: Channel,
+        /// Why not.
+        reason: String,
+    },
+    /// Publish the SLA's safe-stop message: nobody has answered in time.
+    SafeStop,
+    /// The cloud's time of a request has counted, or more is known of one whose has.
+    Outcome(Outcome),
+    /// A decision about the local original.
+    Event(Event),
+}

@@ -1,0 +1,77 @@
+//! Requests that nobody will answer any more.
+
+use super::{Channel, Effect, Governor};
+use crate::arbiter::{Kind, Record};
+use crate::decider::LocalState;
+use crate::request::{Leg, RequestId};
+use crate::sla::Local;
+
+impl<P: Clone> Governor<P> {
+    /// Fails a call that nobody can answer any more. While the link is down the cloud may come back, and until its
+    /// T_max a call waits for that.
+    pub(super) fn fail_if_hopeless(&mut self, id: RequestId) {
+        let Some(record) = self.arbiter.get(id) else {
+            return;
+        };
+        if !record.is_call() || !record.is_open() {
+            return;
+        }
+        let local = match &record.local {
+            Leg::Asked => return,
+            Leg::NotAsked if self.decider.is_coming() => return,
+            Leg::Failed(reason) => reason.clone(),
+            _ => match (self.sla.local, self.decider.state()) {
+                (Local::None, _) => "no local original is to be used".to_owned(),
+                (_, LocalState::Missing) => "there is no local original".to_owned(),
+                _ => "the local original does not run".to_owned(),
+            },
+        };
+        let cloud = match &record.cloud {
+            Leg::Failed(reason) => reason.clone(),
+            Leg::NotAsked | Leg::Lost if !self.link && record.overdue => {
+                format!(
+                    "the link is down and was not up again within {:?}",
+                    record.deadline - record.asked_at
+                )
+            }
+            _ => return,
+        };
+        let channel = self.channel(&record.kind);
+        self.give_up(id, channel, format!("cloud: {cloud}; local: {local}"));
+    }
+
+    pub(super) fn give_up(&mut self, request: RequestId, channel: Channel, reason: String) {
+        if self.arbiter.fail(request) {
+            self.counts.failed += 1;
+            self.effects.push_back(Effect::Fail {
+                request,
+                channel,
+                reason,
+            });
+        }
+    }
+
+    pub(super) fn forget(&mut self, request: RequestId, record: Record<P>) {
+        let channel = self.channel(&record.kind);
+        if let Kind::Input { pair, key, .. } = &record.kind {
+            let stream = &mut self.pairs[*pair];
+            if let Some(key) = key {
+                stream.keys.remove(key);
+            }
+            for slot in stream.outstanding.iter_mut().chain(&mut stream.owed) {
+                if *slot == Some(request) {
+                    *slot = None;
+                }
+            }
+        }
+        if record.is_open() {
+            self.counts.failed += 1;
+            let reason = "nobody answered while it was remembered".to_owned();
+            self.effects.push_back(Effect::Fail {
+                request,
+                channel,
+                reason,
+            });
+        }
+    }
+}

@@ -1,0 +1,59 @@
+//! The local original: what is decided of it, and what follows when it is gone.
+
+use std::time::Instant;
+
+use super::{EVENTS, Effect, Governor, UNMATCHED};
+use crate::decider::Event;
+use crate::pair::Correlation;
+use crate::request::{Leg, Side};
+
+impl<P: Clone> Governor<P> {
+    pub(super) fn decide(&mut self, now: Instant) {
+        for event in self.decider.decide(&self.satisfaction, self.link) {
+            let (feed, stop) = (
+                matches!(event, Event::Feed(_)),
+                matches!(event, Event::Stop(_)),
+            );
+            self.say(now, event);
+            if feed {
+                self.give_waiting(now, Side::Local);
+            }
+            if stop {
+                self.local_lost(now);
+            }
+        }
+        self.give_straggler(now);
+        for index in 0..self.pairs.len() {
+            let stream = &mut self.pairs[index];
+            if stream.by == Correlation::Stamp && stream.unmatched.is_some_and(|n| n >= UNMATCHED) {
+                stream.by = Correlation::Arrival;
+                let input = stream.pair.input.clone();
+                self.say(now, Event::Uncorrelated(input));
+            }
+        }
+    }
+
+    pub(super) fn say(&mut self, now: Instant, event: Event) {
+        if self.events.len() == EVENTS {
+            self.events.pop_front();
+        }
+        self.events.push_back((now, event.clone()));
+        self.effects.push_back(Effect::Event(event));
+    }
+
+    /// The local original is gone with what it was asked; the cloud is asked where it was not.
+    pub(super) fn local_lost(&mut self, now: Instant) {
+        let reason = Leg::Failed("the local original ended".into());
+        let lost = self.arbiter.turn(Side::Local, &Leg::Asked, &reason);
+        for stream in &mut self.pairs {
+            stream.outstanding[Side::Local.index()] = None;
+            stream.owed[Side::Local.index()] = None;
+        }
+        for id in lost {
+            if self.link {
+                self.ask(now, id, Side::Cloud);
+            }
+            self.fail_if_hopeless(id);
+        }
+    }
+}
