@@ -98,6 +98,8 @@ fn main() -> ExitCode {
             a_slow_network_costs_few_requests,
             a_lost_link_hands_over_and_back,
             frames_that_stay_away_stop_the_robot_and_wake_its_original,
+            outputs_that_become_too_old_wake_the_original,
+            a_first_sign_has_the_original_ready_before_it_is_needed,
             explain_says_why,
         ],
         stories![grants:
@@ -131,12 +133,15 @@ fn main() -> ExitCode {
         stories![launched:
             roslaunch_cannot_tell_the_stub_from_the_original,
             rosrun_gives_the_node_the_name_that_the_original_has,
+            a_launch_file_says_what_is_promised,
         ],
         stories![crossing:
             stamps_mean_the_same_where_clocks_differ,
             simulated_time_is_the_robot_s,
             transforms_of_all_publishers_arrive,
             an_action_is_carried_out_in_the_cloud,
+            an_action_is_carried_out_by_the_original_while_the_cloud_is_slow,
+            explain_names_a_clock_and_a_queue,
             settings_are_changed_through_dynamic_reconfigure,
             pictures_are_made_smaller_where_the_link_is_slow,
         ],

@@ -346,6 +346,151 @@ pub fn an_action_is_carried_out_in_the_cloud() -> Told {
     Ok(())
 }
 
+/// A network over which nothing comes in time.
+const LATE: Badness = Badness {
+    rate: 100_000,
+    delay: 15_000,
+    loss: 0.0,
+    limit: 10_000,
+};
+
+pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Told {
+    let daemon = world().with(CROSSING)?;
+    let types = types()?;
+    let action = types.action("actionlib/Test")?;
+    let cable = Cable::new(&daemon.address)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let node = ("crossing_py", "crossing.py");
+    let program = "/opt/cloudroid/install/lib/crossing_py/crossing.py";
+    let workspace = site.installs_original(&daemon, "crossing_py", node, program)?;
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"crossing_py\"\nrobot = \"crossing-late-action\"\nlocal = \"cold\"\n\
+         desire = 5.0\nmax = 5.0\nthreshold = 4.0\ninitial = 15.0\n",
+        cable.server
+    );
+    let workspace = workspace.to_string_lossy();
+    let environment = [("CMAKE_PREFIX_PATH", &*workspace), ("NO_COLOR", "1")];
+    let stub = site.stub_among(&environment, &toml, node.0, node.1, &["__name:=crossing"])?;
+    with_log(is_there(&site, &app), &stub)?;
+    let goals = "/crossing/act/goal";
+    let goals = advertises(&site, &app, goals, &action.action_goal, false)?;
+    site.connected(&*goals, 1)?;
+    let mut results = listens(&site, &app, "/crossing/act/result")?;
+    let mut feedback = listens(&site, &app, "/crossing/act/feedback")?;
+    let mut status = listens(&site, &app, "/crossing/act/status")?;
+    with_log(site.next(&mut status), &stub)?;
+    let now = link::clock::now();
+    let asks = |id: &str, steps: u32| {
+        let goal = Written::default().word(0).time(now).text("").time(now);
+        goals.publish(goal.text(id).word(steps).0.into());
+    };
+    let is_of = |message: &Message, id: &str| {
+        let told = Written::default().time(now).text(id).0;
+        message.bytes.windows(told.len()).any(|part| part == told)
+    };
+    let mut all: Vec<Message> = Vec::new();
+    let mut hears = |id: &str| -> Told {
+        while !all.iter().any(|result| is_of(result, id)) {
+            let result = with_log(site.next(&mut results), &stub)?;
+            all.push(result);
+        }
+        Ok(())
+    };
+    asks("quick", 2);
+    hears("quick")?;
+    cable.degrade(LATE)?;
+    // Two that are late, and it is started; it carries them out as well.
+    asks("late-1", 1);
+    asks("late-2", 1);
+    stub.says("the local original answers, too")?;
+    hears("late-1")?;
+    hears("late-2")?;
+    // Whoever is first with a goal's feedback goes on with it.
+    asks("steps", 3);
+    hears("steps")?;
+    let mut steps = Vec::new();
+    while steps.len() < 3 {
+        let step = with_log(site.next(&mut feedback), &stub)?;
+        if is_of(&step, "steps") {
+            steps.push(i32::from_le_bytes(
+                *step.bytes.last_chunk().context("a number")?,
+            ));
+        }
+    }
+    ensure!(steps == [0, 1, 2], "{steps:?}");
+    ensure!(!stub.said().contains("is stopped"), "{}", stub.said());
+    cable.restore()?;
+    let deadline = Instant::now() + PATIENCE;
+    let mut asked = 0;
+    while !stub.said().contains("the local original is stopped") {
+        ensure!(Instant::now() < deadline, "{}", stub.said());
+        asked += 1;
+        let id = format!("good-{asked}.");
+        asks(&id, 0);
+        hears(&id)?;
+    }
+    // What the cloud still owed has come before this.
+    asks("last", 1);
+    hears("last")?;
+    let mut ids: Vec<String> = ["quick", "late-1", "late-2", "steps", "last"]
+        .map(str::to_owned)
+        .into();
+    ids.extend((1..=asked).map(|number| format!("good-{number}.")));
+    for id in ids {
+        let times = all.iter().filter(|result| is_of(result, &id)).count();
+        ensure!(times == 1, "{id}: {times} results\n{}", stub.said());
+    }
+    Ok(())
+}
+
+pub fn explain_names_a_clock_and_a_queue() -> Told {
+    let daemon = world().with(CROSSING)?;
+    let types = types()?;
+    let stamped = types.message("geometry_msgs/PointStamped")?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let robot = "crossing-explained";
+    let settings = "desire = 20.0\nmax = 20.0\nrequest = \"/crossing/work -> /crossing/worked\"";
+    let stub = crossing(&site, &daemon.address, robot, HOUR, settings)?;
+    with_log(is_there(&site, &app), &stub)?;
+    let points = advertises(&site, &app, "/crossing/work", &stamped, false)?;
+    site.connected(&*points, 1)?;
+    let mut worked = site.hears(&app, "/crossing/worked")?;
+    let now = link::clock::now() + HOUR * 1_000_000_000;
+    let say = || points.publish(point(now).into());
+    with_log(answers(&site, say, &mut worked), &stub)?;
+    // Each takes the node 50 ms, and they come all at once.
+    let bursts = 2;
+    for burst in 0..bursts {
+        let sent: Vec<i64> = (1..=8).map(|number| now + burst * 100 + number).collect();
+        for at in &sent {
+            points.publish(point(*at).into());
+        }
+        let last = point(*sent.last().context("some")?);
+        while with_log(site.next(&mut worked), &stub)?.bytes[4..] != last[4..] {}
+    }
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let explained = daemon.deployer().asks(&["explain", robot])?;
+        let causes = explained["causes"].to_string();
+        let named = |words: &str| causes.contains(words);
+        if named("requests queue before /crossing: ") && named("the robot's clock is 3600") {
+            ensure!(named("ms ahead of the server's"), "{causes}");
+            let phases = &explained["servants"][0]["links"][0]["phases"];
+            let median = |name: &str| -> Option<f64> {
+                let all = phases.as_array()?.iter();
+                let mut parts = all.filter(|part| part["name"] == name);
+                parts.next()?["p50"].as_f64()
+            };
+            let (queue, compute) = (median("queue"), median("compute"));
+            ensure!(queue > compute && compute > Some(0.0), "{phases:#}");
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "{explained:#}\n{}", stub.said());
+    }
+}
+
 pub fn settings_are_changed_through_dynamic_reconfigure() -> Told {
     let daemon = world().with(PEOPLE)?;
     let site = Site::new()?;

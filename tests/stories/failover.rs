@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
-use bytes::{BufMut, Bytes, BytesMut};
-use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
-use ros::ros1::Ros1Bus;
+use bytes::Bytes;
+use ros::bus::Subscription;
 use support::Told;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
+use support::people::{self, Camera, picture};
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
 use support::world::{PEOPLE, world};
@@ -24,15 +24,11 @@ const SLOW: Badness = Badness {
     limit: 10_000,
 };
 const SILENT: Badness = Badness { loss: 1.0, ..SLOW };
-const ARGUMENTS: [&str; 2] = ["__name:=people_detect", "_debug_view:=false"];
-const PROGRAM: &str = "/usr/lib/opencv_apps/people_detect";
 
 /// A camera and a listener before a people_detect that runs in the cloud, behind a cable.
 struct Scene {
     // In the order in which they end.
-    found: Subscription,
-    image: Box<dyn Publisher>,
-    app: Arc<Ros1Bus>,
+    camera: Camera,
     stub: Running,
     site: Site,
     cable: Cable,
@@ -46,35 +42,24 @@ impl Scene {
     /// With these lines in `stub.toml`.
     fn new(robot: &str, more: &str) -> anyhow::Result<Self> {
         let daemon = world().with(PEOPLE)?;
+        Self::before(daemon, robot, |site, daemon, cable| {
+            people::stub(site, daemon, cable, (PEOPLE.name, robot), more, &[])
+        })
+    }
+
+    /// With a stub that is started so.
+    fn before(
+        daemon: Arc<Daemon>,
+        robot: &str,
+        start: impl FnOnce(&Site, &Daemon, &Cable) -> anyhow::Result<Running>,
+    ) -> anyhow::Result<Self> {
         let cable = Cable::new(&daemon.address)?;
         let site = Site::new()?;
-        let people = ("opencv_apps", "people_detect");
-        let workspace = site.installs_original(&daemon, PEOPLE.name, people, PROGRAM)?;
-        let toml = format!(
-            "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{robot}\"\nthreshold = 4.0\ninitial = 15.0\n{more}",
-            cable.server, PEOPLE.name
-        );
-        let workspace = workspace.to_string_lossy().into_owned();
-        let environment = [("CMAKE_PREFIX_PATH", workspace.as_str()), ("NO_COLOR", "1")];
-        let stub = site.stub_among(&environment, &toml, people.0, people.1, &ARGUMENTS)?;
-        let app = site.node("/camera")?;
-        let found = site.hears(&app, "/people_detect/found")?;
-        let image = AdvertiseOptions {
-            wire_type: WireType {
-                name: "sensor_msgs/Image".into(),
-                md5: "060021388200f6f0f447d0fcd9c64743".into(),
-                definition: IMAGE.into(),
-            },
-            latch: false,
-            queue: 10,
-        };
-        let image = site.runtime.block_on(app.advertise("/image", image))?;
-        site.connected(&*image, 1)
-            .with_context(|| format!("the stub said:\n{}", stub.said()))?;
+        let stub = start(&site, &daemon, &cable)?;
+        let camera = Camera::new(&site, 10);
+        let camera = camera.with_context(|| format!("the stub said:\n{}", stub.said()))?;
         Ok(Self {
-            found,
-            image,
-            app,
+            camera,
             stub,
             site,
             cable,
@@ -88,14 +73,14 @@ impl Scene {
     /// Shows a picture; its number.
     fn asks(&mut self) -> u32 {
         self.sent += 1;
-        self.image.publish(picture(self.sent));
+        self.camera.image.publish(black(self.sent));
         self.sent
     }
 
     /// Waits until this picture is answered; others are noted.
     fn hears(&mut self, number: u32) -> Told {
         while !self.answers.contains_key(&number) {
-            let message = self.site.next(&mut self.found);
+            let message = self.site.next(&mut self.camera.found);
             let message = message.with_context(|| {
                 let said = self.stub.said();
                 format!(
@@ -103,9 +88,8 @@ impl Scene {
                     self.sent, self.answers
                 )
             })?;
-            let stamp = message.bytes.get(4..8).context("a stamp")?;
-            let stamp = u32::from_le_bytes(stamp.try_into()?);
-            *self.answers.entry(stamp).or_default() += 1;
+            let answered = people::number(&message).context("a stamp")?;
+            *self.answers.entry(answered).or_default() += 1;
         }
         Ok(())
     }
@@ -157,6 +141,27 @@ impl Scene {
         }
     }
 
+    /// Waits until the last events of this robot about its local original are of these kinds.
+    fn happened(&self, kinds: &[&str]) -> Told {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let events = self.daemon.deployer().asks(&["events", "-n", "500"])?;
+            let mine = events.as_array().context("a list")?.iter();
+            let mine = mine.filter(|event| event["robot"] == *self.robot);
+            let told: Vec<&str> = mine
+                .filter_map(|event| event["kind"].as_str())
+                .filter(|kind| kind.starts_with("local-") || kind.starts_with("cloud-"))
+                .collect();
+            if told.ends_with(kinds) {
+                return Ok(());
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "events should end with {kinds:?}: {told:?}"
+            );
+        }
+    }
+
     /// Waits until the robot's diagnostics say this.
     fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Told {
         let deadline = Instant::now() + PATIENCE;
@@ -170,6 +175,22 @@ impl Scene {
             if String::from_utf8_lossy(&message.bytes).contains(words) {
                 return Ok(());
             }
+        }
+    }
+
+    /// Waits until `explain` has this of the link.
+    fn explains_link(&self, key: &str, value: f64) -> Told {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let explained = self.explained()?;
+            let link = &explained["servants"][0]["links"][0];
+            if link[key] == value {
+                return Ok(());
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "{key} should be {value}: {explained:#}"
+            );
         }
     }
 
@@ -211,6 +232,9 @@ pub fn a_slow_network_costs_few_requests() -> Told {
             scene.stub.said()
         );
     }
+    scene.explains("requests of /people_detect passed T_max (5000 ms); most of the time")?;
+    scene.explains("look at the robot's network")?;
+    scene.happened(&["local-answers-too", "cloud-answers-alone"])?;
     // The cloud alone: what it still owed has come before this.
     let last = scene.asks();
     scene.hears(last)?;
@@ -225,8 +249,15 @@ pub fn a_slow_network_costs_few_requests() -> Told {
 }
 
 pub fn a_lost_link_hands_over_and_back() -> Told {
-    let more = format!("local = \"warm\"\nstateful = true\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
-    let mut scene = Scene::new("failover-lost", &more)?;
+    let (daemon, robot) = (world().shared()?, "failover-lost");
+    let service = "people_stateful";
+    let push = ["push", "--stateful", "--name", service];
+    let push = [&push, PEOPLE.arguments].concat();
+    daemon.deployer().types(&push)?.succeeded()?;
+    let more = format!("local = \"warm\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
+    let mut scene = Scene::before(daemon, robot, |site, daemon, cable| {
+        people::installed_stub(site, daemon, cable, (service, robot), &more)
+    })?;
     let watcher = scene.site.node("/watcher")?;
     let mut diagnostics = scene.site.hears(&watcher, "/diagnostics")?;
     let number = scene.asks();
@@ -249,6 +280,19 @@ pub fn a_lost_link_hands_over_and_back() -> Told {
         let number = scene.asks();
         scene.hears(number)?;
         scene.diagnosed(&mut diagnostics, "the cloud answers")?;
+    }
+    scene.happened(&[
+        "local-takes-over",
+        "local-hands-back",
+        "local-takes-over",
+        "local-hands-back",
+    ])?;
+    let listed = scene.daemon.deployer().types(&["events"])?.succeeded()?;
+    for words in [
+        "robot failover-lost: /people_detect: the local original takes over: the link is down, ",
+        "robot failover-lost: /people_detect: the local original hands back: the link is up again",
+    ] {
+        ensure!(listed.stdout.contains(words), "{words}: {}", listed.stdout);
     }
     ensure!(
         scene.answers.values().all(|times| *times == 1),
@@ -285,6 +329,55 @@ pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Told {
     scene.asks_until("the local original is stopped", 1)
 }
 
+pub fn outputs_that_become_too_old_wake_the_original() -> Told {
+    let more = format!("local = \"cold\"\nage = {T_MAX:?}");
+    let mut scene = Scene::new("failover-age", &more)?;
+    scene.explains_link("age", T_MAX * 1e3)?;
+    // Stamps are when a picture was taken: those of our pictures are of 1970, and any answer to them is too old.
+    let number = scene.asks();
+    scene.hears(number)?;
+    scene.says("the local original answers, too", 1)?;
+    // Fresh ones are young enough, as long as they come.
+    scene.sent = now()?;
+    scene.asks_until("the local original is stopped", 1)?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    // Then none comes.
+    scene.cable.degrade(SILENT)?;
+    scene.says("the local original answers, too", 2)
+}
+
+pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Told {
+    let more = format!("local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
+    let mut scene = Scene::new("failover-sign", &more)?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    let started = "the local original is started why=FirstSign";
+    ensure!(scene.count("is started") == 0, "{}", scene.stub.said());
+    // One late request: it is started, and asked nothing.
+    scene.cable.degrade(SLOW)?;
+    let late = scene.asks();
+    scene.says(started, 1)?;
+    scene.cable.restore()?;
+    scene.hears(late)?;
+    ensure!(scene.count("answers, too") == 0, "{}", scene.stub.said());
+    // All is well for long: it is not needed.
+    scene.asks_until("the local original is stopped", 1)?;
+    ensure!(scene.count("answers, too") == 0, "{}", scene.stub.said());
+    // Two late requests: it was started by the first, and answers after the second.
+    scene.cable.degrade(SLOW)?;
+    scene.asks();
+    scene.says(started, 2)?;
+    scene.asks();
+    scene.says("the local original answers, too", 1)?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    let said = scene.stub.said();
+    let place = |words: &str| said.rfind(words);
+    ensure!(place(started) < place("answers, too"), "{said}");
+    Ok(())
+}
+
 pub fn explain_says_why() -> Told {
     let more = format!("local = \"none\"\ndesire = 0.001\nmax = {T_MAX:?}");
     let mut scene = Scene::new("failover-why", &more)?;
@@ -308,6 +401,18 @@ pub fn explain_says_why() -> Told {
             scene.stub.said()
         );
     }
+    let (_, metrics) = scene.daemon.request("GET", "/metrics", &[])?;
+    for family in [
+        "cloudroid_request_seconds",
+        "cloudroid_request_phase_seconds",
+    ] {
+        let counted = metrics.lines().any(|line| {
+            let count = line.rsplit(' ').next().and_then(|count| count.parse().ok());
+            let of = format!("{family}_count{{service=\"{}\"", PEOPLE.name);
+            line.starts_with(&of) && count >= Some(3)
+        });
+        ensure!(counted, "{family}: {metrics}");
+    }
     // A topic that is named otherwise than it is published.
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
@@ -317,43 +422,42 @@ pub fn explain_says_why() -> Told {
     let _astray = scene
         .site
         .stub_with(&toml, "opencv_apps", "people_detect", &argv)?;
-    let _listener = scene.site.hears(&scene.app, "/astray/found")?;
+    let _listener = scene.site.hears(&scene.camera.node, "/astray/found")?;
     scene.explains("/nowhere, which nobody on the robot publishes")?;
     // Less of a core than it needs.
     let servant = scene.daemon.servant_of(PEOPLE.name, &scene.robot)?;
     let id = servant["id"].as_str().context("an id")?;
     let less = ["set", id, "--cpus", "0.05"];
     scene.daemon.deployer().types(&less)?.succeeded()?;
-    for _ in 0..50 {
+    // Each takes it half a tenth of a second of a whole core.
+    let deadline = Instant::now() + PATIENCE;
+    while !scene.explained()?["causes"]
+        .to_string()
+        .contains("held back by its CPU limit")
+    {
+        scene.sent += 1;
+        let large = [0; 640 * 480 * 3];
+        scene
+            .camera
+            .image
+            .publish(picture(scene.sent, (640, 480), &large));
+        ensure!(Instant::now() < deadline, "{:#}", scene.explained()?);
+    }
+    // More at once than the link takes: all but the newest give way.
+    for _ in 0..10 {
         scene.asks();
     }
-    scene.explains("held back by its CPU limit")
+    scene.explains(" inputs of /people_detect were not sent in the last minute")
 }
 
-/// A `sensor_msgs/Image` of 160x120, black.
-fn picture(number: u32) -> Bytes {
+/// Seconds since 1970.
+fn now() -> anyhow::Result<u32> {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?;
+    Ok(u32::try_from(since.as_secs())?)
+}
+
+/// A small picture.
+fn black(number: u32) -> Bytes {
     const SIZE: (u32, u32) = (160, 120);
-    let pixels = vec![0; (SIZE.0 * SIZE.1 * 3) as usize];
-    let mut out = BytesMut::with_capacity(pixels.len() + 64);
-    let text = |out: &mut BytesMut, text: &str| {
-        out.put_u32_le(text.len() as u32);
-        out.put_slice(text.as_bytes());
-    };
-    for word in [number, number, 0] {
-        out.put_u32_le(word);
-    }
-    text(&mut out, "camera");
-    out.put_u32_le(SIZE.1);
-    out.put_u32_le(SIZE.0);
-    text(&mut out, "bgr8");
-    out.put_u8(0);
-    out.put_u32_le(SIZE.0 * 3);
-    out.put_u32_le(pixels.len() as u32);
-    out.put_slice(&pixels);
-    out.freeze()
+    picture(number, SIZE, &[0; (SIZE.0 * SIZE.1 * 3) as usize])
 }
-
-const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
-    uint32 step\nuint8[] data\n\
-    ================================================================================\n\
-    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";

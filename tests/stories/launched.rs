@@ -1,6 +1,6 @@
 //! A robot launches as ever: the real roslaunch, with the original and with its stub.
 
-use anyhow::ensure;
+use anyhow::{Context, ensure};
 use support::Told;
 use support::machine::{Machine, free_port};
 use support::world::{TELLER, world};
@@ -142,5 +142,119 @@ find /opt/cloudroid -name teller.py -perm /111
         "{}",
         outcome.said()
     );
+    Ok(())
+}
+
+/// What a robot is promised, where it is written as ever: in a launch file, for a node and for a namespace.
+const PROMISES: &str = r#"
+cat > /root/promises.launch << 'END'
+<launch>
+  <group ns="front">
+    <rosparam>
+      cloudroid: { max: 2, threshold: 3 }
+    </rosparam>
+    <node pkg="teller_py" type="teller.py" name="teller">
+      <param name="cloudroid/desire" value="0.25"/>
+    </node>
+    <node pkg="teller_py" type="teller.py" name="other">
+      <param name="cloudroid/desire" value="0.5"/>
+      <param name="cloudroid/max" value="1.5"/>
+    </node>
+  </group>
+  <node pkg="teller_py" type="teller.py" name="frames">
+    <param name="cloudroid/frames_per_second" value="4.0"/>
+  </node>
+</launch>
+END
+cat > /root/explained.py << 'END'
+import json, sys, time, urllib.error, urllib.request
+for attempt in range(600):
+    try:
+        with urllib.request.urlopen(sys.argv[1]) as answer:
+            explained = json.load(answer)
+        links = [link for served in explained["servants"] for link in served["links"]]
+        if len(links) == 3:
+            print(json.dumps(links))
+            sys.exit()
+    except urllib.error.HTTPError as error:
+        explained = error.read()
+    time.sleep(0.1)
+sys.exit("three nodes should be linked: %s" % explained)
+END
+roslaunch -p PORT /root/promises.launch > /root/log 2>&1 & launched=$!
+python3 /root/explained.py http://SERVER/api/v1/robots/launched-promises/explain || { cat /root/log; exit 1; }
+kill -INT $launched; wait $launched
+"#;
+
+/// Values that cannot be: each ends its own node.
+const NONSENSE: &str = r#"
+cat > /root/nonsense.launch << 'END'
+<launch>
+  <group ns="front">
+    <rosparam ns="cloudroid">max: 1</rosparam>
+    <node pkg="teller_py" type="teller.py" name="more" output="screen"><param name="cloudroid/desire" value="2"/></node>
+    <node pkg="teller_py" type="teller.py" name="less" output="screen"><param name="cloudroid/desire" value="-0.5"/></node>
+    <node pkg="teller_py" type="teller.py" name="text" output="screen"><param name="cloudroid/desire" value="soon"/></node>
+    <node pkg="teller_py" type="teller.py" name="half" output="screen"/>
+    <node pkg="teller_py" type="teller.py" name="typo" output="screen"><param name="cloudroid/desired" value="1"/></node>
+  </group>
+</launch>
+END
+roslaunch -p PORT /root/nonsense.launch > /root/log 2>&1 & launched=$!
+for attempt in $(seq 300); do
+  [ "$(grep -c 'has died' /root/log)" = 5 ] && break
+  sleep 0.1
+done
+kill -INT $launched; wait $launched
+cat /root/log
+"#;
+
+pub fn a_launch_file_says_what_is_promised() -> Told {
+    let daemon = world().with(TELLER)?;
+    let machine = Machine::with_stub(&daemon, "teller_py")?;
+    let installs = "sh teller_py-stub/install.sh --robot launched-promises";
+    machine.runs("sh", installs)?.succeeded()?;
+    let port = free_port()?;
+    let promises = PROMISES
+        .replace("PORT", &port.to_string())
+        .replace("SERVER", &daemon.address);
+    let setup = prelude(port, ". /opt/cloudroid/setup.sh");
+    let outcome = machine.runs("bash", &format!("{setup}{promises}"))?;
+    let links = outcome.stdout.lines().find(|line| line.starts_with('['));
+    let links: serde_json::Value =
+        serde_json::from_str(links.with_context(|| outcome.said())?).context(outcome.said())?;
+    for (node, key, value) in [
+        ("/front/teller", "desire", 250.0),
+        ("/front/teller", "max", 2000.0),
+        ("/front/teller", "threshold", 3.0),
+        ("/front/other", "desire", 500.0),
+        ("/front/other", "max", 1500.0),
+        ("/front/other", "threshold", 3.0),
+        ("/frames", "frames_per_second", 4.0),
+    ] {
+        let all = links.as_array().context("a list")?;
+        let link = all.iter().find(|link| link["node"] == node);
+        let told = link.context(node)?[key].as_f64();
+        ensure!(told == Some(value), "{key} of {node}: {links:#}");
+    }
+    let nonsense = NONSENSE.replace("PORT", &free_port()?.to_string());
+    let setup = prelude(free_port()?, ". /opt/cloudroid/setup.sh");
+    let outcome = machine.runs("bash", &format!("{setup}{nonsense}"))?;
+    for words in [
+        "parameter /front/more/cloudroid/desire: desire (2 s) is greater than max (1 s); lower it, or raise max",
+        "parameter /front/less/cloudroid/desire: desire is -0.5; it should be a number greater than 0",
+        "parameter /front/text/cloudroid/desire is \"soon\": invalid type",
+        "rosparam delete /front/text/cloudroid/desire",
+        "parameter /front/cloudroid/max: max is given without desire; set desire, too, or remove max",
+        "parameter /front/typo/cloudroid/desired is 1: unknown field",
+    ] {
+        ensure!(
+            outcome.stdout.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    let died = outcome.stdout.matches("exit code 1").count();
+    ensure!(died == 5, "{died} died: {}", outcome.said());
     Ok(())
 }

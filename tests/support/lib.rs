@@ -11,6 +11,7 @@ pub mod deployer;
 pub mod grants;
 pub mod leftovers;
 pub mod machine;
+pub mod people;
 pub mod procfs;
 pub mod robot;
 pub mod shaper;

@@ -266,8 +266,20 @@ impl Site {
         executable: &str,
         argv: &[&str],
     ) -> anyhow::Result<Running> {
+        self.runs_among(&[], overlay, package, executable, argv)
+    }
+
+    /// The same, with these variables in its environment.
+    pub fn runs_among(
+        &self,
+        environment: &[(&str, &str)],
+        overlay: &Path,
+        package: &str,
+        executable: &str,
+        argv: &[&str],
+    ) -> anyhow::Result<Running> {
         let mut command = Command::new(overlay.join("lib").join(package).join(executable));
-        command.args(argv);
+        command.args(argv).envs(environment.iter().copied());
         let log = tempfile::Builder::new().tempfile_in(self.place.path())?;
         self.start(command, &log.into_temp_path().keep()?)
     }

@@ -4,11 +4,11 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bytes::{BufMut, Bytes, BytesMut};
 use nix::sys::signal::Signal;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::bus::{Publisher, Subscription};
 use support::cable::Cable;
 use support::daemon::Daemon;
+use support::people::{self, Camera, picture};
 use support::site::{Running, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
@@ -21,8 +21,6 @@ const STRAGGLERS: Duration = Duration::from_secs(10);
 const SIZE: (u32, u32) = (640, 480);
 /// Stamps of measured requests begin after this one.
 const FIRST: u32 = 1000;
-const PROGRAM: &str = "/usr/lib/opencv_apps/people_detect";
-const ARGUMENTS: [&str; 2] = ["__name:=people_detect", "_debug_view:=false"];
 
 /// What to do.
 pub struct Plan<'a> {
@@ -127,45 +125,28 @@ pub fn run(daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Outcome> {
 fn start(site: &Site, daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Running> {
     let service = "opencv_apps";
     if plan.local == "alone" {
-        return site.original(daemon, service, PROGRAM, &ARGUMENTS);
+        return people::original(site, daemon, service);
     }
-    let people = ("opencv_apps", "people_detect");
-    let workspace = site.installs_original(daemon, service, people, PROGRAM)?;
-    let toml = format!(
-        "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"failover-{}\"\nlocal = \"{}\"\n\
-         desire = {:?}\nmax = {:?}\nthreshold = 4.0\ninitial = 15.0\n",
-        cable.server, plan.local, plan.local, plan.times.0, plan.times.1
+    let settings = format!(
+        "local = \"{}\"\ndesire = {:?}\nmax = {:?}",
+        plan.local, plan.times.0, plan.times.1
     );
-    let workspace = workspace.to_string_lossy();
-    let environment = [
-        ("CMAKE_PREFIX_PATH", &*workspace),
-        ("CLOUDROID_LOG", "info,requests=debug"),
-        ("NO_COLOR", "1"),
-    ];
-    site.stub_among(&environment, &toml, people.0, people.1, &ARGUMENTS)
+    let robot = format!("failover-{}", plan.local);
+    let environment = [("CLOUDROID_LOG", "info,requests=debug")];
+    let who = (service, robot.as_str());
+    people::stub(site, daemon, cable, who, &settings, &environment)
 }
 
 fn ask(site: &Site, cable: &Cable, plan: &Plan) -> Result<Outcome> {
-    let bus = site.node("/camera")?;
-    let mut found = site.hears(&bus, "/people_detect/found")?;
-    let image = AdvertiseOptions {
-        wire_type: WireType {
-            name: "sensor_msgs/Image".into(),
-            md5: "060021388200f6f0f447d0fcd9c64743".into(),
-            definition: IMAGE.into(),
-        },
-        latch: false,
-        queue: 1,
-    };
-    let image = site.runtime.block_on(bus.advertise("/image", image))?;
-    site.connected(&*image, 1)?;
+    let mut camera = Camera::new(site, 1)?;
+    let (image, found) = (&*camera.image, &mut camera.found);
     let pictures = std::fs::read(plan.pictures)?;
     let pictures: Vec<&[u8]> = pictures
         .chunks_exact((SIZE.0 * SIZE.1 * 3) as usize)
         .collect();
     site.runtime.block_on(async {
-        warm_up(&*image, &mut found, pictures[0], plan.times.1).await?;
-        measure(&*image, &mut found, cable, plan, &pictures).await
+        warm_up(image, found, pictures[0], plan.times.1).await?;
+        measure(image, found, cable, plan, &pictures).await
     })
 }
 
@@ -180,7 +161,7 @@ async fn measure(
     let mut sent = vec![Instant::now(); REQUESTS];
     let begun = At::now();
     for index in 0..REQUESTS {
-        let message = message(FIRST + index as u32, pictures[index % pictures.len()]);
+        let message = picture(FIRST + index as u32, SIZE, pictures[index % pictures.len()]);
         let due = begun + Duration::from_secs_f64(index as f64 / plan.rate);
         collect(found, &mut answers, &sent, due).await;
         let number = index + 1;
@@ -208,7 +189,7 @@ async fn measure(
 async fn warm_up(
     image: &dyn Publisher,
     found: &mut Subscription,
-    picture: &[u8],
+    pixels: &[u8],
     max: f64,
 ) -> Result<()> {
     let begun = Instant::now();
@@ -219,7 +200,7 @@ async fn warm_up(
             begun.elapsed() < PATIENCE,
             "the first pictures are not answered in time"
         );
-        image.publish(message(number, picture));
+        image.publish(picture(number, SIZE, pixels));
         let asked = Instant::now();
         let waiting = timeout(Duration::from_secs(2), found.messages.recv()).await;
         let in_time = waiting.is_ok() && asked.elapsed().as_secs_f64() <= max;
@@ -240,13 +221,7 @@ async fn collect(found: &mut Subscription, answers: &mut [Answer], sent: &[Insta
             Some(message) = found.messages.recv() => message,
             () = sleep_until(until) => return,
         };
-        let word = message
-            .bytes
-            .get(4..8)
-            .and_then(|word| word.try_into().ok());
-        let index = word
-            .map(u32::from_le_bytes)
-            .and_then(|secs| secs.checked_sub(FIRST));
+        let index = people::number(&message).and_then(|secs| secs.checked_sub(FIRST));
         let Some(index) = index
             .map(|index| index as usize)
             .filter(|index| *index < answers.len())
@@ -284,29 +259,3 @@ fn read(log: &str, outcome: &mut Outcome) {
         answer.q = answer.q.or(q);
     }
 }
-
-/// A `sensor_msgs/Image`.
-fn message(secs: u32, picture: &[u8]) -> Bytes {
-    let mut out = BytesMut::with_capacity(picture.len() + 64);
-    let text = |out: &mut BytesMut, text: &str| {
-        out.put_u32_le(text.len() as u32);
-        out.put_slice(text.as_bytes());
-    };
-    out.put_u32_le(secs);
-    out.put_u32_le(secs);
-    out.put_u32_le(0);
-    text(&mut out, "camera");
-    out.put_u32_le(SIZE.1);
-    out.put_u32_le(SIZE.0);
-    text(&mut out, "bgr8");
-    out.put_u8(0);
-    out.put_u32_le(SIZE.0 * 3);
-    out.put_u32_le(picture.len() as u32);
-    out.put_slice(picture);
-    out.freeze()
-}
-
-const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
-    uint32 step\nuint8[] data\n\
-    ================================================================================\n\
-    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";

@@ -73,6 +73,15 @@ pub struct Link {
     pub desire: Option<f64>,
     /// T_max.
     pub max: Option<f64>,
+    /// Q_t, where the robot says it.
+    #[serde(default)]
+    pub threshold: Option<f64>,
+    /// The least rate of an output, where that is promised instead: frames per second.
+    #[serde(default)]
+    pub frames_per_second: Option<f64>,
+    /// The greatest age of an output, where that is promised instead.
+    #[serde(default)]
+    pub age: Option<f64>,
     /// Q after the last request.
     pub satisfaction: Option<f64>,
     /// So many requests are known.
@@ -83,6 +92,18 @@ pub struct Link {
     pub local: usize,
     /// Where their time went.
     pub phases: Vec<Part>,
+    /// Where most of the time of the late ones went; none when none was answered.
+    #[serde(default)]
+    pub late_in: Option<Part>,
+    /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
+    #[serde(default)]
+    pub unsent: u64,
+    /// Of so many of the last inputs that the node was given and that have a stamp …
+    #[serde(default)]
+    pub given: usize,
+    /// … it has left out so many, since newer ones had come.
+    #[serde(default)]
+    pub left_out: usize,
     /// Inputs that the node listens to and nobody on the robot publishes.
     pub unfed: Vec<String>,
 }
@@ -101,11 +122,21 @@ pub struct Part {
 }
 
 impl Link {
+    /// A part by name.
+    pub fn part(&self, name: &str) -> Option<&Part> {
+        self.phases.iter().find(|part| part.name == name)
+    }
+
     /// The part with the greatest median.
     pub fn dominant(&self) -> Option<&Part> {
-        self.phases
-            .iter()
-            .filter(|part| part.name != "total" && part.p50 > 0.0)
-            .max_by(|a, b| a.p50.total_cmp(&b.p50))
+        dominant(&self.phases)
     }
+}
+
+/// The part with the greatest median, the whole not counted.
+pub fn dominant(parts: &[Part]) -> Option<&Part> {
+    parts
+        .iter()
+        .filter(|part| part.name != "total" && part.p50 > 0.0)
+        .max_by(|a, b| a.p50.total_cmp(&b.p50))
 }

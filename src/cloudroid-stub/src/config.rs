@@ -16,7 +16,8 @@
 //! output = "/people"   # which output those two are about; the one that answers the node's requests where absent
 //! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
 //!
-//! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed, "none"
+//! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed,
+//!                      # "first-sign" started by the first late request and fed when needed, "none"
 //! stateful = false     # the local original takes over only while the link is down
 //! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time, or
 //! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
@@ -26,18 +27,21 @@
 //! codec = "auto"       # "none", "auto" (lossless), or "video" (lossy pictures allowed)
 //! ```
 //!
-//! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by the node's
-//! private parameter `~cloudroid/KEY`.
+//! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by a ROS
+//! parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
+
+mod parameters;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
-use ros::bus::ParamValue;
+use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::address::Address;
+
+pub use parameters::{Group, groups};
 
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
@@ -152,15 +156,6 @@ impl Config {
             .with_context(|| format!("cannot read the token in {}", path.display()))?;
         Ok(Some(text.trim().to_owned()))
     }
-
-    /// With some keys given otherwise by ROS parameters.
-    pub fn with_parameters(&self, given: &BTreeMap<String, ParamValue>) -> anyhow::Result<Config> {
-        let mut table = Table::try_from(self)?;
-        for (key, value) in given {
-            table.insert(key.clone(), Value::try_from(value)?);
-        }
-        with(table, std::iter::empty())
-    }
 }
 
 /// A path with `~` for the user's own directory.
@@ -184,13 +179,15 @@ pub enum SafeStop {
 
 /// When the local original runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum Local {
     /// Started when it is needed.
     #[default]
     Cold,
     /// Started at once, given requests when it is needed.
     Warm,
+    /// Started by the first late request, given requests when it is needed.
+    FirstSign,
     /// Never.
     None,
 }
@@ -282,24 +279,59 @@ fn with(
         config.server.pop();
     }
     Address::parse(&config.server).map_err(anyhow::Error::msg)?;
-    for (key, value) in [
-        ("desire", config.desire),
-        ("max", config.max),
-        ("age", config.age),
-        ("frames_per_second", config.frames_per_second),
-        ("threshold", config.threshold),
-        ("initial", config.initial),
-    ] {
-        if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
-            bail!("{key} is {value}; it should be a number greater than 0 and less than {MOST}");
-        }
-    }
-    if let (Some(desire), Some(max)) = (config.desire, config.max) {
-        if desire > max {
-            bail!("desire ({desire} s) is greater than max ({max} s)");
-        }
-    }
+    config.check()?;
     Ok(config)
+}
+
+/// A key whose value cannot be.
+#[derive(Debug, thiserror::Error)]
+#[error("{key} {reason}")]
+struct Wrong {
+    key: &'static str,
+    /// Why not, and what to do.
+    reason: String,
+}
+
+impl Config {
+    /// What no type can say.
+    fn check(&self) -> Result<(), Wrong> {
+        let wrong = |key, reason| Err(Wrong { key, reason });
+        for (key, value) in [
+            ("desire", self.desire),
+            ("max", self.max),
+            ("age", self.age),
+            ("frames_per_second", self.frames_per_second),
+            ("threshold", self.threshold),
+            ("initial", self.initial),
+        ] {
+            if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
+                let reason = format!(
+                    "is {value}; it should be a number greater than 0 and less than {MOST}"
+                );
+                return wrong(key, reason);
+            }
+        }
+        match (self.desire, self.max) {
+            (Some(desire), Some(max)) if desire > max => wrong(
+                "desire",
+                format!("({desire} s) is greater than max ({max} s); lower it, or raise max"),
+            ),
+            _ => Ok(()),
+        }
+    }
+
+    /// What must hold once all that say something have been heard.
+    fn check_whole(&self) -> Result<(), Wrong> {
+        let without = |key, other| {
+            let reason = format!("is given without {other}; set {other}, too, or remove {key}");
+            Err(Wrong { key, reason })
+        };
+        match (self.desire, self.max) {
+            (Some(_), None) => without("desire", "max"),
+            (None, Some(_)) => without("max", "desire"),
+            _ => Ok(()),
+        }
+    }
 }
 
 /// A value as TOML would read it, or else as text.
@@ -334,6 +366,8 @@ mod tests {
         assert_eq!(config.server, "ws://cloud:9090");
         assert_eq!((config.desire, config.max), (Some(0.1), Some(1.0)));
         assert_eq!((config.local, config.codec), (Local::Cold, Codec::Auto));
+        let local = toml::from_str::<Config>(&format!("{FILE}local = 'first-sign'"));
+        assert_eq!(local.unwrap().local, Local::FirstSign);
     }
 
     #[test]

@@ -18,7 +18,7 @@ use link::session::{receive_open, send_open};
 use link::{Lost, Session, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
-use ros::bus::Bus;
+use ros::bus::{Bus, BusError, ParamValue};
 use ros::net::Sockets;
 use ros::ros1::{Ros1Bus, Ros1Options};
 use tokio::signal::unix::{SignalKind, signal as signals};
@@ -26,7 +26,7 @@ use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use ws::WebSocket;
 
-use crate::config::{self, Config, Local};
+use crate::config::{self, Config, Group, Local};
 use crate::connect;
 use crate::local::{Program, Setting};
 use crate::mirror::diagnostics::Diagnostics;
@@ -192,14 +192,22 @@ async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<Ros1Bus>> {
     }
 }
 
-/// The configuration with the node's private parameters `~cloudroid/…` over it.
+/// The configuration with what parameters of the node's namespaces say instead.
 async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::Result<Config> {
-    match bus.get_param(&format!("{node}/cloudroid")).await {
-        Ok(ros::bus::ParamValue::Map(given)) => config
-            .with_parameters(&given)
-            .with_context(|| format!("parameters below {node}/cloudroid")),
-        _ => Ok(config),
+    let mut given = Vec::new();
+    for name in config::groups(node) {
+        match bus.get_param(&name).await {
+            Ok(ParamValue::Map(settings)) => given.push(Group { name, settings }),
+            Ok(_) => bail!(
+                "parameter {name} is a single value, and stands where this node's settings are looked for; remove it with: rosparam delete {name}"
+            ),
+            Err(BusError::NoParam(_)) => {}
+            Err(error) => bail!(
+                "parameter {name} cannot be read ({error}); set it otherwise, or remove it with: rosparam delete {name}"
+            ),
+        }
     }
+    config.with_parameters(&given)
 }
 
 /// How the original would have been started without this stub.
@@ -241,6 +249,7 @@ fn sla(config: &Config) -> Sla {
         max: config.max,
         frames_per_second: config.frames_per_second,
         age: config.age,
+        threshold: config.threshold,
     }
 }
 

@@ -68,16 +68,32 @@ fn servant(served: &Served) -> anyhow::Result<()> {
     served.links.iter().try_for_each(link)
 }
 
+/// What the robot was promised.
+fn promise(link: &Link) -> String {
+    let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
+    let threshold = link
+        .threshold
+        .map_or_else(String::new, |threshold| format!(", Q_t {threshold:.1}"));
+    match (link.frames_per_second, link.age) {
+        (Some(rate), _) => format!("at least {rate} frames a second{threshold}"),
+        (None, Some(_)) => format!("at most {} old{threshold}", millis(link.age)),
+        (None, None) => format!(
+            "T_desire {}, T_max {}{threshold}",
+            millis(link.desire),
+            millis(link.max)
+        ),
+    }
+}
+
 fn link(link: &Link) -> anyhow::Result<()> {
     let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
     output::line(&format!(
-        "  {}: link {}, round trip {}, clock {}, T_desire {}, T_max {}, Q {}; of {} requests {} late, {} answered locally",
+        "  {}: link {}, round trip {}, clock {}, {}, Q {}; of {} requests {} late, {} answered locally",
         link.node,
         if link.up { "up" } else { "DOWN" },
         millis(link.round_trip),
         millis(link.clock),
-        millis(link.desire),
-        millis(link.max),
+        promise(link),
         link.satisfaction
             .map_or("-".to_owned(), |q| format!("{q:.1}")),
         link.requests,

@@ -37,6 +37,7 @@ use crate::definitions::Definitions;
 use crate::errors::Error;
 use crate::journal::Journal;
 use crate::names;
+use crate::request_times::RequestTimes;
 use crate::state::{self, NewEvent, RevisionRecord, ServantRecord, State};
 
 pub use handle::{Asked, Handle, Lease};
@@ -61,6 +62,7 @@ pub(crate) struct Inner {
     pub(crate) engine: Arc<dyn Engine>,
     pub(crate) admission: Admission,
     pub(crate) definitions: Definitions,
+    pub(crate) request_times: Arc<RequestTimes>,
     servants: Mutex<Servants>,
     spares: Spares,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
@@ -94,6 +96,7 @@ impl Choreographer {
             engine,
             admission,
             definitions: Definitions::default(),
+            request_times: Arc::default(),
             servants: Mutex::default(),
             spares: Spares::default(),
             incomplete: Mutex::default(),
@@ -367,6 +370,11 @@ impl Choreographer {
     /// Ends all spares and makes no more.
     pub async fn end_spares(&self) {
         spares::end_all(&self.inner).await;
+    }
+
+    /// How long requests of robots take.
+    pub fn request_times(&self) -> &RequestTimes {
+        &self.inner.request_times
     }
 
     /// Spare containers that there are.

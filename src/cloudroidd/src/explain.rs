@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
+use api::explain::{Cause, Explanation, Link, Part, Served, Weight, dominant};
 use api::{Event, Phase};
 use link::cloud::LinkStatus;
 use link::control::Request;
@@ -23,6 +23,10 @@ const THROTTLED: f64 = 0.05;
 const WAITS: f64 = 10.0;
 const CLOCK_APART: f64 = 100.0;
 const LATE: f64 = 0.05;
+const QUEUED: f64 = 0.25;
+/// Milliseconds: less is no queue.
+const QUEUE: f64 = 5.0;
+const LEFT_OUT: f64 = 0.1;
 
 /// Explains one robot.
 pub async fn robot(app: &App, name: &str) -> Result<Explanation, Error> {
@@ -86,18 +90,7 @@ fn link(status: LinkStatus) -> Link {
         (answered, _) => answered.is_none(),
     };
     let requests = &status.requests;
-    let times = |of: fn(&Request) -> f64| {
-        let answered = requests.iter().filter(|request| request.total.is_some());
-        answered.map(of).collect::<Vec<_>>()
-    };
-    let phases = [
-        part("serialise", times(|request| request.serialise)),
-        part("up", times(|request| request.up)),
-        part("queue", times(|request| request.queue)),
-        part("compute", times(|request| request.compute)),
-        part("down", times(|request| request.down)),
-        part("total", times(|request| request.total.unwrap_or(f64::NAN))),
-    ];
+    let late: Vec<&Request> = requests.iter().filter(is_late).collect();
     Link {
         up: status.up,
         round_trip: status.round_trip,
@@ -106,14 +99,39 @@ fn link(status: LinkStatus) -> Link {
         dropped: status.dropped,
         desire: status.sla.desire.map(millis),
         max,
+        threshold: status.sla.threshold,
+        frames_per_second: status.sla.frames_per_second,
+        age: status.sla.age.map(millis),
         satisfaction: requests.last().map(|request| request.satisfaction),
         requests: requests.len(),
-        late: requests.iter().filter(is_late).count(),
+        late: late.len(),
         local: requests.iter().filter(|request| request.local).count(),
-        phases: phases.into_iter().flatten().collect(),
+        phases: parts(requests),
+        late_in: dominant(&parts(late)).cloned(),
+        unsent: status.unsent,
+        given: status.given,
+        left_out: status.left_out,
         unfed: status.unfed,
         node: status.node,
     }
+}
+
+/// Where the time of those went that were answered.
+fn parts<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Vec<Part> {
+    let answered: Vec<&Request> = requests
+        .into_iter()
+        .filter(|request| request.total.is_some())
+        .collect();
+    let times = |of: fn(&Request) -> f64| answered.iter().map(|request| of(request)).collect();
+    let parts = [
+        part("serialise", times(|request| request.serialise)),
+        part("up", times(|request| request.up)),
+        part("queue", times(|request| request.queue)),
+        part("compute", times(|request| request.compute)),
+        part("down", times(|request| request.down)),
+        part("total", times(|request| request.total.unwrap_or(f64::NAN))),
+    ];
+    parts.into_iter().flatten().collect()
 }
 
 /// What follows from all that, the weightiest first.
@@ -245,6 +263,7 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             "sudo apt install chrony, on both sides".to_owned(),
         );
     }
+    of_queue(served, link, say);
     if link.requests == 0 {
         return;
     }
@@ -278,12 +297,54 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
     }
 }
 
+/// Inputs come faster than the node takes them.
+fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+    let node = &link.node;
+    let next = || {
+        format!(
+            "lower the rate of its inputs, or give it more cores: cloudroidctl set {} --cpus N",
+            served.servant.id
+        )
+    };
+    let median = |name: &str| link.part(name).map_or(0.0, |part| part.p50);
+    let (queue, compute, total) = (median("queue"), median("compute"), median("total"));
+    if queue > QUEUE && queue > QUEUED * total {
+        say(
+            Weight::Slows,
+            format!(
+                "requests queue before {node}: {queue:.0} ms of {total:.0} ms, while it needs {compute:.0} ms for one"
+            ),
+            next(),
+        );
+    }
+    if link.unsent > 0 {
+        say(
+            Weight::Slows,
+            format!(
+                "{} inputs of {node} were not sent in the last minute: the link was busy until newer ones came",
+                link.unsent
+            ),
+            "lower their rate, or look at the robot's network; codec = \"video\" in stub.toml sends less".to_owned(),
+        );
+    }
+    if link.left_out as f64 > LEFT_OUT * link.given as f64 {
+        say(
+            Weight::Slows,
+            format!(
+                "{node} has left out {} of its last {} inputs: newer ones came before it was done",
+                link.left_out, link.given
+            ),
+            next(),
+        );
+    }
+}
+
 /// Where the time goes, and what helps there.
 fn blame(served: &Served, link: &Link) -> (String, String) {
-    let Some(part) = link.dominant() else {
+    let Some(part) = &link.late_in else {
         return (
-            String::new(),
-            "no request was answered: see the robot's log".into(),
+            "; of these none was answered".to_owned(),
+            "see the robot's log, and what else is named here".to_owned(),
         );
     };
     let text = format!(
@@ -380,7 +441,16 @@ mod tests {
 
     #[test]
     fn late_requests_are_blamed_on_the_part_that_takes_longest() {
-        let causes = texts(served(Link { late: 20, ..link() }));
+        let late_in = part("compute", vec![90.0]);
+        let late = Link { late: 20, ..link() };
+        let unanswered = texts(served(late.clone()));
+        assert!(
+            unanswered[0]
+                .1
+                .contains("; of these none was answered; see"),
+            "{unanswered:?}"
+        );
+        let causes = texts(served(Link { late_in, ..late }));
         assert_eq!(causes.len(), 1);
         assert!(
             causes[0].1.starts_with(
@@ -396,6 +466,14 @@ mod tests {
             up: false,
             clock: Some(-2000.0),
             unfed: vec!["/image".into()],
+            unsent: 12,
+            given: 128,
+            left_out: 40,
+            phases: vec![
+                part("queue", vec![60.0; 3]).expect("times"),
+                part("compute", vec![30.0; 3]).expect("times"),
+                part("total", vec![100.0; 3]).expect("times"),
+            ],
             local: 7,
             satisfaction: Some(2.5),
             ..link()
@@ -420,6 +498,9 @@ mod tests {
             "1 processes of s1 were killed",
             "3 messages of s1 were dropped",
             "2000 ms behind the server's",
+            "requests queue before /detect: 60 ms of 100 ms, while it needs 30 ms for one; lower the rate of its inputs, or give it more cores: cloudroidctl set s1 --cpus N",
+            "12 inputs of /detect were not sent in the last minute",
+            "/detect has left out 40 of its last 128 inputs",
             "answered 7 of the last 100 requests of /detect, Q is 2.5",
         ];
         for words in words {
@@ -472,9 +553,15 @@ mod tests {
             },
             requests: vec![
                 request(Some(50.0), false),
-                request(Some(150.0), true),
+                Request {
+                    up: 90.0,
+                    ..request(Some(150.0), true)
+                },
                 request(None, true),
             ],
+            unsent: 0,
+            given: 3,
+            left_out: 1,
             unfed: vec![],
         });
         assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
@@ -484,10 +571,10 @@ mod tests {
             (total.name.as_str(), total.p50, total.max),
             ("total", 50.0, 150.0)
         );
-        assert_eq!(
-            seen.dominant().map(|part| part.name.as_str()),
-            Some("compute")
-        );
+        let name = |part: Option<&Part>| part.map(|part| part.name.clone());
+        assert_eq!(name(seen.dominant()).as_deref(), Some("compute"));
+        let late_in = name(seen.late_in.as_ref());
+        assert_eq!(late_in.as_deref(), Some("up"), "of those that were late");
     }
 
     #[test]

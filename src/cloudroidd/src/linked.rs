@@ -3,11 +3,13 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, Weak};
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use link::cloud::Nodes;
-use link::control::{Exit, Node, Sla};
+use link::control::{Decision, Exit, Node, Request, Sla};
+use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use servant::engine::{NodeExit, Servant};
 use servant::spec::NodeSpec;
@@ -15,12 +17,28 @@ use tokio::sync::mpsc;
 
 use crate::choreographer::{Handle, Inner, how_it_ended};
 use crate::definitions;
+use crate::journal::Journal;
+use crate::request_times::RequestTimes;
 use crate::state::{RevisionRecord, State};
 
 /// How deep executables may lie below `share/PKG`.
 const DEPTH: usize = 4;
 /// Lines that wait for a slow link; more are lost, and stand in the servant's log.
 const LINES: usize = 256;
+/// So many decisions of a robot become events within this time; more are left out, for a robot can tell any number.
+const DECISIONS: (u32, Duration) = (60, Duration::from_secs(60));
+/// Characters of what a robot says in an event.
+const WORDS: usize = 400;
+
+/// Kinds of a robot's decisions that are known.
+const KINDS: [&str; 6] = [
+    "local-takes-over",
+    "local-hands-back",
+    "local-answers-too",
+    "cloud-answers-alone",
+    "local-missing",
+    "local-crashed",
+];
 
 /// Whether a servant that an earlier daemon started runs for stubs: it never knew the revision's own nodes.
 pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> bool {
@@ -37,6 +55,10 @@ pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> boo
 pub struct LinkedNodes {
     revision: RevisionRecord,
     state: Arc<State>,
+    journal: Journal,
+    request_times: Arc<RequestTimes>,
+    /// Decisions since then.
+    decisions: Mutex<(Instant, u32)>,
     /// A container is made before anybody asks for it.
     handle: OnceLock<Weak<Handle>>,
     container: Arc<dyn Servant>,
@@ -57,6 +79,9 @@ impl LinkedNodes {
         LinkedNodes {
             revision: revision.clone(),
             state: Arc::clone(&inner.state),
+            journal: inner.journal.clone(),
+            request_times: Arc::clone(&inner.request_times),
+            decisions: Mutex::new((Instant::now(), 0)),
             handle: OnceLock::new(),
             container: Arc::clone(container),
             layers: layers.ok().and_then(Result::ok).unwrap_or_default(),
@@ -292,6 +317,40 @@ impl Nodes for LinkedNodes {
             Some(share) => text.replace(&node.share, &share.to_string_lossy()),
             None => text.to_owned(),
         }
+    }
+
+    fn decided(&self, node: &str, decision: &Decision) {
+        let Ok(handle) = self.handle() else { return };
+        let count = {
+            let mut decisions = self.decisions.lock();
+            if decisions.0.elapsed() > DECISIONS.1 {
+                *decisions = (Instant::now(), 0);
+            }
+            decisions.1 = decisions.1.saturating_add(1);
+            decisions.1
+        };
+        if count > DECISIONS.0 {
+            tracing::debug!(servant = handle.id, ?decision, "one of too many decisions");
+            return;
+        }
+        let known = KINDS.iter().find(|kind| **kind == decision.kind);
+        let kind = known.copied().unwrap_or("local-other");
+        let text: String = decision.text.chars().take(WORDS).collect();
+        let ago = match decision.ago {
+            ago if (2.0..1e9).contains(&ago) => format!(", {ago:.0} s ago"),
+            _ => String::new(),
+        };
+        let message = format!("robot {}: {node}: {text}{ago}", handle.robot);
+        let about = handle.about();
+        if decision.warning {
+            self.journal.warning(kind, &message, &about);
+        } else {
+            self.journal.info(kind, &message, &about);
+        }
+    }
+
+    fn measured(&self, request: &Request) {
+        self.request_times.note(&self.revision.service, request);
     }
 
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {

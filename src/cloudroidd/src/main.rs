@@ -24,6 +24,7 @@ mod linked;
 mod names;
 mod portal;
 mod push;
+mod request_times;
 mod revisions;
 mod shim;
 mod sockets;

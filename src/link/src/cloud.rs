@@ -11,12 +11,14 @@
 //! A link outlives its connections for a grace time. Of an input that several nodes of the servant listen to, one
 //! link is the feeder; what nodes of one servant publish for each other stays inside.
 
+mod given;
 mod inputs;
 mod lent;
 mod mirror;
 mod node_link;
 mod outputs;
 mod parameters;
+mod unsent;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -32,7 +34,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use crate::control::{Control, Exit, Hello, Node, Request, Sla, Welcome};
+use crate::control::{Control, Decision, Exit, Hello, Node, Request, Sla, Welcome};
 use crate::packing::decoded_here;
 use crate::session::{Lost, SessionOptions, receive_open, send_open};
 use crate::skew::Skew;
@@ -68,6 +70,10 @@ pub trait Nodes: Send + Sync + 'static {
     fn translate(&self, node: &Node, text: &str) -> String;
     /// What the node prints from now on: on standard error or not, and the line.
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)>;
+    /// Its robot has decided something about the local original.
+    fn decided(&self, _node: &str, _decision: &Decision) {}
+    /// The cloud's time of a request, and its parts, have become known: once for each request.
+    fn measured(&self, _request: &Request) {}
 }
 
 /// Habits of a hub.
@@ -130,6 +136,12 @@ pub struct LinkStatus {
     pub sla: Sla,
     /// Its last requests, as it told them, oldest first.
     pub requests: Vec<Request>,
+    /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
+    pub unsent: u64,
+    /// Of so many of the last inputs that the node was given and that have a stamp …
+    pub given: usize,
+    /// … it answered so many later ones first: it has left them out.
+    pub left_out: usize,
     /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
     pub unfed: Vec<String>,
 }

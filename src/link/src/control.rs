@@ -83,6 +83,8 @@ pub struct Sla {
     pub frames_per_second: Option<f64>,
     /// Greatest age of an output.
     pub age: Option<f64>,
+    /// Q_t, which has no unit.
+    pub threshold: Option<f64>,
 }
 
 /// The cloud's first frame on every connection.
@@ -194,6 +196,29 @@ pub enum Control {
         /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
         of: Option<Served>,
     },
+    /// Robot: messages of this session that it has not sent, so far.
+    Unsent {
+        /// A newer one took their place.
+        replaced: u64,
+        /// They were too old.
+        stale: u64,
+    },
+    /// Robot: what was decided about the local original, for the cloud's events, oldest first.
+    Decided(Vec<Decision>),
+}
+
+/// A decision about the local original.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Decision {
+    /// What kind of event it is, such as `local-takes-over`.
+    pub kind: String,
+    /// It needs attention.
+    pub warning: bool,
+    /// In words.
+    pub text: String,
+    /// So many seconds before it was told: while the link is down it waits.
+    pub ago: f64,
 }
 
 /// How the node ended.
@@ -300,7 +325,7 @@ pub struct Request {
     pub serialise: f64,
     /// On the way up.
     pub up: f64,
-    /// Waiting in the cloud.
+    /// Waiting: on both sides, and for the node to be done with what came before.
     pub queue: f64,
     /// In the node.
     pub compute: f64,

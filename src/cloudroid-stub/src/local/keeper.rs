@@ -198,7 +198,8 @@ impl Keeper {
 
     fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
         let verdict = self.with(|state, now| {
-            let age = state.stamps.of(message).map(age).unwrap_or_default();
+            let stamp = state.stamps.of(message).filter(|stamp| !stamp.is_zero());
+            let age = stamp.map(age).unwrap_or_default();
             let key = state.stamps.key(message);
             let verdict = state.governor.output(now, side, topic, key, age);
             if let Some(phases) = phases {

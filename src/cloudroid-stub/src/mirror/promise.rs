@@ -8,7 +8,7 @@ use bytes::Bytes;
 use link::Session;
 use link::control::Graph;
 use parking_lot::Mutex;
-use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, Topic};
+use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, Topic, Warm};
 use ros::bus::{Bus, Message, WireType};
 use serde_json::json;
 
@@ -67,6 +67,10 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
     let local = match config.local {
         config::Local::Cold => Local::Cold,
         config::Local::Warm => Local::Warm,
+        config::Local::FirstSign => {
+            sla.insert("warm".into(), json!(Warm::FirstSign));
+            Local::Warm
+        }
         config::Local::None => Local::None,
     };
     sla.insert("mode".into(), json!(mode));
@@ -304,6 +308,10 @@ impl Application for Way {
     }
 
     fn decided(&self, event: &Event) {
+        let mirror = self.0.upgrade();
+        if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
+            promise.reports.decided(event);
+        }
         match event {
             Event::Start(why) => tracing::info!(?why, "the local original is started"),
             Event::Feed(why) => tracing::warn!(?why, "the local original answers, too"),
@@ -334,7 +342,10 @@ mod tests {
 
     #[test]
     fn a_promise_is_about_times_or_frames_or_age() {
-        assert_eq!(promised("desire = 0.1").unwrap(), None);
+        assert_eq!(promised("local = 'warm'").unwrap(), None);
+        let sign = promised("desire = 0.1\nmax = 0.3\nlocal = 'first-sign'").unwrap();
+        let sign = sign.map(|sla| (sla.local, sla.warm));
+        assert_eq!(sign, Some((Local::Warm, Warm::FirstSign)));
         let times = promised("desire = 0.1\nmax = 0.3\nstateful = true")
             .unwrap()
             .unwrap();

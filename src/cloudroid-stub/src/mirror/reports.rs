@@ -1,13 +1,14 @@
 //! How requests went, for whoever wants to know: each in the log (`CLOUDROID_LOG=info,requests=debug`), once a second to the
 //! cloud (`cloudroidctl explain`) and on the robot's `/diagnostics`.
 
-use std::sync::Weak;
-use std::time::Duration;
+use std::collections::VecDeque;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
 
-use link::control::{Control, Request};
+use link::control::{Control, Decision, Request};
 use link::record::Data;
 use parking_lot::Mutex;
-use qos::{Channel, Outcome, Phases, Side};
+use qos::{Channel, Event, Outcome, Phases, Side, Why};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::Mirror;
@@ -17,11 +18,14 @@ use super::diagnostics::Diagnostics;
 const PERIOD: Duration = Duration::from_secs(1);
 /// Requests that wait for the next report, at most: while the link is down nobody takes them.
 const WAITING: usize = 512;
+/// And decisions.
+const DECISIONS: usize = 32;
 
 /// Requests that were not reported yet.
 #[derive(Default)]
 pub struct Reports {
     waiting: Mutex<Vec<Request>>,
+    decisions: Mutex<VecDeque<(Instant, Decision)>>,
 }
 
 impl Reports {
@@ -61,10 +65,79 @@ impl Reports {
     }
 }
 
+impl Reports {
+    /// Something was decided about the local original.
+    pub fn decided(&self, event: &Event) {
+        let Some(decision) = decision(event) else {
+            return;
+        };
+        let mut decisions = self.decisions.lock();
+        if decisions.len() == DECISIONS {
+            decisions.pop_front();
+        }
+        decisions.push_back((Instant::now(), decision));
+    }
+
+    /// What was decided and not told yet.
+    fn take_decisions(&self) -> Vec<Decision> {
+        let decisions = std::mem::take(&mut *self.decisions.lock());
+        let told = |(at, decision): (Instant, Decision)| Decision {
+            ago: at.elapsed().as_secs_f64(),
+            ..decision
+        };
+        decisions.into_iter().map(told).collect()
+    }
+}
+
+/// What the cloud is to know of; that a process starts or ends is the robot's own affair.
+fn decision(event: &Event) -> Option<Decision> {
+    let (kind, warning, text) = match event {
+        Event::Feed(Why::LinkDown) => (
+            "local-takes-over",
+            true,
+            "the local original takes over: the link is down".to_owned(),
+        ),
+        Event::StopFeeding(Why::LinkUp) => (
+            "local-hands-back",
+            false,
+            "the local original hands back: the link is up again".to_owned(),
+        ),
+        Event::Feed(Why::Satisfaction { q }) => (
+            "local-answers-too",
+            true,
+            format!("the local original answers, too: Q has fallen to {q:.1}"),
+        ),
+        Event::StopFeeding(Why::Satisfaction { q }) => (
+            "cloud-answers-alone",
+            false,
+            format!("the cloud answers alone again: Q has risen to {q:.1}"),
+        ),
+        Event::SaidOnceMissing => (
+            "local-missing",
+            true,
+            "there is no local original: the cloud is alone".to_owned(),
+        ),
+        Event::Crashed(reason) => (
+            "local-crashed",
+            true,
+            format!("the local original ended: {reason}"),
+        ),
+        _ => return None,
+    };
+    Some(Decision {
+        kind: kind.to_owned(),
+        warning,
+        text,
+        ago: 0.0,
+    })
+}
+
 /// Reports until the node ends.
 pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
     let mut due = interval(PERIOD);
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    // Of which session, and how many messages it had not sent.
+    let mut told = (Weak::new(), link::Dropped::default());
     loop {
         due.tick().await;
         let Some(mirror) = mirror.upgrade() else {
@@ -78,6 +151,21 @@ pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             let requests = std::mem::take(&mut *promise.reports.waiting.lock());
             if !requests.is_empty() {
                 session.tell(&Control::Requests(requests));
+            }
+            let (of, dropped) = (Arc::downgrade(&session), session.dropped());
+            if !Weak::ptr_eq(&told.0, &of) {
+                told = (of, link::Dropped::default());
+            }
+            if told.1 != dropped {
+                told.1 = dropped;
+                session.tell(&Control::Unsent {
+                    replaced: dropped.replaced,
+                    stale: dropped.stale,
+                });
+            }
+            let decisions = promise.reports.take_decisions();
+            if !decisions.is_empty() {
+                session.tell(&Control::Decided(decisions));
             }
         }
         diagnostics.publish(&promise.keeper().report());
@@ -122,6 +210,23 @@ mod tests {
     use link::record::Answered;
 
     const MS: i64 = 1_000_000;
+
+    #[test]
+    fn decisions_wait_until_they_are_told_and_the_oldest_give_way() {
+        let reports = Reports::default();
+        reports.decided(&Event::Start(Why::LinkDown));
+        assert_eq!(reports.take_decisions(), [], "a process is no decision");
+        for number in 0..DECISIONS {
+            reports.decided(&Event::Crashed(format!("signal {number}")));
+        }
+        reports.decided(&Event::Feed(Why::LinkDown));
+        let told = reports.take_decisions();
+        assert_eq!(told.len(), DECISIONS);
+        assert!(told[0].text.ends_with("signal 1"), "{told:?}");
+        assert_eq!(told[DECISIONS - 1].kind, "local-takes-over");
+        assert!(told[DECISIONS - 1].warning && told[DECISIONS - 1].ago >= 0.0);
+        assert_eq!(reports.take_decisions(), []);
+    }
 
     #[test]
     fn the_parts_of_a_request_are_its_whole_by_either_clock() {

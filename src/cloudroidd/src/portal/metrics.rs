@@ -26,12 +26,12 @@ const PHASES: [Phase; 6] = [
 /// Answers with all figures.
 pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
     let mut out = String::new();
-    let services = app.state.service_names()?.len();
+    let services = app.state.service_names()?;
     gauge(
         &mut out,
         "cloudroid_services",
         "Published services.",
-        [(String::new(), services as f64)],
+        [(String::new(), services.len() as f64)],
     );
     servants(&mut out, &app.choreographer);
     let (pushes, failed) = app.pusher.counts();
@@ -46,6 +46,10 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
         ],
     );
     room(&mut out, &app.choreographer);
+    let exists = |name: &str| services.iter().any(|service| service == name);
+    app.choreographer
+        .request_times()
+        .prometheus(&mut out, exists);
     usage(&mut out, &app.choreographer.servants()).await;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], out).into_response())
 }

@@ -12,6 +12,7 @@ use tokio::task::AbortHandle;
 use super::inputs::Inputs;
 use super::lent::Lent;
 use super::outputs::Outputs;
+use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
 use crate::clock::Sample;
 use crate::control::{Control, Hello, Request, Sla};
@@ -43,6 +44,7 @@ pub(super) struct NodeLink {
     pub(super) listening: Mutex<BTreeSet<String>>,
     sla: Sla,
     requests: Mutex<VecDeque<Request>>,
+    unsent: Unsent,
     orders: mpsc::UnboundedSender<Control>,
     tasks: Mutex<Vec<AbortHandle>>,
 }
@@ -79,6 +81,7 @@ impl NodeLink {
             listening: Mutex::default(),
             sla: hello.sla.clone(),
             requests: Mutex::default(),
+            unsent: Unsent::default(),
             orders,
             tasks: Mutex::default(),
         });
@@ -125,6 +128,7 @@ impl NodeLink {
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
         let dropped = self.session.dropped();
+        let (given, left_out) = self.outputs.left_out();
         LinkStatus {
             node: self.node.clone(),
             up: *self.session.up().borrow(),
@@ -137,6 +141,9 @@ impl NodeLink {
             dropped: dropped.replaced + dropped.stale,
             sla: self.sla.clone(),
             requests: self.requests.lock().iter().cloned().collect(),
+            unsent: self.unsent.lately(),
+            given,
+            left_out,
             unfed: self.unfed(),
         }
     }
@@ -222,8 +229,9 @@ impl NodeLink {
                 let Some(hub) = self.hub.upgrade() else {
                     return;
                 };
-                if let Some(given) = self.inputs.take(&hub.skew, data, arrived) {
-                    self.outputs.note(given);
+                let channel = data.channel;
+                if let Some((mark, answered)) = self.inputs.take(&hub.skew, data, arrived) {
+                    self.outputs.note(channel, mark, answered);
                 }
             }
             Record::Call {
@@ -271,13 +279,26 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
                 let mut kept = link.requests.lock();
                 for request in requests {
                     // What was late is told again when its answer has come after all.
-                    match kept.iter_mut().find(|known| known.id == request.id) {
+                    let known = kept.iter_mut().find(|known| known.id == request.id);
+                    let before = known.as_ref().and_then(|known| known.total);
+                    if before.is_none() && request.total.is_some() {
+                        hub.nodes.measured(&request);
+                    }
+                    match known {
                         Some(known) => *known = request,
                         None => kept.push_back(request),
                     }
                 }
                 let surplus = kept.len().saturating_sub(REQUESTS);
                 kept.drain(..surplus);
+            }
+            Control::Unsent { replaced, stale } => {
+                link.unsent.note(replaced.saturating_add(stale));
+            }
+            Control::Decided(decisions) => {
+                for decision in &decisions {
+                    hub.nodes.decided(&link.node, decision);
+                }
             }
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
         }

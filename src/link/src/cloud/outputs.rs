@@ -1,7 +1,7 @@
 //! Topics that the node publishes: subscribed to in the servant only while the robot has listeners, so a node that
 //! works only for listeners does so here, too.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -10,6 +10,7 @@ use ros::bus::SubscribeOptions;
 use tokio::task::AbortHandle;
 
 use super::Hub;
+use super::given::Given;
 use super::inputs::{Mark, mark};
 use super::node_link::NodeLink;
 use crate::Quality;
@@ -20,14 +21,12 @@ use crate::stamps::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;
-/// Inputs remembered, to say which one an output may answer.
-const RECENT: usize = 16;
 
 /// Outputs by channel.
 #[derive(Default)]
 pub(super) struct Outputs {
     channels: Mutex<HashMap<u32, Channel>>,
-    recent: Mutex<VecDeque<(Mark, Answered)>>,
+    given: Mutex<Given>,
 }
 
 struct Channel {
@@ -64,12 +63,13 @@ impl Outputs {
     }
 
     /// An input was given to the node.
-    pub(super) fn note(&self, given: (Mark, Answered)) {
-        let mut recent = self.recent.lock();
-        if recent.len() == RECENT {
-            recent.pop_front();
-        }
-        recent.push_back(given);
+    pub(super) fn note(&self, channel: u32, mark: Mark, answered: Answered) {
+        self.given.lock().note(channel, mark, answered);
+    }
+
+    /// Of how many of the last inputs something is known, and how many of them the node has left out.
+    pub(super) fn left_out(&self) -> (usize, usize) {
+        self.given.lock().left_out()
     }
 
     /// So many listen on the robot now.
@@ -126,29 +126,19 @@ impl Outputs {
             reading.abort();
         }
     }
-
-    /// The input that a message may answer: the one of the same stamp, else the newest.
-    fn answered(&self, message: &[u8]) -> Option<Answered> {
-        let recent = self.recent.lock();
-        let mark = mark(message);
-        let same = recent
-            .iter()
-            .rev()
-            .find(|(given, _)| mark.is_some() && *given == mark);
-        same.or(recent.back()).map(|(_, answered)| *answered)
-    }
 }
 
 impl NodeLink {
     fn send(&self, channel: u32, message: Bytes, latching: bool) {
+        let born = now();
         let data = Data {
             channel,
             encoded: false,
             latching,
-            born: now(),
+            born,
             left: 0,
             serialise: 0,
-            answered: self.outputs.answered(&message),
+            answered: self.outputs.given.lock().answered_by(mark(&message), born),
             message,
         };
         let quality = if latching {

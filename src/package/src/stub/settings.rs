@@ -22,7 +22,7 @@ pub(super) fn stub(about: &About<'_>) -> String {
     let known = toml::to_string(&known).expect("texts and a word are TOML");
     format!(
         "# How this robot uses the service {}. Each key can also be given by the environment (CLOUDROID_MAX=0.3) or by\n\
-         # a private parameter of the node (~cloudroid/max). `rosrun {} cloudroid-stub doctor` checks it.\n\
+         # a parameter of the node or of a namespace around it (~cloudroid/max). `rosrun {} cloudroid-stub doctor` checks it.\n\
          {known}{SETTINGS}",
         about.service, about.package
     )
@@ -34,7 +34,7 @@ const SETTINGS: &str = r#"
 # token_file = "/path"     # holds the token, where the server asks for one
 # desire = 0.1             # T_desire: the response time that is wished for, seconds
 # max = 0.3                # T_max: the longest that is acceptable, seconds
-# local = "cold"           # the local original: "cold", "warm" or "none"
+# local = "cold"           # the local original: "cold", "first-sign", "warm" or "none"
 # nodes = { "talk.py" = "talker" }   # what an executable's node is called by default, where that is not its own name
 "#;
 

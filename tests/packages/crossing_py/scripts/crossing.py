@@ -1,5 +1,7 @@
 #!/usr/bin/env python3
 """Minds what many nodes mind: how old its input is, which transforms it was told, what time it is."""
+import time
+
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestFeedback, TestResult
@@ -11,6 +13,7 @@ from tf2_msgs.msg import TFMessage
 
 rospy.init_node("crossing")
 seen = rospy.Publisher("~seen", PointStamped, queue_size=10)
+worked = rospy.Publisher("~worked", PointStamped, queue_size=100)
 refused = rospy.Publisher("~refused", String, queue_size=10)
 frames = rospy.Publisher("~frames", String, queue_size=10, latch=True)
 mirrored = rospy.Publisher("~mirrored", Image, queue_size=2)
@@ -23,6 +26,11 @@ def look(point):
         seen.publish(point)
     else:
         refused.publish("%.1f s old" % age)
+
+
+def work(point):
+    time.sleep(0.05)
+    worked.publish(point)
 
 
 def learn(kind):
@@ -53,6 +61,7 @@ def wait(_):
 
 
 rospy.Subscriber("~point", PointStamped, look)
+rospy.Subscriber("~work", PointStamped, work)
 rospy.Subscriber("~picture", Image, mirrored.publish, queue_size=1, buff_size=1 << 22)
 rospy.Subscriber("/tf", TFMessage, learn("moving"))
 rospy.Subscriber("/tf_static", TFMessage, learn("fixed"))

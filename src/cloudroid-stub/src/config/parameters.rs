@@ -1,0 +1,203 @@
+//! What ROS parameters say instead of `stub.toml`: `cloudroid/KEY` in the node's own namespace, or in one around it,
+//! where it holds for all nodes of that namespace. The nearest wins.
+
+use std::collections::{BTreeMap, HashMap};
+
+use anyhow::bail;
+use ros::bus::ParamValue;
+use toml::{Table, Value};
+
+use super::{Config, with};
+
+/// A group's name: what comes after the namespace.
+const GROUP: &str = "cloudroid";
+
+/// The settings of one namespace.
+pub struct Group {
+    /// The parameter that holds them, such as `/front/cloudroid`.
+    pub name: String,
+    /// By key.
+    pub settings: BTreeMap<String, ParamValue>,
+}
+
+/// The parameters that may hold settings for a node, the nearest last: `/cloudroid`, `/front/cloudroid`,
+/// `/front/teller/cloudroid`.
+pub fn groups(node: &str) -> Vec<String> {
+    let ends = node.match_indices('/').map(|(at, _)| at).skip(1);
+    let namespaces = std::iter::once("").chain(ends.map(|at| &node[..at]));
+    let namespaces = namespaces.chain([node.trim_end_matches('/')]);
+    namespaces
+        .map(|namespace| format!("{namespace}/{GROUP}"))
+        .collect()
+}
+
+impl Config {
+    /// With some keys given otherwise by these groups, the nearest last.
+    ///
+    /// # Errors
+    /// The parameter that cannot be as it is, why not, and what to do.
+    pub fn with_parameters(&self, given: &[Group]) -> anyhow::Result<Config> {
+        let mut table = Table::try_from(self)?;
+        // Who has given a key.
+        let mut givers: HashMap<&str, String> = HashMap::new();
+        for group in given {
+            for (key, value) in &group.settings {
+                let giver = format!("{}/{key}", group.name);
+                let refused = |reason: &str| {
+                    let value = shown(value);
+                    let set = "set it otherwise, or remove it with";
+                    anyhow::anyhow!(
+                        "parameter {giver} is {value}: {reason}; {set}: rosparam delete {giver}"
+                    )
+                };
+                let given = Value::try_from(value).map_err(|error| refused(&error.to_string()))?;
+                table.insert(key.clone(), given);
+                if let Err(error) = table.clone().try_into::<Config>() {
+                    return Err(refused(error.message().trim()));
+                }
+                givers.insert(key, giver);
+            }
+        }
+        let config: Config = table.clone().try_into()?;
+        if let Err(wrong) = config.check().and_then(|()| config.check_whole()) {
+            let both = ["desire", "max"].contains(&wrong.key);
+            let other = if wrong.key == "max" { "desire" } else { "max" };
+            let giver = givers
+                .get(wrong.key)
+                .or_else(|| givers.get(other).filter(|_| both));
+            match giver {
+                Some(giver) => bail!("parameter {giver}: {wrong} (rosparam delete {giver})"),
+                None => return Err(wrong.into()),
+            }
+        }
+        with(table, std::iter::empty())
+    }
+}
+
+fn shown(value: &ParamValue) -> String {
+    match value {
+        ParamValue::String(text) => format!("{text:?}"),
+        ParamValue::Int(number) => number.to_string(),
+        ParamValue::Double(number) => number.to_string(),
+        ParamValue::Bool(yes) => yes.to_string(),
+        _ => "no single value".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Local;
+
+    fn group(name: &str, settings: &[(&str, ParamValue)]) -> Group {
+        let settings = settings.iter();
+        Group {
+            name: name.to_owned(),
+            settings: settings
+                .map(|(key, value)| ((*key).to_owned(), value.clone()))
+                .collect(),
+        }
+    }
+
+    fn config(given: &[Group]) -> anyhow::Result<Config> {
+        let file: Config = toml::from_str("server = 'ws://cloud:9090'\nservice = 's'\n")?;
+        file.with_parameters(given)
+    }
+
+    fn text(text: &str) -> ParamValue {
+        ParamValue::String(text.to_owned())
+    }
+
+    #[test]
+    fn a_node_is_in_its_namespaces() {
+        assert_eq!(groups("/teller"), ["/cloudroid", "/teller/cloudroid"]);
+        assert_eq!(
+            groups("/a/b/teller"),
+            [
+                "/cloudroid",
+                "/a/cloudroid",
+                "/a/b/cloudroid",
+                "/a/b/teller/cloudroid"
+            ]
+        );
+    }
+
+    #[test]
+    fn the_nearest_wins() {
+        let (half, two) = (ParamValue::Double(0.5), ParamValue::Int(2));
+        let config = config(&[
+            group(
+                "/cloudroid",
+                &[("desire", half.clone()), ("max", two.clone())],
+            ),
+            group(
+                "/front/cloudroid",
+                &[("max", ParamValue::Int(1)), ("local", text("warm"))],
+            ),
+            group("/front/teller/cloudroid", &[("local", text("first-sign"))]),
+        ])
+        .unwrap();
+        assert_eq!((config.desire, config.max), (Some(0.5), Some(1.0)));
+        assert_eq!(config.local, Local::FirstSign);
+    }
+
+    #[test]
+    fn half_a_promise_may_be_in_the_file() {
+        let file = "server = 'ws://cloud:9090'\nservice = 's'\ndesire = 0.5";
+        let file: Config = toml::from_str(file).unwrap();
+        let max = [group("/cloudroid", &[("max", ParamValue::Int(1))])];
+        assert_eq!(file.with_parameters(&max).unwrap().max, Some(1.0));
+        let error = file.with_parameters(&[]).unwrap_err().to_string();
+        assert!(error.contains("desire is given without max"), "{error}");
+    }
+
+    #[test]
+    fn what_cannot_be_is_named_with_its_parameter() {
+        let (one, two) = (ParamValue::Int(1), ParamValue::Int(2));
+        for (settings, words) in [
+            (
+                vec![("desire", two.clone()), ("max", one.clone())],
+                vec!["desire (2 s) is greater than max (1 s)", "lower it"],
+            ),
+            (
+                vec![("desire", ParamValue::Double(-0.5)), ("max", one.clone())],
+                vec!["desire is -0.5", "greater than 0"],
+            ),
+            (
+                vec![("desire", text("soon"))],
+                vec!["desire is \"soon\"", "expected f64"],
+            ),
+            (
+                vec![("desire", one.clone())],
+                vec!["desire is given without max"],
+            ),
+            (
+                vec![("desre", one.clone())],
+                vec!["desre is 1", "unknown field"],
+            ),
+            (
+                vec![("local", text("hot"))],
+                vec!["local is \"hot\"", "first-sign"],
+            ),
+            (
+                vec![("max", ParamValue::List(vec![]))],
+                vec!["max is no single value", "f64"],
+            ),
+        ] {
+            let error = config(&[group("/front/cloudroid", &settings)]).unwrap_err();
+            let error = format!("{error:#}");
+            let named = format!("parameter /front/cloudroid/{}", settings[0].0);
+            assert!(error.starts_with(&named), "{error}");
+            assert!(
+                error.contains(&format!(
+                    "rosparam delete /front/cloudroid/{}",
+                    settings[0].0
+                )),
+                "{error}"
+            );
+            for words in words {
+                assert!(error.contains(words), "{words}: {error}");
+            }
+        }
+    }
+}
