@@ -151,7 +151,7 @@ impl NodeLink {
             }
             let state = match of {
                 Some(served) => State::There {
-                    there: Arc::new(there(&hub, served)),
+                    there: Arc::new(there(&hub, self, served)),
                     asked: now,
                 },
                 None => State::NotThere { since: now },
@@ -255,15 +255,17 @@ impl Drop for Abandoned<'_> {
     }
 }
 
-fn there(hub: &Hub, served: Served) -> There {
+fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     let known = hub.registry.service(&served.type_name).ok();
     let known = known.filter(|known| known.md5 == served.md5);
-    if known.is_none() {
-        tracing::debug!(
-            service = served.name,
-            of = served.type_name,
-            "its stamps stay as they are: the image has no such definition"
-        );
+    if known.is_none() && hub.skew.difference() != 0 {
+        link.session.tell(&Control::Notice {
+            warning: true,
+            text: format!(
+                "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with md5sum {}; push the package with the Debian package that holds it (--with DEB)",
+                served.name, served.type_name, served.md5
+            ),
+        });
     }
     let stamps = known.map(|known| (Stamps::of(&known.request), Stamps::of(&known.response)));
     let (request, response) = stamps.unwrap_or_default();
