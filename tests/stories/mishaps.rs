@@ -285,7 +285,11 @@ rosnode list | grep teller | grep -v _cloudroid # which tells diagnostics
 kill -9 $first
 until original | grep -qv "^$first$"; do kill -0 $stub; sleep 0.1; done
 echo "another runs"
-kill -INT $launched; wait $launched || true
+last=$(pgrep -f '[c]loudroid-stub run')
+kill -9 $last
+timeout 60 sh -c 'while pgrep -f "[p]ython3 /usr/lib/teller_py" > /dev/null; do sleep 0.1; done'
+echo "it ends with a stub that is killed"
+kill -INT $launched || true; wait $launched || true
 pgrep -fa '[p]ython3 /usr/lib/teller_py|[c]loudroid-stub run' || echo "none is left"
 grep 'the local original ended' log
 echo "crashes: $(grep -c 'the local original ended' log)"
@@ -302,7 +306,7 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Told {
         "same group: yes",
         "namespace: ROS_NAMESPACE=/front/",
         "a Master of its own\n/front/teller\nanother",
-        "another runs\nnone is left\n",
+        "another runs\nit ends with a stub that is killed\nnone is left\n",
         "signal: 9",
         // That it ends with the launch is none.
         "crashes: 1\n",

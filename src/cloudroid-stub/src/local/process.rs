@@ -28,7 +28,10 @@ pub struct Program {
 }
 
 impl Program {
-    /// Starts it. It is killed when what is returned is dropped.
+    /// Starts it. It is killed when what is returned is dropped, and by the kernel when the calling thread ends
+    /// without that: a stub that is killed leaves nobody behind who computes for no one. So the caller is a thread that
+    /// lasts as long as the stub does.
+    #[allow(unsafe_code)]
     pub fn spawn(&self, master: &str) -> anyhow::Result<Child> {
         let mut command = Command::new(&self.path);
         command
@@ -39,6 +42,20 @@ impl Program {
             .env_remove("ROS_IP")
             .stdin(std::process::Stdio::null())
             .kill_on_drop(true);
+        let stub = nix::unistd::getpid();
+        // SAFETY: between fork and exec two system calls are made, both of which a signal handler may make, and nothing
+        // is allocated.
+        unsafe {
+            command.pre_exec(move || {
+                nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
+                // It may have ended before it was to be told of.
+                if nix::unistd::getppid() == stub {
+                    Ok(())
+                } else {
+                    Err(std::io::ErrorKind::Interrupted.into())
+                }
+            });
+        }
         command.spawn().with_context(|| {
             format!(
                 "the local original {} cannot be executed",
