@@ -15,8 +15,10 @@
 //! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided under one
 //! short lock: a servant that is being ended is never given to anyone.
 
+mod adoption;
 mod driver;
 mod handle;
+mod limits;
 mod nodes;
 mod readiness;
 mod restart;
@@ -38,9 +40,10 @@ use crate::errors::Error;
 use crate::journal::Journal;
 use crate::names;
 use crate::request_times::RequestTimes;
-use crate::state::{self, NewEvent, RevisionRecord, ServantRecord, State};
+use crate::state::{self, State};
 
 pub use handle::{Asked, Handle, Lease};
+pub use limits::engine_limits;
 pub(crate) use nodes::how_it_ended;
 pub use tail::{read as read_log, record as log_record};
 
@@ -168,137 +171,6 @@ impl Choreographer {
         let beginning = Beginning::Asked(spare);
         tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
         Ok(lease)
-    }
-
-    /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
-    pub async fn adopt(&self) -> Result<usize, Error> {
-        let inner = &self.inner;
-        let running = inner.engine.adopt().await?;
-        let mut records: HashMap<String, ServantRecord> = inner
-            .state
-            .servants()?
-            .into_iter()
-            .map(|record| (record.id.clone(), record))
-            .collect();
-        let mut adopted = 0;
-        for servant in running {
-            let record = records.remove(servant.id());
-            let revision = match &record {
-                Some(record) => inner.state.revision(&record.service, record.revision)?,
-                None => None,
-            };
-            match (record, revision) {
-                (Some(record), Some(revision)) => {
-                    self.adopt_one(record, revision, servant);
-                    adopted += 1;
-                }
-                // A spare, or one that was killed before it had nodes: nobody misses it.
-                (None, _) if servant.processes().await.is_ok_and(|all| all.is_empty()) => {
-                    servant.stop().await?;
-                }
-                _ => {
-                    inner.journal.warning(
-                        "servant-unknown",
-                        &format!(
-                            "ended servant {}, which belongs to no service any more",
-                            servant.id()
-                        ),
-                        &NewEvent {
-                            servant: Some(servant.id()),
-                            ..NewEvent::default()
-                        },
-                    );
-                    servant.stop().await?;
-                    inner.state.remove_servant(servant.id());
-                }
-            }
-        }
-        for gone in records.into_values() {
-            inner.state.remove_servant(&gone.id);
-            inner.journal.warning(
-                "servant-lost",
-                &format!(
-                    "servant {} of {} for {} ended while no daemon ran",
-                    gone.id, gone.service, gone.robot
-                ),
-                &NewEvent {
-                    service: Some(&gone.service),
-                    servant: Some(&gone.id),
-                    robot: Some(&gone.robot),
-                },
-            );
-        }
-        Ok(adopted)
-    }
-
-    fn adopt_one(
-        &self,
-        record: ServantRecord,
-        revision: Arc<RevisionRecord>,
-        servant: Arc<dyn servant::engine::Servant>,
-    ) {
-        let inner = &self.inner;
-        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.config.limits);
-        let key = (record.service, record.robot.clone());
-        let handle = Arc::new(Handle::new(
-            record.id.clone(),
-            record.robot,
-            record.anonymous,
-            asked,
-            revision,
-            record.created,
-        ));
-        if crate::linked::has_no_planned_node(&handle, &servant) {
-            handle.set_linked();
-        }
-        {
-            let mut servants = inner.servants.lock();
-            servants.all.insert(record.id, Arc::clone(&handle));
-            servants.given.insert(key, Arc::clone(&handle));
-        }
-        let permit = inner.admission.adopt(inner.promised(&handle));
-        tokio::spawn(driver::drive(
-            Arc::clone(inner),
-            handle,
-            Beginning::Adopted(servant, Some(permit)),
-        ));
-    }
-
-    /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.
-    pub async fn set_limits(&self, id: &str, change: api::Limits) -> Result<(), Error> {
-        let handle = self.servant(id)?;
-        let unreached = || Error::Servant {
-            service: handle.service().to_owned(),
-            robot: handle.robot.clone(),
-            reason: "does not run, so that its limits cannot be changed".to_owned(),
-            log: Vec::new(),
-        };
-        let container = handle.container().ok_or_else(unreached)?;
-        // One change after the other: what is promised, in force and remembered must be of the same.
-        let _turn = handle.limits_turn().await;
-        let (before, wanted) = (handle.asked(), change.or(handle.asked()));
-        let promise = handle.promise().ok_or_else(unreached)?;
-        promise.change(self.inner.promised_for(&wanted))?;
-        if let Err(error) = container
-            .set_limits(engine_limits(&handle::with_weight(change)))
-            .await
-        {
-            // What the kernel took of it before it refused the rest is taken back.
-            let earlier = engine_limits(&before.or(handle.limits()));
-            let _ = container.set_limits(earlier).await;
-            let _ = promise.change(self.inner.promised_for(&before));
-            return Err(error.into());
-        }
-        handle.set_asked(wanted);
-        self.inner.state.set_servant_limits(id, &wanted)?;
-        let message = format!(
-            "servant {id}: limits changed to {}",
-            in_words(&limits_of(&container.enforced().limits))
-        );
-        self.inner
-            .journal
-            .info("limits-changed", &message, &handle.about());
-        Ok(())
     }
 
     /// All servants that live, oldest first.
@@ -518,7 +390,7 @@ pub async fn describe(handle: &Handle) -> api::Servant {
         cgroup_version: enforced
             .as_ref()
             .map_or(0, |enforced| enforced.cgroup_version),
-        enforced: enforced.map(|enforced| limits_of(&enforced.limits)),
+        enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
         usage: usage.map(|usage| api::Usage {
             cpu_usec: usage.cpu_usec,
             memory: usage.memory,
@@ -533,50 +405,5 @@ pub async fn describe(handle: &Handle) -> api::Servant {
         }),
         pids,
         dropped: works.map_or(0, |works| works.dropped()),
-    }
-}
-
-/// Limits for people, by the names of the flags that set them.
-fn in_words(limits: &api::Limits) -> String {
-    let named = [
-        ("cpus", limits.cpus.map(|cpus| cpus.to_string())),
-        ("cpu-weight", limits.cpu_weight.map(|n| n.to_string())),
-        ("cpuset", limits.cpuset.map(|cores| cores.to_string())),
-        ("memory", limits.memory.map(|bytes| bytes.to_string())),
-        ("memory-high", limits.memory_high.map(|n| n.to_string())),
-        ("pids", limits.pids.map(|pids| pids.to_string())),
-        ("io-read", limits.io_read.map(|bytes| bytes.to_string())),
-        ("io-write", limits.io_write.map(|bytes| bytes.to_string())),
-    ];
-    let set = named
-        .into_iter()
-        .filter_map(|(name, value)| Some(format!("{name} {}", value?)));
-    set.collect::<Vec<_>>().join(", ")
-}
-
-fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
-    api::Limits {
-        cpus: limits.cpus,
-        cpu_weight: limits.cpu_weight,
-        memory: limits.memory.map(api::Size),
-        memory_high: limits.memory_high.map(api::Size),
-        pids: limits.pids,
-        io_read: limits.io_read.map(api::Size),
-        io_write: limits.io_write.map(api::Size),
-        cpuset: limits.cpuset.map(api::CpuSet),
-    }
-}
-
-/// Limits as the engine takes them.
-pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
-    servant::spec::Limits {
-        cpus: limits.cpus,
-        cpu_weight: limits.cpu_weight,
-        memory: limits.memory.map(|memory| memory.0),
-        memory_high: limits.memory_high.map(|memory| memory.0),
-        pids: limits.pids,
-        io_read: limits.io_read.map(|bytes| bytes.0),
-        io_write: limits.io_write.map(|bytes| bytes.0),
-        cpuset: limits.cpuset.map(|set| set.0),
     }
 }

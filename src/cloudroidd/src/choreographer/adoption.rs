@@ -1,0 +1,105 @@
+//! Servants that an earlier daemon left: taken over, or forgotten.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use super::driver::{self, Beginning};
+use super::{Asked, Choreographer, Handle};
+use crate::errors::Error;
+use crate::state::{NewEvent, RevisionRecord, ServantRecord};
+
+impl Choreographer {
+    /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
+    pub async fn adopt(&self) -> Result<usize, Error> {
+        let inner = &self.inner;
+        let running = inner.engine.adopt().await?;
+        let mut records: HashMap<String, ServantRecord> = inner
+            .state
+            .servants()?
+            .into_iter()
+            .map(|record| (record.id.clone(), record))
+            .collect();
+        let mut adopted = 0;
+        for servant in running {
+            let record = records.remove(servant.id());
+            let revision = match &record {
+                Some(record) => inner.state.revision(&record.service, record.revision)?,
+                None => None,
+            };
+            match (record, revision) {
+                (Some(record), Some(revision)) => {
+                    self.adopt_one(record, revision, servant);
+                    adopted += 1;
+                }
+                // A spare, or one that was killed before it had nodes: nobody misses it.
+                (None, _) if servant.processes().await.is_ok_and(|all| all.is_empty()) => {
+                    servant.stop().await?;
+                }
+                _ => {
+                    inner.journal.warning(
+                        "servant-unknown",
+                        &format!(
+                            "ended servant {}, which belongs to no service any more",
+                            servant.id()
+                        ),
+                        &NewEvent {
+                            servant: Some(servant.id()),
+                            ..NewEvent::default()
+                        },
+                    );
+                    servant.stop().await?;
+                    inner.state.remove_servant(servant.id());
+                }
+            }
+        }
+        for gone in records.into_values() {
+            inner.state.remove_servant(&gone.id);
+            inner.journal.warning(
+                "servant-lost",
+                &format!(
+                    "servant {} of {} for {} ended while no daemon ran",
+                    gone.id, gone.service, gone.robot
+                ),
+                &NewEvent {
+                    service: Some(&gone.service),
+                    servant: Some(&gone.id),
+                    robot: Some(&gone.robot),
+                },
+            );
+        }
+        Ok(adopted)
+    }
+
+    fn adopt_one(
+        &self,
+        record: ServantRecord,
+        revision: Arc<RevisionRecord>,
+        servant: Arc<dyn servant::engine::Servant>,
+    ) {
+        let inner = &self.inner;
+        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.config.limits);
+        let key = (record.service, record.robot.clone());
+        let handle = Arc::new(Handle::new(
+            record.id.clone(),
+            record.robot,
+            record.anonymous,
+            asked,
+            revision,
+            record.created,
+        ));
+        if crate::linked::has_no_planned_node(&handle, &servant) {
+            handle.set_linked();
+        }
+        {
+            let mut servants = inner.servants.lock();
+            servants.all.insert(record.id, Arc::clone(&handle));
+            servants.given.insert(key, Arc::clone(&handle));
+        }
+        let permit = inner.admission.adopt(inner.promised(&handle));
+        tokio::spawn(driver::drive(
+            Arc::clone(inner),
+            handle,
+            Beginning::Adopted(servant, Some(permit)),
+        ));
+    }
+}
