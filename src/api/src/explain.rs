@@ -106,6 +106,9 @@ pub struct Link {
     pub left_out: usize,
     /// Inputs that the node listens to and nobody on the robot publishes.
     pub unfed: Vec<String>,
+    /// Services that the node has looked for in vain.
+    #[serde(default)]
+    pub unserved: Vec<String>,
 }
 
 /// A part of the response time, over the last requests.

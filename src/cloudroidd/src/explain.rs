@@ -112,6 +112,7 @@ fn link(status: LinkStatus) -> Link {
         given: status.given,
         left_out: status.left_out,
         unfed: status.unfed,
+        unserved: status.unserved,
         node: status.node,
     }
 }
@@ -250,6 +251,13 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             Weight::Blocks,
             format!("{node} listens to {topic}, which nobody on the robot publishes"),
             format!("remap it to the topic that is meant: {topic}:=/THE/TOPIC"),
+        );
+    }
+    for service in &link.unserved {
+        say(
+            Weight::Hint,
+            format!("{node} looked for the service {service}, which nobody served"),
+            format!("start what serves it on the robot, or remap it: {service}:=/THE/SERVICE"),
         );
     }
     if let Some(clock) = link.clock.filter(|clock| clock.abs() > CLOCK_APART) {
@@ -466,6 +474,7 @@ mod tests {
             up: false,
             clock: Some(-2000.0),
             unfed: vec!["/image".into()],
+            unserved: vec!["/static_map".into()],
             unsent: 12,
             given: 128,
             left_out: 40,
@@ -493,6 +502,7 @@ mod tests {
         let words = [
             "the link of /detect is down",
             "listens to /image, which nobody on the robot publishes; remap it",
+            "looked for the service /static_map, which nobody served; start",
             "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
             "waits for memory 30 %",
             "1 processes of s1 were killed",
@@ -563,6 +573,7 @@ mod tests {
             given: 3,
             left_out: 1,
             unfed: vec![],
+            unserved: vec![],
         });
         assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
         assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));

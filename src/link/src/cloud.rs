@@ -144,6 +144,8 @@ pub struct LinkStatus {
     pub left_out: usize,
     /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
     pub unfed: Vec<String>,
+    /// Services that the node has looked for in vain, and that are not known to be there now.
+    pub unserved: Vec<String>,
 }
 
 impl Hub {

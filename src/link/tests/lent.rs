@@ -56,6 +56,7 @@ impl Nodes for Still {
 /// A servant with a node in it.
 struct Servant {
     hub: Arc<Hub>,
+    bus: Arc<Ros1Bus>,
     node: Arc<Ros1Bus>,
 }
 
@@ -69,7 +70,8 @@ async fn servant() -> Servant {
     let registry = Arc::new(Registry::new());
     let options = HubOptions::default();
     Servant {
-        hub: Hub::new("s", bus, registry, Arc::new(Still), options),
+        hub: Hub::new("s", bus.clone(), registry, Arc::new(Still), options),
+        bus,
         node,
     }
 }
@@ -302,6 +304,10 @@ async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
     };
     let (first, second) = (waits().await, waits().await);
     assert!(second < first / 2, "{first:?}, then {second:?}");
+    let mut graph = servant.bus.graph();
+    let known = graph.wait_for(|graph| graph.sought.contains_key("/map"));
+    timeout(LONG, known).await.unwrap().unwrap();
+    assert_eq!(servant.hub.status()[0].unserved, ["/map"]);
     // The question was not lost, and was asked once.
     robot.links(&servant).await;
     assert_eq!(robot.hears().await, lookup());
@@ -322,6 +328,7 @@ async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
         .await
         .unwrap();
     assert_eq!(called.unwrap(), "z");
+    assert!(servant.hub.status()[0].unserved.is_empty());
 }
 
 #[tokio::test]

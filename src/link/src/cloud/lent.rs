@@ -118,6 +118,11 @@ impl Lent {
         }
     }
 
+    /// Whether the robot is known to have this service.
+    pub(super) fn has(&self, service: &str) -> bool {
+        self.there(service).is_some()
+    }
+
     fn there(&self, service: &str) -> Option<Arc<There>> {
         match self.names.lock().get(service) {
             Some(State::There { there, .. }) => Some(Arc::clone(there)),

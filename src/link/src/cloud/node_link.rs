@@ -145,7 +145,22 @@ impl NodeLink {
             given,
             left_out,
             unfed: self.unfed(),
+            unserved: self.unserved(),
         }
+    }
+
+    fn unserved(&self) -> Vec<String> {
+        let Some(hub) = self.hub.upgrade() else {
+            return Vec::new();
+        };
+        let graph = hub.bus.graph();
+        let graph = graph.borrow();
+        let sought = graph.sought.iter();
+        let missing = sought.filter(|(service, nodes)| {
+            let served = graph.services.contains_key(*service) || self.lent.has(service);
+            nodes.contains(&self.node) && !served
+        });
+        missing.map(|(service, _)| service.clone()).collect()
     }
 
     /// Our own end publishes what the robot sends.
