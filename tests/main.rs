@@ -152,6 +152,9 @@ fn main() -> ExitCode {
             what_a_stub_cannot_do_is_said,
             the_robot_s_graph_is_the_original_s,
             a_lost_link_is_taken_up_again,
+            a_connection_that_falls_silent_is_replaced,
+            one_message_right_after_connecting_is_not_lost,
+            who_has_just_connected_hears_what_the_node_answers,
             the_robot_s_master_starts_again,
         ],
         stories![mishaps:

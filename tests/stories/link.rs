@@ -8,6 +8,7 @@ use nix::sys::signal::Signal;
 use ros::bus::{Bus, Graph, ParamValue};
 use ros::ros1::Ros1Bus;
 use support::Told;
+use support::freezer::Freezer;
 use support::robot::PATIENCE;
 use support::site::{Running, Site, registered, string};
 use support::world::{ADDER, GREETER, PEOPLE, world};
@@ -364,5 +365,104 @@ pub fn the_robot_s_master_starts_again() -> Told {
         }),
         &stub,
     )?;
+    Ok(())
+}
+
+pub fn a_connection_that_falls_silent_is_replaced() -> Told {
+    let daemon = world().with(GREETER)?;
+    let freezer = Freezer::new(&daemon.address)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    // It would be given up ten times T_max after it fell silent.
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"greeter_cpp\"\nrobot = \"linked-silent\"\nlocal = \"none\"\ndesire = 1.0\nmax = 2.0\n",
+        freezer.server
+    );
+    let argv = ["__name:=greeter", "~name:=/who"];
+    let stub = site.stub_with(&toml, "greeter_cpp", "greeter", &argv)?;
+    with_log(
+        site.until(&app, "the service", serves("/greeter/count")),
+        &stub,
+    )?;
+    let names = site.says(&app, "/who", false)?;
+    site.connected(&*names, 1)?;
+    let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    names.publish(string("first"));
+    with_log(site.next(&mut greetings), &stub)?;
+    ensure!(freezer.freeze() == 1, "one connection carries it");
+    // What is sent meanwhile is not lost: the same node hears it.
+    names.publish(string("second"));
+    // roscpp may give whoever has just connected the latched one twice.
+    while !text(&with_log(site.next(&mut greetings), &stub)?.bytes).contains("second") {}
+    let count = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?;
+    ensure!(count[0] == 2, "{count:?}");
+    let said = stub.said();
+    ensure!(
+        said.contains("is silent, another takes its place"),
+        "{said}"
+    );
+    ensure!(!said.contains("nothing came from the other end"), "{said}");
+    Ok(())
+}
+
+pub fn one_message_right_after_connecting_is_not_lost() -> Told {
+    let daemon = world().with(GREETER)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    for round in 0..5 {
+        // Each time another servant, whose node has heard nothing yet.
+        let robot = format!("linked-once-{round}");
+        let argv = ["__name:=greeter", "~name:=/who"];
+        // The application is there first, as often; or it comes to a stub that is.
+        let early = site.says(&app, "/who", false)?;
+        let stub = site.stub(&daemon, THE_GREETER, &robot, &argv)?;
+        let names = if round % 2 == 0 {
+            early
+        } else {
+            drop(early);
+            site.until(&app, "the service", serves("/greeter/count"))?;
+            site.says(&app, "/who", false)?
+        };
+        with_log(site.connected(&*names, 1), &stub)?;
+        names.publish(string("only"));
+        site.until(&app, "the service", serves("/greeter/count"))?;
+        let deadline = Instant::now() + PATIENCE;
+        while with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?[0] != 1 {
+            ensure!(
+                Instant::now() < deadline,
+                "the message was lost in round {round}:\n{}",
+                stub.said()
+            );
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let mut stub = stub;
+        stub.signal(Signal::SIGINT)?;
+        stub.ends()?;
+    }
+    Ok(())
+}
+
+pub fn who_has_just_connected_hears_what_the_node_answers() -> Told {
+    let daemon = world().with(ADDER)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let stub = site.stub(&daemon, THE_ADDER, "linked-newcomer", &["__name:=adder"])?;
+    with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
+    for number in 1..=10_i64 {
+        // Nobody listens yet: in the cloud the node is subscribed to from now on.
+        let app = site.node(&format!("/app{number}"))?;
+        let mut sums = site.hears(&app, "/sums")?;
+        let connected = sums.publishers.wait_for(|count| *count == 1);
+        site.runtime
+            .block_on(async { tokio::time::timeout(PATIENCE, connected).await.map(drop) })
+            .context("the stub should be connected to")?;
+        let request = [number.to_le_bytes(), 0_i64.to_le_bytes()].concat();
+        with_log(site.calls(&app, "/add_two", &request), &stub)?;
+        let sum = with_log(site.next(&mut sums), &stub)
+            .with_context(|| format!("sum {number} was not heard"))?;
+        ensure!(text(&sum.bytes[4..]) == number.to_string(), "{sum:?}");
+        drop(sums);
+        site.runtime.block_on(app.close());
+    }
     Ok(())
 }

@@ -185,11 +185,29 @@ rosmaster --core -p {port} > /dev/null 2>&1 &
 exec timeout 60 rosrun teller_py teller.py"#
     );
     machine.runs("bash", &script)?.failed_saying(&[
-        "another machine is connected as this robot and runs /teller",
+        ") is connected as this robot and runs /teller; give one of them another id",
         "CLOUDROID_ROBOT",
     ])?;
     let mut told = site.hears(&app, "/teller/told")?;
     site.next(&mut told).context("the first goes on")?;
+    // Another node of the package would share the servant: both sides and the server say so.
+    let script = script
+        .replace("exec timeout 60 rosrun teller_py teller.py", "rosrun teller_py teller.py __name:=other > said 2>&1 & node=$!\nuntil grep 'two machines' said; do kill -0 $node; sleep 0.1; done\nkill -INT $node; wait $node || true");
+    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    for said in [outcome.stdout, stub.said()] {
+        ensure!(
+            said.contains("two machines are connected as this robot: ")
+                && said.contains(" runs /other")
+                && said.contains("CLOUDROID_ROBOT"),
+            "{said}"
+        );
+    }
+    let told = daemon.deployer().asks(&["explain", robot])?;
+    let events = told["events"].as_array().context("events")?;
+    ensure!(
+        events.iter().any(|event| event["kind"] == "robot-twins"),
+        "{told:#}"
+    );
     Ok(())
 }
 
@@ -212,6 +230,7 @@ import sys, xmlrpc.client
 xmlrpc.client.Marshaller.dispatch[int] = lambda self, value, write: write("<value><i8>%d</i8></value>" % value)
 for name in "/teller/big", "/odd/big":
     xmlrpc.client.ServerProxy(sys.argv[1]).setParam("/poison", name, 2 ** 40)
+xmlrpc.client.ServerProxy(sys.argv[1]).setParam("/poison", "/teller/key", xmlrpc.client.Binary(b"as bytes"))
 END
 python3 poison.py $ROS_MASTER_URI
 ! rosparam get / > /dev/null 2>&1
@@ -227,6 +246,7 @@ cat said"#
     let outcome = machine.runs("bash", &script)?.succeeded()?;
     for words in [
         "word hello, number nan",
+        ", key as bytes",
         "parameter /teller/big has a value that XML-RPC cannot carry",
         "parameter /odd/big has a value that XML-RPC cannot carry",
         "rosparam delete /odd/big",

@@ -8,6 +8,7 @@ pub mod cable;
 pub mod cutter;
 pub mod daemon;
 pub mod deployer;
+pub mod freezer;
 pub mod grants;
 pub mod leftovers;
 pub mod machine;

@@ -4,6 +4,7 @@
 
 #![forbid(unsafe_code)]
 
+mod beside;
 mod idle;
 mod people;
 mod strings;
@@ -35,6 +36,7 @@ fn main() -> Result<()> {
     let mut report = Report::new("link");
     people::measure(&mut report, &daemon)?;
     strings::measure(&mut report, &daemon)?;
+    beside::measure(&mut report, &daemon)?;
     report.finish()?;
     daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
     daemon.ends()?;

@@ -11,7 +11,7 @@ use support::daemon::Daemon;
 use support::site::Site;
 
 const SIZE: (u32, u32) = (640, 480);
-const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
+pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
     uint32 step\nuint8[] data\n\
     ================================================================================\n\
     MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";

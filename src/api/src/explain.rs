@@ -67,8 +67,11 @@ pub struct Link {
     pub clock: Option<f64>,
     /// Bytes a second downwards, when it had to hurry.
     pub throughput: Option<f64>,
-    /// Messages that were not sent down.
+    /// Messages that were dropped on either side.
     pub dropped: u64,
+    /// Of which topics, where and why: a sentence each.
+    #[serde(default)]
+    pub drops: Vec<String>,
     /// T_desire.
     pub desire: Option<f64>,
     /// T_max.
@@ -109,6 +112,9 @@ pub struct Link {
     /// Services that the node has looked for in vain.
     #[serde(default)]
     pub unserved: Vec<String>,
+    /// Other machines that are connected as the same robot.
+    #[serde(default)]
+    pub twins: Vec<String>,
 }
 
 /// A part of the response time, over the last requests.

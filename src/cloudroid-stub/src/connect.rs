@@ -16,6 +16,8 @@ use crate::config::Config;
 use crate::resolver;
 use crate::stream::Stream;
 
+/// For TCP's own handshake.
+const TCP: Duration = Duration::from_secs(2);
 /// The longest answer to the handshake.
 const MAX_HEAD: usize = 64 * 1024;
 const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
@@ -28,6 +30,9 @@ pub enum Error {
     /// Trying again may help.
     #[error("{0}")]
     Unreachable(String),
+    /// Trying again may help, and the server is there: it has no room, say.
+    #[error("{0}")]
+    Busy(String),
     /// The portal does not want this stub; trying again changes nothing.
     #[error("{0}")]
     Refused(String),
@@ -65,11 +70,15 @@ async fn handshake(
     let ip = resolver::resolve(&address.host)
         .await
         .map_err(|error| unreachable("cannot find", error))?;
-    let stream = TcpStream::connect((ip, address.port))
-        .await
-        .map_err(|error| unreachable("cannot connect to", error))?;
+    // A packet that was lost would be sent again ever more seldom.
+    let stream = match timeout(TCP, TcpStream::connect((ip, address.port))).await {
+        Ok(stream) => stream,
+        Err(elapsed) => Err(elapsed.into()),
+    };
+    let stream = stream.map_err(|error| unreachable("cannot connect to", error))?;
     let socket = socket2::SockRef::from(&stream);
     let _ = socket.set_tcp_nodelay(true);
+    let _ = socket.set_tcp_keepalive(&keepalive());
     let _ = socket.set_tcp_notsent_lowat(UNSENT);
     let mut stream = Stream::over(stream, address, authorities)
         .await
@@ -121,7 +130,7 @@ async fn handshake(
         // No room and the like pass; what this stub is does not.
         return Err(match status {
             400..=499 if status != 408 && status != 429 => Error::Refused(text),
-            _ => Error::Unreachable(text),
+            _ => Error::Busy(text),
         });
     }
     let expected = STANDARD.encode(Sha1::digest(format!("{key}{GUID}")));
@@ -143,6 +152,14 @@ async fn handshake(
         link::MAX_RECORD,
         rand::random(),
     ))
+}
+
+/// While a servant is made ready nothing comes, and yet the network may be lost.
+fn keepalive() -> socket2::TcpKeepalive {
+    socket2::TcpKeepalive::new()
+        .with_time(Duration::from_secs(5))
+        .with_interval(Duration::from_secs(2))
+        .with_retries(3)
 }
 
 /// What a problem document says, or the text as it is.

@@ -11,6 +11,7 @@
 
 mod calls;
 pub mod diagnostics;
+mod dropped;
 mod inputs;
 mod lent;
 mod outputs;
@@ -23,6 +24,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock, Weak};
 
 use link::control::{Control, Exit, Graph};
+use link::drops::{Cause, Drops};
 use link::record::Record;
 use link::{Handler, Session};
 use parking_lot::{Mutex, RwLock};
@@ -49,6 +51,8 @@ pub struct Mirror {
     calls: Calls,
     lent: Lent,
     parameters: Parameters,
+    /// Messages dropped on this side, but for the session's own.
+    drops: Drops,
     promise: OnceLock<Promise>,
     /// Definitions by name and md5.
     types: Mutex<HashMap<(String, String), WireType>>,
@@ -71,6 +75,7 @@ impl Mirror {
             calls: Calls::default(),
             lent: Lent::default(),
             parameters: Parameters::default(),
+            drops: Drops::default(),
             promise: OnceLock::new(),
             types: Mutex::default(),
             siblings: RwLock::default(),
@@ -79,6 +84,7 @@ impl Mirror {
         });
         tokio::spawn(obey(Arc::downgrade(&mirror), taken));
         tokio::spawn(lent::follow(Arc::downgrade(&mirror)));
+        tokio::spawn(dropped::tell(Arc::downgrade(&mirror)));
         mirror
     }
 
@@ -101,7 +107,10 @@ impl Mirror {
     /// listens to is opened again.
     pub fn renew(&self, session: Arc<Session>) {
         self.calls.renew();
-        *self.session.write() = session;
+        let before = std::mem::replace(&mut *self.session.write(), session);
+        for drop in before.drops() {
+            self.drops.add(&drop.topic, drop.cause, drop.count);
+        }
         self.lent.renew();
         self.calls.fail(
             self.keeper(),
@@ -120,6 +129,12 @@ impl Mirror {
 }
 
 impl Handler for Mirror {
+    fn undecodable(&self, channel: u32) {
+        if let Some(topic) = self.outputs.topic_of(channel) {
+            self.drops.add(&topic, Cause::Undecodable, 1);
+        }
+    }
+
     fn record(&self, record: Record, arrived: i64) {
         match record {
             Record::Data(data) => self.outputs.take(self, data, arrived),

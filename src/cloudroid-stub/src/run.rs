@@ -1,21 +1,19 @@
 //! The life of a stub: from roslaunch's exec to the real node's exit status.
 //!
 //! ```text
-//!  Master reached ─▶ hello ─▶ Linked ──connection lost──▶ Away ──jittered backoff──▶ hello (resume)
-//!       │              │        └─ node exited ─▶ exit status        └─ SIGINT, shutdown ─▶ exit
+//!  Master reached ─▶ linked (see `linked`) ── node exited ─▶ exit status
+//!       │              │        └─ SIGINT, shutdown ─▶ exit
 //!       │              └─ refused ─▶ the local original in its place, or an error
 //!       └─ not there: waits for it, as any node does
 //! ```
 
-use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use link::control::{Control, Exit, Hello, Resume, Sla, Welcome};
-use link::session::{receive_open, send_open};
-use link::{Lost, Session, SessionOptions};
+use link::control::{Control, Exit, Hello, Sla};
+use link::{Session, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
 use ros::bus::{Bus, BusError, ParamValue};
@@ -24,23 +22,17 @@ use ros::ros1::{Ros1Bus, Ros1Options};
 use tokio::signal::unix::{SignalKind, signal as signals};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
-use ws::WebSocket;
 
 use crate::config::{self, Config, Group, Local};
-use crate::connect;
+use crate::linked;
 use crate::local::{Program, Setting};
+use crate::machine;
 use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::resolver::RobotSockets;
 use crate::robot::{Robot, usual_name};
-use crate::stream::Stream;
 
-/// For the portal to accept a connection; a first one waits until the servant runs.
-const CONNECT: Duration = Duration::from_secs(10);
-const SERVANT: Duration = Duration::from_secs(120);
-/// Between attempts to connect, at first and at last.
-const BACKOFF: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(3));
 /// For the real node to end after it was told to. roslaunch escalates after 15 s.
 const FAREWELL: Duration = Duration::from_secs(12);
 /// Where no T_max is given, a link silent for so long counts as down.
@@ -105,7 +97,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     let mut hello = Hello {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         run: format!("{:016x}", rand::random::<u64>()),
-        machine: machine(),
+        machine: machine::id(),
+        host: machine::host(),
+        roscore: machine::roscore(&*bus).await,
         node: robot.for_the_cloud(&asked.node.package, &asked.node.node, &asked.node.share),
         sla: sla(&config),
         codecs: match config.codec {
@@ -120,7 +114,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     };
     let mut exit = mirror.exit();
     let end = {
-        let linked = keep_linked(&config, &mirror, &mut hello);
+        let linked = linked::keep(&config, &mirror, &mut hello);
         tokio::pin!(linked);
         tokio::select! {
             refused = &mut linked => End::Refused(refused),
@@ -229,18 +223,12 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
     }
 }
 
-fn session_options(config: &Config) -> SessionOptions {
+/// How the link is watched.
+pub fn session_options(config: &Config) -> SessionOptions {
     let max = config
         .longest()
         .and_then(|max| Duration::try_from_secs_f64(max).ok());
-    // A ping is out, and its pong awaited, within T_max.
-    let silent = max.unwrap_or(SILENT).max(Duration::from_millis(50));
-    SessionOptions {
-        ping: (silent / 2).clamp(Duration::from_millis(100), Duration::from_secs(2)),
-        silent,
-        lost: (silent * 10).clamp(Duration::from_secs(3), Duration::from_secs(20)),
-        max_age: max,
-    }
+    SessionOptions::for_silence(max.unwrap_or(SILENT), max)
 }
 
 fn sla(config: &Config) -> Sla {
@@ -251,100 +239,6 @@ fn sla(config: &Config) -> Sla {
         age: config.age,
         threshold: config.threshold,
     }
-}
-
-/// Keeps a link until the cloud refuses it; says why.
-async fn keep_linked(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
-    let mut pause = BACKOFF.0;
-    let mut resume: Option<String> = None;
-    let mut told = String::new();
-    loop {
-        match link_once(config, mirror, hello, &mut resume).await {
-            Ok(lost) => {
-                tracing::warn!("the link to {} was lost: {lost}", config.server);
-                pause = BACKOFF.0;
-                told.clear();
-            }
-            Err(connect::Error::Refused(reason)) => return reason,
-            Err(connect::Error::Unreachable(reason)) => {
-                if reason != told {
-                    tracing::warn!("no link: {reason}; trying again");
-                    told = reason;
-                }
-            }
-        }
-        sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
-        pause = (pause * 2).min(BACKOFF.1);
-    }
-}
-
-/// One connection, from its handshake to its loss.
-async fn link_once(
-    config: &Config,
-    mirror: &Arc<Mirror>,
-    hello: &mut Hello,
-    resume: &mut Option<String>,
-) -> Result<Lost, connect::Error> {
-    let path = format!("/{}?robot={}", config.service, config.robot());
-    let token = config
-        .token()
-        .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
-    let mut socket = connect::open(config, &path, token.as_deref(), CONNECT).await?;
-    if resume.is_none() && hello.parameters.is_empty() {
-        hello.parameters = mirror.parameters().await;
-    }
-    let (received, ahead, next) = mirror.session().position();
-    hello.next = next;
-    hello.resume = resume.clone().map(|session| Resume {
-        session,
-        received,
-        ahead,
-    });
-    let welcome = timeout(SERVANT, greet(&mut socket, hello)).await;
-    let welcome = match welcome {
-        Ok(Ok(welcome)) => welcome,
-        Ok(Err(lost)) => return Err(connect::Error::Unreachable(lost.to_string())),
-        Err(_) => {
-            return Err(connect::Error::Unreachable(format!(
-                "no servant after {SERVANT:?}"
-            )));
-        }
-    };
-    match welcome {
-        Welcome::Refused {
-            reason,
-            again: true,
-        } => Err(connect::Error::Unreachable(reason)),
-        Welcome::Refused { reason, .. } => Err(connect::Error::Refused(reason)),
-        Welcome::Accepted {
-            session,
-            resumed,
-            received,
-            ahead,
-            next,
-            codecs,
-            servant,
-        } => {
-            if !resumed && resume.is_some() {
-                let fresh = Session::new(session_options(config));
-                fresh.begin_at(hello.next);
-                mirror.renew(Arc::new(fresh));
-            }
-            *resume = Some(session);
-            tracing::info!(servant, resumed, "linked to {}", config.server);
-            let session = mirror.session();
-            if config.codec != config::Codec::None {
-                session.peer_decodes(&codecs);
-            }
-            session.reconnect(received, &ahead, next);
-            Ok(session.run(&mut socket, &**mirror).await)
-        }
-    }
-}
-
-async fn greet(socket: &mut WebSocket<Stream>, hello: &Hello) -> Result<Welcome, Lost> {
-    send_open(socket, hello).await?;
-    receive_open(socket, "welcome").await
 }
 
 /// The streams of signals that end a node.
@@ -402,25 +296,4 @@ fn exit_as(exit: &Exit) -> ExitCode {
 fn restore(number: Signal) {
     // SAFETY: the default action runs no code of this process.
     let _ = unsafe { signal(number, SigHandler::SigDfl) };
-}
-
-/// Tells this machine from others, without telling which it is.
-fn machine() -> String {
-    let id = [
-        "/etc/machine-id",
-        "/var/lib/dbus/machine-id",
-        "/proc/sys/kernel/random/boot_id",
-    ]
-    .iter()
-    .find_map(|path| {
-        std::fs::read_to_string(Path::new(path))
-            .ok()
-            .filter(|id| id.len() > 8)
-    });
-    let digest = <sha1::Sha1 as sha1::Digest>::digest(id.unwrap_or_default().trim());
-    digest
-        .iter()
-        .take(8)
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
 }

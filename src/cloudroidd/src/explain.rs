@@ -91,12 +91,22 @@ fn link(status: LinkStatus) -> Link {
     };
     let requests = &status.requests;
     let late: Vec<&Request> = requests.iter().filter(is_late).collect();
+    let dropped = status.drops.iter().chain(&status.dropped);
+    let here = status
+        .drops
+        .iter()
+        .map(|drop| format!("in the cloud {drop}"));
+    let there = status.dropped.iter();
+    let drops = here
+        .chain(there.map(|drop| format!("on the robot {drop}")))
+        .collect();
     Link {
         up: status.up,
         round_trip: status.round_trip,
         clock: status.clock,
         throughput: status.throughput,
-        dropped: status.dropped,
+        dropped: dropped.map(|drop| drop.count).sum(),
+        drops,
         desire: status.sla.desire.map(millis),
         max,
         threshold: status.sla.threshold,
@@ -113,6 +123,7 @@ fn link(status: LinkStatus) -> Link {
         left_out: status.left_out,
         unfed: status.unfed,
         unserved: status.unserved,
+        twins: status.twins,
         node: status.node,
     }
 }
@@ -246,6 +257,16 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
         );
     }
+    if !link.twins.is_empty() {
+        say(
+            Weight::Blocks,
+            format!(
+                "another machine ({}) is connected as this robot, beside that of {node}",
+                link.twins.join(", ")
+            ),
+            "give one of them another id: `robot` in stub.toml, or CLOUDROID_ROBOT".to_owned(),
+        );
+    }
     for topic in &link.unfed {
         say(
             Weight::Blocks,
@@ -272,6 +293,13 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
         );
     }
     of_queue(served, link, say);
+    for drop in &link.drops {
+        say(
+            Weight::Hint,
+            drop.clone(),
+            "send less (a lower rate, codec = \"video\"), or give the topic's reader a longer queue".to_owned(),
+        );
+    }
     if link.requests == 0 {
         return;
     }
@@ -483,6 +511,8 @@ mod tests {
                 part("compute", vec![30.0; 3]).expect("times"),
                 part("total", vec![100.0; 3]).expect("times"),
             ],
+            twins: vec!["rover2".into()],
+            drops: vec!["on the robot 9 messages of /scan were dropped: why".into()],
             local: 7,
             satisfaction: Some(2.5),
             ..link()
@@ -501,6 +531,7 @@ mod tests {
         let causes = texts(all);
         let words = [
             "the link of /detect is down",
+            "another machine (rover2) is connected as this robot, beside that of /detect; give one",
             "listens to /image, which nobody on the robot publishes; remap it",
             "looked for the service /static_map, which nobody served; start",
             "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
@@ -511,6 +542,7 @@ mod tests {
             "requests queue before /detect: 60 ms of 100 ms, while it needs 30 ms for one; lower the rate of its inputs, or give it more cores: cloudroidctl set s1 --cpus N",
             "12 inputs of /detect were not sent in the last minute",
             "/detect has left out 40 of its last 128 inputs",
+            "on the robot 9 messages of /scan were dropped: why; send less",
             "answered 7 of the last 100 requests of /detect, Q is 2.5",
         ];
         for words in words {
@@ -542,6 +574,7 @@ mod tests {
 
     #[test]
     fn a_links_requests_are_summed_up() {
+        use link::drops::{Cause, Drop};
         let request = |total: Option<f64>, local| Request {
             total,
             compute: 40.0,
@@ -549,13 +582,19 @@ mod tests {
             satisfaction: 6.0,
             ..Request::default()
         };
+        let dropped = |cause, count| Drop {
+            topic: "/image".into(),
+            cause,
+            count,
+        };
         let seen = super::link(LinkStatus {
             node: "/detect".into(),
             up: true,
             round_trip: Some(2.0),
             clock: None,
             throughput: None,
-            dropped: 0,
+            drops: vec![dropped(Cause::Slow, 2)],
+            dropped: vec![dropped(Cause::Replaced, 30)],
             sla: link::control::Sla {
                 desire: Some(0.05),
                 max: Some(0.1),
@@ -574,8 +613,12 @@ mod tests {
             left_out: 1,
             unfed: vec![],
             unserved: vec![],
+            twins: vec![],
         });
         assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
+        assert_eq!(seen.dropped, 32);
+        assert!(seen.drops[0].starts_with("in the cloud 2 messages of /image were dropped: "));
+        assert!(seen.drops[1].starts_with("on the robot 30 messages of /image were dropped: "));
         assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
         let total = seen.phases.last().expect("parts");
         assert_eq!(

@@ -19,7 +19,7 @@ use crate::choreographer::{Handle, Inner, how_it_ended};
 use crate::definitions;
 use crate::journal::Journal;
 use crate::request_times::RequestTimes;
-use crate::state::{RevisionRecord, State};
+use crate::state::{NewEvent, RevisionRecord, State};
 
 /// How deep executables may lie below `share/PKG`.
 const DEPTH: usize = 4;
@@ -351,6 +351,16 @@ impl Nodes for LinkedNodes {
 
     fn measured(&self, request: &Request) {
         self.request_times.note(&self.revision.service, request);
+    }
+
+    fn warn(&self, kind: &str, text: &str) {
+        let handle = self.handle();
+        let about = NewEvent {
+            service: Some(&self.revision.service),
+            servant: Some(self.container.id()),
+            robot: handle.as_ref().ok().map(|handle| handle.robot.as_str()),
+        };
+        self.journal.warning(kind, text, &about);
     }
 
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {

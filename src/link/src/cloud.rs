@@ -11,16 +11,19 @@
 //! A link outlives its connections for a grace time. Of an input that several nodes of the servant listen to, one
 //! link is the feeder; what nodes of one servant publish for each other stays inside.
 
+mod attempts;
 mod given;
+mod held;
 mod inputs;
 mod lent;
 mod mirror;
 mod node_link;
 mod outputs;
 mod parameters;
+mod twins;
 mod unsent;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -35,12 +38,15 @@ use tokio::time::timeout;
 use ws::WebSocket;
 
 use crate::control::{Control, Decision, Exit, Hello, Node, Request, Sla, Welcome};
+use crate::drops::Drop;
 use crate::packing::decoded_here;
 use crate::session::{Lost, SessionOptions, receive_open, send_open};
 use crate::skew::Skew;
 use crate::{MAX_FRAME, MAX_RECORD};
 
+use attempts::Attempts;
 use node_link::NodeLink;
+use twins::Machine;
 
 /// For the robot's hello.
 const HELLO: Duration = Duration::from_secs(10);
@@ -74,6 +80,8 @@ pub trait Nodes: Send + Sync + 'static {
     fn decided(&self, _node: &str, _decision: &Decision) {}
     /// The cloud's time of a request, and its parts, have become known: once for each request.
     fn measured(&self, _request: &Request) {}
+    /// Something that whoever looks after the server should know of this robot.
+    fn warn(&self, kind: &str, text: &str);
 }
 
 /// Habits of a hub.
@@ -114,6 +122,9 @@ pub struct Hub {
     lends: AtomicBool,
     /// The robot's clock against ours.
     skew: Skew,
+    attempts: Attempts,
+    /// Machines that were told of each other.
+    twins: Mutex<BTreeSet<(String, String)>>,
     closed: watch::Sender<Option<String>>,
 }
 
@@ -130,8 +141,10 @@ pub struct LinkStatus {
     pub clock: Option<f64>,
     /// Bytes per second downwards, when it had to hurry.
     pub throughput: Option<f64>,
-    /// Messages not sent down.
-    pub dropped: u64,
+    /// Messages that were dropped in the cloud …
+    pub drops: Vec<Drop>,
+    /// … and on the robot, as it told.
+    pub dropped: Vec<Drop>,
     /// What the robot asked for.
     pub sla: Sla,
     /// Its last requests, as it told them, oldest first.
@@ -146,6 +159,8 @@ pub struct LinkStatus {
     pub unfed: Vec<String>,
     /// Services that the node has looked for in vain, and that are not known to be there now.
     pub unserved: Vec<String>,
+    /// Other machines that are connected as the same robot.
+    pub twins: Vec<String>,
 }
 
 impl Hub {
@@ -169,17 +184,16 @@ impl Hub {
             parameters: parameters::Known::default(),
             lends: AtomicBool::new(false),
             skew: Skew::default(),
+            attempts: Attempts::default(),
+            twins: Mutex::default(),
             closed: watch::Sender::new(None),
         })
     }
 
     /// All links, by node.
     pub fn status(&self) -> Vec<LinkStatus> {
-        self.links
-            .lock()
-            .values()
-            .map(|link| link.status())
-            .collect()
+        let links: Vec<_> = self.links.lock().values().cloned().collect();
+        links.iter().map(|link| link.status()).collect()
     }
 
     /// Ends every connection with these words, and all links.
@@ -233,6 +247,7 @@ impl Hub {
             _ = replaced => return replaced_by_another(),
             seat = link.seat.lock() => seat,
         };
+        self.tell_twins(&link);
         let (received, ahead, next) = link.session.position();
         let welcome = Welcome::Accepted {
             session: link.id.clone(),
@@ -268,6 +283,9 @@ impl Hub {
             lost,
             Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full
         );
+        if matches!(lost, Lost::Closed { code: 1000, .. }) {
+            self.attempts.ended(&hello.run);
+        }
         if for_good {
             self.end(&link).await;
         } else {
@@ -294,6 +312,13 @@ impl Hub {
                 again: true,
             });
         }
+        if !self.attempts.is_newest(&hello.run, hello.attempt) {
+            return Err(Refusal {
+                reason: format!("{node} has tried again since, or has ended"),
+                again: true,
+            });
+        }
+        let machine = Machine::of(hello);
         let earlier = self.links.lock().get(node).cloned();
         if let Some(link) = earlier {
             let same = link.run == hello.run;
@@ -303,10 +328,12 @@ impl Hub {
                 let turn = *link.kick.borrow();
                 return Ok((link, true, turn));
             }
-            let alive = *link.session.up().borrow();
-            if !same && alive && link.machine != hello.machine {
+            let alive = link.is_connected();
+            if !same && alive && machine.is_of_another_robot(&link.machine) {
                 return Err(Refusal::final_(format!(
-                    "another machine is connected as this robot and runs {node}; give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)"
+                    "another machine{} is connected as this robot and runs {node}; {}",
+                    link.machine.named(),
+                    twins::NEXT
                 )));
             }
             link.kick.send_modify(|kicks| *kicks += 1);
@@ -457,3 +484,6 @@ fn session_options(sla: &Sla) -> SessionOptions {
             .map(Duration::from_secs_f64),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 use ros::bus::ParamValue;
 use serde::{Deserialize, Serialize};
 
+use crate::drops::Drop;
+
 /// The robot's first frame on every connection.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -14,8 +16,15 @@ pub struct Hello {
     pub version: String,
     /// Made up when the stub's process began: names this life of the node.
     pub run: String,
-    /// The robot's machine, so that two robots under one id can be told apart.
+    /// Counts the connections that this life has tried: one that was overtaken on its way does not displace a later
+    /// one. 0: they are not counted.
+    pub attempt: u64,
+    /// The robot's machine since it was started, so that two robots under one id can be told apart …
     pub machine: String,
+    /// … its host name, for messages …
+    pub host: String,
+    /// … and the id of its ROS Master's life: several machines with one Master are one robot.
+    pub roscore: String,
     /// The session to go on with.
     pub resume: Option<Resume>,
     /// The first number that the robot will use on this connection.
@@ -196,6 +205,8 @@ pub enum Control {
         /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
         of: Option<Served>,
     },
+    /// Robot: all messages that were dropped on its side so far.
+    Dropped(Vec<Drop>),
     /// Robot: messages of this session that it has not sent, so far.
     Unsent {
         /// A newer one took their place.
@@ -335,4 +346,78 @@ pub struct Request {
     pub local: bool,
     /// The satisfaction after it.
     pub satisfaction: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    #[test]
+    fn what_earlier_stubs_say_is_understood() {
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        let hello = r#"{"version":"0.1.0","run":"r","machine":"m","resume":{"session":"s","received":4,"ahead":[6]},
+            "next":5,"node":{"name":"/n","package":"p","executable":"e","argv":["a:=b"],"namespace":"/","share":"/s",
+            "directory":"/d","revision":3,"image":"sha256:0","calls":[]},"sla":{"desire":0.1,"max":0.3,
+            "frames_per_second":null,"age":null},"codecs":["image"],"keep_stamps":false,"parameters":{"a":{"b":1}}}"#;
+        let hello: Hello = serde_json::from_str(hello).unwrap();
+        assert_eq!((hello.run.as_str(), hello.machine.as_str()), ("r", "m"));
+        assert_eq!((hello.next, hello.attempt), (5, 0));
+        assert_eq!(hello.resume.unwrap().ahead, [6]);
+        assert_eq!((hello.node.name.as_str(), hello.sla.max), ("/n", Some(0.3)));
+        let welcome = r#"{"accepted":{"session":"s","resumed":true,"received":1,"ahead":[],"next":2,"servant":"v"}}"#;
+        let welcome: Welcome = serde_json::from_str(welcome).unwrap();
+        assert!(matches!(welcome, Welcome::Accepted { next: 2, .. }));
+        let refused = r#"{"refused":{"reason":"why","again":true}}"#;
+        let refused: Welcome = serde_json::from_str(refused).unwrap();
+        assert!(matches!(refused, Welcome::Refused { again: true, .. }));
+        for told in [
+            r#"{"open":{"channel":1,"topic":"/t","type":"p/T","md5":"0","definition":"d","latching":false}}"#,
+            r#"{"close":{"channel":1}}"#,
+            r#"{"listeners":{"channel":1,"count":2}}"#,
+            r#"{"parameters":[["/a",1],["/b",null]]}"#,
+            r#"{"signal":{"signal":2}}"#,
+            r#"{"keyframe":{"channel":1}}"#,
+            r#"{"decoded":{"channel":1,"sequence":2}}"#,
+            r#"{"type":{"name":"p/T","md5":"0","definition":"d"}}"#,
+            r#"{"graph":{"outputs":[{"channel":1,"topic":"/t","type":"p/T","md5":"0"}],
+                "inputs":[{"topic":"/t","type":"*","md5":"*","feed":true}],
+                "services":[{"channel":2,"name":"/s","type":"p/S","md5":"0"}],"siblings":["/m"]}}"#,
+            r#"{"exited":{"code":0,"signal":null,"text":"t"}}"#,
+            r#"{"notice":{"warning":true,"text":"t"}}"#,
+            r#"{"line":{"error":false,"text":"t"}}"#,
+            r#"{"requests":[{"id":1,"name":"/s","total":null,"serialise":0,"up":1,"queue":2,"compute":3,"down":4,
+                "local":true,"satisfaction":2.5}]}"#,
+            r#"{"dropped":[{"topic":"/t","cause":"cut_off","count":3}]}"#,
+        ] {
+            let control: Control = serde_json::from_str(told).expect(told);
+            // Written again it says the same: nothing was left out for want of understanding.
+            let again = serde_json::to_value(&control).unwrap();
+            let told: serde_json::Value = serde_json::from_str(told).unwrap();
+            assert_eq!(covers(&again, &told), None, "{again} {told}");
+        }
+    }
+
+    /// Where `whole` lacks something of `part`.
+    fn covers(whole: &serde_json::Value, part: &serde_json::Value) -> Option<String> {
+        use serde_json::Value;
+        match (whole, part) {
+            (Value::Object(whole), Value::Object(part)) => part.iter().find_map(|(key, value)| {
+                let Some(found) = whole.get(key) else {
+                    return Some(key.clone());
+                };
+                covers(found, value)
+            }),
+            (Value::Array(whole), Value::Array(part)) if whole.len() == part.len() => {
+                let pairs = whole.iter().zip(part);
+                pairs
+                    .into_iter()
+                    .find_map(|(whole, part)| covers(whole, part))
+            }
+            (Value::Number(whole), Value::Number(part)) => {
+                (whole.as_f64() != part.as_f64()).then(|| part.to_string())
+            }
+            (whole, part) => (whole != part).then(|| part.to_string()),
+        }
+    }
 }

@@ -10,8 +10,8 @@
 //! | 5 pong | sent i64 · arrived i64 · left i64 · received u32 · bytes u64 |
 //! | 6 ack | received u32 · bytes u64 |
 //!
-//! A record with a number other than 0 is kept by its sender until the peer has it, and sent again after a lost
-//! connection: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
+//! A record with a number other than 0 is remembered by its sender until the peer has it, and sent again after a lost
+//! connection or counted as dropped: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
 //! the sender knows how fast the link is. Times are nanoseconds since 1970 on the clock of whoever wrote them.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
@@ -33,7 +33,7 @@ pub enum Frame {
     Open(Bytes),
     /// A record in one piece.
     Whole {
-        /// 0: not kept.
+        /// 0: whether it came is of no interest.
         number: u32,
         /// The record.
         record: Bytes,
@@ -42,7 +42,7 @@ pub enum Frame {
     Begin {
         /// Names the record while it is under way.
         stream: u32,
-        /// 0: not kept.
+        /// 0: whether it came is of no interest.
         number: u32,
         /// The record's length.
         total: u32,
@@ -247,6 +247,57 @@ mod tests {
             Frame::Ack(received),
         ] {
             assert_eq!(Frame::decode(frame.encode()).unwrap(), frame);
+        }
+    }
+
+    /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    #[test]
+    fn the_bytes_of_frames_are_those_of_this_version() {
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        let received = Received {
+            number: 7,
+            bytes: 0x0102_0304_0506_0708,
+        };
+        let bytes = Bytes::from_static(b"abc");
+        let pinned = [
+            (Frame::Open(bytes.clone()), "00 616263"),
+            (
+                Frame::Whole {
+                    number: 1,
+                    record: bytes.clone(),
+                },
+                "01 01000000 616263",
+            ),
+            (
+                Frame::Begin {
+                    stream: 2,
+                    number: 3,
+                    total: 9,
+                    bytes: bytes.clone(),
+                },
+                "02 02000000 03000000 09000000 616263",
+            ),
+            (Frame::More { stream: 2, bytes }, "03 02000000 616263"),
+            (
+                Frame::Ping { sent: -1, received },
+                "04 ffffffffffffffff 07000000 0807060504030201",
+            ),
+            (
+                Frame::Pong {
+                    sent: 1,
+                    arrived: 2,
+                    left: 3,
+                    received,
+                },
+                "05 0100000000000000 0200000000000000 0300000000000000 07000000 0807060504030201",
+            ),
+            (Frame::Ack(received), "06 07000000 0807060504030201"),
+        ];
+        for (frame, expected) in pinned {
+            let encoded = frame.encode();
+            let hex: String = encoded.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(hex, expected.replace(' ', ""), "{frame:?}");
+            assert_eq!(Frame::decode(encoded).unwrap(), frame);
         }
     }
 

@@ -22,6 +22,7 @@
 pub mod clock;
 pub mod cloud;
 pub mod control;
+pub mod drops;
 pub mod frame;
 mod incoming;
 mod outgoing;
@@ -32,10 +33,22 @@ pub mod skew;
 pub mod stamps;
 mod values;
 
-pub use outgoing::{Dropped, Quality};
+pub use drops::Dropped;
+pub use outgoing::Quality;
 pub use session::{Handler, Lost, Session, SessionOptions};
 
 /// The WebSocket subprotocol of this version. Both ends list those they speak, newest first.
+///
+/// Its number grows when an end of the version before would misread what an end of this one sends:
+///
+/// * the bytes of a [frame](frame) or a [record](record) change, or there is a new kind of either: the tests that pin
+///   those bytes fail, and are changed together with this number;
+/// * a field of [hello, welcome or what is told later](control) changes its name, its type or what it means, or one
+///   that was optional must be there.
+///
+/// It stays when a field with a default is added to one of those, or something more is told: readers leave out what
+/// they do not know, and what they do not find has its default, which must mean what it meant before. So it does when
+/// a codec is added, since each end says which it decodes.
 pub const SUBPROTOCOL: &str = "cloudroid-link.v1";
 /// What all versions begin with.
 pub const SUBPROTOCOLS: &str = "cloudroid-link.";

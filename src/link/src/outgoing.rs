@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use bytes::{BufMut, Bytes, BytesMut};
 
+use crate::drops::Cause;
 use crate::frame::Frame;
 use crate::record::{ENCODED, FLAGS_AT, LEFT_AT, Record, SERIALISE_AT};
 
@@ -30,7 +31,7 @@ const SMALL_IN_A_ROW: u32 = 16;
 const WAITING: (usize, usize) = (256, 2 << 20);
 /// Big messages that wait on one topic: only the newest counts.
 const BIG_WAITING: usize = 1;
-/// Records kept in case they are lost, and their bytes. Messages beyond go without a number.
+/// Records kept in case they are lost, and their bytes. Messages beyond are not sent again.
 const KEPT: (usize, usize) = (2048, 4 << 20);
 /// Urgent records that may wait and be kept: beyond, the session is given up.
 const MAX_URGENT: usize = 65_536;
@@ -47,13 +48,16 @@ pub enum Quality {
     Each,
 }
 
-/// Messages not sent.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Dropped {
-    /// A newer one took their place.
-    pub replaced: u64,
-    /// They were too old.
-    pub stale: u64,
+/// Messages dropped so far, by channel and cause.
+pub(crate) type Dropped = BTreeMap<(u32, Cause), u64>;
+
+/// What the peer was sent and has not said to have.
+#[derive(Debug)]
+enum Kept {
+    /// It is sent again after a lost connection.
+    Again(Out),
+    /// It is not: too much was kept already, or a newer one will come. Of this channel.
+    Not(u32),
 }
 
 #[derive(Debug, Clone)]
@@ -89,6 +93,8 @@ impl Out {
 struct Sending {
     stream: u32,
     number: u32,
+    /// It is sent again after a lost connection.
+    again: bool,
     at: usize,
     out: Out,
 }
@@ -104,7 +110,7 @@ pub(crate) struct Outgoing {
     /// Topics with something to send that is not under way.
     turns: VecDeque<u32>,
     sending: VecDeque<Sending>,
-    kept: VecDeque<(u32, Out)>,
+    kept: VecDeque<(u32, Kept)>,
     kept_bytes: usize,
     in_a_row: u32,
     /// Messages of these topics are encoded before they are sent, while `packs`.
@@ -184,7 +190,7 @@ impl Outgoing {
                 break;
             }
             bytes -= topic.remove(at).map_or(0, |gone| gone.len());
-            self.dropped.replaced += 1;
+            count(&mut self.dropped, channel, Cause::Replaced);
         }
         if topic.len() == 1 && !self.is_under_way(channel) {
             self.turns.push_back(channel);
@@ -260,7 +266,10 @@ impl Outgoing {
 
     /// Forgets what waits on a channel.
     pub(crate) fn forget(&mut self, channel: u32) {
-        self.topics.remove(&channel);
+        let waiting = self.topics.remove(&channel).unwrap_or_default();
+        for _ in waiting {
+            count(&mut self.dropped, channel, Cause::Gone);
+        }
         self.packable.remove(&channel);
         if self
             .packed
@@ -268,6 +277,7 @@ impl Outgoing {
             .is_some_and(|out| out.channel == Some(channel))
         {
             self.packed = None;
+            count(&mut self.dropped, channel, Cause::Gone);
         }
         self.turns.retain(|turn| *turn != channel);
     }
@@ -322,7 +332,7 @@ impl Outgoing {
             |first: &Out| !first.each && self.max_age.is_some_and(|age| now - first.born > age);
         while topic.len() > 1 && topic.front().is_some_and(stale) {
             topic.pop_front();
-            self.dropped.stale += 1;
+            count(&mut self.dropped, channel, Cause::Stale);
         }
         let out = topic.pop_front()?;
         if self.to_be_packed(&out) {
@@ -356,11 +366,17 @@ impl Outgoing {
             out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
         }
         let length = out.len();
-        let number = self.number_for(&out);
+        let again = self.is_sent_again(&out);
+        let number = if again || self.kept.len() < MAX_URGENT {
+            self.next_number += 1;
+            self.next_number - 1
+        } else {
+            0
+        };
         if length <= SMALL {
             self.sent += length as u64;
             let record = out.piece(0, length);
-            self.keep(number, out);
+            self.keep(number, again, out);
             return Frame::Whole { number, record };
         }
         let stream = self.next_stream;
@@ -373,6 +389,7 @@ impl Outgoing {
         self.sending.push_back(Sending {
             stream,
             number,
+            again,
             at,
             out,
         });
@@ -384,24 +401,24 @@ impl Outgoing {
         }
     }
 
-    fn number_for(&mut self, out: &Out) -> u32 {
+    fn is_sent_again(&self, out: &Out) -> bool {
         let room = self.kept.len() < KEPT.0 && self.kept_bytes + out.len() <= KEPT.1;
-        let keep = out.channel.is_none() || (room && (out.len() <= SMALL || out.each));
-        if !keep {
-            return 0;
-        }
-        let number = self.next_number;
-        self.next_number += 1;
-        number
+        out.channel.is_none() || (room && (out.len() <= SMALL || out.each))
     }
 
-    fn keep(&mut self, number: u32, out: Out) {
+    fn keep(&mut self, number: u32, again: bool, out: Out) {
         if number == 0 {
             return;
         }
-        self.kept_bytes += out.len();
+        let kept = match out.channel {
+            Some(channel) if !again => Kept::Not(channel),
+            _ => {
+                self.kept_bytes += out.len();
+                Kept::Again(out)
+            }
+        };
         let at = self.kept.partition_point(|(kept, _)| *kept < number);
-        self.kept.insert(at, (number, out));
+        self.kept.insert(at, (number, kept));
     }
 
     fn next_piece(&mut self) -> Option<Frame> {
@@ -414,7 +431,7 @@ impl Outgoing {
             self.sending.push_back(sending);
         } else {
             self.turn_after(&sending.out);
-            self.keep(sending.number, sending.out);
+            self.keep(sending.number, sending.again, sending.out);
         }
         Some(Frame::More { stream, bytes })
     }
@@ -422,7 +439,7 @@ impl Outgoing {
     /// The peer has all numbers up to this one.
     pub(crate) fn acknowledge(&mut self, number: u32) {
         while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
-            if let Some((_, out)) = self.kept.pop_front() {
+            if let Some((_, Kept::Again(out))) = self.kept.pop_front() {
                 self.kept_bytes -= out.len();
             }
         }
@@ -454,21 +471,24 @@ impl Outgoing {
                 if out.each || topic.is_empty() {
                     topic.push_front(out);
                 } else {
-                    self.dropped.replaced += 1;
+                    count(&mut self.dropped, channel, Cause::Replaced);
                 }
             }
         }
         for sending in std::mem::take(&mut self.sending) {
-            if sending.number != 0 {
-                self.keep(sending.number, sending.out);
-            } else {
-                self.dropped.replaced += 1;
-            }
+            self.keep(sending.number, sending.again, sending.out);
         }
-        for (number, out) in std::mem::take(&mut self.kept).into_iter().rev() {
+        for (number, kept) in std::mem::take(&mut self.kept).into_iter().rev() {
             if number <= received || ahead.contains(&number) {
                 continue;
             }
+            let out = match kept {
+                Kept::Again(out) => out,
+                Kept::Not(channel) => {
+                    count(&mut self.dropped, channel, Cause::CutOff);
+                    continue;
+                }
+            };
             match out.channel {
                 None => {
                     self.urgent_bytes += out.len();
@@ -485,6 +505,10 @@ impl Outgoing {
             .map(|(channel, _)| *channel)
             .collect();
     }
+}
+
+fn count(dropped: &mut Dropped, channel: u32, cause: Cause) {
+    *dropped.entry((channel, cause)).or_default() += 1;
 }
 
 #[cfg(test)]

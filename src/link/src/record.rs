@@ -216,6 +216,77 @@ impl Record {
 mod tests {
     use super::*;
 
+    fn hex(bytes: &[u8]) -> String {
+        bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    #[test]
+    fn the_bytes_of_records_are_those_of_this_version() {
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        let data = Data {
+            channel: 0x0102_0304,
+            encoded: true,
+            latching: false,
+            born: 0x1112_1314_1516_1718,
+            left: -2,
+            serialise: 0x2122_2324,
+            answered: None,
+            message: Bytes::from_static(b"msg"),
+        };
+        let answered = Data {
+            encoded: false,
+            latching: true,
+            answered: Some(Answered {
+                born: 1,
+                serialise: 2,
+                left: 3,
+                taken: 4,
+                given: 5,
+            }),
+            ..data.clone()
+        };
+        let answer = |response| Record::Answer {
+            id: 6,
+            taken: 7,
+            given: 8,
+            response,
+        };
+        let pinned = [
+            (Record::Control(Bytes::from_static(b"{}")), "007b7d"),
+            (
+                Record::Data(data),
+                "01 04030201 01 1817161514131211 feffffffffffffff 24232221 6d7367",
+            ),
+            (
+                Record::Data(answered),
+                "01 04030201 06 1817161514131211 feffffffffffffff 24232221 0100000000000000 02000000 0300000000000000 0400000000000000 0500000000000000 6d7367",
+            ),
+            (
+                Record::Call {
+                    id: 9,
+                    service: 10,
+                    request: Bytes::from_static(b"ask"),
+                },
+                "02 09000000 0a000000 61736b",
+            ),
+            (
+                answer(Ok(Bytes::from_static(b"yes"))),
+                "03 06000000 01 0700000000000000 0800000000000000 796573",
+            ),
+            (
+                answer(Err("no".into())),
+                "03 06000000 00 0700000000000000 0800000000000000 6e6f",
+            ),
+        ];
+        for (record, expected) in pinned {
+            let (mut head, payload) = record.parts();
+            head.extend_from_slice(&payload);
+            assert_eq!(hex(&head), expected.replace(' ', ""), "{record:?}");
+            assert_eq!(Record::decode(head.freeze()).unwrap(), record);
+        }
+    }
+
     #[test]
     fn records_come_back() {
         let data = Data {

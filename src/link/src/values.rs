@@ -1,8 +1,11 @@
-//! Parameters as JSON, which has no numbers for infinities and NaN: those are spelt out, as `{"~double": "inf"}`.
+//! Parameters as JSON, which has no numbers for infinities and NaN, and no bytes: those are spelt out, as
+//! `{"~double": "inf"}` and `{"~base64": "AA=="}`.
 //! No parameter is called so, since a ROS name holds no tilde but at its beginning.
 
 use std::collections::BTreeMap;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use ros::bus::ParamValue;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -16,6 +19,7 @@ enum Written {
     String(String),
     List(Vec<Written>),
     Spelt(Spelt),
+    Bytes(Bytes),
     Map(BTreeMap<String, Written>),
 }
 
@@ -24,6 +28,13 @@ enum Written {
 struct Spelt {
     #[serde(rename = "~double")]
     double: String,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Bytes {
+    #[serde(rename = "~base64")]
+    base64: String,
 }
 
 impl From<&ParamValue> for Written {
@@ -36,6 +47,11 @@ impl From<&ParamValue> for Written {
                 double: number.to_string(),
             }),
             ParamValue::String(text) => Self::String(text.clone()),
+            // Stubs leave it out, and say so.
+            ParamValue::Nil => Self::String(String::new()),
+            ParamValue::Binary(bytes) => Self::Bytes(Bytes {
+                base64: STANDARD.encode(bytes),
+            }),
             ParamValue::List(items) => Self::List(items.iter().map(Self::from).collect()),
             ParamValue::Map(members) => {
                 let members = members.iter();
@@ -56,6 +72,9 @@ impl From<Written> for ParamValue {
             Written::Int(number) => Self::Int(number),
             Written::Double(number) => Self::Double(number),
             Written::Spelt(spelt) => Self::Double(spelt.double.parse().unwrap_or(f64::NAN)),
+            Written::Bytes(bytes) => {
+                Self::Binary(STANDARD.decode(bytes.base64).unwrap_or_default())
+            }
             Written::String(text) => Self::String(text),
             Written::List(items) => Self::List(items.into_iter().map(Self::from).collect()),
             Written::Map(members) => {
@@ -118,13 +137,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_json_has_not_arrive_as_they_were() {
+    fn what_json_has_not_arrives_as_it_was() {
         let values = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.0, 1e300];
         let list = ParamValue::List(values.map(ParamValue::Double).to_vec());
         let map = ParamValue::Map(
             [
                 ("range".to_owned(), list),
                 ("n".to_owned(), ParamValue::Int(3)),
+                ("key".to_owned(), ParamValue::Binary(vec![0, 255, 7])),
+                ("text".to_owned(), ParamValue::String("AP8H".into())),
             ]
             .into(),
         );

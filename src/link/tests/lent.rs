@@ -48,6 +48,7 @@ impl Nodes for Still {
     fn translate(&self, _: &Node, text: &str) -> String {
         text.to_owned()
     }
+    fn warn(&self, _: &str, _: &str) {}
     fn lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
         mpsc::channel(1).1
     }

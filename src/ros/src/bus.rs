@@ -2,7 +2,7 @@
 //!
 //! Messages cross it serialized, reference-counted and never copied per subscriber.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -188,10 +188,21 @@ pub enum ParamValue {
     Double(f64),
     /// UTF-8 text.
     String(String),
+    /// Bytes: XML-RPC's base64. In JSON it is written as base64 text, and read back as text.
+    #[serde(serialize_with = "as_base64", skip_deserializing)]
+    Binary(Vec<u8>),
+    /// Nothing: a Master may hold it, ROS knows no such value. It is never sent.
+    #[serde(skip_deserializing)]
+    Nil,
     /// A list.
     List(Vec<ParamValue>),
     /// A dictionary.
     Map(BTreeMap<String, ParamValue>),
+}
+
+fn as_base64<S: serde::Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    use base64::Engine as _;
+    serializer.serialize_str(&base64::engine::general_purpose::STANDARD.encode(bytes))
 }
 
 impl PartialEq for ParamValue {
@@ -201,6 +212,8 @@ impl PartialEq for ParamValue {
             (Self::Int(a), Self::Int(b)) => a == b,
             (Self::Double(a), Self::Double(b)) => a == b || (a.is_nan() && b.is_nan()),
             (Self::String(a), Self::String(b)) => a == b,
+            (Self::Binary(a), Self::Binary(b)) => a == b,
+            (Self::Nil, Self::Nil) => true,
             (Self::List(a), Self::List(b)) => a == b,
             (Self::Map(a), Self::Map(b)) => a == b,
             _ => false,
@@ -331,6 +344,10 @@ pub trait Bus: Send + Sync + 'static {
     /// Asks a topic's peers for their type without subscribing: a publisher's header, or, for a topic that is
     /// only subscribed to, what the subscribers announce when connected to.
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError>;
+    /// The connections over which a topic's publishers send to this side, as they say themselves: each publisher with
+    /// its own number of it. One that has just been connected to is not among them for a moment, and what it publishes
+    /// then is not heard.
+    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<(String, i32)>, BusError>;
     /// Serves a service until the returned guard is dropped.
     async fn serve(
         &self,

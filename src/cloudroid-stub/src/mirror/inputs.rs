@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use link::Quality;
 use link::clock::now;
 use link::control::{Control, Input, Wanted};
+use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use ros::bus::{Message, SubscribeOptions, WireType};
@@ -151,6 +152,10 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
             return;
         }
     };
+    if let Some(mirror) = mirror.upgrade() {
+        let dropped = Arc::clone(&subscription.dropped);
+        mirror.drops.watch(&wanted.topic, Cause::Busy, dropped);
+    }
     let topic: Arc<str> = wanted.topic.as_str().into();
     while let Some(message) = subscription.messages.recv().await {
         let Some(mirror) = mirror.upgrade() else {
@@ -193,7 +198,7 @@ impl Channels {
             }));
             let of = &message.wire_type;
             let schema = codec::Schema::of(&of.name, &of.md5);
-            mirror.session().packs(channel, schema);
+            mirror.session().opens(channel, topic, schema);
             channel
         })
     }

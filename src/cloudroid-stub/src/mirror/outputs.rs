@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use link::control::{Control, Output};
+use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
@@ -87,6 +88,12 @@ impl Outputs {
         }
     }
 
+    /// The topic of a channel.
+    pub fn topic_of(&self, channel: u32) -> Option<String> {
+        let channels = self.channels.lock();
+        channels.get(&channel).map(|topic| topic.name.clone())
+    }
+
     /// Publishes a message of this side, on a topic that is advertised.
     pub fn publish(&self, topic: &str, message: bytes::Bytes) {
         if let Some(topic) = self.topics.lock().get(topic) {
@@ -150,6 +157,12 @@ impl Outputs {
                     latched: Mutex::default(),
                     news: Notify::new(),
                     counting: Mutex::default(),
+                });
+                let counted = Arc::downgrade(&topic.publisher);
+                mirror.drops.ask(&output.topic, Cause::Slow, move || {
+                    let publisher = counted.upgrade();
+                    let count = publisher.as_ref().map_or(0, |it| it.dropped());
+                    (count, publisher.is_none())
                 });
                 self.topics
                     .lock()

@@ -39,12 +39,15 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
         Ok(mut changes) => {
             let mirror = Arc::downgrade(mirror);
             tokio::spawn(async move {
-                while let Some(change) = changes.recv().await {
+                while let Some((key, mut value)) = changes.recv().await {
                     let Some(mirror) = mirror.upgrade() else {
                         return;
                     };
-                    if mirror.parameters.is_news(&change.0, change.1.as_ref()) {
-                        mirror.session().tell(&Control::Parameters(vec![change]));
+                    if mirror.parameters.is_news(&key, value.as_ref())
+                        && parameters::can_be_carried(key.trim_end_matches('/'), &mut value)
+                    {
+                        let changes = vec![(key, value)];
+                        mirror.session().tell(&Control::Parameters(changes));
                     }
                 }
             });

@@ -12,12 +12,13 @@ use super::Hub;
 use super::node_link::within;
 use crate::clock::now;
 use crate::control::Input;
+use crate::drops::{Cause, Drops};
 use crate::record::{Answered, Data};
 use crate::skew::{Skew, Way};
 use crate::stamps::Stamps;
 
 /// Messages kept for a slow node.
-const QUEUE: usize = 100;
+const QUEUE: usize = 256;
 /// Messages, and bytes, that wait until the topic is advertised and the node connected.
 const WAITING: (usize, usize) = (256, 32 << 20);
 
@@ -38,6 +39,7 @@ pub(super) struct Inputs {
 }
 
 struct Channel {
+    topic: String,
     stamps: Stamps,
     state: State,
 }
@@ -52,6 +54,7 @@ impl Inputs {
     /// Messages of this channel may come before it is open.
     pub(super) fn expect(&self, input: &Input) {
         let fresh = Channel {
+            topic: input.topic.clone(),
             stamps: stamps(input),
             state: State::Waiting(VecDeque::new()),
         };
@@ -59,7 +62,12 @@ impl Inputs {
     }
 
     /// Publishes a message; says when, and by what its answer may be known.
-    pub(super) fn take(&self, skew: &Skew, data: Data, arrived: i64) -> Option<(Mark, Answered)> {
+    pub(super) fn take(
+        &self,
+        (skew, drops): (&Skew, &Drops),
+        data: Data,
+        arrived: i64,
+    ) -> Option<(Mark, Answered)> {
         let mut channels = self.channels.lock();
         let channel = channels.get_mut(&data.channel)?;
         let message = data.message;
@@ -73,6 +81,7 @@ impl Inputs {
                 let mut bytes: usize = waiting.iter().map(Bytes::len).sum();
                 while waiting.len() > WAITING.0 || (waiting.len() > 1 && bytes > WAITING.1) {
                     bytes -= waiting.pop_front().map_or(0, |oldest| oldest.len());
+                    drops.add(&channel.topic, Cause::Early, 1);
                 }
             }
         }
@@ -87,7 +96,7 @@ impl Inputs {
     }
 
     /// Advertises, and lets messages through once the node has connected.
-    pub(super) async fn open(&self, hub: &Arc<Hub>, input: Input) {
+    pub(super) async fn open(&self, hub: &Arc<Hub>, drops: &Drops, input: Input) {
         let options = AdvertiseOptions {
             wire_type: WireType {
                 name: input.type_name.clone(),
@@ -104,6 +113,12 @@ impl Inputs {
                 return;
             }
         };
+        let counted = Arc::downgrade(&publisher);
+        drops.ask(&input.topic, Cause::Slow, move || {
+            let publisher = counted.upgrade();
+            let count = publisher.as_ref().map_or(0, |it| it.dropped());
+            (count, publisher.is_none())
+        });
         let graph = hub.bus.graph().borrow().clone();
         let listeners = graph
             .topics
@@ -123,6 +138,12 @@ impl Inputs {
                 }
             }
             channel.state = State::Open(publisher);
+        }
+    }
+
+    pub(super) fn undecodable(&self, drops: &Drops, channel: u32) {
+        if let Some(channel) = self.channels.lock().get(&channel) {
+            drops.add(&channel.topic, Cause::Undecodable, 1);
         }
     }
 

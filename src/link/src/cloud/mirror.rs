@@ -131,7 +131,7 @@ impl Told {
         let stamps = of.map(|of| Stamps::of(&of)).unwrap_or_default();
         link.outputs.add(self.next, topic, stamps);
         let schema = codec::Schema::of(&wire_type.name, &wire_type.md5);
-        link.session.packs(self.next, schema);
+        link.session.opens(self.next, topic, schema);
         self.next
     }
 

@@ -9,13 +9,16 @@ use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 
+use super::held::{Held, Hold};
 use super::inputs::Inputs;
 use super::lent::Lent;
 use super::outputs::Outputs;
+use super::twins::Machine;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
 use crate::clock::Sample;
 use crate::control::{Control, Hello, Request, Sla};
+use crate::drops::{Drop, Drops, Teller};
 use crate::record::Record;
 use crate::session::{Handler, Session, SessionOptions};
 use crate::skew::Way;
@@ -23,12 +26,14 @@ use crate::stamps::Stamps;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;
+/// Between two looks at what was dropped.
+const DROPS: Duration = Duration::from_secs(2);
 
 /// A robot's node, as the cloud sees it.
 pub(super) struct NodeLink {
     pub(super) node: String,
     pub(super) run: String,
-    pub(super) machine: String,
+    pub(super) machine: Machine,
     /// Names the session.
     pub(super) id: String,
     pub(super) session: Session,
@@ -45,7 +50,13 @@ pub(super) struct NodeLink {
     sla: Sla,
     requests: Mutex<VecDeque<Request>>,
     unsent: Unsent,
-    orders: mpsc::UnboundedSender<Control>,
+    /// On this side, but for the session's own.
+    pub(super) drops: Drops,
+    /// On the robot's side, as it told.
+    dropped: Mutex<Vec<Drop>>,
+    /// What must wait for an output to be subscribed to.
+    pub(super) held: Held,
+    orders: mpsc::UnboundedSender<(Control, Option<Hold>)>,
     tasks: Mutex<Vec<AbortHandle>>,
 }
 
@@ -68,7 +79,7 @@ impl NodeLink {
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
             run: hello.run.clone(),
-            machine: hello.machine.clone(),
+            machine: Machine::of(hello),
             id,
             session: Session::new(options),
             seat: tokio::sync::Mutex::default(),
@@ -82,6 +93,9 @@ impl NodeLink {
             sla: hello.sla.clone(),
             requests: Mutex::default(),
             unsent: Unsent::default(),
+            drops: Drops::default(),
+            held: Held::default(),
+            dropped: Mutex::default(),
             orders,
             tasks: Mutex::default(),
         });
@@ -106,6 +120,7 @@ impl NodeLink {
             })
             .abort_handle(),
         );
+        tasks.push(tokio::spawn(tell_drops(Arc::clone(&link))).abort_handle());
         link.tasks.lock().extend(tasks);
         link
     }
@@ -121,13 +136,19 @@ impl NodeLink {
         self.lent.end();
     }
 
+    /// A connection carries it, and is not silent.
+    pub(super) fn is_connected(&self) -> bool {
+        // One that is new has exchanged nothing yet.
+        let fresh = self.session.clock().is_none();
+        self.seat.try_lock().is_err() && (fresh || *self.session.up().borrow())
+    }
+
     pub(super) fn listens_to(&self, topic: &str) -> bool {
         self.listening.lock().contains(topic)
     }
 
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
-        let dropped = self.session.dropped();
         let (given, left_out) = self.outputs.left_out();
         LinkStatus {
             node: self.node.clone(),
@@ -138,7 +159,8 @@ impl NodeLink {
                 .clock()
                 .map(|sample| milliseconds(sample.offset)),
             throughput: self.session.throughput(),
-            dropped: dropped.replaced + dropped.stale,
+            drops: self.drops_here(),
+            dropped: self.dropped.lock().clone(),
             sla: self.sla.clone(),
             requests: self.requests.lock().iter().cloned().collect(),
             unsent: self.unsent.lately(),
@@ -146,7 +168,24 @@ impl NodeLink {
             left_out,
             unfed: self.unfed(),
             unserved: self.unserved(),
+            twins: self.twins(),
         }
+    }
+
+    fn twins(&self) -> Vec<String> {
+        let hub = self.hub.upgrade();
+        let twins = hub.map(|hub| hub.twins_of(self)).unwrap_or_default();
+        let names = twins.iter().map(|twin| twin.machine.name().to_owned());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        names.dedup();
+        names
+    }
+
+    fn drops_here(&self) -> Vec<Drop> {
+        let mut all = self.session.drops();
+        all.extend(self.drops.all());
+        all
     }
 
     fn unserved(&self) -> Vec<String> {
@@ -213,12 +252,20 @@ impl Handler for Arc<NodeLink> {
         (**self).take(self, record, arrived);
     }
 
+    fn undecodable(&self, channel: u32) {
+        (**self).undecodable(channel);
+    }
+
     fn clock(&self, best: Sample) {
         (**self).clock(best);
     }
 }
 
 impl Handler for NodeLink {
+    fn undecodable(&self, channel: u32) {
+        self.inputs.undecodable(&self.drops, channel);
+    }
+
     fn record(&self, record: Record, arrived: i64) {
         // The hub holds every link by an Arc; one that it let go of hears no more.
         let Some(hub) = self.hub.upgrade() else {
@@ -240,32 +287,31 @@ impl Handler for NodeLink {
 impl NodeLink {
     fn take(&self, this: &Arc<Self>, record: Record, arrived: i64) {
         match record {
-            Record::Data(data) => {
-                let Some(hub) = self.hub.upgrade() else {
-                    return;
-                };
-                let channel = data.channel;
-                if let Some((mark, answered)) = self.inputs.take(&hub.skew, data, arrived) {
-                    self.outputs.note(channel, mark, answered);
+            Record::Data(_) | Record::Call { .. } => {
+                match self.held.take(record, arrived) {
+                    Some((record, arrived)) => this.give(record, arrived),
+                    // There may be too much by now.
+                    None => this.pass_held(),
                 }
             }
-            Record::Call {
-                id,
-                service,
-                request,
-            } => this.call(id, service, request, arrived),
             Record::Answer { id, response, .. } => self.lent.answered(id, response),
             Record::Control(json) => match serde_json::from_slice(&json) {
+                // A call that waits for it must not wait for other orders.
+                Ok(Control::Lent { service, of }) => this.lends(service, of),
                 Ok(control) => {
                     // Data may follow in the same breath.
-                    if let Control::Open(input) = &control {
-                        self.inputs.expect(input);
-                    }
-                    match control {
-                        // A call that waits for it must not wait for other orders.
-                        Control::Lent { service, of } => this.lends(service, of),
-                        control => drop(self.orders.send(control)),
-                    }
+                    let hold = match &control {
+                        Control::Open(input) => {
+                            self.inputs.expect(input);
+                            None
+                        }
+                        Control::Listeners { channel, count } => {
+                            let begin = self.outputs.expect(*channel, *count);
+                            begin.then(|| Hold::new(this))
+                        }
+                        _ => None,
+                    };
+                    let _ = self.orders.send((control, hold));
                 }
                 Err(error) => {
                     tracing::debug!(node = self.node, %error, "the robot tells something unknown");
@@ -275,14 +321,48 @@ impl NodeLink {
     }
 }
 
+impl NodeLink {
+    /// Gives a message or a call to the node.
+    fn give(self: &Arc<Self>, record: Record, arrived: i64) {
+        match record {
+            Record::Data(data) => {
+                let Some(hub) = self.hub.upgrade() else {
+                    return;
+                };
+                let channel = data.channel;
+                let taken = self.inputs.take((&hub.skew, &self.drops), data, arrived);
+                if let Some((mark, answered)) = taken {
+                    self.outputs.note(channel, mark, answered);
+                }
+            }
+            Record::Call {
+                id,
+                service,
+                request,
+            } => self.call(id, service, request, arrived),
+            _ => {}
+        }
+    }
+
+    /// Gives it what has waited, if that need not wait any longer.
+    pub(super) fn pass_held(self: &Arc<Self>) {
+        self.held.pass(|record, arrived| self.give(record, arrived));
+    }
+}
+
 /// Does what the robot tells, one thing after the other.
-async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<Control>) {
-    while let Some(order) = orders.recv().await {
+async fn obey(
+    link: Arc<NodeLink>,
+    hub: Arc<Hub>,
+    mut orders: mpsc::UnboundedReceiver<(Control, Option<Hold>)>,
+) {
+    while let Some((order, hold)) = orders.recv().await {
         match order {
-            Control::Open(input) => link.inputs.open(&hub, input).await,
+            Control::Open(input) => link.inputs.open(&hub, &link.drops, input).await,
             Control::Close { channel } => link.inputs.close(channel),
             Control::Listeners { channel, count } => {
-                link.outputs.listeners(&link, &hub, channel, count).await;
+                let outputs = &link.outputs;
+                outputs.listeners(&link, &hub, (channel, count), hold).await;
             }
             Control::Parameters(changes) => hub.parameters.change(&hub, changes).await,
             Control::Signal { signal } => {
@@ -315,7 +395,23 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
                     hub.nodes.decided(&link.node, decision);
                 }
             }
+            Control::Dropped(dropped) => *link.dropped.lock() = dropped,
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
+        }
+    }
+}
+
+/// Tells of messages that were dropped here, in the daemon's log and in the robot's.
+async fn tell_drops(link: Arc<NodeLink>) {
+    let mut teller = Teller::default();
+    loop {
+        tokio::time::sleep(DROPS).await;
+        for drop in teller.news(&link.drops_here()) {
+            tracing::info!(node = link.node, "{drop}");
+            link.session.tell(&Control::Notice {
+                warning: !drop.cause.is_meant(),
+                text: format!("in the cloud {drop}"),
+            });
         }
     }
 }

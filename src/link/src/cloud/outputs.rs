@@ -1,26 +1,31 @@
 //! Topics that the node publishes: subscribed to in the servant only while the robot has listeners, so a node that
 //! works only for listeners does so here, too.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::SubscribeOptions;
+use ros::bus::{Bus, SubscribeOptions};
+use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use super::Hub;
 use super::given::Given;
+use super::held::Hold;
 use super::inputs::{Mark, mark};
 use super::node_link::NodeLink;
 use crate::Quality;
 use crate::clock::now;
+use crate::drops::Cause;
 use crate::record::{Answered, Data};
 use crate::skew::Way;
 use crate::stamps::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;
+/// Between two questions whether a node sends a topic to us.
+const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
 
 /// Outputs by channel.
 #[derive(Default)]
@@ -32,6 +37,8 @@ pub(super) struct Outputs {
 struct Channel {
     topic: String,
     stamps: Stamps,
+    /// How many listen once all that the robot told is done.
+    expected: usize,
     reading: Option<AbortHandle>,
 }
 
@@ -49,6 +56,7 @@ impl Outputs {
         let fresh = Channel {
             topic: topic.to_owned(),
             stamps,
+            expected: 0,
             reading: None,
         };
         self.channels.lock().insert(channel, fresh);
@@ -72,13 +80,22 @@ impl Outputs {
         self.given.lock().left_out()
     }
 
-    /// So many listen on the robot now.
+    /// So many will listen, as soon as that is done; whether they are the first ones.
+    pub(super) fn expect(&self, channel: u32, count: usize) -> bool {
+        let mut channels = self.channels.lock();
+        let Some(known) = channels.get_mut(&channel) else {
+            return false;
+        };
+        std::mem::replace(&mut known.expected, count) == 0 && count > 0
+    }
+
+    /// So many listen on the robot now; `hold` is let go of once the node knows of it.
     pub(super) async fn listeners(
         &self,
         link: &Arc<NodeLink>,
         hub: &Arc<Hub>,
-        channel: u32,
-        count: usize,
+        (channel, count): (u32, usize),
+        hold: Option<Hold>,
     ) {
         let (topic, stamps) = {
             let mut channels = self.channels.lock();
@@ -100,6 +117,7 @@ impl Outputs {
             wire_type: None,
             queue: QUEUE,
         };
+        let before = hub.bus.heard_over(&topic).await.unwrap_or_default();
         let subscription = match hub.bus.subscribe(&topic, options).await {
             Ok(subscription) => subscription,
             Err(error) => {
@@ -107,24 +125,56 @@ impl Outputs {
                 return;
             }
         };
+        link.drops
+            .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
+        let publishers = subscription.publishers.clone();
+        let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = tokio::spawn(async move {
             // All of it, or its guard would stay behind and end the subscription.
             let subscription = &mut { subscription };
-            while let Some(message) = subscription.messages.recv().await {
-                // Other nodes of the servant have links of their own.
-                if *message.publisher == *reader.node {
-                    let Some(hub) = hub.upgrade() else { return };
-                    let bytes = hub.skew.apply(Way::Out, &stamps, message.bytes);
-                    reader.send(channel, bytes, message.latching);
+            let connected = async {
+                let heard = heard(&*bus, &reader.node, &topic, publishers, before);
+                let _ = tokio::time::timeout(warm_up, heard).await;
+                drop(hold);
+            };
+            let read = async {
+                while let Some(message) = subscription.messages.recv().await {
+                    // Other nodes of the servant have links of their own.
+                    if *message.publisher == *reader.node {
+                        let Some(hub) = hub.upgrade() else { break };
+                        let bytes = hub.skew.apply(Way::Out, &stamps, message.bytes);
+                        reader.send(channel, bytes, message.latching);
+                    }
                 }
-            }
+            };
+            tokio::join!(connected, read);
         });
         if let Some(known) = self.channels.lock().get_mut(&channel) {
             known.reading = Some(reading.abort_handle());
         } else {
             reading.abort();
         }
+    }
+}
+
+/// Returns once the node sends the topic to us, over a connection that is not one of those before.
+async fn heard(
+    bus: &dyn Bus,
+    node: &str,
+    topic: &str,
+    mut publishers: watch::Receiver<usize>,
+    before: BTreeSet<(String, i32)>,
+) {
+    let _ = publishers.wait_for(|count| *count > 0).await;
+    loop {
+        let Ok(now) = bus.heard_over(topic).await else {
+            return;
+        };
+        if now.difference(&before).any(|(of, _)| of == node) {
+            return;
+        }
+        tokio::time::sleep(LOOK).await;
     }
 }
 

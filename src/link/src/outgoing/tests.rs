@@ -95,7 +95,7 @@ fn newest_wins_among_big_ones_and_old_ones_are_not_sent() {
     for n in 0..5 {
         out.push(&data(1, n, 1 << 17), Quality::Newest);
     }
-    assert_eq!(out.dropped.replaced, 4);
+    assert_eq!(out.dropped[&(1, Cause::Replaced)], 4);
     for n in 0..5 {
         out.push(&data(2, n * 50, 10), Quality::Newest);
     }
@@ -103,9 +103,47 @@ fn newest_wins_among_big_ones_and_old_ones_are_not_sent() {
     let mut came: Vec<i64> = std::iter::from_fn(|| out.next(250))
         .filter_map(|frame| born(deliver(&mut incoming, frame)))
         .collect();
-    assert_eq!(out.dropped.stale, 3, "those of 0, 50 and 100");
+    assert_eq!(out.dropped[&(2, Cause::Stale)], 3, "those of 0, 50 and 100");
     came.sort_unstable();
     assert_eq!(came, [4, 150, 200]);
+}
+
+#[test]
+fn what_was_sent_and_did_not_come_is_counted_unless_it_is_sent_again() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    let mut came = Vec::new();
+    // The first picture arrives; the end of the second, and a short message, do not; of the third all waits.
+    for number in 1..=3 {
+        out.push(&data(1, number, 40_000), Quality::Newest);
+        let frames = std::iter::from_fn(|| out.next(0)).take(3 - number as usize / 2);
+        for frame in frames.collect::<Vec<_>>() {
+            if number == 1 || matches!(frame, Frame::Begin { .. }) {
+                came.extend(born(deliver(&mut incoming, frame)));
+            }
+        }
+    }
+    out.push(&data(2, 4, 10), Quality::Newest);
+    let (received, ahead) = incoming.state();
+    incoming.reconnect(out.next_number());
+    out.reconnect(received, &ahead);
+    while let Some(frame) = out.next(0) {
+        came.extend(born(deliver(&mut incoming, frame)));
+    }
+    assert_eq!(came[0], 1);
+    let lost: u64 = out.dropped.values().sum();
+    assert_eq!(came.len() as u64 + lost, 4, "{came:?} {:?}", out.dropped);
+    assert!(out.dropped[&(1, Cause::CutOff)] >= 1, "{:?}", out.dropped);
+    assert!(came.contains(&4));
+}
+
+#[test]
+fn what_waits_on_a_channel_that_is_gone_is_counted() {
+    let mut out = Outgoing::new(None);
+    for number in 0..3 {
+        out.push(&data(1, number, 10), Quality::Newest);
+    }
+    out.forget(1);
+    assert_eq!(out.dropped[&(1, Cause::Gone)], 3);
 }
 
 #[test]

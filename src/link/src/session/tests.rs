@@ -2,6 +2,7 @@ use std::sync::Arc;
 
 use tokio::io::duplex;
 use tokio::sync::mpsc;
+use ws::WebSocket;
 
 use super::*;
 use crate::{MAX_FRAME, MAX_RECORD};
@@ -149,6 +150,43 @@ async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
     drop(peer.await.unwrap());
 }
 
+/// A link that carries nothing any more and does not say so, with the robot's habits for this T_max: how long it takes
+/// until that is noticed, and until the connection is given up.
+async fn noticed(max: Duration) -> (Duration, Duration) {
+    let options = SessionOptions::for_silence(max, None);
+    let (robot, cloud) = (Session::new(options), session());
+    let (sender, _records) = mpsc::unbounded_channel();
+    let (to_robot, to_cloud) = (To(sender.clone()), To(sender));
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    let mut up = robot.up();
+    let running = robot.run(&mut at_robot, &to_robot);
+    let watching = async {
+        // For a while all is well; then, between two pings, nobody is there to answer.
+        tokio::select! {
+            lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
+            () = tokio::time::sleep(max * 7 + max / 3) => {}
+        }
+        let cut = Instant::now();
+        assert!(*up.borrow_and_update(), "it was there all the time");
+        up.wait_for(|up| !*up).await.unwrap();
+        (cut, cut.elapsed())
+    };
+    let (lost, (cut, noticed)) = tokio::join!(running, watching);
+    assert!(matches!(lost, Lost::Silent(_)), "{lost}");
+    (noticed, cut.elapsed())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_silent_link_is_noticed_within_t_max() {
+    for milliseconds in [50, 100, 300, 500, 1000, 2000, 10_000] {
+        let max = Duration::from_millis(milliseconds);
+        let (noticed, given_up) = noticed(max).await;
+        assert!(noticed <= max, "{noticed:?} for {max:?}");
+        assert!(given_up > max * 2 || given_up > Duration::from_secs(2));
+    }
+}
+
 #[tokio::test]
 async fn a_call_is_not_lost_when_a_welcome_is() {
     let (robot, cloud) = (session(), session());
@@ -198,7 +236,7 @@ async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     let codecs = crate::packing::decoded_here(false);
     robot.peer_decodes(&codecs);
     cloud.peer_decodes(&codecs);
-    robot.packs(1, codec::Schema::Image);
+    robot.opens(1, "/image", codec::Schema::Image);
     open(&robot, &cloud);
     let (near, mut slow) = duplex(1 << 12);
     let (mut slower, far) = duplex(1 << 12);

@@ -11,6 +11,7 @@
 //! has, so a Master that restarted, or forgot us, is told again.
 
 mod calls;
+mod heard;
 mod lending;
 mod link;
 mod master_client;
@@ -23,7 +24,7 @@ mod subscriptions;
 mod topic_type;
 mod watcher;
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::fmt;
 use std::future::Future;
 use std::io;
@@ -370,6 +371,10 @@ impl Bus for Ros1Bus {
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
         self.inner.check_name(topic)?;
         topic_type::find(&self.inner, topic).await
+    }
+
+    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<(String, i32)>, BusError> {
+        heard::connections(&self.inner, topic).await
     }
 
     async fn serve(

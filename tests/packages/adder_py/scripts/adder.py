@@ -7,7 +7,8 @@ from std_msgs.msg import String
 
 rospy.init_node("adder")
 offset = yaml.safe_load(str(rospy.get_param("~offset", 0)))
-sums = rospy.Publisher("/sums", String, queue_size=10)
+# No limit: rospy's thread that sends may fall far behind those that add.
+sums = rospy.Publisher("/sums", String, queue_size=0)
 
 
 def add(request):

@@ -28,6 +28,8 @@ def end(message):
         os._exit(rospy.get_param("~code", 0))
 
 
+key = rospy.get_param("~key", None)
+key = ", key %s" % key if key else ""
 told = rospy.Publisher("~told", String, latch=True, queue_size=1)
 told.publish(
     "life %d of %s in %s, directory %s, arguments %s, word %s, number %s, file %s"
@@ -39,7 +41,7 @@ told.publish(
         rospy.myargv()[1:],
         rospy.get_param("~word", "none"),
         rospy.get_param("~number", "none"),
-        "there" if os.path.exists(rospy.get_param("~file", "")) else "missing",
+        ("there" if os.path.exists(rospy.get_param("~file", "")) else "missing") + key,
     )
 )
 said = rospy.Publisher("~said", String, queue_size=10)

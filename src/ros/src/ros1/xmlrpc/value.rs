@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use base64::Engine as _;
 use serde::{Deserialize, Serialize};
 
 use crate::bus::ParamValue;
@@ -157,7 +156,7 @@ impl From<Vec<Value>> for Value {
     }
 }
 
-/// As JSON and the bus see it: binary becomes base64 text, nil becomes the empty string.
+/// As the bus sees it: of dates the text.
 impl From<Value> for ParamValue {
     fn from(value: Value) -> Self {
         match value {
@@ -165,9 +164,7 @@ impl From<Value> for ParamValue {
             Value::Bool(truth) => ParamValue::Bool(truth),
             Value::String(text) | Value::DateTime(text) => ParamValue::String(text),
             Value::Double(number) => ParamValue::Double(number),
-            Value::Base64(bytes) => {
-                ParamValue::String(base64::engine::general_purpose::STANDARD.encode(bytes))
-            }
+            Value::Base64(bytes) => ParamValue::Binary(bytes),
             Value::Array(elements) => {
                 ParamValue::List(elements.into_iter().map(ParamValue::from).collect())
             }
@@ -177,12 +174,12 @@ impl From<Value> for ParamValue {
                     .map(|(name, value)| (name, value.into()))
                     .collect(),
             ),
-            Value::Nil => ParamValue::String(String::new()),
+            Value::Nil => ParamValue::Nil,
         }
     }
 }
 
-/// Fails, saying where, on an integer wider than XML-RPC's 32 bits.
+/// Fails, saying where, on nothing and on an integer wider than XML-RPC's 32 bits.
 impl TryFrom<ParamValue> for Value {
     type Error = String;
 
@@ -195,6 +192,8 @@ impl TryFrom<ParamValue> for Value {
             ),
             ParamValue::Double(number) => Value::Double(number),
             ParamValue::String(text) => Value::String(text),
+            ParamValue::Binary(bytes) => Value::Base64(bytes),
+            ParamValue::Nil => return Err("nothing is no value that ROS knows".to_owned()),
             ParamValue::List(elements) => Value::Array(
                 elements
                     .into_iter()

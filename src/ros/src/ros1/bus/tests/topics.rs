@@ -118,6 +118,31 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
 }
 
 #[tokio::test]
+async fn a_publisher_says_whom_it_sends_to() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    until(&two, |graph| graph.topics.contains_key("/chat")).await;
+    assert!(two.heard_over("/chat").await.unwrap().is_empty());
+    let first = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    let before = two.heard_over("/chat").await.unwrap();
+    assert_eq!(
+        before.iter().map(|(node, _)| node).collect::<Vec<_>>(),
+        ["/one"]
+    );
+    drop(first);
+    connected(&*publisher, 0).await;
+    let _second = two.subscribe("/chat", any()).await.unwrap();
+    connected(&*publisher, 1).await;
+    let after = two.heard_over("/chat").await.unwrap();
+    assert!(
+        after.len() == 1 && after != before,
+        "another connection: {after:?}"
+    );
+}
+
+#[tokio::test]
 async fn local_subscriptions_share_one_connection() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);

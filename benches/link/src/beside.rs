@@ -1,0 +1,224 @@
+//! A small message's way there and back while pictures go the same way, over a network that carries two or three of
+//! them a second: what the link's pieces are for.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use bench_report::Report;
+use bytes::Bytes;
+use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::ros1::Ros1Bus;
+use serde_json::json;
+use support::cable::{Badness, Cable};
+use support::daemon::Daemon;
+use support::robot::{PATIENCE, Robot};
+use support::site::{Site, string};
+use tokio_tungstenite::tungstenite::Message;
+
+/// What the network is like.
+const NETWORK: Badness = Badness {
+    rate: 20_000,
+    delay: 5,
+    loss: 0.0,
+    limit: 1000,
+};
+/// Nothing in it can be made smaller.
+const PICTURE: usize = 900_000;
+/// Between two pictures, and two small messages.
+const PICTURES: Duration = Duration::from_millis(100);
+const PAUSE: Duration = Duration::from_millis(20);
+
+/// Quantiles of the trips, ms.
+struct Trips {
+    p50: f64,
+    p99: f64,
+}
+
+fn quantiles(mut times: Vec<Duration>) -> Trips {
+    times.sort_unstable();
+    let rank = |share: f64| {
+        let at = (times.len() as f64 * share).ceil() as usize;
+        let time = times.get(at.max(1) - 1);
+        time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
+    };
+    Trips {
+        p50: rank(0.5),
+        p99: rank(0.99),
+    }
+}
+
+/// A sensor_msgs/Image of noise.
+fn picture(number: u32) -> Bytes {
+    let mut out = Vec::with_capacity(PICTURE + 64);
+    for word in [number, 0, 0, 0, 480, 640, 4] {
+        out.extend(u32::to_le_bytes(word));
+    }
+    out.extend(b"rgb8\0");
+    out.extend(u32::to_le_bytes(640 * 3));
+    out.extend(u32::try_from(PICTURE).unwrap_or(0).to_le_bytes());
+    let mut noise = number.wrapping_mul(2_654_435_761) | 1;
+    out.extend((0..PICTURE).map(|_| {
+        noise ^= noise << 13;
+        noise ^= noise >> 17;
+        noise ^= noise << 5;
+        (noise >> 24) as u8
+    }));
+    out.into()
+}
+
+fn advertises(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
+    let options = AdvertiseOptions {
+        wire_type: WireType {
+            name: "sensor_msgs/Image".into(),
+            md5: "060021388200f6f0f447d0fcd9c64743".into(),
+            definition: crate::people::IMAGE.into(),
+        },
+        latch: false,
+        queue: 1,
+    };
+    Ok(site
+        .runtime
+        .block_on(app.advertise("/meter/image_in", options))?)
+}
+
+/// One small message after the other through the stub.
+fn through_the_link(
+    site: &Site,
+    pings: &dyn Publisher,
+    pongs: &mut Subscription,
+    trips: usize,
+) -> Result<Trips> {
+    let mut times = Vec::with_capacity(trips);
+    for number in 0..trips {
+        let text = string(&number.to_string());
+        let begun = Instant::now();
+        pings.publish(text.clone());
+        while site.next(pongs)?.bytes != text {}
+        times.push(begun.elapsed());
+        std::thread::sleep(PAUSE);
+    }
+    Ok(quantiles(times))
+}
+
+/// The same by a client of the portal.
+fn by_a_client(client: &mut Robot, trips: usize) -> Result<Trips> {
+    let mut times = Vec::with_capacity(trips);
+    for number in 0..trips {
+        let text = number.to_string();
+        let begun = Instant::now();
+        client.says(json!({"op": "publish", "topic": "/meter/ping", "msg": {"data": text}}))?;
+        // Pictures come in frames of their own kind.
+        loop {
+            if let Message::Text(heard) = client.frame(PATIENCE)? {
+                let heard: serde_json::Value = serde_json::from_str(heard.as_str())?;
+                if heard["topic"] == "/meter/pong" && heard["msg"]["data"] == *text {
+                    break;
+                }
+            }
+        }
+        times.push(begun.elapsed());
+        std::thread::sleep(PAUSE);
+    }
+    Ok(quantiles(times))
+}
+
+/// Trips over the shaped network, alone and beside pictures.
+pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
+    let trips = if crate::full() { 1000 } else { 200 };
+    eprintln!("a small message beside pictures: {trips} trips each");
+    let cable = Cable::new(&daemon.address)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"meter\"\nrobot = \"bench-beside\"\nlocal = \"none\"\n",
+        cable.server
+    );
+    let stub = site.stub_with(&toml, "rosbridge_fixture", "meter", &["__name:=meter"])?;
+    let pings = site.says(&app, "/meter/ping", false)?;
+    site.connected(&*pings, 1).with_context(|| stub.said())?;
+    let mut pongs = site.hears(&app, "/meter/pong")?;
+    site.runtime.block_on(async {
+        let mut connected = pongs.publishers.clone();
+        connected.wait_for(|count| *count == 1).await.map(drop)
+    })?;
+    let pictures: Arc<dyn Publisher> = advertises(&site, &app)?.into();
+    site.connected(&*pictures, 1).with_context(|| stub.said())?;
+    cable.degrade(NETWORK)?;
+    let alone = through_the_link(&site, &*pings, &mut pongs, trips)?;
+    let over = Arc::new(AtomicBool::new(false));
+    let camera = {
+        let (over, pictures) = (Arc::clone(&over), Arc::clone(&pictures));
+        std::thread::spawn(move || {
+            let frames: Vec<Bytes> = (0..4).map(picture).collect();
+            for frame in frames.iter().cycle() {
+                if over.load(Ordering::Relaxed) {
+                    return;
+                }
+                pictures.publish(frame.clone());
+                std::thread::sleep(PICTURES);
+            }
+        })
+    };
+    let beside = through_the_link(&site, &*pings, &mut pongs, trips);
+    over.store(true, Ordering::Relaxed);
+    let _ = camera.join();
+    let beside = beside.with_context(|| stub.said())?;
+    drop((pictures, pings, pongs, stub));
+    cable.restore()?;
+    // Small messages and pictures in one WebSocket, as a client of the portal has it.
+    let url = format!("ws://{}/meter?robot=bench-beside-client", cable.server);
+    let mut client = Robot::connect(&url)?;
+    client.says(json!({"op": "advertise", "topic": "/meter/ping", "type": "std_msgs/String"}))?;
+    client.says(json!({"op": "subscribe", "topic": "/meter/pong"}))?;
+    client.awaits_subscriber("/meter/ping")?;
+    cable.degrade(NETWORK)?;
+    let client_alone = by_a_client(&mut client, trips)?;
+    // Its pictures come down: the library's call that sends one would return when the socket has taken it.
+    client.says(json!({"op": "subscribe", "topic": "/meter/image_out", "compression": "cbor-raw", "queue_length": 1}))?;
+    client.says(
+        json!({"op": "advertise", "topic": "/meter/image_out_credit", "type": "std_msgs/UInt32"}),
+    )?;
+    client.says(
+        json!({"op": "publish", "topic": "/meter/image_out_credit", "msg": {"data": 1000}}),
+    )?;
+    let client_beside = by_a_client(&mut client, trips.min(100));
+    cable.restore()?;
+    for (what, beside, alone, theirs, theirs_alone) in [
+        (
+            "p50",
+            beside.p50,
+            alone.p50,
+            client_beside.as_ref().map(|it| it.p50),
+            client_alone.p50,
+        ),
+        (
+            "p99",
+            beside.p99,
+            alone.p99,
+            client_beside.as_ref().map(|it| it.p99),
+            client_alone.p99,
+        ),
+    ] {
+        report
+            .figure(
+                format!("String there and back beside 900 kB pictures, 20 Mbit/s: {what}"),
+                "ms",
+                beside,
+            )
+            .beside("the same without pictures", alone)
+            .note(cable.means());
+        if let Ok(theirs) = theirs {
+            report
+                .figure(
+                    format!("the same in one WebSocket of the portal: {what}"),
+                    "ms",
+                    theirs,
+                )
+                .beside("without pictures", theirs_alone)
+                .note("pictures come down in cbor-raw");
+        }
+    }
+    Ok(())
+}

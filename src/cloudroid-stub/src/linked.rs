@@ -1,0 +1,252 @@
+//! The link and the connections that carry it.
+//!
+//! ```text
+//!  hello ─▶ Linked ──lost──▶ Away ──pause──▶ hello (resume)
+//!             └──silent──▶ tries another connection beside it ──it stands──▶ hello (resume)
+//!                  └─anything came─▶ Linked
+//! ```
+//! TCP waits ever longer before it sends again what was lost: after some seconds without a network a connection stays
+//! silent for as many more once the network is back. So a silent one is not waited for until it is given up; a new one
+//! takes its place as soon as there can be one.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use link::control::{Hello, Resume, Welcome};
+use link::session::{receive_open, send_open};
+use link::{Lost, Session};
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+use ws::WebSocket;
+
+use crate::config::{self, Config};
+use crate::connect;
+use crate::mirror::Mirror;
+use crate::run::session_options;
+use crate::stream::Stream;
+
+/// For the portal to accept a connection.
+const CONNECT: Duration = Duration::from_secs(10);
+/// For the first welcome, which comes when the servant runs.
+const SERVANT: Duration = Duration::from_secs(120);
+/// For the welcome of a link that is taken up again, at first: a network may be lost here, too.
+const WELCOME: Duration = Duration::from_secs(5);
+/// Between the beginnings of two attempts, at first …
+const PAUSE: Duration = Duration::from_millis(50);
+/// … at last, while no server is reached …
+const AWAY: Duration = Duration::from_secs(1);
+/// … and while one says that it has no room.
+const BUSY: Duration = Duration::from_secs(3);
+/// After a link has fallen silent, until another connection is tried beside it.
+const STANDBY: Duration = Duration::from_secs(1);
+
+/// How a connection ended that had carried the link.
+enum End {
+    Lost(Lost),
+    /// It was silent, and this one is not.
+    Replaced(Box<WebSocket<Stream>>),
+}
+
+/// Keeps a link until the cloud refuses it; says why.
+pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
+    let mut link = Link {
+        config,
+        mirror,
+        hello,
+        session: None,
+        welcome: WELCOME,
+    };
+    let mut pace = Pace::default();
+    let mut told = String::new();
+    let mut standby: Option<Box<WebSocket<Stream>>> = None;
+    loop {
+        pace.begin();
+        let outcome = match standby.take() {
+            Some(socket) => link.carry(*socket).await,
+            None => link.once().await,
+        };
+        let reason = match outcome {
+            Ok(End::Lost(lost)) => {
+                tracing::warn!("the link to {} was lost: {lost}", config.server);
+                told.clear();
+                pace = Pace::default();
+                pace.begin();
+                None
+            }
+            Ok(End::Replaced(socket)) => {
+                tracing::warn!(
+                    "the connection to {} is silent, another takes its place",
+                    config.server
+                );
+                told.clear();
+                standby = Some(socket);
+                continue;
+            }
+            Err(connect::Error::Refused(reason)) => return reason,
+            Err(connect::Error::Unreachable(reason)) => Some((reason, AWAY)),
+            Err(connect::Error::Busy(reason)) => Some((reason, BUSY)),
+        };
+        let longest = reason.as_ref().map_or(AWAY, |(_, longest)| *longest);
+        if let Some((reason, _)) = reason {
+            if reason != told {
+                tracing::warn!("no link: {reason}; trying again");
+                told = reason;
+            }
+        }
+        pace.wait(longest).await;
+    }
+}
+
+/// Attempts begin ever more seldom; the time that one took counts.
+struct Pace {
+    began: Instant,
+    pause: Duration,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self {
+            began: Instant::now(),
+            pause: PAUSE,
+        }
+    }
+}
+
+impl Pace {
+    fn begin(&mut self) {
+        self.began = Instant::now();
+    }
+
+    /// Until the next attempt: with jitter, or all robots of a server come at once when it is back.
+    async fn wait(&mut self, longest: Duration) {
+        let pause = self.pause.min(longest);
+        let jitter = rand::random_range(0.5..1.0);
+        // An attempt may have taken longer than its pause.
+        let least = Instant::now() + PAUSE.mul_f64(jitter);
+        sleep_until(least.max(self.began + pause.mul_f64(jitter))).await;
+        self.pause = (pause * 2).min(longest);
+    }
+}
+
+struct Link<'a> {
+    config: &'a Config,
+    mirror: &'a Arc<Mirror>,
+    hello: &'a mut Hello,
+    /// As the last welcome named it.
+    session: Option<String>,
+    /// How long a welcome may take when the link is taken up again.
+    welcome: Duration,
+}
+
+impl Link<'_> {
+    /// One connection, from its handshake to its loss.
+    async fn once(&mut self) -> Result<End, connect::Error> {
+        let socket = open(self.config).await?;
+        self.carry(socket).await
+    }
+
+    /// Says hello on a connection, and has it carry the link until it is lost or another one is better.
+    async fn carry(&mut self, mut socket: WebSocket<Stream>) -> Result<End, connect::Error> {
+        self.greet(&mut socket).await?;
+        let session = self.mirror.session();
+        let running = session.run(&mut socket, &**self.mirror);
+        tokio::select! {
+            lost = running => Ok(End::Lost(lost)),
+            fresh = standby(self.config, &session) => Ok(End::Replaced(Box::new(fresh))),
+        }
+    }
+
+    /// Hello and welcome: the session goes on, or another one begins.
+    async fn greet(&mut self, socket: &mut WebSocket<Stream>) -> Result<(), connect::Error> {
+        let hello = &mut *self.hello;
+        if self.session.is_none() && hello.parameters.is_empty() {
+            hello.parameters = self.mirror.parameters().await;
+        }
+        let (received, ahead, next) = self.mirror.session().position();
+        hello.attempt += 1;
+        hello.next = next;
+        hello.resume = self.session.clone().map(|session| Resume {
+            session,
+            received,
+            ahead,
+        });
+        let patience = match &self.session {
+            Some(_) => self.welcome,
+            None => SERVANT,
+        };
+        let opening = async {
+            send_open(socket, hello).await?;
+            receive_open(socket, "welcome").await
+        };
+        let welcome: Welcome = match timeout(patience, opening).await {
+            Ok(Ok(welcome)) => welcome,
+            Ok(Err(lost)) => return Err(connect::Error::Unreachable(lost.to_string())),
+            Err(_) => {
+                self.welcome = (self.welcome * 2).min(SERVANT);
+                let reason = format!("no servant after {patience:?}");
+                return Err(connect::Error::Unreachable(reason));
+            }
+        };
+        self.welcome = WELCOME;
+        match welcome {
+            Welcome::Refused {
+                reason,
+                again: true,
+            } => Err(connect::Error::Busy(reason)),
+            Welcome::Refused { reason, .. } => Err(connect::Error::Refused(reason)),
+            Welcome::Accepted {
+                session,
+                resumed,
+                received,
+                ahead,
+                next,
+                codecs,
+                servant,
+            } => {
+                if !resumed && self.session.is_some() {
+                    let fresh = Session::new(session_options(self.config));
+                    fresh.begin_at(self.hello.next);
+                    self.mirror.renew(Arc::new(fresh));
+                }
+                self.session = Some(session);
+                tracing::info!(servant, resumed, "linked to {}", self.config.server);
+                let session = self.mirror.session();
+                if self.config.codec != config::Codec::None {
+                    session.peer_decodes(&codecs);
+                }
+                session.reconnect(received, &ahead, next);
+                Ok(())
+            }
+        }
+    }
+}
+
+async fn open(config: &Config) -> Result<WebSocket<Stream>, connect::Error> {
+    let path = format!("/{}?robot={}", config.service, config.robot());
+    let token = config
+        .token()
+        .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
+    connect::open(config, &path, token.as_deref(), CONNECT).await
+}
+
+/// A connection beside the one that carries the session, once that has been silent and still is.
+async fn standby(config: &Config, session: &Session) -> WebSocket<Stream> {
+    let mut up = session.up();
+    loop {
+        // The session lives as long as this.
+        let _ = up.wait_for(|up| !up).await;
+        let mut back = session.up();
+        let opening = async {
+            loop {
+                sleep(STANDBY).await;
+                if let Ok(socket) = open(config).await {
+                    return socket;
+                }
+            }
+        };
+        tokio::select! {
+            biased;
+            _ = back.wait_for(|up| *up) => {}
+            fresh = opening => return fresh,
+        }
+    }
+}

@@ -1,0 +1,340 @@
+//! One connection of a session, from its opening frames to its end.
+
+use std::future::{Future, poll_fn};
+use std::pin::{Pin, pin};
+use std::task::Poll;
+use std::time::Duration;
+
+use bytes::Bytes;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, Sleep, sleep_until};
+use ws::{Message, WebSocket, WsError, frame as opcode};
+
+use super::{Handler, Lost, Session, SessionOptions};
+use crate::Error;
+use crate::clock::{Sample, now};
+use crate::frame::{Frame, Received};
+use crate::packing::Packed;
+use crate::record::Record;
+
+/// The socket is given more only when it holds less than this: what is decided later is decided better.
+const LOW_WATER: usize = 24 * 1024;
+/// Acknowledged at the latest after so many records, and bytes.
+const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
+/// After so many messages in a row those who pass them on have their turn, or their queues would overflow.
+const IN_A_ROW: u32 = 32;
+/// Exchanges made at once on a new connection, to know the peer's clock.
+const FIRST_PINGS: u32 = 6;
+
+impl Session {
+    /// Carries the session over a connection that was opened, until that ends.
+    pub async fn run<S, H>(&self, socket: &mut WebSocket<S>, handler: &H) -> Lost
+    where
+        S: AsyncRead + AsyncWrite + Unpin,
+        H: Handler + ?Sized,
+    {
+        let lost = match self.carry(socket, handler).await {
+            Ok(never) => match never {},
+            Err(lost) => lost,
+        };
+        self.up.send_replace(false);
+        let goodbye = match &lost {
+            Lost::Ended => self.state.lock().ending.clone(),
+            Lost::Protocol(error) => Some((1002, error.to_string())),
+            Lost::Full => Some((1008, lost.to_string())),
+            _ => None,
+        };
+        if let Some((code, reason)) = goodbye {
+            socket.queue_close(code, &reason);
+            let _ = tokio::time::timeout(Duration::from_secs(1), socket.leave(true)).await;
+        }
+        lost
+    }
+
+    async fn carry<S, H>(
+        &self,
+        socket: &mut WebSocket<S>,
+        handler: &H,
+    ) -> Result<std::convert::Infallible, Lost>
+    where
+        S: AsyncRead + AsyncWrite + Unpin,
+        H: Handler + ?Sized,
+    {
+        let mut connection = Connection::new();
+        let mut job: Option<JoinHandle<Packed>> = None;
+        let mut tick = pin!(sleep_until(connection.next_tick(&self.options)));
+        connection.ping(self, socket);
+        self.up.send_if_modified(|up| !std::mem::replace(up, true));
+        loop {
+            let mut woken = pin!(self.wake.notified());
+            let event = poll_fn(|cx| {
+                loop {
+                    self.fill(socket);
+                    if job.is_none() {
+                        job = self.pack();
+                    }
+                    let polled = job.as_mut().map(|job| Pin::new(job).poll(cx));
+                    if let Some(Poll::Ready(packed)) = polled {
+                        job = None;
+                        self.packed(packed.ok());
+                        continue;
+                    }
+                    if socket.queued() == 0 {
+                        break;
+                    }
+                    match socket.poll_flush(cx) {
+                        Poll::Ready(Ok(())) => {}
+                        Poll::Ready(Err(error)) => {
+                            return Poll::Ready(Event::Message(Err(error.into())));
+                        }
+                        Poll::Pending => break,
+                    }
+                }
+                if socket.queued() == 0 && self.has_ended() {
+                    return Poll::Ready(Event::Ended);
+                }
+                if let Poll::Ready(message) = socket.poll_next(cx) {
+                    return Poll::Ready(Event::Message(message));
+                }
+                if woken.as_mut().poll(cx).is_ready() {
+                    return Poll::Ready(Event::Woken);
+                }
+                tick.as_mut().poll(cx).map(|()| Event::Tick)
+            })
+            .await;
+            match event {
+                Event::Message(message) => {
+                    connection.heard = Instant::now();
+                    connection.in_a_row += 1;
+                    if connection.in_a_row == IN_A_ROW {
+                        connection.in_a_row = 0;
+                        tokio::task::yield_now().await;
+                    }
+                    self.up.send_if_modified(|up| !std::mem::replace(up, true));
+                    match message.map_err(socket_lost)? {
+                        Message::Binary(bytes) => {
+                            self.take(socket, &mut connection, bytes, handler)?;
+                        }
+                        Message::Ping(payload) => socket.queue(opcode::PONG, payload),
+                        Message::Pong(_) => {}
+                        Message::Text(_) => {
+                            return Err(Error::Protocol("text, where frames are binary").into());
+                        }
+                        Message::Close(code, reason) => {
+                            socket.queue_close(code, "");
+                            let _ = poll_fn(|cx| socket.poll_flush(cx)).await;
+                            return Err(Lost::Closed { code, reason });
+                        }
+                    }
+                }
+                Event::Woken => {
+                    if self.state.lock().out.is_full() {
+                        return Err(Lost::Full);
+                    }
+                }
+                Event::Ended => return Err(Lost::Ended),
+                Event::Tick => {
+                    let silence = connection.heard.elapsed();
+                    if silence >= self.options.lost {
+                        return Err(Lost::Silent(silence));
+                    }
+                    if silence >= self.options.silent {
+                        self.up.send_if_modified(|up| std::mem::replace(up, false));
+                    }
+                    if connection.pinged.elapsed() >= self.options.ping {
+                        connection.ping(self, socket);
+                    }
+                    let next = connection.next_tick(&self.options);
+                    Sleep::reset(tick.as_mut(), next);
+                }
+            }
+        }
+    }
+
+    fn has_ended(&self) -> bool {
+        let state = self.state.lock();
+        state.ending.is_some() && state.out.is_empty()
+    }
+
+    fn fill<S: AsyncRead + AsyncWrite + Unpin>(&self, socket: &mut WebSocket<S>) {
+        if socket.queued() >= LOW_WATER {
+            return;
+        }
+        let mut state = self.state.lock();
+        while socket.queued() < LOW_WATER {
+            let Some(frame) = state.out.next(now()) else {
+                return;
+            };
+            socket.queue(opcode::BINARY, frame.encode());
+        }
+    }
+
+    fn take<S, H>(
+        &self,
+        socket: &mut WebSocket<S>,
+        connection: &mut Connection,
+        bytes: Bytes,
+        handler: &H,
+    ) -> Result<(), Error>
+    where
+        S: AsyncRead + AsyncWrite + Unpin,
+        H: Handler + ?Sized,
+    {
+        let arrived = now();
+        let record = match Frame::decode(bytes)? {
+            Frame::Whole { number, record } => {
+                connection.unacknowledged += u32::from(number != 0);
+                self.state.lock().incoming.whole(number, record)?
+            }
+            Frame::Begin {
+                stream,
+                number,
+                total,
+                bytes,
+            } => {
+                connection.unacknowledged += u32::from(number != 0);
+                let incoming = &mut self.state.lock().incoming;
+                incoming.begin(stream, number, total, &bytes)?
+            }
+            Frame::More { stream, bytes } => {
+                let whole = self.state.lock().incoming.more(stream, &bytes)?;
+                // The end of a big one tells how fast the link is.
+                connection.big_came = whole.is_some();
+                whole
+            }
+            Frame::Ping { sent, received } => {
+                self.acknowledged(received);
+                let received = self.received(connection);
+                let pong = Frame::Pong {
+                    sent,
+                    arrived,
+                    left: now(),
+                    received,
+                };
+                socket.queue(opcode::BINARY, pong.encode());
+                None
+            }
+            Frame::Pong {
+                sent,
+                arrived: there,
+                left,
+                received,
+            } => {
+                self.acknowledged(received);
+                let sample = Sample::new(sent, there, left, arrived);
+                let best = {
+                    let clock = &mut self.state.lock().clock;
+                    clock.add(sample);
+                    clock.best()
+                };
+                if let Some(best) = best {
+                    handler.clock(best);
+                }
+                connection.pongs += 1;
+                if connection.pongs < FIRST_PINGS {
+                    connection.ping(self, socket);
+                }
+                None
+            }
+            Frame::Ack(received) => {
+                self.acknowledged(received);
+                None
+            }
+            Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
+        };
+        if let Some(record) = record {
+            match Record::decode(record)? {
+                Record::Data(data) => {
+                    let channel = data.channel;
+                    match self.unpacked(data) {
+                        Some(data) => handler.record(Record::Data(data), arrived),
+                        None => handler.undecodable(channel),
+                    }
+                }
+                Record::Control(json) if self.is_answer(&json) => {}
+                record => handler.record(record, arrived),
+            }
+        }
+        let come = self.state.lock().incoming.received().bytes;
+        if std::mem::take(&mut connection.big_came)
+            || connection.unacknowledged >= ACK_AFTER.0
+            || come - connection.acknowledged_bytes >= ACK_AFTER.1
+        {
+            let ack = Frame::Ack(self.received(connection));
+            socket.queue(opcode::BINARY, ack.encode());
+        }
+        Ok(())
+    }
+
+    /// What has come, about to be told.
+    fn received(&self, connection: &mut Connection) -> Received {
+        let received = self.state.lock().incoming.received();
+        connection.unacknowledged = 0;
+        connection.acknowledged_bytes = received.bytes;
+        received
+    }
+}
+
+enum Event {
+    Message(Result<Message, WsError>),
+    Woken,
+    Ended,
+    Tick,
+}
+
+/// What belongs to one connection.
+struct Connection {
+    heard: Instant,
+    pinged: Instant,
+    pongs: u32,
+    unacknowledged: u32,
+    acknowledged_bytes: u64,
+    big_came: bool,
+    in_a_row: u32,
+}
+
+impl Connection {
+    fn new() -> Self {
+        Self {
+            heard: Instant::now(),
+            pinged: Instant::now(),
+            pongs: 0,
+            unacknowledged: 0,
+            acknowledged_bytes: 0,
+            big_came: false,
+            in_a_row: 0,
+        }
+    }
+
+    /// The next ping, or the moment at which the peer will have been silent for too long: not a ping later.
+    fn next_tick(&self, options: &SessionOptions) -> Instant {
+        let limits = [options.silent, options.lost].map(|limit| self.heard + limit);
+        let now = Instant::now();
+        let ahead = limits.into_iter().filter(|limit| *limit > now);
+        ahead.fold(self.pinged + options.ping, Instant::min)
+    }
+
+    fn ping<S: AsyncRead + AsyncWrite + Unpin>(
+        &mut self,
+        session: &Session,
+        socket: &mut WebSocket<S>,
+    ) {
+        self.pinged = Instant::now();
+        let received = session.received(self);
+        let ping = Frame::Ping {
+            sent: now(),
+            received,
+        };
+        socket.queue(opcode::BINARY, ping.encode());
+    }
+}
+
+pub(super) fn socket_lost(error: WsError) -> Lost {
+    match error {
+        WsError::Refused { .. } => {
+            Lost::Protocol(Error::Protocol("its WebSocket frames are broken"))
+        }
+        error => Lost::Socket(error.to_string()),
+    }
+}

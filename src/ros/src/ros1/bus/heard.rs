@@ -1,0 +1,43 @@
+//! Whom a topic's publishers send to, as they say themselves (`getBusInfo` of the slave API). A publisher answers a
+//! subscriber's header before it sends to it: what it publishes in between, the subscriber does not hear.
+
+use std::collections::BTreeSet;
+
+use super::master_client::to_bus_error;
+use super::{HANDSHAKE, Inner};
+use crate::bus::BusError;
+use crate::ros1::reply::Reply;
+use crate::ros1::xmlrpc::{Client, Value};
+
+/// The connections over which the topic's publishers send to `bus`: each publisher with its own number of it.
+pub(super) async fn connections(
+    bus: &Inner,
+    topic: &str,
+) -> Result<BTreeSet<(String, i32)>, BusError> {
+    let graph = bus.graph.borrow().clone();
+    let ends = graph.topics.get(topic);
+    let publishers = ends.map(|ends| ends.publishers.clone());
+    let mut found = BTreeSet::new();
+    for node in publishers.unwrap_or_default() {
+        let Some(uri) = graph.nodes.get(&node).filter(|_| node != bus.node) else {
+            continue;
+        };
+        let client = Client::new(bus.sockets.clone(), uri).map_err(to_bus_error)?;
+        let caller = [bus.node.as_str().into()];
+        let asked = client.call("getBusInfo", &caller, HANDSHAKE);
+        let answer = asked.await.map_err(to_bus_error)?;
+        let rows = Reply::from_value(answer).map(|reply| reply.value);
+        let rows = rows.as_ref().and_then(Value::as_array).unwrap_or_default();
+        let ours = rows.iter().filter_map(|row| {
+            let [Value::Int(id), peer, direction, _, of, ..] = row.as_array()? else {
+                return None;
+            };
+            let ours = peer.as_str() == Some(&bus.node)
+                && direction.as_str() == Some("o")
+                && of.as_str() == Some(topic);
+            ours.then(|| (node.clone(), *id))
+        });
+        found.extend(ours);
+    }
+    Ok(found)
+}
