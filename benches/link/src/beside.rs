@@ -10,12 +10,9 @@ use bench_report::Report;
 use bytes::Bytes;
 use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
 use ros::ros1::Ros1Bus;
-use serde_json::json;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
-use support::robot::{PATIENCE, Robot};
 use support::site::{Site, string};
-use tokio_tungstenite::tungstenite::Message;
 
 /// What the network is like.
 const NETWORK: Badness = Badness {
@@ -102,28 +99,6 @@ fn through_the_link(
     Ok(quantiles(times))
 }
 
-/// The same by a client of the portal.
-fn by_a_client(client: &mut Robot, trips: usize) -> Result<Trips> {
-    let mut times = Vec::with_capacity(trips);
-    for number in 0..trips {
-        let text = number.to_string();
-        let begun = Instant::now();
-        client.says(json!({"op": "publish", "topic": "/meter/ping", "msg": {"data": text}}))?;
-        // Pictures come in frames of their own kind.
-        loop {
-            if let Message::Text(heard) = client.frame(PATIENCE)? {
-                let heard: serde_json::Value = serde_json::from_str(heard.as_str())?;
-                if heard["topic"] == "/meter/pong" && heard["msg"]["data"] == *text {
-                    break;
-                }
-            }
-        }
-        times.push(begun.elapsed());
-        std::thread::sleep(PAUSE);
-    }
-    Ok(quantiles(times))
-}
-
 /// Trips over the shaped network, alone and beside pictures.
 pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
     let trips = if crate::full() { 1000 } else { 200 };
@@ -167,39 +142,11 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
     let beside = beside.with_context(|| stub.said())?;
     drop((pictures, pings, pongs, stub));
     cable.restore()?;
-    // Small messages and pictures in one WebSocket, as a client of the portal has it.
-    let url = format!("ws://{}/meter?robot=bench-beside-client", cable.server);
-    let mut client = Robot::connect(&url)?;
-    client.says(json!({"op": "advertise", "topic": "/meter/ping", "type": "std_msgs/String"}))?;
-    client.says(json!({"op": "subscribe", "topic": "/meter/pong"}))?;
-    client.awaits_subscriber("/meter/ping")?;
-    cable.degrade(NETWORK)?;
-    let client_alone = by_a_client(&mut client, trips)?;
-    // Its pictures come down: the library's call that sends one would return when the socket has taken it.
-    client.says(json!({"op": "subscribe", "topic": "/meter/image_out", "compression": "cbor-raw", "queue_length": 1}))?;
-    client.says(
-        json!({"op": "advertise", "topic": "/meter/image_out_credit", "type": "std_msgs/UInt32"}),
-    )?;
-    client.says(
-        json!({"op": "publish", "topic": "/meter/image_out_credit", "msg": {"data": 1000}}),
-    )?;
-    let client_beside = by_a_client(&mut client, trips.min(100));
-    cable.restore()?;
-    for (what, beside, alone, theirs, theirs_alone) in [
-        (
-            "p50",
-            beside.p50,
-            alone.p50,
-            client_beside.as_ref().map(|it| it.p50),
-            client_alone.p50,
-        ),
-        (
-            "p99",
-            beside.p99,
-            alone.p99,
-            client_beside.as_ref().map(|it| it.p99),
-            client_alone.p99,
-        ),
+    // What a message waits for that comes behind a whole one.
+    let picture = PICTURE as f64 * 8.0 / f64::from(NETWORK.rate);
+    for (what, beside, alone) in [
+        ("p50", beside.p50, alone.p50),
+        ("p99", beside.p99, alone.p99),
     ] {
         report
             .figure(
@@ -208,17 +155,10 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
                 beside,
             )
             .beside("the same without pictures", alone)
-            .note(cable.means());
-        if let Ok(theirs) = theirs {
-            report
-                .figure(
-                    format!("the same in one WebSocket of the portal: {what}"),
-                    "ms",
-                    theirs,
-                )
-                .beside("without pictures", theirs_alone)
-                .note("pictures come down in cbor-raw");
-        }
+            .note(format!(
+                "a picture takes {picture:.0} ms; {}",
+                cable.means()
+            ));
     }
     Ok(())
 }
