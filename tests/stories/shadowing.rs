@@ -305,7 +305,7 @@ rosrun nodelet nodelet standalone opencv_apps/people_detect || echo "standalone:
 cat > load.launch << 'END'
 <launch>
   <node pkg="nodelet" type="nodelet" name="manager" args="manager" output="screen"/>
-  <node pkg="nodelet" type="nodelet" name="people" args="load opencv_apps/people_detect manager" output="screen" required="rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps"/>
+  <node pkg="nodelet" type="nodelet" name="people" args="load opencv_apps/people_detect manager" output="screen" required="true"/>
 </launch>
 END
 timeout 60 roslaunch load.launch || echo "roslaunch: $?""#
