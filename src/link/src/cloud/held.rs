@@ -27,6 +27,15 @@ struct State {
     passing: bool,
 }
 
+/// Bytes that it takes while it waits.
+fn size(record: &Record) -> usize {
+    match record {
+        Record::Data(data) => data.message.len(),
+        Record::Call { request, .. } => request.len(),
+        _ => 0,
+    }
+}
+
 impl State {
     fn is_due(&self) -> bool {
         self.outputs == 0 || self.records.len() >= MOST.0 || self.bytes >= MOST.1
@@ -40,11 +49,7 @@ impl Held {
         if state.outputs == 0 && !state.passing && state.records.is_empty() {
             return Some((record, arrived));
         }
-        state.bytes += match &record {
-            Record::Data(data) => data.message.len(),
-            Record::Call { request, .. } => request.len(),
-            _ => 0,
-        };
+        state.bytes += size(&record);
         state.records.push_back((record, arrived));
         None
     }
@@ -61,9 +66,7 @@ impl Held {
             let Some((record, arrived)) = state.records.pop_front() else {
                 break;
             };
-            if state.records.is_empty() {
-                state.bytes = 0;
-            }
+            state.bytes -= size(&record);
             drop(state);
             to(record, arrived);
             state = self.state.lock();
