@@ -113,6 +113,7 @@ fn main() -> ExitCode {
         ],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,
+            the_state_is_closed_to_others,
             a_taken_port_is_named,
             the_demo_ends_by_itself_and_leaves_nothing,
             doctor_names_each_need,

@@ -106,6 +106,8 @@ impl Apt {
         // One daemon at a time; the others then find the lists fresh.
         let path = self.root.join("lock");
         let file = fs::File::create(&path).at("opening", &path)?;
+        // Whoever could open it could hold it.
+        crate::install::set_mode(&path, 0o600)?;
         let locked =
             tokio::task::spawn_blocking(move || Flock::lock(file, FlockArg::LockExclusive)).await?;
         let _lock = locked.map_err(|(_, error)| Error::io("locking", &path, error.into()))?;

@@ -93,6 +93,7 @@ pub(crate) async fn compile(
     environment.remove("PYTHONDONTWRITEBYTECODE");
 
     let mut file = fs::File::create(log).at("making", log)?;
+    crate::install::set_mode(log, 0o600)?;
     let mut writing = Ok(());
     let mut package = units
         .first()

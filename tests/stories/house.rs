@@ -1,11 +1,16 @@
 //! The daemon as a lodger of its machine.
 
+use std::fs::Permissions;
 use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
 
 use anyhow::ensure;
 use serde_json::{Value, json};
+use support::daemon::Daemon;
 use support::deployer::run;
 use support::robot::PATIENCE;
 use support::world::{PEOPLE, world};
@@ -20,6 +25,94 @@ pub fn a_second_daemon_on_the_same_home_is_refused() -> Told {
     );
     ensure!(daemon.get("/healthz")?.0 == 200, "and is not disturbed");
     Ok(())
+}
+
+/// What below a home others may read, write or enter, but for what layers hold: that has the rights of its image.
+fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Told {
+    let about = match path.symlink_metadata() {
+        // Servants come and go.
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        about => about?,
+    };
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    // The story's own.
+    if about.is_symlink() || ["daemon.log", "test-config.toml"].contains(&&*name) {
+        return Ok(());
+    }
+    let root_of_servant = name == "skeleton";
+    if about.permissions().mode() & 0o077 != 0 && !root_of_servant {
+        found.push(path.to_owned());
+    }
+    if about.is_dir() && !root_of_servant && name != "layers" {
+        for entry in std::fs::read_dir(path).into_iter().flatten() {
+            open_to_others(&entry?.path(), found)?;
+        }
+    }
+    Ok(())
+}
+
+fn is_closed(home: &Path) -> Told {
+    let mut found = Vec::new();
+    open_to_others(home, &mut found)?;
+    ensure!(found.is_empty(), "open to others: {found:#?}");
+    Ok(())
+}
+
+/// As earlier versions left it.
+fn open_up(path: &Path) -> Told {
+    let about = path.symlink_metadata()?;
+    if about.is_symlink()
+        || ["skeleton", "layers"]
+            .iter()
+            .any(|name| path.ends_with(name))
+    {
+        return Ok(());
+    }
+    let rights = if about.is_dir() { 0o755 } else { 0o644 };
+    std::fs::set_permissions(path, Permissions::from_mode(rights))?;
+    if about.is_dir() {
+        for entry in std::fs::read_dir(path)? {
+            open_up(&entry?.path())?;
+        }
+    }
+    Ok(())
+}
+
+pub fn the_state_is_closed_to_others() -> Told {
+    let daemon = world().own("closed").start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let adds = |daemon: &Daemon| -> Told {
+        let mut robot = daemon.robot("adder_py?robot=r1")?;
+        let answer = robot.calls("/add_two", json!({"a": 1, "b": 2}))?;
+        ensure!(answer["values"]["sum"] == 3, "{answer}");
+        is_closed(&daemon.home)
+    };
+    adds(&daemon)?;
+    // Nobody else can hold what servants' user ids are counted by.
+    let held = Command::new("flock")
+        .args([
+            "--shared",
+            "--nonblock",
+            "/run/cloudroid/uid-ranges",
+            "true",
+        ])
+        .uid(65534)
+        .gid(65534)
+        .output()?;
+    let said = String::from_utf8_lossy(&held.stderr);
+    ensure!(
+        !held.status.success() && said.contains("Permission denied"),
+        "{said}"
+    );
+    let home = daemon.home.clone();
+    daemon.ends()?;
+    open_up(&home)?;
+    let daemon = world().own("closed").start()?;
+    is_closed(&home)?;
+    adds(&daemon)
 }
 
 pub fn a_taken_port_is_named() -> Told {

@@ -6,6 +6,7 @@ use anyhow::Context;
 
 use crate::config::Config;
 use crate::home::Home;
+use crate::private;
 
 /// `images/` of the source tree.
 const BUILT_IN: [(&str, &str); 1] = [(
@@ -25,7 +26,7 @@ pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
     if directory.exists() {
         std::fs::remove_dir_all(&directory).with_context(made)?;
     }
-    std::fs::create_dir(&directory).with_context(made)?;
+    private::make_directory(&directory).with_context(made)?;
     for (name, text) in BUILT_IN {
         std::fs::write(directory.join(name), text).with_context(made)?;
     }
@@ -40,6 +41,7 @@ pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
             }
         }
     }
+    private::close_below(&directory, 1, &|_| false).with_context(made)?;
     Ok(directory)
 }
 

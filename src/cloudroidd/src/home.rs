@@ -1,32 +1,37 @@
 //! The state directory: where everything of one daemon is, and the lock that makes it one.
 //!
 //! ```text
-//! lock  cloudroid.db  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/
+//! lock  cloudroid.db  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/
 //! ```
+//!
+//! Nobody else enters it (docs/adr/033).
 
-use std::fs::{DirBuilder, File, OpenOptions, Permissions};
+use std::fs::File;
 use std::io::{Read, Seek, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::{Flock, FlockArg};
+use servant::process::Identity;
 use tokio::net::UnixListener;
+
+use crate::private;
 
 /// Why a directory cannot be the home.
 #[derive(Debug, thiserror::Error)]
 pub enum HomeError {
     /// Another daemon has it.
     #[error(
-        "another cloudroidd{pid} already uses {home}; end it first (kill{pid_bare}), or choose another directory with --home"
+        "another cloudroidd{pid} already uses {home}; end it first ({way}), or choose another directory with --home"
     )]
     Taken {
         /// The directory.
         home: PathBuf,
-        /// ` (pid N)`, where known.
+        /// ` (pid N)`, where it is surely that one.
         pid: String,
-        /// ` N`, where known.
-        pid_bare: String,
+        /// How to end it, or to find it.
+        way: String,
     },
     /// No default directory can be named.
     #[error(
@@ -44,6 +49,9 @@ pub enum HomeError {
         source: std::io::Error,
     },
 }
+
+/// What is done to what others could enter or read.
+const CLOSE: &str = "close to others";
 
 /// A home that this process has locked. The lock falls with the process, however it ends.
 #[derive(Debug)]
@@ -71,20 +79,47 @@ impl Home {
     /// Makes what is missing of the directory and locks it.
     pub fn open(path: &Path) -> Result<Home, HomeError> {
         let path = std::path::absolute(path).map_err(io("resolve", path))?;
-        // Servants run as unprivileged users: they pass through to their layers, and read nothing else.
-        make_directory(&path, 0o711)?;
+        private::make_directory(&path).map_err(io("create the directory", &path))?;
         let lock = lock(&path)?;
         let home = Home { path, _lock: lock };
-        for (name, mode) in [
-            ("images", 0o755),
-            ("layers", 0o711),
-            ("run", 0o711),
-            ("servants", 0o711),
-            ("build", 0o711),
-        ] {
-            make_directory(&home.path.join(name), mode)?;
+        for name in ["images", "layers", "run", "servants", "build", "logs"] {
+            let directory = home.path.join(name);
+            private::make_directory(&directory).map_err(io("create the directory", &directory))?;
         }
+        home.close()?;
         Ok(home)
+    }
+
+    /// Takes from others what an earlier version, or an operator's umask, has left open. Roots of servants are left alone:
+    /// what is in a layer has the rights that its image gives, and is behind a directory that nobody else enters.
+    fn close(&self) -> Result<(), HomeError> {
+        let closed = |name: &str, levels, leave: &dyn Fn(&Path) -> bool| {
+            let path = self.path.join(name);
+            private::close_below(&path, levels, leave).map_err(io(CLOSE, &path))
+        };
+        let nothing = |_: &Path| false;
+        closed("images", 3, &nothing)?;
+        closed("definitions", 1, &nothing)?;
+        closed("logs", 1, &nothing)?;
+        closed("run", 1, &nothing)?;
+        closed("layers", 0, &nothing)?;
+        closed("build", 1, &nothing)?;
+        // Below a servant's there is only the topmost layer of its root.
+        closed("servants", 2, &|path| {
+            path.is_dir() && path.ends_with("skeleton")
+        })?;
+        for name in ["cloudroid.db", "cloudroid.db-wal", "cloudroid.db-shm"] {
+            closed(name, 0, &nothing)?;
+        }
+        if !is_ours(&self.path).map_err(io(CLOSE, &self.path))? {
+            tracing::warn!(
+                "{} is not the daemon's alone: who may enter it stays as it is, and what the daemon keeps in it is closed to \
+                 others; give it a directory of its own with --home",
+                self.path.display()
+            );
+            return Ok(());
+        }
+        private::close_below(&self.path, 1, &|path| path.is_dir()).map_err(io(CLOSE, &self.path))
     }
 
     /// The directory.
@@ -117,8 +152,7 @@ impl Home {
         // Through a descriptor of its directory, because the path itself may be longer than an address can be.
         let address = format!("/proc/self/fd/{}/daemon.sock", opened.as_raw_fd());
         let listener = UnixListener::bind(address).map_err(io("listen on", &path))?;
-        std::fs::set_permissions(&path, Permissions::from_mode(0o600))
-            .map_err(io("protect", &path))?;
+        private::close(&path).map_err(io("protect", &path))?;
         Ok(listener)
     }
 
@@ -145,45 +179,77 @@ impl Home {
     }
 }
 
-fn make_directory(path: &Path, mode: u32) -> Result<(), HomeError> {
-    DirBuilder::new()
-        .recursive(true)
-        .mode(mode)
-        .create(path)
-        .map_err(io("create the directory", path))
+/// Directories that a daemon, or a new file system, makes in a home.
+const DIRECTORIES: [&str; 9] = [
+    "images",
+    "layers",
+    "run",
+    "servants",
+    "build",
+    "logs",
+    "definitions",
+    "cache",
+    "lost+found",
+];
+
+/// Whether a directory is a daemon's alone: it belongs to this user, and nobody has directories of other things in it.
+fn is_ours(path: &Path) -> std::io::Result<bool> {
+    let about = std::fs::metadata(path)?;
+    let shared = about.mode() & libc::S_ISVTX != 0;
+    if shared || about.uid() != nix::unistd::geteuid().as_raw() {
+        return Ok(false);
+    }
+    for entry in std::fs::read_dir(path)? {
+        let entry = entry?;
+        let known = DIRECTORIES.iter().any(|name| entry.file_name() == *name);
+        if entry.file_type()?.is_dir() && !known {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 fn lock(home: &Path) -> Result<Flock<File>, HomeError> {
     let path = home.join("lock");
-    let file = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .open(&path)
-        .map_err(io("open", &path))?;
+    let file = private::open(&path).map_err(io("open", &path))?;
     match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
         Ok(mut locked) => {
+            let holder = Identity::of(std::process::id() as i32).map_err(io("look at", &path))?;
             locked.set_len(0).map_err(io("write", &path))?;
             locked.rewind().map_err(io("write", &path))?;
-            writeln!(locked, "{}", std::process::id()).map_err(io("write", &path))?;
+            let record = serde_json::to_string(&holder).unwrap_or_default();
+            writeln!(locked, "{record}").map_err(io("write", &path))?;
             Ok(locked)
         }
         Err((mut file, nix::errno::Errno::EWOULDBLOCK)) => {
-            let mut holder = String::new();
-            let _ = file.read_to_string(&mut holder);
-            let known = holder.trim().parse::<u32>().ok();
-            Err(HomeError::Taken {
-                home: home.to_owned(),
-                pid: known.map(|pid| format!(" (pid {pid})")).unwrap_or_default(),
-                pid_bare: known.map(|pid| format!(" {pid}")).unwrap_or_default(),
-            })
+            let mut record = String::new();
+            let _ = file.read_to_string(&mut record);
+            Err(taken(home, &record))
         }
         Err((_, errno)) => Err(HomeError::Io {
             action: "lock",
             path,
             source: errno.into(),
         }),
+    }
+}
+
+/// Who has the home. A process is named only if it is the one that wrote the record, not another that has its number by now.
+fn taken(home: &Path, record: &str) -> HomeError {
+    let holder = serde_json::from_str::<Identity>(record)
+        .ok()
+        .filter(|holder| holder.open().is_ok_and(|held| held.is_some()));
+    let (pid, way) = match holder {
+        Some(Identity { pid, .. }) => (format!(" (pid {pid})"), format!("kill {pid}")),
+        None => {
+            let way = format!("fuser -v {}/lock shows which it is", home.display());
+            (String::new(), way)
+        }
+    };
+    HomeError::Taken {
+        home: home.to_owned(),
+        pid,
+        way,
     }
 }
 
@@ -248,6 +314,120 @@ mod tests {
         let path = first.path().to_owned();
         drop(first);
         Home::open(&path).expect("free again");
+    }
+
+    #[test]
+    fn a_process_that_only_has_the_number_is_not_named() {
+        let own = Identity::of(std::process::id() as i32).expect("this process");
+        let later = Identity {
+            start: own.start + 1,
+            ..own
+        };
+        let before = Identity {
+            boot: own.boot ^ 1,
+            ..own
+        };
+        let home = Path::new("/home/of/a/daemon");
+        let text = |holder: &Identity| serde_json::to_string(holder).expect("JSON");
+        for record in [text(&later), text(&before), "1\n".to_owned(), String::new()] {
+            let refused = taken(home, &record).to_string();
+            assert!(!refused.contains("kill"), "{record}: {refused}");
+            assert!(!refused.contains("pid"), "{record}: {refused}");
+            assert!(
+                refused.contains("fuser -v /home/of/a/daemon/lock"),
+                "{refused}"
+            );
+        }
+        let known = taken(home, &text(&own)).to_string();
+        assert!(known.contains(&format!("kill {}", own.pid)), "{known}");
+    }
+
+    fn mode(path: &Path) -> u32 {
+        use std::os::unix::fs::PermissionsExt;
+        path.symlink_metadata().expect("there").permissions().mode() & 0o7777
+    }
+
+    /// As an earlier version left it, at work for a servant.
+    fn lay_out(home: &Path) {
+        use std::os::unix::fs::PermissionsExt;
+        let files = [
+            "cloudroid.db",
+            "cloudroid.db-wal",
+            "cloudroid.db-shm",
+            "lock",
+            "images/index.json",
+            "images/blobs/sha256/0a",
+            "definitions/a.toml",
+            "logs/p1.log",
+            "run/daemon.sock",
+            "servants/s1/spec.json",
+            "servants/s1/log.jsonl",
+            "servants/s1/log.jsonl.1",
+            "servants/s1/skeleton/etc/hosts",
+            "layers/0b/usr/lib/thing",
+            "build/p1/tree/source.cpp",
+        ];
+        for name in files {
+            let path = home.join(name);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(&path, "").expect("made");
+            for path in path.ancestors().take_while(|path| path.starts_with(home)) {
+                let rights = if path.is_dir() { 0o755 } else { 0o644 };
+                let permissions = std::fs::Permissions::from_mode(rights);
+                std::fs::set_permissions(path, permissions).expect("set");
+            }
+        }
+    }
+
+    /// Everything below, but for what is in directories of these names.
+    fn walk(path: &Path, inside: &[&str], each: &mut dyn FnMut(&Path)) {
+        each(path);
+        let skipped = inside.iter().any(|name| path.ends_with(name));
+        if path.is_dir() && !skipped {
+            for entry in std::fs::read_dir(path).expect("read") {
+                walk(&entry.expect("read").path(), inside, each);
+            }
+        }
+    }
+
+    #[test]
+    fn a_home_that_others_could_read_is_mended() {
+        let parent = tempfile::tempdir().expect("a directory");
+        let path = parent.path().join("home");
+        lay_out(&path);
+        drop(Home::open(&path).expect("free"));
+        walk(&path, &["layers", "skeleton", "build/p1"], &mut |found| {
+            let expected = found.ends_with("skeleton");
+            assert_eq!(mode(found) & 0o077 != 0, expected, "{}", found.display());
+        });
+        for (name, rights) in [
+            ("layers/0b", 0o755),
+            ("layers/0b/usr/lib/thing", 0o644),
+            ("servants/s1/skeleton", 0o755),
+            ("servants/s1/skeleton/etc/hosts", 0o644),
+        ] {
+            assert_eq!(mode(&path.join(name)), rights, "{name} is a servant's");
+        }
+    }
+
+    #[test]
+    fn a_directory_with_other_things_in_it_keeps_its_rights() {
+        use std::os::unix::fs::PermissionsExt;
+        let parent = tempfile::tempdir().expect("a directory");
+        let theirs = parent.path().join("notes");
+        std::fs::create_dir(&theirs).expect("made");
+        let shared = std::fs::Permissions::from_mode(0o755);
+        std::fs::set_permissions(parent.path(), shared).expect("set");
+        let rights = mode(&theirs);
+        drop(Home::open(parent.path()).expect("free"));
+        // A second time, too, when the daemon's own things are there.
+        let home = Home::open(parent.path()).expect("free");
+        assert_eq!((mode(parent.path()), mode(&theirs)), (0o755, rights));
+        for name in [
+            "lock", "images", "layers", "servants", "run", "build", "logs",
+        ] {
+            assert_eq!(mode(&home.path().join(name)) & 0o077, 0, "{name}");
+        }
     }
 
     #[test]

@@ -23,6 +23,7 @@ mod journal;
 mod linked;
 mod names;
 mod portal;
+mod private;
 mod push;
 mod request_times;
 mod revisions;

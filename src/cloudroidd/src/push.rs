@@ -40,6 +40,7 @@ use crate::errors::Error;
 use crate::home::Home;
 use crate::journal::Journal;
 use crate::names;
+use crate::private;
 use crate::state::{self, NewEvent, Plan, RevisionRecord, State};
 
 /// Events that may wait for a slow client before the build waits for it.
@@ -83,8 +84,13 @@ impl Pusher {
         choreographer: Choreographer,
         bases_dir: PathBuf,
     ) -> anyhow::Result<Pusher> {
+        let cache = cache_directory(home);
+        // What was compiled lies there, too.
+        private::make_directory(&cache)
+            .and_then(|()| private::close(&cache))
+            .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
         let builder = Builder::new(rootfs_builder::Config {
-            cache_dir: cache_directory(home),
+            cache_dir: cache,
             bases_dir,
             build_dir: home.path().join("build"),
             logs_dir: home.path().join("logs"),

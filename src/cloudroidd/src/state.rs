@@ -87,6 +87,12 @@ pub fn millis(time: SystemTime) -> Millis {
         .map_or(0, |since| since.as_millis() as Millis)
 }
 
+/// What SQLite would say.
+fn cannot_open(error: &std::io::Error) -> rusqlite::Error {
+    let code = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_CANTOPEN);
+    rusqlite::Error::SqliteFailure(code, Some(error.to_string()))
+}
+
 impl State {
     /// Opens the database, making or migrating it.
     pub fn open(path: &Path) -> Result<State, StateError> {
@@ -95,6 +101,8 @@ impl State {
             path: name.clone(),
             source,
         };
+        // It holds hashes of tokens. SQLite's own files beside it get the rights that this one has.
+        crate::private::open(path).map_err(|error| failed(cannot_open(&error)))?;
         let mut connection = Connection::open(path).map_err(failed)?;
         connection
             .execute_batch(

@@ -93,7 +93,7 @@ impl NewFile {
                 .read(true)
                 .write(true)
                 .create_new(true)
-                .mode(0o644)
+                .mode(0o600)
                 .open(&path)
                 .map_err(|error| Error::file("create", &path, error))?;
             let new = Self {

@@ -115,7 +115,7 @@ impl Store {
             }
         }
         let blobs = self.blobs();
-        std::fs::create_dir_all(&blobs).map_err(|error| Error::file("create", &blobs, error))?;
+        files::make_private_directory(&blobs)?;
         if self.index()?.is_none() {
             self.write_index(&Index::default())?;
         }

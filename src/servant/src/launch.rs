@@ -12,6 +12,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -93,7 +94,10 @@ pub fn write<T: Serialize>(path: &Path, value: &T) -> Result<(), Error> {
         reason: error.to_string(),
     })?;
     let half = path.with_extension("half");
-    let mut file = fs::File::create(&half).map_err(Error::file("make", &half))?;
+    // It may hold an environment, and with it secrets.
+    let mut options = fs::File::options();
+    options.write(true).create(true).truncate(true).mode(0o600);
+    let mut file = options.open(&half).map_err(Error::file("make", &half))?;
     file.write_all(&text).map_err(Error::file("write", &half))?;
     fs::rename(&half, path).map_err(Error::file("write", path))
 }

@@ -3,6 +3,7 @@
 use std::fs;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
+use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +16,20 @@ pub struct Identity {
     pub pid: i32,
     /// Clock ticks from boot to its start (proc(5), /proc/PID/stat, field 22).
     pub start: u64,
+    /// Which boot: the first half of its random id (proc(5), /proc/sys/kernel/random/boot_id). 0, in records of earlier
+    /// versions, is any.
+    #[serde(default)]
+    pub boot: u64,
+}
+
+/// The first half of this boot's id; 0 where `/proc` does not tell.
+fn boot() -> u64 {
+    static BOOT: OnceLock<u64> = OnceLock::new();
+    *BOOT.get_or_init(|| {
+        let text = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+        let digits = text.chars().filter(char::is_ascii_hexdigit);
+        u64::from_str_radix(&digits.take(16).collect::<String>(), 16).unwrap_or(0)
+    })
 }
 
 impl Identity {
@@ -25,9 +40,19 @@ impl Identity {
         let start = stat
             .rsplit_once(") ")
             .and_then(|(_, fields)| fields.split(' ').nth(19)?.parse().ok());
-        start
-            .map(|start| Self { pid, start })
-            .ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))
+        let start = start.ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))?;
+        Ok(Self {
+            pid,
+            start,
+            boot: boot(),
+        })
+    }
+
+    /// Whether a record is of the same process as another.
+    fn is(&self, found: &Self) -> bool {
+        let boots_known = self.boot != 0 && found.boot != 0;
+        (self.pid, self.start) == (found.pid, found.start)
+            && (!boots_known || self.boot == found.boot)
     }
 
     /// Holds on to it; none when it has ended.
@@ -38,7 +63,7 @@ impl Identity {
         };
         // Compared after it was opened: from here on the number is surely that of the process held.
         match Self::of(self.pid) {
-            Ok(found) if found == *self && !has_ended(&pidfd) => Ok(Some(pidfd)),
+            Ok(found) if self.is(&found) && !has_ended(&pidfd) => Ok(Some(pidfd)),
             Ok(_) => Ok(None),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
@@ -82,7 +107,17 @@ mod tests {
             start: identity.start + 1,
             ..identity
         };
-        assert!(stranger.open().unwrap().is_none());
+        let of_another_boot = Identity {
+            boot: identity.boot ^ 1,
+            ..identity
+        };
+        for other in [stranger, of_another_boot] {
+            assert!(other.open().unwrap().is_none(), "{other:?}");
+        }
+        // What an earlier version wrote.
+        let text = format!(r#"{{"pid":{},"start":{}}}"#, identity.pid, identity.start);
+        let earlier: Identity = serde_json::from_str(&text).unwrap();
+        assert!(earlier.open().unwrap().is_some());
         drop(child.stdin.take());
         child.wait().unwrap();
         assert!(identity.open().unwrap().is_none());

@@ -2,7 +2,9 @@
 //! that all engines of the host share; the lock is held by the shim and ends with it, however that ends.
 
 use std::fs::{self, File};
+use std::io;
 use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
 use crate::{Error, sys};
@@ -20,14 +22,7 @@ pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
     let path = Path::new(FILE);
     let directory = path.parent().unwrap_or(path);
     fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
-    let file: OwnedFd = File::options()
-        .create(true)
-        .truncate(false)
-        .write(true)
-        .read(true)
-        .open(path)
-        .map_err(Error::file("open", path))?
-        .into();
+    let file: OwnedFd = open(path).map_err(Error::file("open", path))?.into();
     let first = base.div_ceil(RANGE);
     let end = if base < END {
         END / RANGE
@@ -43,6 +38,20 @@ pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
         base,
         ranges: end.saturating_sub(first),
     })
+}
+
+/// For this user alone: whoever can open it can hold any range, by a lock that only reads.
+fn open(path: &Path) -> io::Result<File> {
+    let file = File::options()
+        .create(true)
+        .truncate(false)
+        .write(true)
+        .read(true)
+        .mode(0o600)
+        .open(path)?;
+    // An earlier version made it for all to read.
+    file.set_permissions(fs::Permissions::from_mode(0o600))?;
+    Ok(file)
 }
 
 #[cfg(test)]
@@ -62,5 +71,17 @@ mod tests {
         ));
         drop(lock);
         assert_eq!(take(base).unwrap().0, base);
+    }
+
+    #[test]
+    fn nobody_else_can_hold_a_range() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("uid-ranges");
+        let mode = || path.metadata().unwrap().permissions().mode() & 0o777;
+        drop(open(&path).unwrap());
+        assert_eq!(mode(), 0o600);
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).unwrap();
+        drop(open(&path).unwrap());
+        assert_eq!(mode(), 0o600);
     }
 }

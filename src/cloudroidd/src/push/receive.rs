@@ -47,7 +47,7 @@ pub(super) async fn unpack(
     let destination = tree.to_owned();
     let work = tokio::task::spawn_blocking(move || {
         let parent = destination.parent().unwrap_or(&destination);
-        std::fs::create_dir_all(parent).map_err(|error| Error::Push {
+        crate::private::make_directory(parent).map_err(|error| Error::Push {
             message: format!("cannot make {}: {error}", parent.display()),
             next: None,
             log: Vec::new(),

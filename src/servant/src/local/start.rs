@@ -3,7 +3,7 @@
 use std::fs::{self, File};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
-use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::Stdio;
@@ -24,7 +24,7 @@ pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalSe
     validate::validate(&spec)?;
     let id = spec.id.clone();
     let directory = shared.config.home_servants_dir.join(&id);
-    match fs::DirBuilder::new().mode(0o755).create(&directory) {
+    match fs::DirBuilder::new().mode(0o700).create(&directory) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
             return Err(Error::Exists { id });
         }
@@ -67,7 +67,9 @@ async fn start_in(
 fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Error> {
     let (control, theirs) = UnixStream::pair().map_err(Error::call("socketpair for the shim"))?;
     let path = directory.join(launch::SHIM_LOG);
-    let log = File::create(&path).map_err(Error::file("make", &path))?;
+    let mut options = File::options();
+    options.write(true).create(true).truncate(true).mode(0o600);
+    let log = options.open(&path).map_err(Error::file("make", &path))?;
     let log_again = log.try_clone().map_err(Error::file("open", &path))?;
     let (program, arguments) =
         shared

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use init::socket::{self, MAX_FDS};
 use nix::sys::socket::{AddressFamily, SockFlag, SockType, socketpair};
+use nix::sys::stat::{Mode, umask};
 
 use super::create::{self, Creator};
 use crate::cgroup::{self, Cgroup};
@@ -44,6 +45,8 @@ pub(super) struct Begun {
 pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     // Fails only for the leader of a process group, such as a shim started by hand from a shell.
     let _ = nix::unistd::setsid();
+    // What is written from here on, the log above all, is for this user alone.
+    umask(Mode::from_bits_truncate(0o077));
     let control = take_control()?;
     let (network, uid_lock) = receive_descriptors(&control)?;
     let path = directory.join(launch::SPEC);

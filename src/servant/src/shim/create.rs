@@ -18,6 +18,7 @@ use std::ffi::CString;
 use std::fs::File;
 use std::io::Write;
 use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -27,6 +28,7 @@ use libcontainer::workload::{
     Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError,
 };
 use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, send, socketpair};
+use nix::sys::stat::{Mode, umask};
 use nix::unistd::ForkResult;
 use serde::{Deserialize, Serialize};
 
@@ -131,6 +133,8 @@ struct Ready {
 /// Everything that libcontainer is to find: root, volumes, configuration.
 fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
     let text = |error: &dyn std::error::Error| chain(error);
+    // Roots of containers are for their own users to read, whatever is usual in the shim.
+    umask(Mode::from_bits_truncate(0o022));
     let init = File::open(&launch.init)
         .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
     let skeleton = directory.join("skeleton");
@@ -158,7 +162,11 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
         bundle::config(&launch.spec, &staged, launch.uid_range).map_err(|error| text(&error))?;
     let file = directory.join("config.json");
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
-    std::fs::write(&file, json)
+    let mut options = File::options();
+    options.write(true).create(true).truncate(true).mode(0o600);
+    options
+        .open(&file)
+        .and_then(|mut file| file.write_all(&json))
         .map_err(|error| format!("could not write {}: {error}", file.display()))?;
     Ok(Ready {
         init,
