@@ -56,6 +56,8 @@ mod strangers;
 mod survival;
 #[path = "stories/tls.rs"]
 mod tls;
+#[path = "stories/tokens.rs"]
+mod tokens;
 #[path = "stories/trying.rs"]
 mod trying;
 
@@ -167,6 +169,13 @@ fn main() -> ExitCode {
             a_missing_original_is_said_once_and_the_cloud_goes_on,
             a_local_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
+        ],
+        stories![tokens:
+            no_route_answers_without_a_token,
+            whoever_lacks_a_token_is_told_how_to_give_one,
+            a_proxy_s_clients_are_told_from_this_machine_s,
+            services_are_told_to_those_who_have_shown_a_token,
+            a_resume_token_is_no_way_into_another_s_servant,
         ],
         stories![portal:
             topics_and_services_cross_both_ways,

@@ -125,7 +125,7 @@ pub fn nobody_takes_over_anothers_robot() -> Told {
     let asks = |token: &str| Robot::try_connect(&daemon.url(&format!("adder_py?robot=r1{token}")));
     let mut owner = asks("&token=open%20sesame").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
     ensure!(owner.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
-    for token in ["&token=rosebuds", "&token=guess", ""] {
+    for token in ["&token=rosebuds", "&token=guess"] {
         let Err(refusal) = asks(token) else {
             anyhow::bail!("{token:?} took over r1")
         };
@@ -138,6 +138,11 @@ pub fn nobody_takes_over_anothers_robot() -> Told {
             ensure!(refusal.body.contains("r1"), "{token:?}: {refusal}");
         }
     }
+    // Who shows the other token later gets no further.
+    let mut silent = asks("").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
+    silent.says(json!({"op": "auth", "mac": "rosebuds"}))?;
+    let close = silent.hears_close()?;
+    ensure!(close.reason.contains("r1"), "{close:?}");
     // Not after the owner has gone, either.
     owner.leaves()?;
     ensure!(

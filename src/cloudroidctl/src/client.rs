@@ -20,6 +20,10 @@ use tokio::net::{TcpStream, UnixStream};
 
 const FALLBACK: &str = "127.0.0.1:9090";
 
+/// What to do about a 401.
+const TOKEN_WANTED: &str = "give a token of the daemon's configuration with --token TOKEN or CLOUDROID_TOKEN; root on the \
+                            daemon's own machine needs none over its socket (--server unix:HOME/run/daemon.sock)";
+
 /// What is sent.
 pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
 
@@ -267,8 +271,9 @@ async fn refusal(response: Response<Incoming>) -> anyhow::Error {
     };
     match serde_json::from_slice::<Problem>(&body) {
         Ok(mut problem) => {
-            if status == StatusCode::UNAUTHORIZED && problem.next.is_none() {
-                problem.next = Some("give a token with --token or CLOUDROID_TOKEN".to_owned());
+            if status == StatusCode::UNAUTHORIZED {
+                // The daemon tells whoever speaks HTTP what to send; here it is an option.
+                problem.next = Some(TOKEN_WANTED.to_owned());
             }
             problem.into()
         }

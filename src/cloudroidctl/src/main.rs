@@ -42,7 +42,7 @@ struct Arguments {
     /// your own or of the installed daemon, or http://127.0.0.1:9090 where there is none.
     #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
     server: Option<String>,
-    /// Bearer token; needed beyond this machine.
+    /// Bearer token; needed over TCP where the daemon has tokens configured.
     #[arg(
         long,
         global = true,

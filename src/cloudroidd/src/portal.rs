@@ -16,6 +16,7 @@ mod metrics;
 mod oci;
 mod page;
 mod robots;
+mod routes;
 mod stubs;
 
 use std::convert::Infallible;
@@ -24,8 +25,6 @@ use std::time::Duration;
 
 use api::Millis;
 use axum::Router;
-use axum::extract::{DefaultBodyLimit, OriginalUri};
-use axum::routing::{any, get, post};
 use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
@@ -39,7 +38,6 @@ use tokio_util::task::TaskTracker;
 
 use crate::choreographer::Choreographer;
 use crate::config::Config;
-use crate::errors::Error;
 use crate::push::Pusher;
 use crate::state::State;
 use crate::tokens::Tokens;
@@ -104,75 +102,18 @@ impl App {
     }
 }
 
-/// The routes.
+/// The routes, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
-    let v1 = Router::new()
-        .route("/status", get(api_v1::status))
-        .route("/doctor", get(api_v1::doctor))
-        .route("/clock", get(api_v1::clock))
-        .route("/events", get(api_v1::events))
-        .route("/services", get(api_v1::services))
-        .route(
-            "/services/{name}",
-            get(api_v1::service).delete(api_v1::remove_service),
-        )
-        .route("/services/{name}/interface", get(api_v1::interface))
-        .route("/services/{name}/rollback", post(api_v1::rollback))
-        .route(
-            "/services/{name}/trial",
-            post(api_v1::trial).layer(DefaultBodyLimit::max(api_v1::LARGEST_TRIAL)),
-        )
-        .route(
-            "/servants",
-            get(api_v1::servants).delete(api_v1::stop_servants),
-        )
-        .route(
-            "/servants/{id}",
-            get(api_v1::servant)
-                .patch(api_v1::set_limits)
-                .delete(api_v1::stop_servant),
-        )
-        .route("/servants/{id}/logs", get(api_v1::logs))
-        .route("/robots/{name}/explain", get(api_v1::explain))
-        .route(
-            "/push",
-            post(crate::push::handle).layer(DefaultBodyLimit::disable()),
-        )
-        .route("/openapi.json", get(api_v1::openapi))
-        .fallback(nothing);
-    let images = Router::new()
-        .route("/", get(oci::version))
-        .route("/_catalog", get(oci::catalog))
-        .route("/{name}/tags/list", get(oci::tags))
-        .route("/{name}/manifests/{reference}", get(oci::manifest))
-        .route("/{name}/blobs/{digest}", get(oci::blob))
-        .fallback(oci::nothing);
-    Router::new()
-        .route("/", any(robots::root))
-        .route("/healthz", get(api_v1::health))
-        .route("/metrics", get(metrics::metrics))
-        .route("/assets/{name}", get(page::asset))
-        .nest("/api/v1", v1)
-        // `nest` does not take the path with the closing slash, which is where clients of /v2/ begin.
-        .route("/v2/", get(oci::version))
-        .nest("/v2", images)
-        .route("/api", any(nothing))
-        .route("/stubs", get(stubs::list))
-        .route("/stubs/{file}", get(stubs::archive))
-        .route("/assets", any(nothing))
-        .route("/{service}", any(robots::service))
-        .fallback(nothing)
+    let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
+        router.route(route.path, (route.handler)())
+    });
+    served
+        .fallback(routes::nothing)
         .layer(axum::middleware::from_fn_with_state(
             Arc::clone(&app),
             guard::guard,
         ))
         .with_state(app)
-}
-
-async fn nothing(OriginalUri(uri): OriginalUri) -> Error {
-    Error::UnknownPath {
-        path: uri.path().to_owned(),
-    }
 }
 
 /// Accepts TCP connections until the daemon ends.

@@ -1,7 +1,11 @@
 //! Who may use the portal. Only hashes of tokens are kept in memory and on disk, except for what rosauth's
 //! message authentication needs: there the token is the shared secret.
 
+use std::collections::HashMap;
+use std::sync::Arc;
+
 use anyhow::bail;
+use parking_lot::Mutex;
 use sha2::{Digest, Sha256, Sha512};
 
 /// SHA-256 of a token, lower-case hex.
@@ -13,6 +17,21 @@ pub struct Tokens {
     hashes: Vec<TokenHash>,
     /// Those written in clear.
     secrets: Vec<String>,
+    /// MACs that have let somebody in, and until when (seconds since 1970) each would again.
+    used: Arc<Mutex<HashMap<String, f64>>>,
+}
+
+/// Why an `auth` message lets nobody in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum AuthRefusal {
+    /// It holds no token, and no token signed it for now.
+    #[error("the auth message proves no token that is known")]
+    Unknown,
+    /// Somebody has come in by it already.
+    #[error(
+        "this auth message was used before, and each counts once; sign a new one (t, rand) for each connection"
+    )]
+    Used,
 }
 
 /// rosbridge's `auth` operation (rosauth): a MAC over the other fields and the secret.
@@ -92,19 +111,39 @@ impl Tokens {
         self.hashes.contains(&hash).then_some(hash)
     }
 
-    /// The hash of the token that signed `message`, at `now` (seconds since 1970).
-    pub fn recognise_auth(&self, message: &AuthMessage, now: f64) -> Option<TokenHash> {
+    /// The hash of the token that is in `message` or signed it, at `now` (seconds since 1970). What is signed counts once:
+    /// whoever has overheard it comes too late.
+    pub fn recognise_auth(
+        &self,
+        message: &AuthMessage,
+        now: f64,
+    ) -> Result<TokenHash, AuthRefusal> {
         if let Some(known) = self.recognise(&message.mac) {
-            return Some(known);
+            return Ok(known);
         }
+        let mac = message.mac.to_ascii_lowercase();
         let fresh = (message.t - now).abs() <= CLOCK_DIFFERENCE && message.end > now;
-        let signed_by =
-            |secret: &&String| message.signature(secret) == message.mac.to_ascii_lowercase();
-        fresh
-            .then(|| self.secrets.iter().find(signed_by))
-            .flatten()
-            .map(|secret| hash(secret))
+        let secret = self
+            .secrets
+            .iter()
+            .find(|secret| fresh && message.signature(secret) == mac)
+            .ok_or(AuthRefusal::Unknown)?;
+        let mut used = self.used.lock();
+        used.retain(|_, until| *until >= now);
+        // The fraction of `t` is not signed.
+        let until = message.t.trunc() + 1.0 + CLOCK_DIFFERENCE;
+        match used.insert(mac, until) {
+            None => Ok(hash(secret)),
+            Some(_) => Err(AuthRefusal::Used),
+        }
     }
+}
+
+/// What a client's resume token is known by: bound to who shows it, so that nobody takes over what belongs to another token,
+/// or to none.
+pub fn bound_to(principal: Option<&TokenHash>, resume: &str) -> String {
+    let principal = principal.map_or("", String::as_str);
+    hash(&format!("{principal} {resume}"))
 }
 
 impl AuthMessage {
@@ -169,23 +208,85 @@ mod tests {
         };
         message.mac = message.signature("open-sesame");
         assert_eq!(
-            known.recognise_auth(&message, 1003.0),
-            Some(hash("open-sesame"))
+            known.recognise_auth(&message, 1010.0),
+            Err(AuthRefusal::Unknown),
+            "too old"
         );
-        assert_eq!(known.recognise_auth(&message, 1010.0), None, "too old");
         let forged = AuthMessage {
             client: "10.0.0.3".into(),
             ..message.clone()
         };
         assert_eq!(
             known.recognise_auth(&forged, 1003.0),
-            None,
+            Err(AuthRefusal::Unknown),
             "signed for another"
+        );
+        assert_eq!(
+            known.recognise_auth(&message, 1003.0),
+            Ok(hash("open-sesame"))
         );
         let plain = AuthMessage {
             mac: "open-sesame".into(),
             ..message
         };
-        assert_eq!(known.recognise_auth(&plain, 9e9), Some(hash("open-sesame")));
+        for _ in 0..2 {
+            assert_eq!(known.recognise_auth(&plain, 9e9), Ok(hash("open-sesame")));
+        }
+    }
+
+    #[test]
+    fn a_signed_message_counts_once() {
+        let known = tokens(&["open-sesame"]);
+        let mut message = AuthMessage {
+            mac: String::new(),
+            client: "10.0.0.2".into(),
+            dest: "10.0.0.1".into(),
+            rand: "abc".into(),
+            t: 1000.0,
+            level: "user".into(),
+            end: 2000.0,
+        };
+        message.mac = message.signature("open-sesame");
+        let later = tokens(&["open-sesame"]);
+        known.recognise_auth(&message, 996.0).expect("the first");
+        let upper = AuthMessage {
+            mac: message.mac.to_uppercase(),
+            ..message.clone()
+        };
+        let delayed = AuthMessage {
+            t: 1000.9,
+            ..message.clone()
+        };
+        for (again, now) in [(&message, 996.0), (&upper, 1004.0), (&delayed, 1005.8)] {
+            assert_eq!(
+                known.recognise_auth(again, now),
+                Err(AuthRefusal::Used),
+                "{now}"
+            );
+        }
+        // What is too old anyway is not remembered.
+        let mut next = AuthMessage {
+            t: 1010.0,
+            ..message.clone()
+        };
+        next.mac = next.signature("open-sesame");
+        known.recognise_auth(&next, 1010.0).expect("another one");
+        assert_eq!(known.used.lock().len(), 1);
+        later
+            .recognise_auth(&message, 1000.0)
+            .expect("not used there");
+    }
+
+    #[test]
+    fn a_resume_token_is_bound_to_who_shows_it() {
+        let (one, two) = (hash("one"), hash("two"));
+        assert_eq!(bound_to(Some(&one), "mine"), bound_to(Some(&one), "mine"));
+        for other in [
+            bound_to(Some(&two), "mine"),
+            bound_to(None, "mine"),
+            bound_to(Some(&one), "yours"),
+        ] {
+            assert_ne!(bound_to(Some(&one), "mine"), other);
+        }
     }
 }

@@ -59,7 +59,7 @@ fn recognise(payload: &[u8], tokens: &Tokens, now: f64) -> Result<TokenHash, Str
         .map_err(|error| format!("the auth message cannot be read: {error}"))?;
     tokens
         .recognise_auth(&message, now)
-        .ok_or_else(|| "the auth message proves no token that is known".to_owned())
+        .map_err(|refusal| refusal.to_string())
 }
 
 /// The payload of one whole text frame, taken out of `buffer`; none while it is not complete.

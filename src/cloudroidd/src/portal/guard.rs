@@ -1,20 +1,33 @@
-//! Who asks, and may they: before any handler.
+//! Who asks, and may they: before any handler, and closed unless opened here.
 //!
-//! On loopback nobody needs a token, so a web page from elsewhere must not be able to ask through the browser of
-//! somebody on this machine: requests that name another host (DNS rebinding) or another origin (cross-site
-//! requests and WebSockets) are refused. Beyond loopback a token is needed, which no browser adds by itself.
+//! Where tokens are configured, whoever comes by TCP shows one, from this machine, too: a web server that stands in front of
+//! the portal, and whatever else can connect to loopback, comes from this machine. Without one only the page (which asks
+//! for it), health, and the handshake of a robot (whose first message may be rosbridge's `auth`) are let through.
+//!
+//! Where none are, the portal listens on loopback alone and nobody needs one. A web page from elsewhere must not be able to
+//! ask through the browser of somebody on this machine then: requests that name another host (DNS rebinding) or
+//! another origin (cross-site requests and WebSockets) are refused, and so is what a proxy passes on.
 
+use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderMap, Uri, header};
+use axum::http::{HeaderMap, Method, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use parking_lot::Mutex;
 
 use super::App;
 use crate::errors::Error;
+use crate::names;
 use crate::tokens::{self, TokenHash, Tokens};
+
+/// The same refusal is logged again after so long.
+const AGAIN: Duration = Duration::from_secs(60);
+/// So many different ones meanwhile; what they say is the client's to choose.
+const DIFFERENT: usize = 32;
 
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,14 +38,23 @@ pub enum Peer {
     Unix(u32),
 }
 
+impl fmt::Display for Peer {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Peer::Tcp(address) => address.fmt(out),
+            Peer::Unix(uid) => write!(out, "user {uid}"),
+        }
+    }
+}
+
 /// Who asks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {
     /// From where.
     pub peer: Peer,
-    /// With which token; on loopback also one that is not configured, which then only owns robots' names.
+    /// With which token; where none are configured also any other, which then only owns robots' names.
     pub token: Option<TokenHash>,
-    /// May ask. Only WebSockets may come without, to send a rosbridge `auth` message first.
+    /// May ask. Who is not gets the page, health, and a WebSocket on which to send rosbridge's `auth` first.
     pub trusted: bool,
 }
 
@@ -56,47 +78,70 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     let Some(peer) = request.extensions().get::<Peer>().copied() else {
         return Error::Internal("telling who asks").into_response();
     };
-    match rules.admit(peer, request.uri(), request.headers()) {
+    match rules.admit(peer, request.method(), request.uri(), request.headers()) {
         Ok(caller) => {
             request.extensions_mut().insert(caller);
             next.run(request).await
         }
-        Err(error) => error.into_response(),
+        Err(error) => {
+            if let Error::Foreign { what, next } = &error {
+                tell(peer, what, next);
+            }
+            error.into_response()
+        }
+    }
+}
+
+/// A refusal that the operator may want to end is logged: once in a while, for a page asks again and again.
+fn tell(peer: Peer, what: &str, next: &str) {
+    static TOLD: Mutex<Vec<(Instant, String)>> = Mutex::new(Vec::new());
+    let mut told = TOLD.lock();
+    told.retain(|(at, _)| at.elapsed() < AGAIN);
+    if told.len() < DIFFERENT && !told.iter().any(|(_, earlier)| earlier == what) {
+        told.push((Instant::now(), what.to_owned()));
+        tracing::warn!("refused a request of {peer}: {what}; {next}");
     }
 }
 
 impl Rules<'_> {
-    fn admit(&self, peer: Peer, uri: &Uri, headers: &HeaderMap) -> Result<Caller, Error> {
+    fn admit(
+        &self,
+        peer: Peer,
+        method: &Method,
+        uri: &Uri,
+        headers: &HeaderMap,
+    ) -> Result<Caller, Error> {
         if let Peer::Unix(uid) = peer {
             return admit_user(peer, uid);
         }
         let given = token_in(uri, headers);
+        if self.loopback && self.tokens.is_empty() {
+            check_direct(headers)?;
+            self.check_host(headers)?;
+            self.check_origin(headers)?;
+            return Ok(Caller {
+                peer,
+                token: given.as_deref().map(tokens::hash),
+                trusted: true,
+            });
+        }
         let known = given
             .as_deref()
             .and_then(|token| self.tokens.recognise(token));
-        if given.is_some() && known.is_none() && !self.tokens.is_empty() {
-            return Err(Error::Unauthorised("this token is not known"));
-        }
-        if !self.loopback {
-            let trusted = known.is_some();
-            if !trusted && !is_open(uri, headers) {
-                return Err(Error::Unauthorised("a token is needed"));
-            }
-            return Ok(Caller {
+        match (given, known) {
+            (_, Some(token)) => Ok(Caller {
                 peer,
-                token: known,
-                trusted,
-            });
+                token: Some(token),
+                trusted: true,
+            }),
+            (Some(_), None) => Err(Error::Unauthorised("this token is not known")),
+            (None, None) if is_open(method, uri, headers) => Ok(Caller {
+                peer,
+                token: None,
+                trusted: false,
+            }),
+            (None, None) => Err(Error::Unauthorised("a token is needed")),
         }
-        if known.is_none() {
-            self.check_host(headers)?;
-            self.check_origin(headers)?;
-        }
-        Ok(Caller {
-            peer,
-            token: known.or_else(|| given.as_deref().map(tokens::hash)),
-            trusted: true,
-        })
     }
 
     fn check_host(&self, headers: &HeaderMap) -> Result<(), Error> {
@@ -109,7 +154,7 @@ impl Rules<'_> {
                 "the request is addressed to {host:?}, but this portal serves this machine alone"
             ),
             next:
-                "use 127.0.0.1 or localhost, or show a token of the configuration, where a proxy passes requests on"
+                "use 127.0.0.1 or localhost, or configure tokens, as a proxy in front of it needs"
                     .to_owned(),
         })
     }
@@ -150,10 +195,50 @@ fn admit_user(peer: Peer, uid: u32) -> Result<Caller, Error> {
     })
 }
 
-/// Asked for without a token: the page (which asks for one), and WebSockets (which may send one).
-fn is_open(uri: &Uri, headers: &HeaderMap) -> bool {
+/// Headers by which proxies tell whom they ask for.
+const FORWARDED: [&str; 6] = [
+    "forwarded",
+    "via",
+    "x-forwarded-for",
+    "x-forwarded-host",
+    "x-forwarded-proto",
+    "x-real-ip",
+];
+
+/// Who comes through a proxy is somebody from elsewhere, whatever host the request names.
+fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
+    match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
+        None => Ok(()),
+        Some(name) => Err(Error::Foreign {
+            what: format!(
+                "a proxy passes this request on (its header {name} says so), and this portal has no tokens by which to \
+                 tell who asks"
+            ),
+            next: "configure tokens, and send one: Authorization: Bearer TOKEN, or ?token=TOKEN"
+                .to_owned(),
+        }),
+    }
+}
+
+/// What is answered without a token: the page (which asks for one), health, and the handshake of a robot (which may send
+/// one as its first message).
+fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
-    path == "/" || path == "/healthz" || path.starts_with("/assets/") || is_upgrade(headers)
+    let page = path == "/" || path == "/healthz" || is_asset(path);
+    let reads = matches!(*method, Method::GET | Method::HEAD);
+    let handshake = *method == Method::GET && is_upgrade(headers);
+    page && reads || handshake && (path == "/" || is_service(path))
+}
+
+fn is_asset(path: &str) -> bool {
+    path.strip_prefix("/assets/")
+        .is_some_and(|name| !name.is_empty() && !name.contains('/'))
+}
+
+/// The address of a service that there may be: `/NAME`, or `/NAME/`.
+fn is_service(path: &str) -> bool {
+    let name = path.strip_prefix('/').unwrap_or_default();
+    names::service(name.strip_suffix('/').unwrap_or(name)).is_ok()
 }
 
 /// Whether a WebSocket is asked for.
@@ -235,12 +320,14 @@ mod tests {
 
     struct Ask<'a> {
         rules: Rules<'a>,
+        method: Method,
         headers: HeaderMap,
     }
 
     fn ask<'a>(rules: &Rules<'a>) -> Ask<'a> {
         Ask {
             rules: Rules { ..*rules },
+            method: Method::GET,
             headers: HeaderMap::new(),
         }
         .with("host", "127.0.0.1:9090")
@@ -253,11 +340,19 @@ mod tests {
             self
         }
 
+        fn by(mut self, method: Method) -> Self {
+            self.method = method;
+            self
+        }
+
         fn at(&self, uri: &str) -> Result<Caller, u16> {
+            self.told(uri).map_err(|error| error.problem().status)
+        }
+
+        fn told(&self, uri: &str) -> Result<Caller, Error> {
             let peer = Peer::Tcp("127.0.0.1:5000".parse().expect("an address"));
-            self.rules
-                .admit(peer, &uri.parse().expect("a URI"), &self.headers)
-                .map_err(|error| error.problem().status)
+            let uri = uri.parse().expect("a URI");
+            self.rules.admit(peer, &self.method, &uri, &self.headers)
         }
     }
 
@@ -325,72 +420,144 @@ mod tests {
     }
 
     #[test]
-    fn on_loopback_a_token_given_is_checked_where_some_are_configured() {
+    fn an_origin_that_a_sandboxed_page_has_is_named_with_what_to_write() {
+        let none = Tokens::default();
+        let closed = Rules {
+            loopback: true,
+            tokens: &none,
+            origins: &[],
+        };
+        let refused = ask(&closed)
+            .with("origin", "null")
+            .told("/opencv_apps")
+            .expect_err("nobody's page");
+        let next = refused.problem().next.unwrap_or_default();
+        assert!(next.contains(r#"origins = ["null"]"#), "{next}");
+        let origins = ["null".to_owned()];
+        let opened = Rules {
+            origins: &origins,
+            ..closed
+        };
+        ask(&opened)
+            .with("origin", "null")
+            .at("/opencv_apps")
+            .expect("configured");
+    }
+
+    #[test]
+    fn what_a_proxy_passes_on_needs_tokens() {
         let (none, some) = (Tokens::default(), tokens());
+        let mut rules = Rules {
+            loopback: true,
+            tokens: &none,
+            origins: &[],
+        };
+        for (name, value) in [
+            ("x-forwarded-proto", "https"),
+            ("x-forwarded-for", "203.0.113.7"),
+            ("forwarded", "for=203.0.113.7"),
+            ("via", "1.1 proxy"),
+        ] {
+            // Its client may name whatever host it likes.
+            let refused = ask(&rules).with("host", "localhost").with(name, value);
+            assert_eq!(refused.at("/api/v1/services"), Err(403), "{name}");
+        }
+        rules.tokens = &some;
+        ask(&rules)
+            .with("x-forwarded-proto", "https")
+            .at("/api/v1/services?token=open+sesame")
+            .expect("a token says who asks");
+    }
+
+    #[test]
+    fn without_configured_tokens_any_token_owns_robots_names() {
+        let none = Tokens::default();
         let open = Rules {
             loopback: true,
             tokens: &none,
             origins: &[],
         };
         let caller = ask(&open).at("/x?robot=r&token=mine").expect("let through");
-        assert_eq!(
-            caller.token,
-            Some(tokens::hash("mine")),
-            "it owns robots' names"
-        );
-        let guarded = Rules {
+        assert_eq!(caller.token, Some(tokens::hash("mine")));
+    }
+
+    #[test]
+    fn configured_tokens_are_needed_on_loopback_as_beyond() {
+        let some = tokens();
+        for loopback in [true, false] {
+            let rules = Rules {
+                loopback,
+                tokens: &some,
+                origins: &[],
+            };
+            let far = || ask(&rules).with("host", "localhost");
+            for path in [
+                "/api/v1/services",
+                "/metrics",
+                "/opencv_apps",
+                "/stubs",
+                "/v2/",
+            ] {
+                assert_eq!(far().at(path), Err(401), "{path}");
+            }
+            assert_eq!(far().at("/x?token=wrong"), Err(401));
+            let bearer = |word: &str| far().with("authorization", &format!("Bearer {word}"));
+            assert_eq!(bearer("wrong").at("/api/v1/services"), Err(401));
+            for known in [
+                bearer("open sesame").at("/api/v1/services"),
+                far()
+                    .with("origin", "https://far.example")
+                    .at("/api/v1/services?token=open+sesame"),
+            ] {
+                let known = known.expect("a known token");
+                assert_eq!(known.token, Some(tokens::hash("open sesame")));
+                assert!(known.trusted);
+            }
+        }
+    }
+
+    #[test]
+    fn without_a_token_only_the_page_health_and_handshakes_are_open() {
+        let some = tokens();
+        let rules = Rules {
             loopback: true,
             tokens: &some,
             origins: &[],
         };
-        assert_eq!(ask(&guarded).at("/x?token=wrong"), Err(401));
-        let caller = ask(&guarded)
-            .with("origin", "https://far.example")
-            .at("/x?token=open%20sesame");
-        assert_eq!(
-            caller.expect("a known token").token,
-            Some(tokens::hash("open sesame"))
-        );
-    }
-
-    #[test]
-    fn beyond_loopback_a_token_is_needed() {
-        let some = tokens();
-        let rules = Rules {
-            loopback: false,
-            tokens: &some,
-            origins: &[],
-        };
-        let far = || ask(&rules).with("host", "robots.example");
-        assert_eq!(far().at("/api/v1/services"), Err(401));
-        assert_eq!(far().at("/metrics"), Err(401));
-        assert_eq!(
-            far()
-                .with("authorization", "Bearer wrong")
-                .at("/api/v1/services"),
-            Err(401)
-        );
-        assert!(
-            far()
-                .with("authorization", "bearer open sesame")
-                .at("/api/v1/services")
-                .expect("known")
-                .trusted
-        );
-        assert!(
-            far()
-                .at("/api/v1/services?token=open+sesame")
-                .expect("known")
-                .trusted
-        );
-        assert!(!far().at("/").expect("the page asks for a token").trusted);
-        assert!(
-            !far()
-                .with("upgrade", "WebSocket")
-                .at("/opencv_apps")
-                .expect("may send auth")
-                .trusted
-        );
+        let handshake = |method: Method| ask(&rules).by(method).with("upgrade", "WebSocket");
+        for path in ["/", "/healthz", "/assets/portal.js"] {
+            let caller = ask(&rules).at(path).expect(path);
+            assert!(!caller.trusted, "{path}");
+            ask(&rules).by(Method::HEAD).at(path).expect(path);
+            assert_eq!(ask(&rules).by(Method::POST).at(path), Err(401), "{path}");
+        }
+        for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
+            let caller = handshake(Method::GET).at(path).expect("may send auth");
+            assert!(!caller.trusted, "{path}");
+            for method in [Method::POST, Method::DELETE, Method::PUT, Method::PATCH] {
+                let refused = handshake(method.clone()).at(path);
+                assert_eq!(refused, Err(401), "{method} {path}");
+            }
+        }
+        for path in [
+            "/api",
+            "/api/",
+            "/api/v1/services",
+            "/metrics",
+            "/metrics/",
+            "/stubs",
+            "/stubs/opencv_apps.tar.gz",
+            "/v2",
+            "/v2/",
+            "/assets",
+            "/assets/deep/er",
+            "//opencv_apps",
+            "/opencv_apps/more",
+            "/opencv_apps//",
+            "/%61pi",
+        ] {
+            assert_eq!(handshake(Method::GET).at(path), Err(401), "{path}");
+        }
     }
 
     #[test]

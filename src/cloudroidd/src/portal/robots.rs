@@ -1,4 +1,6 @@
 //! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`.
+//!
+//! Who comes without a token where some are configured is let in only to send one: no servant is asked for, nothing is told.
 
 use std::sync::Arc;
 
@@ -38,6 +40,8 @@ pub async fn root(
         Some(service) => connect(app, service, caller, request)
             .await
             .unwrap_or_else(IntoResponse::into_response),
+        // What there is, is told to those who may ask.
+        None if !caller.trusted => Error::Unauthorised("a token is needed").into_response(),
         None => {
             let exists = app.state.service_names().unwrap_or_default();
             Error::UnknownService {
@@ -131,6 +135,14 @@ impl Asked {
     }
 }
 
+impl Asked {
+    /// The resume token, as whoever shows it is known by it.
+    fn bound_resume(&self, caller: &Caller) -> Option<String> {
+        let token = self.resume.as_deref()?;
+        Some(tokens::bound_to(caller.token.as_ref(), token))
+    }
+}
+
 async fn connect(
     app: Arc<App>,
     service: String,
@@ -144,7 +156,8 @@ async fn connect(
     if asked.link && !caller.trusted {
         return Err(Error::Unauthorised("a link needs a token"));
     }
-    if app.state.service_package(&asked.service)?.is_none() {
+    // Who has yet to show a token is not told what there is, nor whether this is: the auth message comes first.
+    if caller.trusted && app.state.service_package(&asked.service)?.is_none() {
         return Err(Error::UnknownService {
             exists: app.state.service_names()?,
             name: asked.service,
@@ -236,7 +249,7 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
 /// The right to the servant that is asked for, if the robot's name is the caller's.
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     let Some(robot) = &asked.robot else {
-        let (robot, anonymous) = nameless(asked.resume.as_deref());
+        let (robot, anonymous) = nameless(asked.bound_resume(caller).as_deref());
         return app.choreographer.ensure(&asked.service, &robot, anonymous);
     };
     if !asked.shared {
@@ -259,10 +272,11 @@ fn check_owner(app: &App, robot: &str, caller: &Caller) -> Result<(), Error> {
     Ok(())
 }
 
-/// A name for a robot that gave none (one that no robot can give, so nobody takes it over), and whether nobody can come back under it: who holds the resume token can.
+/// A name for a robot that gave none (one that no robot can give, so nobody takes it over), and whether nobody can come
+/// back under it: who holds the resume token, here bound to who shows it, can.
 fn nameless(resume: Option<&str>) -> (String, bool) {
     match resume {
-        Some(token) => (format!("~{}", &tokens::hash(token)[..12]), false),
+        Some(bound) => (format!("~{}", &bound[..12]), false),
         None => (format!("~{}", names::random(6)), true),
     }
 }
@@ -366,7 +380,7 @@ async fn session<S>(
     };
     let options = SessionOptions {
         client,
-        resume: asked.resume,
+        resume: asked.bound_resume(&caller),
         read_ahead,
         ..SessionOptions::default()
     };
@@ -446,11 +460,13 @@ mod tests {
 
     #[test]
     fn who_holds_the_resume_token_comes_back_to_the_same_servant() {
-        assert_eq!(nameless(Some("secret")), nameless(Some("secret")));
-        assert_ne!(nameless(Some("secret")), nameless(Some("other")));
+        let bound = |resume| tokens::bound_to(None, resume);
+        let named = |resume| nameless(Some(&bound(resume)));
+        assert_eq!(named("secret"), named("secret"));
+        assert_ne!(named("secret"), named("other"));
         assert_ne!(nameless(None).0, nameless(None).0);
         assert!(
-            names::robot(&nameless(Some("secret")).0).is_err(),
+            names::robot(&named("secret").0).is_err(),
             "no robot can claim it"
         );
     }

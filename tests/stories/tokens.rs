@@ -1,0 +1,200 @@
+//! Where tokens are configured nobody does anything without one, on loopback either.
+
+use anyhow::{Context, ensure};
+use serde_json::json;
+use support::Told;
+use support::daemon::Daemon;
+use support::robot::Robot;
+use support::world::{ADDER, world};
+
+/// The portal's own table, so that an address that is added to it is walked, too.
+const TABLE: &str = include_str!("../../src/cloudroidd/src/portal/routes.rs");
+const METHODS: [&str; 8] = [
+    "GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE",
+];
+
+/// Methods and addresses of the table, with a name in each place for one.
+fn routes() -> anyhow::Result<Vec<(String, String)>> {
+    let (_, rows) = TABLE.split_once("ROUTES: &[Route]").context("the table")?;
+    let mut routes = Vec::new();
+    for row in rows.split("at(").skip(1) {
+        let mut words = row.split('"').skip(1).step_by(2);
+        let (method, path) = (words.next().context("a method")?, words.next());
+        let path = path.context("a path")?;
+        let filled = path.split('/').map(|segment| match segment {
+            "{service}" => "no_such_service",
+            segment if segment.starts_with('{') => "x",
+            segment => segment,
+        });
+        routes.push((method.to_owned(), filled.collect::<Vec<_>>().join("/")));
+    }
+    Ok(routes)
+}
+
+fn guarded(name: &str) -> anyhow::Result<Daemon> {
+    world()
+        .own(name)
+        .config("tokens = [\"open sesame\"]\n")
+        .start()
+}
+
+/// `Sec-WebSocket-Key` is left out, so that what is let in by this is refused next, without a wait.
+const UPGRADE: [(&str, &str); 3] = [
+    ("Upgrade", "websocket"),
+    ("Connection", "Upgrade, close"),
+    ("Sec-WebSocket-Version", "13"),
+];
+
+pub fn no_route_answers_without_a_token() -> Told {
+    let daemon = guarded("walked")?;
+    let routes = routes()?;
+    for known in [
+        ("POST", "/api/v1/push"),
+        ("ANY", "/"),
+        ("GET", "/v2/_catalog"),
+    ] {
+        let listed = routes
+            .iter()
+            .any(|(method, path)| (&**method, &**path) == known);
+        ensure!(
+            listed,
+            "{known:?} is not in the table as it was read: {routes:?}"
+        );
+    }
+    let mut answered = Vec::new();
+    for (_, path) in &routes {
+        for method in METHODS {
+            for upgrade in [&[][..], &UPGRADE[..]] {
+                for host in ["localhost", "elsewhere.example"] {
+                    let headers = [upgrade, &[("Host", host)]].concat();
+                    let (status, body) = daemon.request(method, path, &headers)?;
+                    if status != 401 {
+                        ensure!(!body.contains("open sesame"), "{body}");
+                        answered.push((method, path.as_str(), !upgrade.is_empty(), status));
+                    }
+                }
+            }
+        }
+    }
+    answered.dedup();
+    let read = |path: &'static str, status| {
+        ["GET", "HEAD"].into_iter().flat_map(move |method| {
+            [false, true].map(move |upgrade| (method, path, upgrade, status))
+        })
+    };
+    // A handshake is let in to show a token: this one is told that it is incomplete, by which nothing is learnt. There is no
+    // default service to connect to.
+    let open: Vec<_> = [("GET", "/", false, 200), ("HEAD", "/", false, 200)]
+        .into_iter()
+        .chain([("HEAD", "/", true, 200)])
+        .chain(read("/healthz", 200))
+        .chain(read("/assets/x", 404))
+        .chain([
+            ("GET", "/no_such_service", true, 400),
+            ("GET", "/no_such_service/", true, 400),
+        ])
+        .collect();
+    for route in &answered {
+        ensure!(open.contains(route), "answered without a token: {route:?}");
+    }
+    for route in &open {
+        ensure!(answered.contains(route), "not answered: {route:?}");
+    }
+    Ok(())
+}
+
+pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Told {
+    let daemon = guarded("told")?;
+    let server = format!("http://{}", daemon.address);
+    let deployer = daemon.deployer();
+    deployer
+        .types(&["--server", &server, "services"])?
+        .failed_saying(&["--token", "CLOUDROID_TOKEN"])?;
+    deployer
+        .types(&["--server", &server, "--token", "guess", "services"])?
+        .failed_saying(&["not known", "--token"])?;
+    deployer
+        .types(&["--server", &server, "--token", "open sesame", "services"])?
+        .succeeded()?;
+    // Root of this machine needs none at the socket.
+    deployer.types(&["services"])?.succeeded()?;
+    let (status, body) = daemon.get("/api/v1/services")?;
+    ensure!(
+        status == 401 && body.contains("Authorization: Bearer TOKEN") && body.contains("?token="),
+        "{status} {body}"
+    );
+    ensure!(daemon.get("/api/v1/services?token=open%20sesame")?.0 == 200);
+    Ok(())
+}
+
+pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Told {
+    let daemon = world().with(ADDER)?;
+    let (status, body) = daemon.request(
+        "GET",
+        "/api/v1/services",
+        &[("Host", "localhost"), ("X-Forwarded-Proto", "https")],
+    )?;
+    ensure!(
+        status == 403 && body.contains("configure tokens"),
+        "{status} {body}"
+    );
+    Ok(())
+}
+
+pub fn services_are_told_to_those_who_have_shown_a_token() -> Told {
+    let daemon = guarded("untold")?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    for path in ["", "adder_py", "no_such_service"] {
+        if let Err(refusal) = Robot::try_connect(&daemon.url(path)) {
+            ensure!(refusal.status == 401, "{path:?}: {refusal}");
+            ensure!(!refusal.body.contains("adder_py"), "{path:?}: {refusal}");
+        }
+    }
+    let mut guesser = daemon.robot("no_such_service")?;
+    guesser.says(json!({"op": "auth", "mac": "guess"}))?;
+    let close = guesser.hears_close()?;
+    ensure!(
+        u16::from(close.code) == 1008 && !close.reason.contains("service"),
+        "{close:?}"
+    );
+    let mut known = daemon.robot("no_such_service")?;
+    known.says(json!({"op": "auth", "mac": "open sesame"}))?;
+    let close = known.hears_close()?;
+    ensure!(close.reason.contains("no_such_service"), "{close:?}");
+    let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service?token=open%20sesame"))
+    else {
+        anyhow::bail!("an unknown service accepted a robot")
+    };
+    ensure!(
+        refusal.status == 404 && refusal.body.contains("adder_py"),
+        "{refusal}"
+    );
+    // And the auth message of rosbridge opens what there is.
+    let mut robot = daemon.robot("adder_py")?;
+    robot.says(json!({"op": "auth", "mac": "open sesame"}))?;
+    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    Ok(())
+}
+
+pub fn a_resume_token_is_no_way_into_another_s_servant() -> Told {
+    let daemon = world()
+        .own("resumers")
+        .config("tokens = [\"open sesame\", \"rosebuds\"]\n[servant]\nanonymous_grace = \"60s\"\n")
+        .start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let asks = |token: &str| daemon.robot(&format!("adder_py?resume=mine&token={token}"));
+    let count = || Ok::<_, anyhow::Error>(daemon.servants_of("adder_py")?.len());
+    let first = asks("open%20sesame")?;
+    let second = asks("rosebuds")?;
+    ensure!(count()? == 2, "two tokens share a servant");
+    let third = asks("rosebuds")?;
+    ensure!(count()? == 2, "one token has two servants");
+    drop((first, second, third));
+    Ok(())
+}
