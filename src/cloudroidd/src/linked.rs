@@ -1,7 +1,7 @@
 //! What a servant does for its robot's stubs: nodes are started and ended one by one, as roslaunch does on the robot.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
@@ -20,9 +20,8 @@ use crate::definitions;
 use crate::journal::Journal;
 use crate::request_times::RequestTimes;
 use crate::state::{NewEvent, RevisionRecord, State};
+use crate::stubs;
 
-/// How deep executables may lie below `share/PKG`.
-const DEPTH: usize = 4;
 /// Lines that wait for a slow link; more are lost, and stand in the servant's log.
 const LINES: usize = 256;
 /// So many decisions of a robot become events within this time; more are left out, for a robot can tell any number.
@@ -127,51 +126,12 @@ impl LinkedNodes {
                 .extend(distributions.map(|entry| Path::new("/opt/ros").join(entry.file_name())));
         }
         let mut seen = BTreeSet::new();
-        prefixes.retain(|prefix| prefix.is_absolute() && seen.insert(prefix.clone()));
+        let below = |prefix: &PathBuf| {
+            let mut parts = prefix.components();
+            prefix.is_absolute() && parts.all(|part| part != Component::ParentDir)
+        };
+        prefixes.retain(|prefix| below(prefix) && seen.insert(prefix.clone()));
         prefixes
-    }
-
-    /// The program that rosrun would start.
-    fn program(&self, node: &Node) -> Option<PathBuf> {
-        let prefixes = self.prefixes();
-        let direct = prefixes.iter().map(|prefix| {
-            prefix
-                .join("lib")
-                .join(&node.package)
-                .join(&node.executable)
-        });
-        direct.into_iter().find(|path| self.has(path)).or_else(|| {
-            let shares = prefixes
-                .iter()
-                .map(|prefix| prefix.join("share").join(&node.package));
-            shares
-                .into_iter()
-                .find_map(|share| self.below(&share, &node.executable))
-        })
-    }
-
-    fn below(&self, directory: &Path, name: &str) -> Option<PathBuf> {
-        let mut open = vec![(directory.to_owned(), 0)];
-        while let Some((directory, depth)) = open.pop() {
-            let here = directory.join(name);
-            if self.has(&here) {
-                return Some(here);
-            }
-            if depth == DEPTH {
-                continue;
-            }
-            let relative = directory.strip_prefix("/").unwrap_or(&directory);
-            for layer in &self.layers {
-                let entries = std::fs::read_dir(layer.join(relative))
-                    .into_iter()
-                    .flatten()
-                    .flatten();
-                let below =
-                    entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
-                open.extend(below.map(|entry| (directory.join(entry.file_name()), depth + 1)));
-            }
-        }
-        None
     }
 
     fn handle(&self) -> Result<Arc<Handle>, String> {
@@ -182,6 +142,9 @@ impl LinkedNodes {
     }
 
     fn share(&self, node: &Node) -> Option<PathBuf> {
+        if node.package != self.revision.package {
+            return None;
+        }
         let shares = self
             .prefixes()
             .into_iter()
@@ -225,15 +188,24 @@ impl LinkedNodes {
     }
 }
 
+/// The program that a stub's node stands for. A robot says which, so nothing but what the push recorded is run: other
+/// programs of the image, by whatever path, are not.
+fn program(revision: &RevisionRecord, node: &Node) -> Option<PathBuf> {
+    if node.package != revision.package {
+        return None;
+    }
+    stubs::programs(revision).remove(&node.executable)
+}
+
 #[async_trait]
 impl Nodes for LinkedNodes {
     async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
         let handle = self.handle()?;
         let (state, revision, made_of) = (&self.state, &self.revision, node.revision);
         crate::revisions::fits(state, revision, made_of, &node.image)?;
-        let Some(program) = self.program(node) else {
+        let Some(program) = program(&self.revision, node) else {
             return Err(format!(
-                "the image of service {} has no executable {} in package {}: is it the package that was pushed, and with that node?",
+                "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",
                 self.revision.service, node.executable, node.package
             ));
         };
@@ -382,5 +354,81 @@ impl Nodes for LinkedNodes {
             }
         });
         lines
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::state::Plan;
+
+    fn revision() -> RevisionRecord {
+        let node = |name: &str, argv: &[&str]| NodeSpec {
+            name: name.to_owned(),
+            argv: argv.iter().map(|word| (*word).to_owned()).collect(),
+            environment: Default::default(),
+            directory: String::new(),
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
+        };
+        RevisionRecord {
+            service: "vision".into(),
+            number: 1,
+            image: "sha256:1".into(),
+            published: 0,
+            package: "vision".into(),
+            source: String::new(),
+            plan: Plan {
+                nodes: vec![
+                    node("/see", &["/opt/mine/lib/vision/see", "_rate:=10"]),
+                    node(
+                        "/look",
+                        &["/bin/nice", "/opt/mine/share/vision/scripts/look.py"],
+                    ),
+                    node("/relay", &["/usr/lib/topic_tools/relay", "/a", "/b"]),
+                ],
+                ..Plan::default()
+            },
+            interface: Default::default(),
+        }
+    }
+
+    fn asks(package: &str, executable: &str) -> Option<PathBuf> {
+        let node = Node {
+            name: "/see".into(),
+            package: package.into(),
+            executable: executable.into(),
+            argv: Vec::new(),
+            namespace: "/".into(),
+            share: String::new(),
+            directory: String::new(),
+            revision: None,
+            image: String::new(),
+        };
+        program(&revision(), &node)
+    }
+
+    #[test]
+    fn a_stub_starts_what_its_push_recorded_and_nothing_else() {
+        let path = |text: &str| Some(PathBuf::from(text));
+        assert_eq!(asks("vision", "see"), path("/opt/mine/lib/vision/see"));
+        assert_eq!(
+            asks("vision", "look.py"),
+            path("/opt/mine/share/vision/scripts/look.py")
+        );
+        for (package, executable) in [
+            ("vision", "/bin/sh"),
+            ("vision", "../../../../bin/sh"),
+            ("vision", "./see"),
+            ("vision", "nice"),
+            ("vision", "other"),
+            ("vision", ""),
+            ("topic_tools", "relay"),
+            ("../lib/vision", "see"),
+            ("/bin", "sh"),
+        ] {
+            assert_eq!(asks(package, executable), None, "{package} {executable}");
+        }
     }
 }

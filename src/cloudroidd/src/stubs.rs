@@ -1,6 +1,6 @@
 //! Stubs of published services: composed from the image and the interface, packed with the robot's program.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -93,20 +93,27 @@ pub fn is_authority(text: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
-/// Executables of the package that run in the cloud: those that a revision's servants run.
-pub fn outsourced(revision: &RevisionRecord) -> BTreeSet<String> {
+/// Executables of the package that run in the cloud, those that a revision's servants run, by name: where each is, as its
+/// push recorded it. A stub may have these started and no others.
+pub fn programs(revision: &RevisionRecord) -> BTreeMap<String, PathBuf> {
     let package = &revision.package;
     let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
     let of_package = |argument: &String| {
         let inside = below
             .iter()
             .any(|below| argument.starts_with('/') && argument.contains(below));
-        inside.then(|| argument.rsplit('/').next().unwrap_or_default().to_owned())
+        let name = argument.rsplit('/').next().unwrap_or_default();
+        inside.then(|| (name.to_owned(), PathBuf::from(argument)))
     };
     let nodes = revision.plan.nodes.iter();
     nodes
         .filter_map(|node| node.argv.iter().find_map(of_package))
         .collect()
+}
+
+/// Their names.
+pub fn outsourced(revision: &RevisionRecord) -> BTreeSet<String> {
+    programs(revision).into_keys().collect()
 }
 
 /// The files of a revision's stub, but for the robot's program.
