@@ -123,6 +123,7 @@ pub(crate) async fn compile(
                         target: "/cloudroid/source".into(),
                         writable: false,
                         device: false,
+                        opened: None,
                     }],
                     environment,
                     argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"]

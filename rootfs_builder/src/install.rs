@@ -176,6 +176,7 @@ async fn make(
                     target: "/cloudroid/debs".into(),
                     writable: false,
                     device: false,
+                    opened: None,
                 }],
                 environment,
                 argv: ["/bin/sh", "/cloudroid/install.sh"]

@@ -170,6 +170,7 @@ pub(crate) async fn ask(
                     target: "/cloudroid/out".into(),
                     writable: true,
                     device: false,
+                    opened: None,
                 }],
                 environment,
                 argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"]

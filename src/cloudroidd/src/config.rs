@@ -138,7 +138,7 @@ pub struct Allow {
     pub devices: Vec<String>,
     /// Directories and files; what is below a directory is allowed, too.
     pub volumes: Vec<PathBuf>,
-    /// `HOST:PORT`, or `*:PORT`.
+    /// `HOST:PORT`, `*:PORT` (any on the internet), `ADDRESS:PORT` or `ADDRESS/PREFIX:PORT`.
     pub egress: Vec<String>,
 }
 
@@ -310,6 +310,8 @@ impl Config {
             );
         }
         check_limits(&self.limits).context("[limits] of the configuration")?;
+        crate::grants::check_egress(&self.allow)
+            .context("egress in [allow] of the configuration")?;
         if let Some(service) = &self.default_service {
             crate::names::service(service).context("default_service of the configuration")?;
         }

@@ -4,17 +4,20 @@
 //! Looked at anew at each start: what is not allowed any more is not given any more.
 
 mod cdi;
+mod egress;
 mod relay;
+mod volume;
 
 use std::collections::BTreeMap;
-use std::net::{IpAddr, Ipv4Addr};
-use std::path::{Path, PathBuf};
+use std::net::IpAddr;
+use std::path::PathBuf;
 
 use api::Grants;
 use servant::spec::Mount;
 
 use crate::config::Allow;
 
+pub use egress::check as check_egress;
 pub use relay::Relays;
 
 /// Why something is not given.
@@ -37,6 +40,21 @@ pub enum GrantError {
         name: String,
         /// What it should be.
         form: &'static str,
+    },
+    /// An address that only its own name allows.
+    #[error(
+        "egress {name} leads to {reach}, which *:{port} does not allow; its operator may name the address in [allow] of the \
+         configuration: egress = [\"{address}:{port}\"]"
+    )]
+    Inward {
+        /// As asked for.
+        name: String,
+        /// Its address.
+        address: IpAddr,
+        /// Its port.
+        port: u16,
+        /// What the address leads to.
+        reach: egress::Reach,
     },
     /// A volume is not there.
     #[error("volume {path} cannot be used: {source}")]
@@ -92,7 +110,7 @@ impl Granted {
 pub fn resolve(grants: &Grants, allow: &Allow) -> Result<Granted, GrantError> {
     let mut granted = Granted::default();
     for volume in &grants.volumes {
-        granted.mounts.push(volume_mount(volume, &allow.volumes)?);
+        granted.mounts.push(volume::open(volume, &allow.volumes)?);
     }
     for name in &grants.devices {
         if !allow.devices.iter().any(|known| device_covers(known, name)) {
@@ -100,9 +118,9 @@ pub fn resolve(grants: &Grants, allow: &Allow) -> Result<Granted, GrantError> {
         }
         cdi::add(name, &cdi::directories(), &mut granted)?;
     }
-    for (name, address, _) in ways_out(grants, allow)? {
-        if name.parse::<IpAddr>().is_err() {
-            granted.hosts.push((IpAddr::V4(address), name));
+    for way in egress::ways_out(grants, allow)? {
+        if way.host.parse::<IpAddr>().is_err() {
+            granted.hosts.push((IpAddr::V4(way.inside), way.host));
         }
     }
     Ok(granted)
@@ -115,72 +133,12 @@ fn not_allowed(kind: &'static str, name: &str) -> GrantError {
     }
 }
 
-fn volume_mount(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, GrantError> {
-    let broken = |source| GrantError::Volume {
-        path: volume.source.clone(),
-        source,
-    };
-    // Where it really is: a link must not lead out of what is allowed.
-    let source = Path::new(&volume.source).canonicalize().map_err(broken)?;
-    let within = allowed
-        .iter()
-        .filter_map(|place| place.canonicalize().ok())
-        .any(|place| source.starts_with(place));
-    if !within {
-        return Err(not_allowed("volume", &volume.source));
-    }
-    Ok(Mount {
-        source,
-        target: PathBuf::from(&volume.target),
-        writable: false,
-        device: false,
-    })
-}
-
 /// `vendor.com/class=*` covers all of a class.
 fn device_covers(known: &str, name: &str) -> bool {
     known == name
         || known
             .strip_suffix('*')
             .is_some_and(|class| class.ends_with('=') && name.starts_with(class))
-}
-
-/// Each host asked for, the loopback address that stands for it inside, and its port. One address for each host, so that
-/// several can be reached on the same port.
-fn ways_out(grants: &Grants, allow: &Allow) -> Result<Vec<(String, Ipv4Addr, u16)>, GrantError> {
-    let mut hosts: Vec<&str> = Vec::new();
-    let mut ways = Vec::new();
-    for name in &grants.egress {
-        let malformed = || GrantError::Malformed {
-            name: name.clone(),
-            form: "a HOST:PORT to connect to",
-        };
-        let (host, port) = name.rsplit_once(':').ok_or_else(malformed)?;
-        let port: u16 = port.parse().map_err(|_| malformed())?;
-        let plain = |c: char| c.is_ascii_alphanumeric() || c == '.' || c == '-';
-        if host.is_empty() || port == 0 || !host.chars().all(plain) {
-            return Err(malformed());
-        }
-        let any = format!("*:{port}");
-        if !allow
-            .egress
-            .iter()
-            .any(|known| known == name || *known == any)
-        {
-            return Err(not_allowed("egress", name));
-        }
-        let index = hosts
-            .iter()
-            .position(|known| *known == host)
-            .unwrap_or_else(|| {
-                hosts.push(host);
-                hosts.len() - 1
-            });
-        // 127.0.1.1 and on: 127.0.0.1 is the servant's own.
-        let number = u8::try_from(index + 1).map_err(|_| malformed())?;
-        ways.push((host.to_owned(), Ipv4Addr::new(127, 0, 1, number), port));
-    }
-    Ok(ways)
 }
 
 #[cfg(test)]
@@ -190,44 +148,7 @@ mod tests {
     fn allow() -> Allow {
         Allow {
             devices: vec!["vendor.com/net=*".into(), "vendor.com/gpu=0".into()],
-            egress: vec!["models.example.org:443".into(), "*:80".into()],
             ..Allow::default()
-        }
-    }
-
-    fn out(egress: &[&str]) -> Result<Vec<(String, Ipv4Addr, u16)>, GrantError> {
-        let grants = Grants {
-            egress: egress.iter().map(|name| (*name).to_owned()).collect(),
-            ..Grants::default()
-        };
-        ways_out(&grants, &allow())
-    }
-
-    #[test]
-    fn each_host_has_an_address_inside() {
-        let ways = out(&[
-            "models.example.org:443",
-            "a.example:80",
-            "models.example.org:80",
-        ])
-        .expect("allowed");
-        let addresses: Vec<String> = ways
-            .iter()
-            .map(|(_, address, port)| format!("{address}:{port}"))
-            .collect();
-        assert_eq!(addresses, ["127.0.1.1:443", "127.0.1.2:80", "127.0.1.1:80"]);
-    }
-
-    #[test]
-    fn what_is_not_allowed_is_named_with_the_way_out() {
-        for (asked, words) in [
-            ("a.example:443", "egress a.example:443 is not allowed"),
-            ("a.example", "HOST:PORT"),
-            ("a.example:0", "HOST:PORT"),
-            ("a b:80", "HOST:PORT"),
-        ] {
-            let refused = out(&[asked]).expect_err(asked).to_string();
-            assert!(refused.contains(words), "{refused}");
         }
     }
 
@@ -241,31 +162,5 @@ mod tests {
         };
         assert!(covered("vendor.com/net=7") && covered("vendor.com/gpu=0"));
         assert!(!covered("vendor.com/gpu=1") && !covered("vendor.com/network=7"));
-    }
-
-    #[test]
-    fn a_link_out_of_an_allowed_directory_is_refused() {
-        let place = tempfile::tempdir().expect("a directory");
-        let (models, secret) = (place.path().join("models"), place.path().join("secret"));
-        std::fs::create_dir_all(&models).expect("made");
-        std::fs::write(&secret, "").expect("made");
-        std::os::unix::fs::symlink("../secret", models.join("sly")).expect("made");
-        let mount = |source: PathBuf| {
-            let volume = api::Volume {
-                source: source.display().to_string(),
-                target: "/models".into(),
-            };
-            volume_mount(&volume, std::slice::from_ref(&models))
-        };
-        assert!(!mount(models.clone()).expect("allowed").writable);
-        let refused = mount(models.join("sly"))
-            .expect_err("leads out")
-            .to_string();
-        assert!(refused.contains("[allow]"), "{refused}");
-        assert!(mount(models.join("../secret")).is_err());
-        assert!(matches!(
-            mount(models.join("none")),
-            Err(GrantError::Volume { .. })
-        ));
     }
 }

@@ -51,6 +51,11 @@ impl Rootfs<'_> {
     /// Mounts it and tells where. The calling process must have one thread: it moves to a mount namespace of its own
     /// and changes its working directory.
     pub fn mount(&self, volumes: &[Mount]) -> Result<Staged, Error> {
+        // Before the mounts that these are of are another namespace's.
+        let copies = volumes
+            .iter()
+            .map(stage::copy_volume)
+            .collect::<Result<Vec<_>, _>>()?;
         let stage = stage::enter()?;
         let shift = stage::user_namespace(self.uid_range)?;
         let (lower, root) = (stage.join("lower"), stage.join("root"));
@@ -89,9 +94,10 @@ impl Rootfs<'_> {
         )
         .map_err(|error| Error::file("mount the layers at", &root)(error.into()))?;
         nix::unistd::chdir("/").map_err(Error::nix("chdir to /"))?;
-        let volumes = volumes.iter().enumerate().map(|(index, volume)| {
+        let volumes = volumes.iter().zip(&copies).enumerate();
+        let volumes = volumes.map(|(index, (volume, copy))| {
             let place = stage.join(format!("volume{index}"));
-            stage::attach_volume(volume, &place, &shift).map(|()| place)
+            stage::attach_volume(volume, copy, &place, &shift).map(|()| place)
         });
         Ok(Staged {
             volumes: volumes.collect::<Result<_, _>>()?,

@@ -2,8 +2,11 @@
 //! process and must be able to outlive the daemon.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::net::IpAddr;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -129,4 +132,41 @@ pub struct Mount {
     /// It is a device node, to be used as such; elsewhere device nodes are dead.
     #[serde(default)]
     pub device: bool,
+    /// What is mounted, whatever is found at `source` by then; without it `source` is looked up when the servant is made.
+    #[serde(skip)]
+    pub opened: Option<Opened>,
+}
+
+impl Mount {
+    /// Whether it is a directory.
+    pub(crate) fn is_directory(&self) -> io::Result<bool> {
+        let mode = match &self.opened {
+            Some(opened) => nix::sys::stat::fstat(opened.as_fd())?.st_mode,
+            None => return Ok(std::fs::metadata(&self.source)?.is_dir()),
+        };
+        Ok(mode & libc::S_IFMT == libc::S_IFDIR)
+    }
+}
+
+/// A file or directory that was opened (O_PATH is enough), to be mounted. Two are equal when they are the same descriptor.
+#[derive(Debug, Clone)]
+pub struct Opened(Arc<OwnedFd>);
+
+impl Opened {
+    /// Takes the descriptor.
+    pub fn new(descriptor: OwnedFd) -> Self {
+        Self(Arc::new(descriptor))
+    }
+}
+
+impl AsFd for Opened {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+}
+
+impl PartialEq for Opened {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
 }

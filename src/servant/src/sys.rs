@@ -63,6 +63,13 @@ pub(crate) fn clone_mount(path: &Path) -> io::Result<OwnedFd> {
     owned(unsafe { libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags) })
 }
 
+/// A detached copy of the mount of what is open, from there on (open_tree(2)).
+pub(crate) fn clone_opened(opened: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+    let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | libc::AT_EMPTY_PATH as u32;
+    // SAFETY: an empty path, which is that of the descriptor itself.
+    owned(unsafe { libc::syscall(libc::SYS_open_tree, opened.as_raw_fd(), c"".as_ptr(), flags) })
+}
+
 /// Shifts the ids of a detached mount by a user namespace's map and makes it read-only (mount_setattr(2)).
 pub(crate) fn shift_mount(mount: BorrowedFd<'_>, user_namespace: BorrowedFd<'_>) -> io::Result<()> {
     let attributes = libc::mount_attr {

@@ -171,6 +171,7 @@ fn granted_by(edits: &Edits) -> Result<Granted, String> {
             target: node.path.clone(),
             writable: false,
             device: true,
+            opened: None,
         });
     }
     for bind in &edits.mounts {
@@ -179,6 +180,7 @@ fn granted_by(edits: &Edits) -> Result<Granted, String> {
             target: bind.container_path.clone(),
             writable: false,
             device: false,
+            opened: None,
         });
     }
     for hook in &edits.hooks {

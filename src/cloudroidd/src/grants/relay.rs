@@ -2,14 +2,18 @@
 //! passed on from here, to one host and one port each. `/etc/hosts` inside gives that address the host's name, so
 //! that programs, and certificates, find what they expect.
 
-use std::net::SocketAddr;
+use std::collections::BTreeSet;
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
 
 use api::Grants;
+use parking_lot::Mutex;
 use servant::endpoint::Endpoint;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
-use super::ways_out;
+use super::egress::{Way, ways_out};
 use crate::config::Allow;
 
 /// The ways out of one servant; closed when dropped.
@@ -23,13 +27,13 @@ impl Relays {
     pub async fn open(endpoint: &Endpoint, grants: &Grants, allow: &Allow) -> Relays {
         let mut listeners = JoinSet::new();
         // Not allowed any more: then the servant would not have been started either.
-        for (host, address, port) in ways_out(grants, allow).unwrap_or_default() {
-            let inside = SocketAddr::from((address, port));
+        for way in ways_out(grants, allow).unwrap_or_default() {
+            let inside = SocketAddr::from((way.inside, way.port));
             match endpoint.netns.listen(inside).await {
                 Ok(listener) => {
-                    listeners.spawn(pass_on(listener, host, port));
+                    listeners.spawn(pass_on(listener, way));
                 }
-                Err(error) => tracing::warn!("no way out to {host}:{port}: {error}"),
+                Err(error) => tracing::warn!("no way out to {}:{}: {error}", way.host, way.port),
             }
         }
         Relays {
@@ -38,7 +42,11 @@ impl Relays {
     }
 }
 
-async fn pass_on(listener: TcpListener, host: String, port: u16) {
+async fn pass_on(listener: TcpListener, way: Way) {
+    let far = Arc::new(Far {
+        way,
+        told: Mutex::default(),
+    });
     // Ended with the listener.
     let mut connections = JoinSet::new();
     loop {
@@ -49,17 +57,111 @@ async fn pass_on(listener: TcpListener, host: String, port: u16) {
                     tokio::time::sleep(std::time::Duration::from_millis(100)).await;
                     continue;
                 };
-                let host = host.clone();
+                let far = Arc::clone(&far);
                 connections.spawn(async move {
-                    match TcpStream::connect((host.as_str(), port)).await {
-                        Ok(mut far) => {
-                            let _ = tokio::io::copy_bidirectional(&mut near, &mut far).await;
+                    let Far { way, .. } = &*far;
+                    match far.dial().await {
+                        Ok(mut stream) => {
+                            let _ = tokio::io::copy_bidirectional(&mut near, &mut stream).await;
                         }
-                        Err(error) => tracing::debug!("{host}:{port} was not reached: {error}"),
+                        Err(error) => {
+                            tracing::debug!("{}:{} was not reached: {error}", way.host, way.port);
+                        }
                     }
                 });
             }
             Some(_) = connections.join_next() => {}
+        }
+    }
+}
+
+/// The far end of a way out.
+struct Far {
+    way: Way,
+    /// Addresses whose refusal was told.
+    told: Mutex<BTreeSet<IpAddr>>,
+}
+
+impl Far {
+    /// Resolves the host and connects to the first of its addresses that may be dialled and answers. What is dialled is
+    /// the address that was looked at: the name is not resolved again.
+    async fn dial(&self) -> io::Result<TcpStream> {
+        let Far { way, .. } = self;
+        let mut outcome = Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
+        for address in tokio::net::lookup_host((way.host.as_str(), way.port)).await? {
+            if let Err(reach) = way.permits(address.ip()) {
+                if self.told.lock().insert(address.ip()) {
+                    tracing::warn!(
+                        "a servant's way out to {}:{} leads to {} ({reach}) and is refused there; if that is meant, name \
+                         the address in [allow] of the configuration: egress = [\"{address}\"]",
+                        way.host,
+                        way.port,
+                        address.ip()
+                    );
+                }
+                outcome = Err(io::Error::from(io::ErrorKind::PermissionDenied));
+                continue;
+            }
+            match TcpStream::connect(address).await {
+                Ok(stream) => return Ok(stream),
+                Err(error) => outcome = Err(error),
+            }
+        }
+        outcome
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    use super::*;
+
+    /// Asks `host` on the port of a listener of this machine's loopback, through a relay; what came back.
+    async fn asks(host: &str, rule: impl Fn(u16) -> String) -> String {
+        let server = TcpListener::bind("127.0.0.1:0").await.expect("bound");
+        let port = server.local_addr().expect("bound").port();
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = server.accept().await {
+                let _ = stream.write_all(b"of the host").await;
+            }
+        });
+        let grants = Grants {
+            egress: vec![format!("{host}:{port}")],
+            ..Grants::default()
+        };
+        let allow = Allow {
+            egress: vec![rule(port)],
+            ..Allow::default()
+        };
+        let way = ways_out(&grants, &allow).expect("allowed").remove(0);
+        let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
+        let near = relay.local_addr().expect("bound");
+        let relaying = tokio::spawn(pass_on(relay, way));
+        let mut heard = String::new();
+        let mut stream = TcpStream::connect(near).await.expect("relayed");
+        let _ = stream.read_to_string(&mut heard).await;
+        relaying.abort();
+        heard
+    }
+
+    #[tokio::test]
+    async fn any_host_is_none_of_this_machine() {
+        // Another way to write 127.0.0.1, which only the resolver understands.
+        for host in ["localhost", "127.1"] {
+            assert_eq!(asks(host, |port| format!("*:{port}")).await, "", "{host}");
+        }
+    }
+
+    #[tokio::test]
+    async fn this_machine_is_reached_where_it_is_named() {
+        for (host, named) in [
+            ("localhost", "localhost"),
+            ("127.0.0.1", "127.0.0.1"),
+            ("127.0.0.1", "127.0.0.0/8"),
+        ] {
+            let heard = asks(host, |port| format!("{named}:{port}")).await;
+            assert_eq!(heard, "of the host", "{host} by {named}");
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fs::{self, File};
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd, OwnedFd, RawFd};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
@@ -16,7 +16,7 @@ use super::{Shared, sweep, validate};
 use crate::launch::{self, Launch};
 use crate::netns::NetNs;
 use crate::process::Identity;
-use crate::spec::Spec;
+use crate::spec::{Mount, Spec};
 use crate::{Error, uids};
 
 pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalServant>, Error> {
@@ -56,7 +56,7 @@ async fn start_in(
     };
     launch::write(&directory.join(launch::SPEC), &launch)?;
     let (control, shim) = spawn(shared, directory)?;
-    hand_over(&control, &network, &lock)?;
+    hand_over(&control, &network, &lock, &launch.spec.mounts)?;
     // The shim holds the lock from here on.
     drop(lock);
     handle::started(&launch, directory, network, control, shim).await
@@ -105,9 +105,26 @@ fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Er
     Ok((control, identity))
 }
 
-fn hand_over(control: &UnixStream, network: &NetNs, lock: &OwnedFd) -> Result<(), Error> {
-    let fds = [network.as_fd().as_raw_fd(), lock.as_raw_fd()];
-    socket::send(control.as_raw_fd(), b".", &fds)
-        .map(drop)
-        .map_err(Error::call("sending to the shim"))
+/// Network namespace and lock beside one byte that says how many more come; then, beside the number of its mount each, what
+/// was opened to be mounted.
+fn hand_over(
+    control: &UnixStream,
+    network: &NetNs,
+    lock: &OwnedFd,
+    mounts: &[Mount],
+) -> Result<(), Error> {
+    let failed = Error::call("sending to the shim");
+    let opened: Vec<(u8, RawFd)> = (0..=u8::MAX)
+        .zip(mounts)
+        .filter_map(|(index, mount)| Some((index, mount.opened.as_ref()?.as_fd().as_raw_fd())))
+        .collect();
+    let count = opened.len() as u8;
+    let send = |byte: u8, fds: &[RawFd]| socket::send(control.as_raw_fd(), &[byte], fds).map(drop);
+    send(count, &[network.as_fd().as_raw_fd(), lock.as_raw_fd()])
+        .and_then(|()| {
+            opened
+                .iter()
+                .try_for_each(|(index, fd)| send(*index, &[*fd]))
+        })
+        .map_err(failed)
 }

@@ -6,6 +6,9 @@ use std::path::{Component, Path};
 use crate::Error;
 use crate::spec::{Profile, Spec};
 
+/// Descriptors of as many are handed to the shim one by one.
+const MOUNTS: usize = 128;
+
 /// Says what is wrong with it, if anything.
 pub(super) fn validate(spec: &Spec) -> Result<(), Error> {
     problem(spec).map_or(Ok(()), |reason| {
@@ -59,6 +62,9 @@ fn problem(spec: &Spec) -> Option<String> {
     if spec.writable.is_none() && !spec.owned_directories.is_empty() {
         return Some("owned directories need a writable directory to be made in".into());
     }
+    if spec.mounts.len() > MOUNTS {
+        return Some(format!("it has more than {MOUNTS} mounts"));
+    }
     for mount in &spec.mounts {
         if !plain(&mount.target) || mount.target.parent().is_none() {
             return Some(format!(
@@ -66,7 +72,8 @@ fn problem(spec: &Spec) -> Option<String> {
                 mount.target.display()
             ));
         }
-        if !mount.source.is_absolute() || !mount.source.exists() {
+        let there = mount.opened.is_some() || mount.source.exists();
+        if !mount.source.is_absolute() || !there {
             return Some(format!(
                 "mount source {} is not there",
                 mount.source.display()
@@ -171,6 +178,7 @@ mod tests {
             target: target.into(),
             writable: false,
             device: false,
+            opened: None,
         };
         let faults = [
             (

@@ -77,8 +77,8 @@ fn make_mount_point(skeleton: &Path, layers: &[PathBuf], mount: &Mount) -> Resul
         }
     }
     let path = skeleton.join(&inside);
-    let source = fs::metadata(&mount.source).map_err(Error::file("mount", &mount.source))?;
-    if source.is_dir() {
+    let is_directory = mount.is_directory();
+    if is_directory.map_err(Error::file("mount", &mount.source))? {
         return fs::create_dir_all(&path).map_err(Error::file("make", &path));
     }
     let above = path.parent().unwrap_or(skeleton);
@@ -101,6 +101,7 @@ mod tests {
             target: target.into(),
             writable: false,
             device: false,
+            opened: None,
         };
         let make = |name: &str, target: &str| {
             make_skeleton(

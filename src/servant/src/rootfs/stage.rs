@@ -88,22 +88,33 @@ pub(super) fn attach_shifted(layer: &Path, place: &Path, shift: &OwnedFd) -> Res
     sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a layer at", place))
 }
 
-/// Attaches what is to be mounted into the container. A read-only volume has shifted ids where its filesystem can, so that
-/// inside root may read what belongs to root; a writable one never, lest root inside write as root.
-pub(super) fn attach_volume(volume: &Mount, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
-    let source = &volume.source;
-    if fs::metadata(source)
-        .map_err(Error::file("mount", source))?
-        .is_dir()
-    {
+/// A detached copy of what is to be mounted: of the very file or directory that was opened, where one was.
+pub(super) fn copy_volume(volume: &Mount) -> Result<OwnedFd, Error> {
+    let copy = match &volume.opened {
+        Some(opened) => sys::clone_opened(opened.as_fd()),
+        None => sys::clone_mount(&volume.source),
+    };
+    copy.map_err(Error::file("mount", &volume.source))
+}
+
+/// Attaches the copy of what is to be mounted into the container. A read-only volume has shifted ids where its filesystem
+/// can, so that inside root may read what belongs to root; a writable one never, lest root inside write as root.
+pub(super) fn attach_volume(
+    volume: &Mount,
+    copy: &OwnedFd,
+    place: &Path,
+    shift: &OwnedFd,
+) -> Result<(), Error> {
+    let is_directory = volume.is_directory();
+    if is_directory.map_err(Error::file("mount", &volume.source))? {
         make_directory(place)?;
     } else {
         fs::write(place, "").map_err(Error::file("make", place))?;
     }
-    if !volume.writable && attach_shifted(source, place, shift).is_ok() {
-        return Ok(());
+    if !volume.writable {
+        // All or nothing: a filesystem that cannot leaves the copy as it was.
+        let _ = sys::shift_mount(copy.as_fd(), shift.as_fd());
     }
-    let copy = sys::clone_mount(source).map_err(Error::file("mount", source))?;
     sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a volume at", place))
 }
 

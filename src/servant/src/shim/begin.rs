@@ -19,6 +19,7 @@ use crate::local::Isolation;
 use crate::netns::NetNs;
 use crate::process::Identity;
 use crate::protocol::{self, FromShim};
+use crate::spec::Opened;
 use crate::{Error, sys};
 
 /// How long a cgroup may take to become empty.
@@ -48,12 +49,17 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     // What is written from here on, the log above all, is for this user alone.
     umask(Mode::from_bits_truncate(0o077));
     let control = take_control()?;
-    let (network, uid_lock) = receive_descriptors(&control)?;
+    let (network, uid_lock, opened) = receive_descriptors(&control)?;
     let path = directory.join(launch::SPEC);
-    let launch: Launch = launch::read(&path)?.ok_or_else(|| Error::Malformed {
+    let mut launch: Launch = launch::read(&path)?.ok_or_else(|| Error::Malformed {
         path: path.clone(),
         reason: "there is no launch record".into(),
     })?;
+    for (index, descriptor) in opened {
+        if let Some(mount) = launch.spec.mounts.get_mut(usize::from(index)) {
+            mount.opened = Some(descriptor);
+        }
+    }
     let own = std::process::id() as i32;
     let identity = Identity::of(own).map_err(Error::call("reading our own start time"))?;
     let cgroup = Cgroup::planned(&launch.parent, &launch.spec);
@@ -64,6 +70,10 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     };
     launch::write(&directory.join(launch::RUNTIME), &runtime)?;
     let begun = prepare(directory, &launch, &cgroup, &network);
+    // The creator has its own: held here they would keep what they are on from being unmounted.
+    for mount in &mut launch.spec.mounts {
+        mount.opened = None;
+    }
     match begun {
         Ok(Prepared {
             enforced,
@@ -113,18 +123,41 @@ fn take_control() -> Result<UnixStream, Error> {
     Ok(UnixStream::from(control))
 }
 
-/// The network namespace and the lock on our uids come beside one byte.
-fn receive_descriptors(control: &UnixStream) -> Result<(NetNs, OwnedFd), Error> {
-    let mut fds = [-1; MAX_FDS];
-    let received = socket::receive(control.as_raw_fd(), &mut [0], &mut fds);
-    let (_, count) = received.map_err(Error::call("receiving from the daemon"))?;
-    if count != 2 {
-        let error = io::Error::new(io::ErrorKind::UnexpectedEof, "the daemon has gone");
-        return Err(Error::call("receiving from the daemon")(error));
-    }
+/// The network namespace and the lock on our uids come first, then what was opened to be mounted, by the number of its
+/// mount (see [`crate::local::start`]).
+fn receive_descriptors(control: &UnixStream) -> Result<(NetNs, OwnedFd, Vec<(u8, Opened)>), Error> {
+    let (count, fds) = receive(control)?;
+    let [network, lock] = <[OwnedFd; 2]>::try_from(fds).map_err(|_| gone())?;
+    let opened = (0..count).map(|_| {
+        let (index, fds) = receive(control)?;
+        let [descriptor] = <[OwnedFd; 1]>::try_from(fds).map_err(|_| gone())?;
+        Ok((index, Opened::new(descriptor)))
+    });
+    Ok((
+        NetNs::from_fd(network)?,
+        lock,
+        opened.collect::<Result<_, Error>>()?,
+    ))
+}
+
+/// One byte, and the descriptors beside it.
+fn receive(control: &UnixStream) -> Result<(u8, Vec<OwnedFd>), Error> {
+    let (mut byte, mut fds) = ([0], [-1; MAX_FDS]);
+    let received = socket::receive(control.as_raw_fd(), &mut byte, &mut fds);
+    let (bytes, count) = received.map_err(Error::call("receiving from the daemon"))?;
     // SAFETY: received just now, owned by nobody else.
-    let [network, lock] = [fds[0], fds[1]].map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
-    Ok((NetNs::from_fd(network)?, lock))
+    let own = |fd: &i32| unsafe { OwnedFd::from_raw_fd(*fd) };
+    let fds = fds[..count].iter().map(own).collect();
+    if bytes == 1 {
+        Ok((byte[0], fds))
+    } else {
+        Err(gone())
+    }
+}
+
+fn gone() -> Error {
+    let error = io::Error::new(io::ErrorKind::UnexpectedEof, "the daemon has gone");
+    Error::call("receiving from the daemon")(error)
 }
 
 struct Prepared {

@@ -1,6 +1,6 @@
 //! What a node cannot do.
 
-use servant::spec::{Mount, Profile};
+use servant::spec::{Mount, Opened, Profile};
 
 use crate::support::*;
 
@@ -110,6 +110,7 @@ async fn a_volume_is_there_and_read_only() {
         target: "/opt/models".into(),
         writable: false,
         device: false,
+        opened: None,
     }];
     let servant = world.start(spec).await;
     assert_eq!(
@@ -122,6 +123,35 @@ async fn a_volume_is_there_and_read_only() {
     );
     world.stop(servant).await;
     assert!(models.join("weights").exists());
+}
+
+#[tokio::test]
+async fn what_was_opened_is_mounted_whatever_took_its_place() {
+    let world = World::new();
+    let (models, secret) = (world.path("models"), world.path("secret"));
+    for directory in [&models, &secret] {
+        std::fs::create_dir(directory).unwrap();
+    }
+    std::fs::write(models.join("weights"), "heavy\n").unwrap();
+    std::fs::write(secret.join("key"), "of the host\n").unwrap();
+    let mut spec = spec(vec![
+        node("/reads", &["read", "/opt/models/weights"]),
+        node("/pries", &["read", "/opt/models/key"]),
+    ]);
+    spec.mounts = vec![Mount {
+        source: models.clone(),
+        target: "/opt/models".into(),
+        writable: false,
+        device: false,
+        opened: Some(Opened::new(std::fs::File::open(&models).unwrap().into())),
+    }];
+    std::fs::rename(&models, world.path("moved")).unwrap();
+    std::os::unix::fs::symlink(&secret, &models).unwrap();
+    let servant = world.start(spec).await;
+    let (reads, pries) = (servant.wait_node("/reads"), servant.wait_node("/pries"));
+    assert_eq!(within(reads).await.unwrap().code, Some(0));
+    assert_eq!(within(pries).await.unwrap().code, Some(libc::ENOENT));
+    world.stop(servant).await;
 }
 
 #[tokio::test]

@@ -272,6 +272,7 @@ async fn a_creation_that_libcontainer_fails_harms_nobody() {
         target: "/proc/nowhere".into(),
         writable: false,
         device: false,
+        opened: None,
     }];
     let id = spec.id.clone();
     let error = world

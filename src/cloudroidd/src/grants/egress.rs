@@ -1,0 +1,535 @@
+//! Which hosts may be reached, and at which of their addresses. A name says nothing about where it leads: whoever keeps it, or
+//! answers for it, can point it at this machine's loopback, at a neighbour, or at the address where a cloud tells its
+//! machines their keys. So what a name resolves to is looked at before it is dialled ([`Way::permits`]), and only
+//! addresses of the public internet need nobody's word (docs/adr/032).
+
+use std::fmt;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
+use std::str::FromStr;
+
+use api::Grants;
+
+use super::{GrantError, not_allowed};
+use crate::config::Allow;
+
+/// What a push may ask for.
+const ASKED: &str = "a HOST:PORT to connect to";
+/// What the configuration may say.
+const WRITTEN: &str =
+    "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
+
+/// One host and port that a servant may reach.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Way {
+    /// The host, as its push named it.
+    pub host: String,
+    /// The address that stands for it inside.
+    pub inside: Ipv4Addr,
+    /// The port, inside and outside.
+    pub port: u16,
+    /// The configuration names this very host.
+    by_name: bool,
+    /// Networks that the configuration names for this port.
+    networks: Vec<Network>,
+}
+
+/// One line of `egress` in `[allow]`.
+#[derive(Debug, Clone, PartialEq)]
+struct Rule {
+    hosts: Hosts,
+    port: u16,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Hosts {
+    /// `*`.
+    Any,
+    Name(String),
+    Network(Network),
+}
+
+/// Addresses that begin with the same bits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Network {
+    address: IpAddr,
+    prefix: u8,
+}
+
+/// What an address leads to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reach {
+    /// The internet.
+    Public,
+    /// Somebody's own network.
+    Private,
+    /// This machine.
+    Loopback,
+    /// This machine, by an address that others know it by.
+    ThisMachine,
+    /// Whoever is on the same wire.
+    LinkLocal,
+    /// Where clouds tell their machines about themselves.
+    Metadata,
+    /// Nobody.
+    Unspecified,
+    /// Many.
+    Multicast,
+    /// An IPv4 address dressed as an IPv6 one.
+    Mapped,
+    /// Something that the internet keeps for itself.
+    Reserved,
+}
+
+impl fmt::Display for Reach {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Reach::Public => "a public address",
+            Reach::Private => "a private address",
+            Reach::Loopback => "a loopback address",
+            Reach::ThisMachine => "an address of this machine",
+            Reach::LinkLocal => "a link-local address",
+            Reach::Metadata => "an address where clouds serve metadata",
+            Reach::Unspecified => "the unspecified address",
+            Reach::Multicast => "a multicast address",
+            Reach::Mapped => "an IPv4-mapped address",
+            Reach::Reserved => "a reserved address",
+        })
+    }
+}
+
+impl Network {
+    fn contains(&self, address: IpAddr) -> bool {
+        match (self.address, address) {
+            (IpAddr::V4(network), IpAddr::V4(address)) => {
+                let mask = u32::MAX.checked_shl(32 - u32::from(self.prefix));
+                let mask = mask.unwrap_or(0);
+                network.to_bits() & mask == address.to_bits() & mask
+            }
+            (IpAddr::V6(network), IpAddr::V6(address)) => {
+                let mask = u128::MAX.checked_shl(128 - u32::from(self.prefix));
+                let mask = mask.unwrap_or(0);
+                network.to_bits() & mask == address.to_bits() & mask
+            }
+            _ => false,
+        }
+    }
+}
+
+impl FromStr for Network {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Network, ()> {
+        let (address, prefix) = match text.split_once('/') {
+            Some((address, prefix)) => (address, Some(prefix)),
+            None => (text, None),
+        };
+        let address: IpAddr = address.parse().map_err(drop)?;
+        let longest = if address.is_ipv4() { 32 } else { 128 };
+        let prefix = match prefix {
+            Some(prefix) => prefix.parse().map_err(drop)?,
+            None => longest,
+        };
+        (prefix <= longest)
+            .then_some(Network { address, prefix })
+            .ok_or(())
+    }
+}
+
+impl FromStr for Rule {
+    type Err = GrantError;
+
+    fn from_str(text: &str) -> Result<Rule, GrantError> {
+        let malformed = || GrantError::Malformed {
+            name: text.to_owned(),
+            form: WRITTEN,
+        };
+        let (host, port) = split(text).ok_or_else(malformed)?;
+        let bare = host
+            .strip_prefix('[')
+            .and_then(|host| host.strip_suffix(']'));
+        let hosts = match bare.unwrap_or(host) {
+            "*" => Hosts::Any,
+            host => match host.parse() {
+                Ok(network) => Hosts::Network(network),
+                Err(()) if bare.is_none() && is_name(host) => Hosts::Name(host.to_owned()),
+                Err(()) => return Err(malformed()),
+            },
+        };
+        Ok(Rule { hosts, port })
+    }
+}
+
+fn split(text: &str) -> Option<(&str, u16)> {
+    let (host, port) = text.rsplit_once(':')?;
+    let port = port.parse().ok().filter(|port| *port != 0)?;
+    Some((host, port))
+}
+
+fn is_name(host: &str) -> bool {
+    let plain = |c: char| c.is_ascii_alphanumeric() || c == '.' || c == '-';
+    !host.is_empty() && host.chars().all(plain)
+}
+
+/// Refuses a configuration in which something cannot be understood.
+pub fn check(allow: &Allow) -> Result<(), GrantError> {
+    allow
+        .egress
+        .iter()
+        .try_for_each(|text| text.parse::<Rule>().map(drop))
+}
+
+/// Each host asked for, if it is allowed. One address inside for each host, so that several can be reached on the same port.
+pub fn ways_out(grants: &Grants, allow: &Allow) -> Result<Vec<Way>, GrantError> {
+    let rules: Vec<Rule> = allow
+        .egress
+        .iter()
+        .map(|text| text.parse())
+        .collect::<Result<_, _>>()?;
+    let mut hosts: Vec<&str> = Vec::new();
+    let mut ways = Vec::new();
+    for name in &grants.egress {
+        let malformed = || GrantError::Malformed {
+            name: name.clone(),
+            form: ASKED,
+        };
+        let (host, port) = split(name).ok_or_else(malformed)?;
+        if !is_name(host) {
+            return Err(malformed());
+        }
+        let index = hosts
+            .iter()
+            .position(|known| *known == host)
+            .unwrap_or_else(|| {
+                hosts.push(host);
+                hosts.len() - 1
+            });
+        // 127.0.1.1 and on: 127.0.0.1 is the servant's own.
+        let number = u8::try_from(index + 1).map_err(|_| malformed())?;
+        ways.push(way(
+            name,
+            host,
+            port,
+            Ipv4Addr::new(127, 0, 1, number),
+            &rules,
+        )?);
+    }
+    Ok(ways)
+}
+
+fn way(
+    name: &str,
+    host: &str,
+    port: u16,
+    inside: Ipv4Addr,
+    rules: &[Rule],
+) -> Result<Way, GrantError> {
+    let literal: Option<IpAddr> = host.parse().ok();
+    let of_port = || rules.iter().filter(|rule| rule.port == port);
+    let networks: Vec<Network> = of_port()
+        .filter_map(|rule| match rule.hosts {
+            Hosts::Network(network) => Some(network),
+            _ => None,
+        })
+        .collect();
+    let by_name = of_port()
+        .any(|rule| matches!(&rule.hosts, Hosts::Name(known) if known.eq_ignore_ascii_case(host)));
+    let any = of_port().any(|rule| rule.hosts == Hosts::Any);
+    let in_network =
+        literal.is_some_and(|address| networks.iter().any(|network| network.contains(address)));
+    if !(any || by_name || in_network) {
+        return Err(not_allowed("egress", name));
+    }
+    let way = Way {
+        host: host.to_owned(),
+        inside,
+        port,
+        by_name,
+        networks,
+    };
+    // What is an address already need not wait for its first connection.
+    match literal.map(|address| (address, way.permits(address))) {
+        Some((address, Err(reach))) => Err(GrantError::Inward {
+            name: name.to_owned(),
+            address,
+            port,
+            reach,
+        }),
+        _ => Ok(way),
+    }
+}
+
+impl Way {
+    /// Whether this address, to which the host was resolved, may be dialled; else what it leads to.
+    pub fn permits(&self, address: IpAddr) -> Result<(), Reach> {
+        if self
+            .networks
+            .iter()
+            .any(|network| network.contains(address))
+        {
+            return Ok(());
+        }
+        match reach(address) {
+            Reach::Public => Ok(()),
+            // Whoever names a host of their own network means that.
+            Reach::Private | Reach::ThisMachine if self.by_name => Ok(()),
+            Reach::Loopback if self.by_name && self.host.eq_ignore_ascii_case("localhost") => {
+                Ok(())
+            }
+            reach => Err(reach),
+        }
+    }
+}
+
+/// What an address leads to, seen from this machine.
+fn reach(address: IpAddr) -> Reach {
+    let reach = match address {
+        IpAddr::V4(address) => of_v4(address),
+        IpAddr::V6(address) => of_v6(address),
+    };
+    let may_be_ours = matches!(reach, Reach::Public | Reach::Private);
+    if may_be_ours && is_of_this_machine(address) {
+        Reach::ThisMachine
+    } else {
+        reach
+    }
+}
+
+/// Only its own addresses can be bound.
+fn is_of_this_machine(address: IpAddr) -> bool {
+    std::net::UdpSocket::bind((address, 0)).is_ok()
+}
+
+/// By the registry of special-purpose addresses (IANA, RFC 6890).
+fn of_v4(address: Ipv4Addr) -> Reach {
+    match address.octets() {
+        // Alibaba's, in the space that RFC 6598 shares out; Oracle's; Azure's, which looks public.
+        [100, 100, 100, 200] | [192, 0, 0, 192] | [168, 63, 129, 16] => Reach::Metadata,
+        [169, 254, 169, 253 | 254] | [169, 254, 170, 2 | 23] => Reach::Metadata,
+        [169, 254, ..] => Reach::LinkLocal,
+        [0, 0, 0, 0] => Reach::Unspecified,
+        [0, ..] | [240..=255, ..] => Reach::Reserved,
+        [127, ..] => Reach::Loopback,
+        [10, ..] | [172, 16..=31, ..] | [192, 168, ..] | [100, 64..=127, ..] => Reach::Private,
+        [198, 18 | 19, ..] => Reach::Private,
+        [192, 0, 0 | 2, _] | [198, 51, 100, _] | [203, 0, 113, _] => Reach::Reserved,
+        [224..=239, ..] => Reach::Multicast,
+        _ => Reach::Public,
+    }
+}
+
+/// By the registry of special-purpose addresses (IANA, RFC 6890).
+fn of_v6(address: Ipv6Addr) -> Reach {
+    let segments = address.segments();
+    let [.., above, below] = segments;
+    let embedded = |above: u16, below: u16| {
+        of_v4(Ipv4Addr::from_bits(
+            u32::from(above) << 16 | u32::from(below),
+        ))
+    };
+    match segments {
+        [0, 0, 0, 0, 0, 0, 0, 0] => Reach::Unspecified,
+        [0, 0, 0, 0, 0, 0, 0, 1] => Reach::Loopback,
+        [0, 0, 0, 0, 0, 0xffff, ..] => Reach::Mapped,
+        // Amazon's.
+        [0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254] => Reach::Metadata,
+        // Through a translator to IPv4 (RFC 6052), by a relay to IPv4 (RFC 3056).
+        [0x64, 0xff9b, 0, 0, 0, 0, ..] => embedded(above, below),
+        [0x2002, above, below, ..] => embedded(above, below),
+        [0xfe80..=0xfebf, ..] => Reach::LinkLocal,
+        [0xfc00..=0xfdff, ..] | [0xfec0..=0xfeff, ..] => Reach::Private,
+        [0xff00..=0xffff, ..] => Reach::Multicast,
+        [0x2001, 0..=0x1ff | 0xdb8, ..] => Reach::Reserved,
+        [0x2000..=0x3fff, ..] => Reach::Public,
+        _ => Reach::Reserved,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn allow(egress: &[&str]) -> Allow {
+        Allow {
+            egress: egress.iter().map(|rule| (*rule).to_owned()).collect(),
+            ..Allow::default()
+        }
+    }
+
+    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Way>, GrantError> {
+        let grants = Grants {
+            egress: asked.iter().map(|name| (*name).to_owned()).collect(),
+            ..Grants::default()
+        };
+        ways_out(&grants, &allow(allowed))
+    }
+
+    /// Whether a host that the rules allow may be dialled at an address.
+    fn dials(allowed: &[&str], asked: &str, address: &str) -> bool {
+        let ways = out(allowed, &[asked]).expect("allowed");
+        ways[0]
+            .permits(address.parse().expect("an address"))
+            .is_ok()
+    }
+
+    #[test]
+    fn each_host_has_an_address_inside() {
+        let ways = out(
+            &["models.example.org:443", "*:80"],
+            &[
+                "models.example.org:443",
+                "a.example:80",
+                "models.example.org:80",
+            ],
+        )
+        .expect("allowed");
+        let addresses: Vec<String> = ways
+            .iter()
+            .map(|way| format!("{}:{}", way.inside, way.port))
+            .collect();
+        assert_eq!(addresses, ["127.0.1.1:443", "127.0.1.2:80", "127.0.1.1:80"]);
+    }
+
+    #[test]
+    fn what_is_not_allowed_is_named_with_the_way_out() {
+        let allowed = ["models.example.org:443", "*:80", "10.1.0.0/16:5000"];
+        for (asked, words) in [
+            ("a.example:443", "egress a.example:443 is not allowed"),
+            ("10.2.0.1:5000", "egress 10.2.0.1:5000 is not allowed"),
+            ("a.example", "HOST:PORT"),
+            ("a.example:0", "HOST:PORT"),
+            ("a b:80", "HOST:PORT"),
+            ("*:80", "HOST:PORT"),
+            ("127.0.0.1:80", "leads to a loopback address"),
+            ("127.0.0.1:80", r#"egress = ["127.0.0.1:80"]"#),
+            ("169.254.169.254:80", "where clouds serve metadata"),
+        ] {
+            let refused = out(&allowed, &[asked]).expect_err(asked).to_string();
+            assert!(refused.contains(words), "{refused}");
+        }
+        out(&allowed, &["10.1.2.3:5000"]).expect("in the network");
+    }
+
+    #[test]
+    fn whatever_a_name_leads_to_inward_is_refused() {
+        for address in [
+            "127.0.0.1",
+            "127.8.8.8",
+            "0.0.0.0",
+            "0.1.2.3",
+            "10.0.0.1",
+            "172.16.0.1",
+            "172.31.255.255",
+            "192.168.1.1",
+            "100.64.0.1",
+            "100.100.100.200",
+            "169.254.0.7",
+            "169.254.169.254",
+            "192.0.0.192",
+            "168.63.129.16",
+            "224.0.0.1",
+            "239.255.255.250",
+            "255.255.255.255",
+            "::",
+            "::1",
+            "::ffff:127.0.0.1",
+            "::ffff:8.8.8.8",
+            "::7f00:1",
+            "64:ff9b::7f00:1",
+            "64:ff9b::a9fe:a9fe",
+            "2002:7f00:1::",
+            "2002:c0a8:101::1",
+            "fe80::1",
+            "fec0::1",
+            "fc00::1",
+            "fd00:ec2::254",
+            "fd12:3456::1",
+            "ff02::1",
+        ] {
+            assert!(!dials(&["*:80"], "a.example:80", address), "{address}");
+        }
+        for address in [
+            "8.8.8.8",
+            "172.32.0.1",
+            "2606:4700::1111",
+            "64:ff9b::808:808",
+        ] {
+            assert!(dials(&["*:80"], "a.example:80", address), "{address}");
+        }
+    }
+
+    #[test]
+    fn a_named_host_may_be_of_the_labs_own_network() {
+        let named = ["a.lab:80"];
+        for address in ["10.0.0.1", "192.168.7.7", "fd12:3456::1", "8.8.8.8"] {
+            assert!(dials(&named, "a.lab:80", address), "{address}");
+        }
+        for address in [
+            "127.0.0.1",
+            "::1",
+            "169.254.169.254",
+            "fd00:ec2::254",
+            "fe80::1",
+        ] {
+            assert!(!dials(&named, "a.lab:80", address), "{address}");
+        }
+        assert!(dials(&["localhost:80"], "localhost:80", "127.0.0.1"));
+        assert!(!dials(&["localhost:80"], "localhost:80", "169.254.1.1"));
+    }
+
+    #[test]
+    fn addresses_that_are_named_may_be_reached() {
+        let named = ["*:80", "127.0.0.1:80", "[fe80::/10]:80", "10.1.0.0/16:80"];
+        for address in ["127.0.0.1", "fe80::7", "10.1.255.255"] {
+            assert!(dials(&named, "a.example:80", address), "{address}");
+        }
+        for address in ["127.0.0.2", "10.2.0.0", "::1", "::ffff:127.0.0.1"] {
+            assert!(!dials(&named, "a.example:80", address), "{address}");
+        }
+        assert!(!dials(
+            &["*:80", "10.1.0.0/16:81"],
+            "a.example:80",
+            "10.1.0.1"
+        ));
+        assert!(dials(
+            &["*:80", "0.0.0.0/0:80"],
+            "a.example:80",
+            "127.0.0.1"
+        ));
+    }
+
+    #[test]
+    fn an_address_of_this_machine_is_not_the_internet() {
+        // Whatever is bound on loopback is told apart from what is not.
+        assert!(is_of_this_machine("127.0.0.1".parse().expect("an address")));
+        assert!(!is_of_this_machine(
+            "192.0.2.1".parse().expect("an address")
+        ));
+    }
+
+    #[test]
+    fn a_rule_that_cannot_be_understood_is_named() {
+        for text in [
+            "a.example",
+            "a.example:x",
+            "[a.example]:80",
+            "10.0.0.0/33:80",
+            "a/8:80",
+            ":80",
+            "::1:80:",
+        ] {
+            let refused = check(&allow(&["*:80", text])).expect_err(text).to_string();
+            assert!(
+                refused.contains(text) && refused.contains("HOST:PORT"),
+                "{refused}"
+            );
+        }
+        check(&allow(&[
+            "*:80",
+            "a-b.example:443",
+            "[::1]:80",
+            "[fd00::/8]:1",
+            "10.0.0.0/8:1",
+        ]))
+        .expect("understood");
+    }
+}
