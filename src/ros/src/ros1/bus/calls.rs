@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::link::broken;
@@ -22,40 +23,66 @@ const MAX_IDLE: usize = 8;
 /// Idle connections, by service.
 #[derive(Default)]
 pub(super) struct CallPool {
-    idle: Mutex<HashMap<String, Vec<ServiceConnection>>>,
+    idle: Mutex<HashMap<String, Vec<Kept>>>,
+}
+
+/// A connection, and the address of its server's node when it was made, where the graph showed that.
+struct Kept {
+    connection: ServiceConnection,
+    address: Option<String>,
+}
+
+impl Kept {
+    /// Whether whom it leads to still serves.
+    fn is_current(&self, service: &str, graph: &Graph) -> bool {
+        let Some(server) = graph.services.get(service) else {
+            // What is lent is not in the graph; what was there and is no more is not served.
+            return self.address.is_none() && !self.connection.is_stale();
+        };
+        let said = self.connection.header().get("callerid");
+        let same_node = said.is_none_or(|name| name == server);
+        // A node of the same name may have taken its place.
+        let address = graph.nodes.get(server);
+        let same_place = match (&self.address, address) {
+            (Some(then), Some(now)) => then == now,
+            _ => true,
+        };
+        same_node && same_place && !self.connection.is_stale()
+    }
 }
 
 impl CallPool {
-    /// A connection that the server has not closed.
-    fn take(&self, service: &str) -> Option<ServiceConnection> {
+    /// A connection that the server has not closed, to whom serves now.
+    fn take(&self, service: &str, graph: &watch::Sender<Arc<Graph>>) -> Option<Kept> {
         let mut idle = self.idle.lock();
         let connections = idle.get_mut(service)?;
-        while let Some(connection) = connections.pop() {
-            if !connection.is_stale() {
-                return Some(connection);
+        while let Some(kept) = connections.pop() {
+            if kept.is_current(service, &graph.borrow()) {
+                return Some(kept);
             }
         }
         None
     }
 
-    fn put(&self, service: &str, connection: ServiceConnection) {
+    /// Keeps a connection for the next call, unless somebody else has come to serve during this one.
+    fn put(&self, service: &str, kept: Kept, graph: &watch::Sender<Arc<Graph>>) {
         let mut idle = self.idle.lock();
+        if !kept.is_current(service, &graph.borrow()) {
+            return;
+        }
         let connections = idle.entry(service.to_owned()).or_default();
         if connections.len() < MAX_IDLE {
-            connections.push(connection);
+            connections.push(kept);
         }
     }
 
     /// Drops connections to nodes that no longer serve what they were called for.
     pub(super) fn keep_current(&self, graph: &Graph) {
         self.idle.lock().retain(|service, connections| {
-            let Some(server) = graph.services.get(service) else {
+            if !graph.services.contains_key(service) {
                 return false;
-            };
-            connections.retain(|connection| {
-                let said = connection.header().get("callerid");
-                !connection.is_stale() && said.is_none_or(|name| name == server)
-            });
+            }
+            connections.retain(|kept| kept.is_current(service, graph));
             !connections.is_empty()
         });
     }
@@ -76,18 +103,26 @@ pub(super) async fn call(
 ) -> Result<Bytes, BusError> {
     let called = timeout(time, async {
         loop {
-            let kept = bus.calls.take(service);
+            let kept = bus.calls.take(service, &bus.graph);
             let reused = kept.is_some();
-            let mut connection = match kept {
-                Some(connection) => connection,
-                None => open(bus, service, ("persistent", "1")).await?,
+            let mut kept = match kept {
+                Some(kept) => kept,
+                None => {
+                    let connection = open(bus, service, ("persistent", "1")).await?;
+                    let said = connection.header().get("callerid");
+                    let address = said.and_then(|node| bus.graph.borrow().nodes.get(node).cloned());
+                    Kept {
+                        connection,
+                        address,
+                    }
+                }
             };
             if let Some(md5) = md5 {
-                same_type(service, md5, connection.header())?;
+                same_type(service, md5, kept.connection.header())?;
             }
-            match connection.call(request.clone()).await {
+            match kept.connection.call(request.clone()).await {
                 Ok(answer) => {
-                    bus.calls.put(service, connection);
+                    bus.calls.put(service, kept, &bus.graph);
                     return answer.map_err(|reason| BusError::CallFailed {
                         service: service.to_owned(),
                         reason,
