@@ -12,6 +12,7 @@ mod transform;
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
+use ros::codec::Time;
 use ros::schema::Registry;
 
 use buffer::Buffer;
@@ -78,15 +79,14 @@ impl SharedBuffer {
     }
 }
 
-/// Serialized `geometry_msgs/TransformStamped[]` without stamps: parent, child, transform.
+/// Serialized `geometry_msgs/TransformStamped[]`: parent, child, transform, when it was so.
 fn write_transforms<'t>(
-    transforms: impl IntoIterator<Item = (&'t str, &'t str, Transform)>,
+    transforms: impl IntoIterator<Item = (&'t str, &'t str, Transform, Time)>,
 ) -> Vec<u8> {
-    let now = ros::codec::Time::now();
     let (mut out, mut count) = (vec![0; 4], 0u32);
-    for (parent, child, transform) in transforms {
+    for (parent, child, transform, time) in transforms {
         count += 1;
-        for word in [0, now.secs, now.nsecs] {
+        for word in [0, time.secs, time.nsecs] {
             out.extend_from_slice(&word.to_le_bytes());
         }
         for name in [parent, child] {

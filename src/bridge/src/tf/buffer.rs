@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use ros::codec::Time;
 
 use super::transform::Transform;
 use crate::hub::{Listener, Listening};
@@ -23,13 +24,36 @@ pub(super) struct Buffer {
 
 #[derive(Default)]
 pub(super) struct Frames {
-    /// By child: its parent, and where it is there.
-    links: Mutex<HashMap<String, (String, Transform)>>,
+    /// By child.
+    links: Mutex<HashMap<String, Link>>,
 }
 
-impl Listener for Frames {
+/// Where a frame is.
+struct Link {
+    parent: String,
+    transform: Transform,
+    /// When it was there; none where it never moves.
+    time: Option<Time>,
+}
+
+/// Where one frame is, seen from another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Found {
+    pub(super) transform: Transform,
+    /// The latest time for which all that lies between them is known; none where nothing of it ever moves.
+    pub(super) time: Option<Time>,
+}
+
+/// Hears one of the topics.
+struct Ear {
+    frames: Arc<Frames>,
+    /// What it says holds for ever.
+    fixed: bool,
+}
+
+impl Listener for Ear {
     fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
-        self.hear(&sample.bytes);
+        self.frames.hear(&sample.bytes, self.fixed);
     }
 
     fn failed(&self, reason: &str) {
@@ -40,8 +64,11 @@ impl Listener for Frames {
 impl Buffer {
     pub(super) fn new(shared: &Arc<Shared>) -> Self {
         let frames = Arc::new(Frames::default());
-        let listening =
-            ["/tf", "/tf_static"].map(|topic| shared.hub(topic, None).listen(frames.clone()));
+        let listening = [("/tf", false), ("/tf_static", true)].map(|(topic, fixed)| {
+            let frames = frames.clone();
+            let ear = Arc::new(Ear { frames, fixed });
+            shared.hub(topic, None).listen(ear)
+        });
         Self {
             frames,
             _listening: listening,
@@ -49,48 +76,86 @@ impl Buffer {
     }
 
     /// Where `source` is, seen from `target`.
-    pub(super) fn find(&self, target: &str, source: &str) -> Option<Transform> {
+    pub(super) fn find(&self, target: &str, source: &str) -> Option<Found> {
         self.frames.find(target, source)
     }
 }
 
 impl Frames {
     /// Takes a `tf2_msgs/TFMessage` (or `tf/tfMessage`, which is the same); a torn one as far as it goes.
-    fn hear(&self, bytes: &[u8]) {
+    fn hear(&self, bytes: &[u8], fixed: bool) {
         let mut reader = Reader { bytes };
         let count = reader.word().unwrap_or(0);
         let mut links = self.links.lock();
         for _ in 0..count {
-            let Some((parent, child, transform)) = reader.link() else {
+            let Some((child, mut link)) = reader.link() else {
                 return;
             };
-            let Some(transform) = transform.normalized() else {
+            let Some(transform) = link.transform.normalized() else {
                 continue;
             };
+            link.transform = transform;
+            link.time = link.time.filter(|_| !fixed);
             if links.len() < MAX_FRAMES || links.contains_key(&child) {
-                links.insert(child, (parent, transform));
+                links.insert(child, link);
             }
         }
     }
 
-    fn find(&self, target: &str, source: &str) -> Option<Transform> {
+    fn find(&self, target: &str, source: &str) -> Option<Found> {
         let links = self.links.lock();
-        let up = |frame: &str| {
-            let (mut at, mut path) = (frame.to_owned(), Transform::IDENTITY);
-            for _ in 0..MAX_DEPTH {
-                match links.get(&at) {
-                    Some((parent, transform)) => {
-                        path = transform.after(&path);
-                        at.clone_from(parent);
-                    }
-                    None => return Some((at, path)),
-                }
-            }
-            // A loop: somebody publishes nonsense.
-            None
+        // Where the source is in each frame above it.
+        let mut above = HashMap::new();
+        let mut at = source;
+        let mut path = Found {
+            transform: Transform::IDENTITY,
+            time: None,
         };
-        let ((root, from), (other_root, to)) = (up(source)?, up(target)?);
-        (root == other_root).then(|| to.inverse().after(&from))
+        loop {
+            // A loop: somebody publishes nonsense.
+            if above.len() > MAX_DEPTH || above.insert(at, path).is_some() {
+                return None;
+            }
+            let Some(link) = links.get(at) else { break };
+            path = link.before(path);
+            at = &link.parent;
+        }
+        // Up from the target to the first of them: what is above that matters to neither.
+        at = target;
+        let mut to = Found {
+            transform: Transform::IDENTITY,
+            time: None,
+        };
+        for _ in 0..MAX_DEPTH {
+            if let Some(from) = above.get(at) {
+                return Some(Found {
+                    transform: to.transform.inverse().after(&from.transform),
+                    time: earlier(to.time, from.time),
+                });
+            }
+            let link = links.get(at)?;
+            to = link.before(to);
+            at = &link.parent;
+        }
+        None
+    }
+}
+
+impl Link {
+    /// Where something is in the parent, that is there in the child.
+    fn before(&self, found: Found) -> Found {
+        Found {
+            transform: self.transform.after(&found.transform),
+            time: earlier(self.time, found.time),
+        }
+    }
+}
+
+/// The earlier of two times; what never moves is as it was at any of them.
+fn earlier(one: Option<Time>, other: Option<Time>) -> Option<Time> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
     }
 }
 
@@ -124,9 +189,13 @@ impl Reader<'_> {
         Some(plain(&text).to_owned())
     }
 
-    /// A `geometry_msgs/TransformStamped`.
-    fn link(&mut self) -> Option<(String, String, Transform)> {
-        self.take(12)?;
+    /// A `geometry_msgs/TransformStamped`: the child, and where it is.
+    fn link(&mut self) -> Option<(String, Link)> {
+        self.word()?;
+        let time = Time {
+            secs: self.word()?,
+            nsecs: self.word()?,
+        };
         let (parent, child) = (self.frame()?, self.frame()?);
         let mut numbers = [0.0; 7];
         for number in &mut numbers {
@@ -137,7 +206,12 @@ impl Reader<'_> {
             translation: [x, y, z],
             rotation: [rx, ry, rz, rw],
         };
-        Some((parent, child, transform))
+        let link = Link {
+            parent,
+            transform,
+            time: Some(time),
+        };
+        Some((child, link))
     }
 }
 
@@ -153,45 +227,70 @@ mod tests {
         }
     }
 
+    fn at(secs: u32) -> Time {
+        Time { secs, nsecs: 0 }
+    }
+
+    fn said(links: &[(&str, &str, f64, u32)]) -> Vec<u8> {
+        let links = links.iter();
+        write_transforms(
+            links.map(|(parent, child, x, secs)| (*parent, *child, step(*x), at(*secs))),
+        )
+    }
+
     #[test]
     fn frames_are_found_through_their_common_ancestor() {
         let frames = Frames::default();
-        let message = write_transforms([
-            ("/map", "base", step(1.0)),
-            ("base", "arm", step(2.0)),
-            ("map", "dock", step(10.0)),
+        let message = said(&[
+            ("/map", "base", 1.0, 1),
+            ("base", "arm", 2.0, 1),
+            ("map", "dock", 10.0, 1),
         ]);
-        frames.hear(&message);
-        assert_eq!(
-            frames.find("dock", "arm").unwrap().translation,
-            [-7.0, 0.0, 0.0]
+        frames.hear(&message, false);
+        let x = |target, source| Some(frames.find(target, source)?.transform.translation[0]);
+        assert_eq!(x("dock", "arm"), Some(-7.0));
+        assert_eq!(x("arm", "map"), Some(-3.0));
+        assert_eq!(x("map", "map"), Some(0.0));
+        assert_eq!(x("map", "nowhere"), None);
+        frames.hear(&said(&[("base", "arm", 5.0, 2)]), false);
+        assert_eq!(x("base", "arm"), Some(5.0));
+    }
+
+    #[test]
+    fn a_transform_is_as_old_as_the_oldest_that_it_is_made_of() {
+        let frames = Frames::default();
+        frames.hear(
+            &said(&[
+                ("earth", "map", 1.0, 3),
+                ("map", "base", 1.0, 7),
+                ("base", "arm", 1.0, 9),
+            ]),
+            false,
         );
-        assert_eq!(
-            frames.find("arm", "map").unwrap().translation,
-            [-3.0, 0.0, 0.0]
+        frames.hear(
+            &said(&[("base", "laser", 1.0, 1), ("laser", "dot", 1.0, 1)]),
+            true,
         );
-        assert_eq!(frames.find("map", "map"), Some(Transform::IDENTITY));
-        assert_eq!(frames.find("map", "nowhere"), None);
-        frames.hear(&write_transforms([("base", "arm", step(5.0))]));
-        assert_eq!(
-            frames.find("base", "arm").unwrap().translation,
-            [5.0, 0.0, 0.0]
-        );
+        let time = |target, source| frames.find(target, source).unwrap().time;
+        assert_eq!(time("base", "arm"), Some(at(9)));
+        assert_eq!(time("map", "arm"), Some(at(7)));
+        assert_eq!(time("earth", "arm"), Some(at(3)));
+        // What never moves makes nothing older, and what is above both does not matter.
+        assert_eq!(time("laser", "arm"), Some(at(9)));
+        assert_eq!(time("base", "dot"), None);
+        assert_eq!(time("map", "dot"), Some(at(7)));
     }
 
     #[test]
     fn nonsense_does_no_harm() {
         let frames = Frames::default();
-        frames.hear(&write_transforms([
-            ("a", "b", step(1.0)),
-            ("b", "a", step(1.0)),
-        ]));
+        frames.hear(&said(&[("a", "b", 1.0, 1), ("b", "a", 1.0, 1)]), false);
         assert_eq!(frames.find("a", "b"), None);
-        let whole = write_transforms([("map", "base", step(1.0))]);
+        let whole = said(&[("map", "base", 1.0, 1)]);
         for end in 0..whole.len() {
-            frames.hear(&whole[..end]);
+            frames.hear(&whole[..end], false);
         }
         assert_eq!(frames.find("map", "base"), None);
-        frames.hear(&[0xff; 64]);
+        frames.hear(&[0xff; 64], false);
     }
 }

@@ -13,9 +13,11 @@ use serde::Deserialize;
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+use super::buffer::Found;
 use super::transform::Transform;
 use super::{Buffer, SharedBuffer, buffer, write_transforms};
 use crate::actionlib::{self, GoalId, GoalState, Status};
+use crate::clock;
 use crate::hub::{Listener, Listening};
 use crate::sample::Sample;
 use crate::shared::Shared;
@@ -380,13 +382,17 @@ async fn send(
             }
             continue;
         }
-        let mut changed = Vec::new();
+        let mut changed: Vec<(&str, &str, Transform, Option<Time>)> = Vec::new();
         for source in wanted
             .source_frames
             .iter()
             .map(|source| buffer::plain(source))
         {
-            let Some(now) = buffer.find(target, source) else {
+            let Some(Found {
+                transform: now,
+                time,
+            }) = buffer.find(target, source)
+            else {
                 continue;
             };
             let moved = sent.get(source).is_none_or(|before| {
@@ -395,9 +401,20 @@ async fn send(
             });
             if moved {
                 sent.insert(source, now);
-                changed.push((target, source, now));
+                changed.push((target, source, now, time));
             }
         }
+        // What never moves is there now, too.
+        let now = match changed.iter().any(|(.., time)| time.is_none()) {
+            true => clock::now(&shared).await,
+            false => Time::default(),
+        };
+        let changed: Vec<_> = changed
+            .into_iter()
+            .map(|(target, source, transform, time)| {
+                (target, source, transform, time.unwrap_or(now))
+            })
+            .collect();
         let transforms = (!changed.is_empty()).then(|| write_transforms(changed));
         if !deliver(&shared, transforms) {
             return;

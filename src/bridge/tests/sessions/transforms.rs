@@ -16,7 +16,7 @@ async fn tf_publisher(world: &World) -> Box<dyn Publisher> {
 
 fn moved(world: &World, publisher: &dyn Publisher, child: &str, x: f64) {
     let transform = json!({
-        "header": {"frame_id": "world"},
+        "header": {"frame_id": "world", "stamp": {"secs": 1_000_000, "nsecs": 5}},
         "child_frame_id": child,
         "transform": {"translation": {"x": x}, "rotation": {"w": 1.0}},
     });
@@ -37,6 +37,11 @@ fn x_of(transforms: &Value) -> f64 {
             &transforms[0]["child_frame_id"]
         ),
         (&json!("world"), &json!("turtle"))
+    );
+    // It was there then, whenever it is told.
+    assert_eq!(
+        transforms[0]["header"]["stamp"],
+        json!({"secs": 1_000_000, "nsecs": 5})
     );
     transforms[0]["transform"]["translation"]["x"]
         .as_f64()
