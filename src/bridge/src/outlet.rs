@@ -1,6 +1,6 @@
 //! A topic that a client publishes on.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::{Arc, Weak};
 use std::time::Instant;
 
@@ -28,10 +28,15 @@ pub(crate) struct Outlet {
     shared: Arc<Shared>,
     /// The last message, where it latches.
     last: Mutex<Option<Bytes>>,
+    /// Subscribers that were waited for in vain: they have another definition of the type, or nobody answers there.
+    given_up: Mutex<BTreeSet<Node>>,
     /// How many nodes are connected; follows the publisher once there is one.
     connected: watch::Sender<usize>,
     state: Mutex<State>,
 }
+
+/// A node's name and address: of the same name another may come.
+type Node = (String, String);
 
 enum State {
     /// Not yet advertised, or a node that the Master names as subscriber has not connected yet: messages wait a
@@ -43,7 +48,7 @@ enum State {
     },
     Live {
         publisher: Box<dyn Publisher>,
-        /// The graph in which waiting has ended: whoever had not connected by then is not waited for again.
+        /// The graph in which nobody is missing but those given up.
         settled: u64,
     },
     Failed,
@@ -82,6 +87,7 @@ impl Outlet {
             name: format!("client#{}", shared.next_number()).into(),
             shared: shared.clone(),
             last: Mutex::default(),
+            given_up: Mutex::default(),
             connected: watch::Sender::default(),
             state: Mutex::new(State::warming(None)),
         });
@@ -105,8 +111,8 @@ impl Outlet {
             hub.deliver(self.message(bytes.clone()), true);
         }
         let mut state = self.state.lock();
-        if let State::Live { publisher, settled } = &*state
-            && *publisher.subscribers().borrow() < self.expected(*settled)
+        if let State::Live { publisher, settled } = &mut *state
+            && self.is_incomplete(publisher.as_ref(), settled)
         {
             let subscribers = publisher.subscribers();
             if let State::Live { publisher, .. } =
@@ -164,19 +170,59 @@ impl Outlet {
         }
     }
 
-    /// How many nodes should be connected, or none if the graph is still the one of generation `settled`. The
-    /// bridge itself may be among those that the Master names, but never connects.
-    fn expected(&self, settled: u64) -> usize {
-        let graph = self.shared.bus.graph();
-        let graph = graph.borrow();
-        if graph.generation == settled {
-            return 0;
+    /// Whether somebody is missing who was not in the graph of generation `settled`, which becomes the present one if
+    /// not.
+    fn is_incomplete(&self, publisher: &dyn Publisher, settled: &mut u64) -> bool {
+        let generation = self.shared.bus.graph().borrow().generation;
+        if generation == *settled {
+            return false;
         }
-        let named = graph
-            .topics
-            .get(&self.topic)
-            .map_or(0, |nodes| nodes.subscribers.len());
-        named.saturating_sub(usize::from(self.shared.live_hub(&self.topic).is_some()))
+        let given_up = self.given_up.lock();
+        let missing = self.missing(&publisher.subscriber_names());
+        let incomplete = !missing.is_subset(&given_up);
+        if !incomplete {
+            *settled = generation;
+        }
+        incomplete
+    }
+
+    /// Nodes that the Master names as subscribers, and that are not connected. The bridge itself may be among those
+    /// that are named, but never connects.
+    fn missing(&self, connected: &[String]) -> BTreeSet<Node> {
+        let bus = &self.shared.bus;
+        let graph = bus.graph().borrow().clone();
+        let Some(nodes) = graph.topics.get(&self.topic) else {
+            return BTreeSet::new();
+        };
+        nodes
+            .subscribers
+            .iter()
+            .filter(|name| *name != bus.node() && !connected.contains(name))
+            .map(|name| {
+                let address = graph.nodes.get(name).cloned();
+                (name.clone(), address.unwrap_or_default())
+            })
+            .collect()
+    }
+
+    fn connected_names(&self) -> Vec<String> {
+        match &*self.state.lock() {
+            State::Live { publisher, .. }
+            | State::Warming {
+                publisher: Some(publisher),
+                ..
+            } => publisher.subscriber_names(),
+            _ => Vec::new(),
+        }
+    }
+
+    /// Whether all are connected who should be, at least one.
+    fn is_complete(&self, connected: usize) -> bool {
+        if connected == 0 {
+            return false;
+        }
+        let missing = self.missing(&self.connected_names());
+        missing.is_subset(&self.given_up.lock())
     }
 
     /// Sends what waits, in order, and from now on at once.
@@ -233,14 +279,16 @@ async fn warm_up(
 /// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits.
 async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<usize>, deadline: Instant) {
     let connected = async {
-        // No generation is that high: the graph as it is counts.
-        while *subscribers.borrow_and_update() < outlet.expected(u64::MAX).max(1) {
+        while !outlet.is_complete(*subscribers.borrow_and_update()) {
             if subscribers.changed().await.is_err() {
                 return;
             }
         }
     };
-    let _ = timeout_at(deadline.into(), connected).await;
+    if timeout_at(deadline.into(), connected).await.is_err() {
+        // Not waited for again while they are what they are.
+        *outlet.given_up.lock() = outlet.missing(&outlet.connected_names());
+    }
     outlet.connected.send_replace(*subscribers.borrow());
     outlet.go_live();
 }
@@ -263,3 +311,7 @@ fn follow(outlet: Weak<Outlet>, mut subscribers: watch::Receiver<usize>) {
         }
     });
 }
+
+#[cfg(test)]
+#[path = "outlet_tests.rs"]
+mod tests;

@@ -305,6 +305,10 @@ pub enum BusError {
 /// One servant's (or one robot's) ROS, reached from outside. Names are resolved, absolute ones (`/image`).
 #[async_trait]
 pub trait Bus: Send + Sync + 'static {
+    /// The name under which this side is a node; empty where it is none.
+    fn node(&self) -> &str {
+        ""
+    }
     /// The graph now and as it changes.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Subscribes; publishers that come later are connected as they register.

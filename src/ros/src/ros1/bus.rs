@@ -309,6 +309,10 @@ impl Inner {
 
 #[async_trait]
 impl Bus for Ros1Bus {
+    fn node(&self) -> &str {
+        &self.inner.node
+    }
+
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {
         self.inner.graph.subscribe()
     }

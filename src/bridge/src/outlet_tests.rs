@@ -1,0 +1,104 @@
+use std::time::Duration;
+
+use ros::bus::{Bus, Graph, SubscribeOptions};
+use ros::net::HostSockets;
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use ros::schema::Registry;
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+
+use super::*;
+use crate::BridgeOptions;
+
+/// Long enough on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+async fn in_graph(bus: &dyn Bus, condition: impl Fn(&Graph) -> bool) {
+    let mut graph = bus.graph();
+    let seen = graph.wait_for(|graph| condition(graph));
+    timeout(PATIENCE, seen).await.expect("in time").unwrap();
+}
+
+async fn is_live(outlet: &Outlet) {
+    let live = async {
+        while !matches!(*outlet.state.lock(), State::Live { .. }) {
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(PATIENCE, live).await.expect("in time");
+}
+
+async fn subscribe(node: &Ros1Bus, md5: &str) -> ros::bus::Subscription {
+    let wire_type = WireType {
+        name: "std_msgs/Int32".to_owned(),
+        md5: md5.to_owned(),
+        definition: String::new(),
+    };
+    let options = SubscribeOptions {
+        wire_type: Some(wire_type),
+        queue: 100,
+    };
+    node.subscribe("/number", options).await.unwrap()
+}
+
+#[tokio::test]
+async fn a_subscriber_that_never_matches_is_waited_for_once() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions {
+        uri: format!("http://{address}/"),
+        ..MasterOptions::default()
+    });
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    let node = |name| Ros1Bus::connect(Arc::new(HostSockets), address, name);
+    let bus = node("/bridge").await.unwrap();
+    let (odd, fitting) = (node("/odd").await.unwrap(), node("/fitting").await.unwrap());
+    let registry = Registry::new();
+    registry
+        .insert("std_msgs/msg/Int32", "int32 data\n")
+        .unwrap();
+    let message_type = registry.message("std_msgs/Int32").unwrap();
+    let options = BridgeOptions {
+        warm_up: Duration::from_millis(100),
+        ..BridgeOptions::default()
+    };
+    let shared = Shared::new(bus.clone(), Arc::new(registry), options);
+
+    let _never = subscribe(&odd, "0123456789abcdef0123456789abcdef").await;
+    in_graph(&*bus, |graph| {
+        graph
+            .topics
+            .get("/number")
+            .is_some_and(|nodes| nodes.subscribers == ["/odd"])
+    })
+    .await;
+    let failed = |reason| panic!("{reason}");
+    let outlet = Outlet::open(&shared, "/number", message_type.clone(), false, 10, failed);
+    is_live(&outlet).await;
+
+    // The graph changes, and what is published goes out at once all the same.
+    for number in 0..3 {
+        let name = format!("/other{number}");
+        let other = ros::bus::AdvertiseOptions {
+            wire_type: (*outlet.wire_type).clone(),
+            latch: false,
+            queue: 1,
+        };
+        let _other = odd.advertise(&name, other).await.unwrap();
+        in_graph(&*bus, |graph| graph.topics.contains_key(&name)).await;
+        outlet.publish(vec![0; 4].into());
+        let live = matches!(*outlet.state.lock(), State::Live { .. });
+        assert!(live, "message {number} waits");
+    }
+
+    // For one who comes later it is waited; not one message is lost to it.
+    let mut heard = subscribe(&fitting, message_type.md5()).await;
+    in_graph(&*bus, |graph| {
+        graph.topics["/number"].subscribers.len() == 2
+    })
+    .await;
+    outlet.publish(vec![7; 4].into());
+    let first = timeout(PATIENCE, heard.messages.recv()).await;
+    assert_eq!(&*first.expect("in time").unwrap().bytes, [7; 4]);
+}
