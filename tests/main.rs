@@ -186,6 +186,8 @@ fn main() -> ExitCode {
             unknown_services_are_404_and_name_what_exists,
             beyond_loopback_only_with_a_token,
             health_and_metrics_are_told,
+            a_slash_behind_a_service_leads_to_the_same_service,
+            a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong,
         ],
         stories![push:
             a_cpp_package_is_compiled_and_greets,
@@ -198,7 +200,10 @@ fn main() -> ExitCode {
             a_revision_is_rolled_back,
             five_packaged_nodes_answer,
         ],
-        stories![readiness: a_node_that_is_slow_is_waited_for_until_its_interface_is_there],
+        stories![readiness:
+            a_node_that_is_slow_is_waited_for_until_its_interface_is_there,
+            who_leaves_while_its_servant_starts_is_let_go_at_once,
+        ],
         stories![refusals:
             a_directory_without_a_package,
             malformed_xml,

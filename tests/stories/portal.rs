@@ -210,3 +210,50 @@ pub fn health_and_metrics_are_told() -> Told {
     }
     Ok(())
 }
+
+pub fn a_slash_behind_a_service_leads_to_the_same_service() -> Told {
+    let daemon = world().with(ADDER)?;
+    let mut robot = daemon.robot("adder_py/?robot=slashed")?;
+    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    let mut other = daemon.robot("adder_py?robot=slashed")?;
+    ensure!(other.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    let servants = daemon.servants_of("adder_py")?;
+    let of_both = servants.iter();
+    let of_both = of_both.filter(|servant| servant["robot"] == "slashed");
+    ensure!(of_both.count() == 1, "{servants:?}");
+    let (status, body) = daemon.get("/adder_py/")?;
+    ensure!(
+        status == 426 && body.contains("rosbridge"),
+        "{status} {body}"
+    );
+    for path in ["/adder_py//", "/adder_py/x", "/metrics/", "/stubs/"] {
+        let (status, body) = daemon.get(path)?;
+        ensure!(status == 404, "{path}: {status} {body}");
+    }
+    Ok(())
+}
+
+pub fn a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong() -> Told {
+    let daemon = world().with(ADDER)?;
+    let shake = |version, key| {
+        let headers = [
+            ("Host", "127.0.0.1"),
+            ("Connection", "Upgrade"),
+            ("Upgrade", "websocket"),
+            ("Sec-WebSocket-Version", version),
+            ("Sec-WebSocket-Key", key),
+        ];
+        daemon.request("GET", "/adder_py", &headers)
+    };
+    let (status, body) = shake("8", "dGhlIHNhbXBsZSBub25jZQ==")?;
+    ensure!(
+        status == 426 && body.contains("Sec-WebSocket-Version is not 13"),
+        "{status} {body}"
+    );
+    let (status, body) = shake("13", "c2hvcnQ=")?;
+    ensure!(
+        status == 400 && body.contains("Sec-WebSocket-Key is not 16 bytes"),
+        "{status} {body}"
+    );
+    Ok(())
+}

@@ -2,10 +2,9 @@
 
 use std::sync::Arc;
 
-use bytes::Bytes;
 use ros::bus::Bus;
 use ros::schema::Registry;
-use rosbridge::{Format, Level, Op, Status};
+use rosbridge::{Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
@@ -13,8 +12,8 @@ use crate::outbox::Goodbye;
 use crate::seat::Seat;
 use crate::session::Session;
 use crate::shared::Shared;
+use crate::waiting::Waiting;
 use crate::{BridgeOptions, Metrics, SessionOptions};
-use ws::{WebSocket, frame};
 
 /// One servant's bridge.
 pub struct Bridge {
@@ -65,24 +64,32 @@ impl Bridge {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
+        let waiting = Waiting::new(io, &options.read_ahead, &self.shared.options);
+        self.serve_waiting(waiting, options).await
+    }
+
+    /// Speaks rosbridge on a connection that has waited for this bridge, until it ends. What the client sent meanwhile
+    /// is carried out first, in order.
+    pub async fn serve_waiting<S>(
+        self: &Arc<Self>,
+        waiting: Waiting<S>,
+        options: SessionOptions,
+    ) -> SessionEnd
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send,
+    {
         let shared = &self.shared;
         let client = match shared.client_for(&options) {
             Ok(client) => client,
             Err(reason) => {
-                refuse(io, 1012, &reason).await;
+                waiting.refuse(1012, &reason).await;
                 return SessionEnd::Closed { code: 1012, reason };
             }
         };
         let seat = Seat::take(shared.clone(), client.clone(), options.resume);
-        let limits = &shared.options;
-        let socket = WebSocket::new(
-            io,
-            &options.read_ahead,
-            limits.max_frame,
-            limits.max_message,
-        );
         tracing::debug!(client = %client.name, "session begins");
-        let end = Session::new(socket, client.clone(), seat.socket)
+        let (socket, kept) = waiting.into_parts();
+        let end = Session::new(socket, kept, client.clone(), seat.socket)
             .run()
             .await;
         tracing::debug!(client = %client.name, ?end, "session ends");
@@ -116,21 +123,12 @@ impl Bridge {
 }
 
 /// Refuses a connection behind its WebSocket upgrade: a status message at level error, then a close frame. For when
-/// there is no bridge to serve it, because the servant could not be started (1013, "try again later").
+/// there is no bridge to serve it, because its client may not have one.
 pub async fn refuse<S>(io: S, code: u16, reason: &str)
 where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
-    let mut out = Vec::new();
-    Op::from(Status {
-        id: None,
-        level: Level::Error,
-        msg: reason.into(),
-    })
-    .print(&mut out, Format::Json);
-    let mut socket = WebSocket::new(io, b"", 4096, 4096);
-    socket.queue(frame::TEXT, Bytes::from(out));
-    socket.queue_close(code, reason);
-    // A client that does not take its leave in time, or is gone already, is left alone.
-    let _ = tokio::time::timeout(BridgeOptions::default().close_timeout, socket.leave(true)).await;
+    Waiting::new(io, b"", &BridgeOptions::default())
+        .refuse(code, reason)
+        .await;
 }

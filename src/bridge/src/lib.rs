@@ -15,9 +15,11 @@
 //! What a client has asked for (subscriptions, advertisements, calls under way) belongs to its *client*, which can
 //! outlive the socket: with a resume token the next socket takes it over.
 //!
-//! A session's life:
+//! A session's life; a connection may come before its servant is there, and wait ([`Waiting`]):
 //!
 //! ```text
+//!  Waiting ──the servant is there──▶ Open
+//!
 //!  Open ──frame over limits, idle, control queue full, servant gone──▶ Closing ──close frame or time-out──▶ Ended
 //!   │ └──client's close frame──────────────────────────────────────────▲                                     ▲
 //!   └──socket lost────────────────────────────────────────────────────────────────────────────────────────────┘
@@ -47,7 +49,9 @@ mod session;
 mod shared;
 mod tf;
 mod topic_queue;
+mod waiting;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use metrics::{Counter, Metrics};
 pub use options::{BridgeOptions, SessionOptions};
+pub use waiting::Waiting;

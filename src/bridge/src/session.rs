@@ -1,6 +1,7 @@
 //! One socket: moves frames between it and its client, in one task, so that nothing is handed over between threads
 //! on the way.
 
+use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
 use std::pin::Pin;
 use std::sync::Arc;
@@ -39,6 +40,8 @@ pub(crate) struct Session<S> {
     /// Which of the client's sockets this is.
     number: u64,
     inbox: Inbox,
+    /// What came before there was a servant to take it.
+    kept: VecDeque<Message>,
     cuts: Cuts,
     heard: Instant,
     /// Bytes received by then.
@@ -68,13 +71,20 @@ enum Stop {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
-    pub(crate) fn new(socket: WebSocket<S>, client: Arc<Client>, number: u64) -> Self {
+    /// A session on `socket`, which takes what was `kept` of it first.
+    pub(crate) fn new(
+        socket: WebSocket<S>,
+        kept: VecDeque<Message>,
+        client: Arc<Client>,
+        number: u64,
+    ) -> Self {
         let now = Instant::now();
         let options = &client.shared.options;
         Self {
             socket,
             number,
             inbox: Inbox::new(&client.shared),
+            kept,
             cuts: Cuts::default(),
             heard: now,
             heard_bytes: 0,
@@ -213,7 +223,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 self.held_back = true;
                 return Poll::Pending;
             }
-            let next = self.socket.poll_next(cx);
+            let next = match self.kept.pop_front() {
+                Some(message) => Poll::Ready(Ok(message)),
+                None => self.socket.poll_next(cx),
+            };
             // A big message on a slow line is heard from its first byte on, not only at its end.
             if self.heard_bytes != self.socket.received() {
                 self.heard_bytes = self.socket.received();
@@ -277,8 +290,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         Ok(())
     }
 
-    /// What the clock demands: a ping, a goodbye. Gives when to look again.
-    fn mind_the_clock(&mut self, now: Instant) -> Result<Option<Instant>, Stop> {
+    /// What the clock demands: a ping, a goodbye.
+    fn mind_the_clock(&mut self, now: Instant) -> Result<(), Stop> {
         let options = &self.client.shared.options;
         let (idle, interval) = (options.idle_timeout, options.ping_interval);
         let silent = now.saturating_duration_since(self.heard);
@@ -303,14 +316,22 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         if regular {
             self.ping_at = Some(now + interval);
         }
+        Ok(())
+    }
+
+    /// When to look at the clock again. To be asked after writing: what was written may need a ping behind it, and its
+    /// topic's next message may have to wait for its throttle rate.
+    fn next_look(&self) -> Option<Instant> {
+        let idle = self.client.shared.options.idle_timeout;
         let idle_at = (!idle.is_zero()).then(|| self.heard + idle);
-        let ack_at = self.acks.ping_due().filter(|at| *at > now);
-        Ok(
-            [self.ping_at, idle_at, ack_at, self.client.outbox.next_due()]
-                .into_iter()
-                .flatten()
-                .min(),
-        )
+        // While the socket takes no more there is nothing to send in time; it wakes this task itself.
+        let blocked = self.socket.queued() >= SOCKET_FULL;
+        let ack_at = self.acks.ping_due().filter(|_| !blocked);
+        let sample_at = self.client.outbox.next_due().filter(|_| !blocked);
+        [self.ping_at, idle_at, ack_at, sample_at]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// Ready when it is time.
@@ -349,10 +370,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 Poll::Ready(Err(stop)) => return Poll::Ready(stop),
                 read => read,
             };
-            let at = match self.mind_the_clock(now) {
-                Ok(at) => at,
-                Err(stop) => return Poll::Ready(stop),
-            };
+            if let Err(stop) = self.mind_the_clock(now) {
+                return Poll::Ready(stop);
+            }
             let written = match self.write(cx, now) {
                 Poll::Ready(Err(error)) => {
                     return Poll::Ready(Stop::Lost {
@@ -367,7 +387,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             if self.moved >= MOVED {
                 break;
             }
-            if !more && self.arm(cx, at).is_pending() {
+            if !more && self.arm(cx, self.next_look()).is_pending() {
                 return Poll::Pending;
             }
         }
@@ -426,3 +446,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         self.socket.queue_close(code, reason);
     }
 }
+
+#[cfg(test)]
+#[path = "session_tests.rs"]
+mod tests;

@@ -95,6 +95,9 @@ pub enum Error {
     /// Something in the request is not what it should be.
     #[error("{0}")]
     BadRequest(String),
+    /// A WebSocket handshake of another version than 13.
+    #[error("this is no WebSocket handshake: Sec-WebSocket-Version is not 13")]
+    WebSocketVersion,
     /// No token, or one that is not known.
     #[error("{0}")]
     Unauthorised(&'static str),
@@ -223,6 +226,11 @@ impl Error {
             Error::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
             Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
+            Error::WebSocketVersion => (
+                S::UPGRADE_REQUIRED,
+                "websocket-version",
+                "other WebSocket version needed",
+            ),
             Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::RobotTaken(_) => (S::FORBIDDEN, "robot-taken", "robot name taken"),
@@ -262,6 +270,7 @@ impl Error {
             Error::NameTaken { name, .. } => {
                 format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
             }
+            Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unauthorised(_) => {
                 "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
@@ -282,7 +291,17 @@ impl Error {
 
 impl IntoResponse for Error {
     fn into_response(self) -> Response {
-        respond(&self.problem())
+        let mut response = respond(&self.problem());
+        if let Error::WebSocketVersion = self {
+            // RFC 6455, section 4.4.
+            let headers = response.headers_mut();
+            headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+            headers.insert(
+                header::SEC_WEBSOCKET_VERSION,
+                HeaderValue::from_static("13"),
+            );
+        }
+        response
     }
 }
 

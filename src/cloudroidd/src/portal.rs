@@ -12,6 +12,7 @@
 mod api_v1;
 mod auth;
 mod guard;
+mod handshake;
 mod metrics;
 mod oci;
 mod page;

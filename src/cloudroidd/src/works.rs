@@ -81,7 +81,8 @@ impl Works {
     }
 }
 
-fn bridge_options(config: &Config) -> BridgeOptions {
+/// What the configuration says of bridges.
+pub fn bridge_options(config: &Config) -> BridgeOptions {
     let bytes = |size: api::Size| usize::try_from(size.0).unwrap_or(usize::MAX);
     BridgeOptions {
         max_frame: bytes(config.portal.max_frame),

@@ -12,3 +12,4 @@ mod rosapi;
 mod services;
 mod subscribing;
 mod transforms;
+mod waiting;

@@ -120,6 +120,9 @@ async fn live(
             };
             handle.set_promise(permit.promise());
             *kept = Some(permit);
+            if handle.anonymous && handle.connections() == 0 {
+                return Ok("its robot left before it was started".to_owned());
+            }
             handle.set_phase(Phase::Admitted);
             record(inner, handle)?;
             match use_spare(handle, spare.take()).await {
@@ -146,6 +149,7 @@ async fn live(
         outcome = &mut supervised => outcome,
         reason = handle.end_asked() => Ok(reason),
         failure = container_over(&container) => Err(failure),
+        () = deserted(handle), if fresh => Ok("its robot left before it was ready".to_owned()),
     }
 }
 
@@ -235,6 +239,19 @@ async fn abandoned(handle: &Handle) {
         .watch_connections()
         .wait_for(|count| *count == 0)
         .await;
+}
+
+/// Comes back when a robot that cannot come back to this servant has left before it was ready. (Others may, and find it
+/// within their grace time.)
+async fn deserted(handle: &Handle) {
+    let mut life = handle.watch();
+    let ready = life.wait_for(|life| life.phase >= Phase::Ready);
+    tokio::select! {
+        biased;
+        _ = ready => {}
+        () = abandoned(handle), if handle.anonymous => return,
+    }
+    std::future::pending().await
 }
 
 /// Writes down that the servant is, before it runs: a daemon killed now finds it again.

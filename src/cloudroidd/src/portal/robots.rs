@@ -9,23 +9,26 @@ use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
-use bridge::{SessionEnd, SessionOptions};
+use bridge::{SessionEnd, SessionOptions, Waiting};
+use bytes::BytesMut;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use hyper_util::rt::TokioIo;
-use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
-use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use super::guard::{self, Caller, Peer};
-use super::{App, auth, page};
+use super::{App, auth, handshake, page};
 use crate::choreographer::Lease;
 use crate::errors::Error;
+use crate::works::{Works, bridge_options};
 use crate::{names, tokens};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
 /// Close code for a policy that was violated.
 const POLICY: u16 = 1008;
+/// Bytes that a robot's stub may send before its servant is there.
+const STUB_AHEAD: usize = 64 * 1024;
 
 /// `/`: the page, or the default service.
 pub async fn root(
@@ -51,6 +54,20 @@ pub async fn root(
             .into_response()
         }
     }
+}
+
+/// `/<service>/`, as some clients write it: the same as without the slash.
+pub async fn service_with_slash(
+    app: State<Arc<App>>,
+    service: Path<String>,
+    caller: Extension<Caller>,
+    request: Request,
+) -> Response {
+    if names::RESERVED.contains(&service.as_str()) {
+        let path = request.uri().path().to_owned();
+        return Error::UnknownPath { path }.into_response();
+    }
+    self::service(app, service, caller, request).await
 }
 
 /// `/<service>`: its servant, or an explanation.
@@ -149,7 +166,7 @@ async fn connect(
     caller: Caller,
     mut request: Request,
 ) -> Result<Response, Error> {
-    let accept = handshake(&request)?;
+    let accept = handshake::accept(&request)?;
     let link = asks_for_link(request.headers())?;
     let asked = Asked::read(&app, service, link, request.uri())?;
     // A stub shows its token at once; without it nothing is told, not even what there is.
@@ -195,34 +212,6 @@ async fn connect(
         headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
     }
     Ok(response)
-}
-
-/// The key that accepts an opening handshake (RFC 6455, section 4.2).
-fn handshake(request: &Request) -> Result<HeaderValue, Error> {
-    let bad = |what: &str| Error::BadRequest(format!("this is no WebSocket handshake: {what}"));
-    let text = |name| {
-        request
-            .headers()
-            .get(name)
-            .and_then(|value| value.to_str().ok())
-    };
-    if request.method() != Method::GET {
-        return Err(bad("it does not GET"));
-    }
-    let connection = text(header::CONNECTION).unwrap_or_default();
-    if !connection
-        .split(',')
-        .any(|option| option.trim().eq_ignore_ascii_case("upgrade"))
-    {
-        return Err(bad("Connection does not say Upgrade"));
-    }
-    if text(header::SEC_WEBSOCKET_VERSION) != Some("13") {
-        return Err(bad("Sec-WebSocket-Version is not 13"));
-    }
-    let key = text(header::SEC_WEBSOCKET_KEY).ok_or_else(|| bad("Sec-WebSocket-Key is missing"))?;
-    derive_accept_key(key.as_bytes())
-        .parse()
-        .map_err(|_| bad("Sec-WebSocket-Key is malformed"))
 }
 
 /// Whether a robot's stub asks, in a version of the link's protocol that is spoken here.
@@ -342,35 +331,29 @@ async fn session<S>(
     if asked.link {
         return linked(&app, &asked, lease, io, read_ahead).await;
     }
-    let lease = match lease {
-        Some(lease) => Ok(lease),
-        None => {
-            let awaited = auth::first_message(&mut io, read_ahead, &app.tokens);
-            match tokio::time::timeout(app.config.portal.handshake.0, awaited).await {
-                Ok(Ok((token, rest))) => {
-                    read_ahead = rest;
-                    caller.token = Some(token);
-                    caller.trusted = true;
-                }
-                Ok(Err(reason)) => return bridge::refuse(io, POLICY, &reason).await,
-                Err(_) => {
-                    return bridge::refuse(io, POLICY, "no auth message came; send a token").await;
-                }
+    if lease.is_none() {
+        let awaited = auth::first_message(&mut io, read_ahead, &app.tokens);
+        match tokio::time::timeout(app.config.portal.handshake.0, awaited).await {
+            Ok(Ok((token, rest))) => {
+                read_ahead = rest;
+                caller.token = Some(token);
+                caller.trusted = true;
             }
-            match self::lease(&app, &asked, &caller) {
-                Ok(lease) => lease.admitted().await.map(|()| lease),
-                Err(error) => Err(error),
+            Ok(Err(reason)) => return bridge::refuse(io, POLICY, &reason).await,
+            Err(_) => {
+                return bridge::refuse(io, POLICY, "no auth message came; send a token").await;
             }
         }
-    };
-    let ready = match &lease {
-        Ok(lease) => lease.ready().await,
-        Err(_) => Err(Error::Internal("taking a servant")),
-    };
-    let (lease, works) = match (lease, ready) {
-        (Ok(lease), Ok(works)) => (lease, works),
-        (Err(error), _) | (_, Err(error)) => {
-            return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
+    }
+    let mut waiting = Waiting::new(io, &read_ahead, &bridge_options(&app.config));
+    let taking = servant(&app, &asked, &caller, lease);
+    let (lease, works) = match waiting.until(taking).await {
+        Ok(Ok(taken)) => taken,
+        Ok(Err(error)) => return waiting.refuse(TRY_AGAIN_LATER, &error.in_a_line()).await,
+        // With its lease its place in the queue is given up, and the servant that only it could have used.
+        Err(end) => {
+            tracing::debug!("a robot left before {} was ready: {end:?}", asked.service);
+            return;
         }
     };
     let client = match (&asked.robot, caller.peer) {
@@ -381,10 +364,9 @@ async fn session<S>(
     let options = SessionOptions {
         client,
         resume: asked.bound_resume(&caller),
-        read_ahead,
         ..SessionOptions::default()
     };
-    let end = works.bridge.serve(io, options).await;
+    let end = works.bridge.serve_waiting(waiting, options).await;
     let handle = lease.handle();
     match end {
         SessionEnd::Client { code, .. } => {
@@ -403,21 +385,50 @@ async fn session<S>(
     }
 }
 
+/// The servant that is asked for, once it is there, and the right to it.
+async fn servant(
+    app: &App,
+    asked: &Asked,
+    caller: &Caller,
+    lease: Option<Lease>,
+) -> Result<(Lease, Arc<Works>), Error> {
+    let lease = match lease {
+        Some(lease) => lease,
+        None => {
+            let lease = self::lease(app, asked, caller)?;
+            lease.admitted().await?;
+            lease
+        }
+    };
+    let works = lease.ready().await?;
+    Ok((lease, works))
+}
+
 /// A connection of a robot's stub.
-async fn linked<S>(app: &App, asked: &Asked, lease: Option<Lease>, io: S, read_ahead: bytes::Bytes)
-where
+async fn linked<S>(
+    app: &App,
+    asked: &Asked,
+    lease: Option<Lease>,
+    mut io: S,
+    read_ahead: bytes::Bytes,
+) where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
-    let ready = match &lease {
-        Some(lease) => lease.ready().await,
-        None => Err(Error::Internal("taking a servant")),
+    let Some(lease) = lease else {
+        let error = Error::Internal("taking a servant");
+        return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
     };
-    let (Some(lease), Ok(works)) = (&lease, &ready) else {
-        let reason = ready
-            .err()
-            .map(|error| error.in_a_line())
-            .unwrap_or_default();
-        return bridge::refuse(io, TRY_AGAIN_LATER, &reason).await;
+    let mut read_ahead = BytesMut::from(read_ahead);
+    let ready = tokio::select! {
+        ready = lease.ready() => ready,
+        () = left(&mut io, &mut read_ahead) => {
+            tracing::debug!("a stub left before {} was ready", asked.service);
+            return;
+        }
+    };
+    let works = match ready {
+        Ok(works) => works,
+        Err(error) => return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await,
     };
     let robot = asked.robot.as_deref().unwrap_or_default();
     let lost = tokio::select! {
@@ -430,33 +441,19 @@ where
     );
 }
 
+/// Keeps what comes from a connection, as far as there is room for it; comes back when the connection has ended.
+async fn left<S: AsyncRead + Unpin>(io: &mut S, kept: &mut BytesMut) {
+    while kept.len() < STUB_AHEAD {
+        if !matches!(io.read_buf(kept).await, Ok(1..)) {
+            return;
+        }
+    }
+    std::future::pending().await
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn request(headers: &[(&str, &str)]) -> Request {
-        let mut request = Request::builder().uri("/opencv_apps");
-        for (name, value) in headers {
-            request = request.header(*name, *value);
-        }
-        request.body(Body::empty()).expect("a request")
-    }
-
-    const GOOD: [(&str, &str); 4] = [
-        ("connection", "keep-alive, Upgrade"),
-        ("upgrade", "websocket"),
-        ("sec-websocket-version", "13"),
-        ("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="),
-    ];
-
-    #[test]
-    fn the_handshake_is_answered_as_the_standard_says() {
-        // The example of RFC 6455, section 1.3.
-        assert_eq!(
-            handshake(&request(&GOOD)).expect("good"),
-            "s3pPLMBiTxaQ9kYGzzhZRbK+xOo="
-        );
-    }
 
     #[test]
     fn who_holds_the_resume_token_comes_back_to_the_same_servant() {
@@ -469,24 +466,5 @@ mod tests {
             names::robot(&named("secret").0).is_err(),
             "no robot can claim it"
         );
-    }
-
-    #[test]
-    fn half_a_handshake_is_refused() {
-        for missing in [0, 2, 3] {
-            let headers: Vec<_> = GOOD
-                .iter()
-                .enumerate()
-                .filter(|(at, _)| *at != missing)
-                .map(|(_, pair)| *pair)
-                .collect();
-            assert_eq!(
-                handshake(&request(&headers))
-                    .expect_err("incomplete")
-                    .problem()
-                    .status,
-                400
-            );
-        }
     }
 }

@@ -1,0 +1,216 @@
+//! A connection whose servant is not there yet: it is read all the same. Pings are answered, a close frame at once,
+//! and what else the client sends is kept, to be carried out in order when the servant is there.
+
+use std::collections::VecDeque;
+use std::future::{Future, poll_fn};
+use std::pin::{Pin, pin};
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use rosbridge::{Format, Level, Op, Status};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::{Sleep, timeout};
+use ws::{Message, WebSocket, WsError, frame};
+
+use crate::{BridgeOptions, SessionEnd};
+
+/// Messages kept, and bytes of those. While there are so many nothing more is read: the client has to wait, as it does
+/// for a servant that is busy.
+const KEPT_MESSAGES: usize = 1000;
+const KEPT_BYTES: usize = 1 << 20;
+/// Answers to pings wait in no more memory than this (bytes).
+const ANSWERS: usize = 64 * 1024;
+
+/// A connection behind its WebSocket upgrade, before a bridge serves it.
+pub struct Waiting<S> {
+    socket: WebSocket<S>,
+    kept: VecDeque<Message>,
+    kept_bytes: usize,
+    ping_interval: Duration,
+    idle_timeout: Duration,
+    close_timeout: Duration,
+    heard: Instant,
+    heard_bytes: u64,
+    /// Fires at the next ping, or when the silence has become too long.
+    timer: Pin<Box<Sleep>>,
+    ping_at: Option<Instant>,
+}
+
+/// Why there is no more need to wait.
+enum Left {
+    Client { code: u16, reason: String },
+    Refused { code: u16, reason: String },
+    Silent(Duration),
+    Lost(String),
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
+    /// A connection that waits; `read_ahead` is what was already read behind its upgrade.
+    pub fn new(io: S, read_ahead: &[u8], options: &BridgeOptions) -> Self {
+        let now = Instant::now();
+        let interval = options.ping_interval;
+        Self {
+            socket: WebSocket::new(io, read_ahead, options.max_frame, options.max_message),
+            kept: VecDeque::new(),
+            kept_bytes: 0,
+            ping_interval: interval,
+            idle_timeout: options.idle_timeout,
+            close_timeout: options.close_timeout,
+            heard: now,
+            heard_bytes: 0,
+            timer: Box::pin(tokio::time::sleep_until(now.into())),
+            ping_at: (!interval.is_zero()).then(|| now + interval),
+        }
+    }
+
+    /// Waits for `ready`, and gives what that gives.
+    ///
+    /// # Errors
+    /// How the connection ended, where its client left before. `ready` has been dropped by then.
+    pub async fn until<T>(&mut self, ready: impl Future<Output = T>) -> Result<T, SessionEnd> {
+        let left = {
+            let mut ready = pin!(ready);
+            let either = poll_fn(|cx| {
+                if let Poll::Ready(value) = ready.as_mut().poll(cx) {
+                    return Poll::Ready(Ok(value));
+                }
+                self.step(cx).map(Err)
+            });
+            match either.await {
+                Ok(value) => return Ok(value),
+                Err(left) => left,
+            }
+        };
+        Err(self.leave(left).await)
+    }
+
+    /// Refuses the connection: a status message at level error, then a close frame.
+    pub async fn refuse(mut self, code: u16, reason: &str) {
+        self.say_goodbye(code, reason, true).await;
+    }
+
+    pub(crate) fn into_parts(self) -> (WebSocket<S>, VecDeque<Message>) {
+        (self.socket, self.kept)
+    }
+
+    async fn leave(&mut self, left: Left) -> SessionEnd {
+        match left {
+            Left::Lost(reason) => SessionEnd::Lost(reason),
+            Left::Client { code, reason } => {
+                self.socket.queue_close(code, "");
+                let answered = poll_fn(|cx| self.socket.poll_flush(cx));
+                // A client that does not wait for the answer is gone all the same.
+                let _ = timeout(self.close_timeout, answered).await;
+                SessionEnd::Client { code, reason }
+            }
+            Left::Refused { code, reason } => {
+                self.say_goodbye(code, &reason, false).await;
+                SessionEnd::Closed { code, reason }
+            }
+            Left::Silent(silence) => {
+                let reason = format!(
+                    "nothing was heard for {} s, not even a pong",
+                    silence.as_secs()
+                );
+                self.say_goodbye(1001, &reason, true).await;
+                SessionEnd::Closed { code: 1001, reason }
+            }
+        }
+    }
+
+    async fn say_goodbye(&mut self, code: u16, reason: &str, readable: bool) {
+        let mut out = Vec::new();
+        let status = Status {
+            id: None,
+            level: Level::Error,
+            msg: reason.into(),
+        };
+        Op::from(status).print(&mut out, Format::Json);
+        self.socket.queue(frame::TEXT, Bytes::from(out));
+        self.socket.queue_close(code, reason);
+        // A client that does not take its leave in time, or is gone already, is left alone.
+        let _ = timeout(self.close_timeout, self.socket.leave(readable)).await;
+    }
+
+    fn step(&mut self, cx: &mut Context<'_>) -> Poll<Left> {
+        loop {
+            if let Poll::Ready(Err(left)) = self.read(cx) {
+                return Poll::Ready(left);
+            }
+            let now = Instant::now();
+            if let Err(left) = self.mind_the_clock(now) {
+                return Poll::Ready(left);
+            }
+            if let Poll::Ready(Err(error)) = self.socket.poll_flush(cx) {
+                return Poll::Ready(Left::Lost(error.to_string()));
+            }
+            let silent_at = self.silent_at();
+            let Some(at) = self.ping_at.into_iter().chain(silent_at).min() else {
+                return Poll::Pending;
+            };
+            self.timer.as_mut().reset(at.into());
+            if self.timer.as_mut().poll(cx).is_pending() {
+                return Poll::Pending;
+            }
+        }
+    }
+
+    fn is_full(&self) -> bool {
+        self.kept.len() >= KEPT_MESSAGES || self.kept_bytes >= KEPT_BYTES
+    }
+
+    /// When silence has become too long; never while it is this side that does not read.
+    fn silent_at(&self) -> Option<Instant> {
+        let counts = !self.idle_timeout.is_zero() && !self.is_full();
+        counts.then(|| self.heard + self.idle_timeout)
+    }
+
+    fn mind_the_clock(&mut self, now: Instant) -> Result<(), Left> {
+        if self.silent_at().is_some_and(|at| at <= now) {
+            return Err(Left::Silent(now.saturating_duration_since(self.heard)));
+        }
+        if self.ping_at.is_some_and(|at| at <= now) {
+            if self.socket.queued() < ANSWERS {
+                self.socket.queue(frame::PING, Bytes::new());
+            }
+            self.ping_at = Some(now + self.ping_interval);
+        }
+        Ok(())
+    }
+
+    /// Takes what the client has sent. Pending when there is no more, or no room for it.
+    fn read(&mut self, cx: &mut Context<'_>) -> Poll<Result<(), Left>> {
+        while !self.is_full() {
+            let next = self.socket.poll_next(cx);
+            if self.heard_bytes != self.socket.received() {
+                self.heard_bytes = self.socket.received();
+                self.heard = Instant::now();
+            }
+            let message = match next {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Ok(message)) => message,
+                Poll::Ready(Err(WsError::Refused { code, reason })) => {
+                    return Poll::Ready(Err(Left::Refused { code, reason }));
+                }
+                Poll::Ready(Err(error)) => {
+                    return Poll::Ready(Err(Left::Lost(error.to_string())));
+                }
+            };
+            match message {
+                Message::Text(ref bytes) | Message::Binary(ref bytes) => {
+                    self.kept_bytes += bytes.len();
+                    self.kept.push_back(message);
+                }
+                Message::Ping(payload) if self.socket.queued() < ANSWERS => {
+                    self.socket.queue(frame::PONG, payload);
+                }
+                Message::Ping(_) | Message::Pong(_) => {}
+                Message::Close(code, reason) => {
+                    return Poll::Ready(Err(Left::Client { code, reason }));
+                }
+            }
+        }
+        Poll::Pending
+    }
+}

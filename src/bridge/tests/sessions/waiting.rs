@@ -1,0 +1,137 @@
+//! Connections whose servant is not there yet.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge::{BridgeOptions, SessionEnd, SessionOptions, Waiting};
+use futures_util::{SinkExt, StreamExt};
+use serde_json::{Value, json};
+use tokio::io::DuplexStream;
+use tokio::sync::oneshot;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::protocol::{Message, Role};
+
+use crate::support::{World, patiently};
+
+type Socket = WebSocketStream<DuplexStream>;
+
+/// A connection that waits, and its client's end.
+async fn connection(options: &BridgeOptions) -> (Waiting<DuplexStream>, Socket) {
+    let (ours, theirs) = tokio::io::duplex(64 * 1024);
+    let client = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
+    (Waiting::new(ours, b"", options), client)
+}
+
+async fn next(client: &mut Socket) -> Message {
+    patiently(client.next()).await.expect("a message").unwrap()
+}
+
+#[tokio::test]
+async fn who_leaves_is_answered_at_once_and_needs_nothing_any_more() {
+    let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
+    // The servant never comes; `given_up` tells when nobody waits for it any more.
+    let (place, given_up) = oneshot::channel::<()>();
+    let waits = tokio::spawn(async move {
+        let servant = async {
+            let _place = place;
+            std::future::pending::<()>().await
+        };
+        waiting.until(servant).await
+    });
+    client.send(Message::Ping("p".into())).await.unwrap();
+    assert_eq!(next(&mut client).await, Message::Pong("p".into()));
+    client.close(None).await.unwrap();
+    assert_eq!(next(&mut client).await, Message::Close(None));
+    let end = patiently(waits).await.unwrap().unwrap_err();
+    assert!(
+        matches!(end, SessionEnd::Client { code: 1005, .. }),
+        "{end:?}"
+    );
+    assert!(patiently(given_up).await.is_err());
+}
+
+#[tokio::test]
+async fn who_is_gone_without_a_word_needs_nothing_any_more() {
+    let (mut waiting, client) = connection(&BridgeOptions::default()).await;
+    let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+    drop(client);
+    let end = patiently(waits).await.unwrap().unwrap_err();
+    assert!(matches!(end, SessionEnd::Lost(_)), "{end:?}");
+
+    // Nor does one whose line is dead.
+    let impatient = BridgeOptions {
+        ping_interval: Duration::from_millis(10),
+        idle_timeout: Duration::from_millis(100),
+        close_timeout: Duration::from_millis(10),
+        ..BridgeOptions::default()
+    };
+    let (mut waiting, _silent) = connection(&impatient).await;
+    let end = patiently(waiting.until(std::future::pending::<()>())).await;
+    assert!(
+        matches!(end, Err(SessionEnd::Closed { code: 1001, .. })),
+        "{end:?}"
+    );
+}
+
+#[tokio::test]
+async fn what_was_said_meanwhile_is_carried_out_in_order() {
+    let world = World::new().await;
+    let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
+    let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
+    let (come, servant) = oneshot::channel();
+    let bridge = world.bridge.clone();
+    let session = tokio::spawn(async move {
+        let bridge: Arc<bridge::Bridge> = waiting.until(servant).await.unwrap().unwrap();
+        bridge
+            .serve_waiting(waiting, SessionOptions::default())
+            .await
+    });
+    let say = |message: Value| Message::text(message.to_string());
+    client
+        .send(say(
+            json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"}),
+        ))
+        .await
+        .unwrap();
+    // More than is kept: the client has to wait with the rest, and loses nothing.
+    let padding = "x".repeat(40_000);
+    let messages = 60;
+    let (mut sending, mut receiving) = client.split();
+    let talk = tokio::spawn(async move {
+        for number in 0..messages {
+            let data = format!("{number}{padding}");
+            let publish = json!({"op": "publish", "topic": "/text", "msg": {"data": data}});
+            sending.send(say(publish)).await.unwrap();
+        }
+        sending
+    });
+    // It is read before there is a servant: a ping in the middle would be answered, too.
+    let mut ahead = world.client().await;
+    ahead.settled().await;
+    come.send(bridge).ok().unwrap();
+    for number in 0..messages {
+        let message = patiently(heard.messages.recv()).await.unwrap();
+        let data = world.json("std_msgs/String", &message.bytes)["data"].clone();
+        let data = data.as_str().unwrap();
+        assert_eq!(data.trim_end_matches('x'), number.to_string());
+    }
+    let mut sending = patiently(talk).await.unwrap();
+    sending.send(Message::Close(None)).await.unwrap();
+    let closed = patiently(receiving.next()).await.unwrap().unwrap();
+    assert_eq!(closed, Message::Close(None));
+    patiently(session).await.unwrap();
+}
+
+#[tokio::test]
+async fn who_cannot_have_a_servant_is_told_why() {
+    let (waiting, mut client) = connection(&BridgeOptions::default()).await;
+    let refusing = tokio::spawn(waiting.refuse(1013, "the machine is full"));
+    let status = next(&mut client).await;
+    assert!(status.to_text().unwrap().contains("the machine is full"));
+    let Message::Close(Some(close)) = next(&mut client).await else {
+        panic!("not closed")
+    };
+    assert_eq!(u16::from(close.code), 1013);
+    while patiently(client.next()).await.is_some() {}
+    patiently(refusing).await.unwrap();
+}
