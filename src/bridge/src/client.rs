@@ -12,9 +12,10 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use ros::schema::MessageType;
 use rosbridge::{
-    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, Id, Level, Op, Payload,
-    Png, Status,
+    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, GoalStatus, Id, Level, Op,
+    Payload, Png, Status, Writer,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -129,7 +130,7 @@ impl Client {
         let format = frame.format();
         let op = match Op::parse(frame) {
             Ok(op) => op,
-            Err(error) => return self.refuse(error, format),
+            Err(error) => return self.refuse(frame, error),
         };
         if self.hears(Level::Warning) {
             for field in rosbridge::unknown_fields(frame) {
@@ -152,7 +153,9 @@ impl Client {
             format,
         };
         if let Err(reason) = self.perform(inbox, op, &reply, source, wrapping) {
-            self.status(Level::Error, reply.id, format, &format!("{name}: {reason}"));
+            let text = format!("{name}: {reason}");
+            self.status(Level::Error, reply.id.clone(), format, &text);
+            self.answer_is_lost(name, reply.id.as_ref(), &text);
         }
     }
 
@@ -252,8 +255,53 @@ impl Client {
         Ok(())
     }
 
-    fn refuse(&self, error: Error, format: Format) {
-        self.status(Level::Error, error.id.clone(), format, &error.to_string());
+    /// Tells that a message cannot be read; where somebody would wait for ever because of it, that its call has failed.
+    fn refuse(&self, frame: Incoming<'_>, error: Error) {
+        let (format, text) = (frame.format(), error.to_string());
+        self.status(Level::Error, error.id.clone(), format, &text);
+        let op = error.op.as_deref().unwrap_or_default();
+        self.answer_is_lost(op, error.id.as_ref(), &text);
+        let answer = match op {
+            "call_service" => "service_response",
+            "send_action_goal" => "action_result",
+            _ => return,
+        };
+        let field = if op == "call_service" {
+            "service"
+        } else {
+            "action"
+        };
+        let name = rosbridge::text_field(frame, field);
+        // As old clients wrote the id.
+        let suffix = name.as_deref().and_then(|name| name.split_once('#'));
+        let id = error
+            .id
+            .or_else(|| suffix.map(|(_, id)| Id::from(id.to_owned())));
+        let mut out = Vec::with_capacity(256);
+        let mut writer = Writer::op(&mut out, format, answer, id.as_ref());
+        if let Some(name) = &name {
+            writer.text(field, name.split('#').next().unwrap_or_default());
+        }
+        writer.text("values", &text);
+        if op == "send_action_goal" {
+            writer.integer("status", GoalStatus::Unknown as i64);
+        }
+        writer.boolean("result", false);
+        writer.end();
+        let bytes = out.into();
+        self.send_frame(Frame { format, bytes }, None, true);
+    }
+
+    /// Ends the call or goal that the client has answered with something that is of no use: no other answer will come.
+    fn answer_is_lost(&self, op: &str, id: Option<&Id<'_>>, reason: &str) {
+        let Some(id) = id.map(Id::to_string) else {
+            return;
+        };
+        match op {
+            "service_response" => self.response_is_lost(&id, reason),
+            "action_result" => self.result_is_lost(&id, reason),
+            _ => {}
+        }
     }
 
     pub(crate) fn hears(&self, level: Level) -> bool {
@@ -327,6 +375,28 @@ impl Client {
         match wrapped {
             Ok(frame) => self.send_frame(frame, fragment_size, true),
             Err(reason) => self.status(Level::Error, None, Format::Json, &reason),
+        }
+    }
+
+    /// Warns of arguments that the type has no fields for.
+    fn tell_surplus(
+        &self,
+        reply: &Reply,
+        op: &str,
+        message_type: &MessageType,
+        args: Option<Payload<'_>>,
+    ) {
+        let fields = message_type.fields().len();
+        if self.hears(Level::Warning)
+            && let Some(found) = args.and_then(|args| args.list_len())
+            && found > fields
+        {
+            let name = message_type.name();
+            let text = format!(
+                "{op}: {name} has {fields} fields, the last {} of \"args\" were left out",
+                found - fields
+            );
+            self.warn(reply, &text);
         }
     }
 

@@ -28,10 +28,12 @@ impl Frame {
         }
     }
 
-    /// JSON text wrapped as the pixels of a picture.
+    /// JSON text wrapped as the pixels of a picture; in ASCII, since browsers take each byte of it for a character.
     pub(crate) fn into_png(self) -> Result<Frame, String> {
-        let data = rosbridge::encode_png(&self.bytes)
-            .map_err(|error| format!("cannot be packed as png: {error}"))?;
+        let failed = |error: &dyn std::fmt::Display| format!("cannot be packed as png: {error}");
+        let text = std::str::from_utf8(&self.bytes).map_err(|error| failed(&error))?;
+        let ascii = rosbridge::to_ascii(text);
+        let data = rosbridge::encode_png(ascii.as_bytes()).map_err(|error| failed(&error))?;
         let mut out = Vec::with_capacity(data.len() + 64);
         rosbridge::Op::from(rosbridge::Png {
             id: None,

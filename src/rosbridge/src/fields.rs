@@ -296,6 +296,17 @@ impl<'a> Fields<'a> {
         }
     }
 
+    /// A payload that must be an object where it is present; an empty one otherwise.
+    pub(crate) fn object_or_empty(&self, field: &'static str) -> Result<Payload<'a>, Problem> {
+        if self.get(field).is_some() {
+            return self.object(field);
+        }
+        Ok(match self.format {
+            Format::Json => Payload::json("{}"),
+            Format::Cbor => Payload::cbor(b"\xa0"),
+        })
+    }
+
     /// A payload that is an object or a list of arguments, where present.
     pub(crate) fn arguments(&self, field: &'static str) -> Result<Option<Payload<'a>>, Problem> {
         let Some(bytes) = self.get(field) else {

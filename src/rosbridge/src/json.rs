@@ -281,6 +281,29 @@ pub(crate) fn write_string(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
 }
 
+/// JSON text with every character beyond ASCII escaped, which only stand in its strings.
+pub fn to_ascii(json: &str) -> Cow<'_, str> {
+    if json.is_ascii() {
+        return Cow::Borrowed(json);
+    }
+    let mut ascii = String::with_capacity(json.len() * 2);
+    let mut units = [0; 2];
+    for character in json.chars() {
+        if character.is_ascii() {
+            ascii.push(character);
+            continue;
+        }
+        for unit in character.encode_utf16(&mut units) {
+            ascii.push_str("\\u");
+            for shift in [12, 8, 4, 0] {
+                let digit = char::from_digit(u32::from(*unit >> shift) & 0xf, 16);
+                ascii.extend(digit);
+            }
+        }
+    }
+    Cow::Owned(ascii)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -339,6 +362,16 @@ mod tests {
             fields(&deep),
             Err(syntax(133, "nested deeper than 128 levels"))
         );
+    }
+
+    #[test]
+    fn json_becomes_ascii_and_means_the_same() {
+        assert!(matches!(to_ascii(r#"{"a":"b\n"}"#), Cow::Borrowed(_)));
+        let json = r#"{"grüße":["🤖 \u00fc",1]}"#;
+        let ascii = to_ascii(json);
+        assert_eq!(ascii, r#"{"gr\u00fc\u00dfe":["\ud83e\udd16 \u00fc",1]}"#);
+        let read = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+        assert_eq!(read(&ascii), read(json));
     }
 
     #[test]

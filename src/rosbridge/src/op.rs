@@ -195,6 +195,12 @@ pub fn is_known_op(op: &str) -> bool {
     KNOWN.contains(&op)
 }
 
+/// A short text field of a frame, also of one that [`Op::parse`] refuses; none where it is not there or something else.
+pub fn text_field(frame: Frame<'_>, field: &'static str) -> Option<String> {
+    let fields = Fields::of(frame.payload()).ok()?;
+    Some(fields.text(field, "").ok()??.into_owned())
+}
+
 /// The fields of a frame that its op does not have: harmless, but often a misspelt one. Empty for frames that
 /// [`Op::parse`] refuses.
 pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
@@ -307,6 +313,17 @@ pub(crate) mod tests {
             r#"{"op":"unsubscribe","id":{},"topic":"/x"}"#,
             "unsubscribe: field \"id\" is {}, a string or an integer is expected",
         );
+    }
+
+    #[test]
+    fn a_text_is_found_in_a_frame_that_is_refused() {
+        let frame = Frame::Text(r#"{"op":"call_service","service":"/add","args":5,"type":7}"#);
+        assert!(Op::parse(frame).is_err());
+        assert_eq!(text_field(frame, "service").as_deref(), Some("/add"));
+        for field in ["args", "type", "id"] {
+            assert_eq!(text_field(frame, field), None, "{field}");
+        }
+        assert_eq!(text_field(Frame::Text("{"), "service"), None);
     }
 
     #[test]

@@ -98,31 +98,33 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// A list of positional arguments as an object with these names, in the same format; the names that have no
-    /// argument are left out. `None` where it is no list, or has more values than there are names.
-    pub fn named<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Option<Vec<u8>> {
-        let items = match self.format {
+    /// How many values a list has; `None` where it is no list.
+    pub fn list_len(&self) -> Option<usize> {
+        Some(self.items()?.len())
+    }
+
+    fn items(&self) -> Option<Vec<&'a [u8]>> {
+        match self.format {
             Format::Json => {
-                crate::json::Cursor::new(std::str::from_utf8(self.bytes).ok()?).list()?
+                let text = std::str::from_utf8(self.bytes).ok()?;
+                crate::json::Cursor::new(text).list()
             }
-            Format::Cbor => cbor::Cursor::new(self.bytes).list()?,
-        };
-        let mut names = names.into_iter();
+            Format::Cbor => cbor::Cursor::new(self.bytes).list(),
+        }
+    }
+
+    /// A list of positional arguments as an object with these names, in the same format. Names that have no argument
+    /// are left out, as are arguments that have no name. `None` where it is no list, or names more than 23.
+    pub fn named<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Option<Vec<u8>> {
+        let items = self.items()?;
         let mut out = Vec::with_capacity(self.bytes.len() + 16 * items.len());
-        let many = items.len() > crate::writer::MAX_FIELDS;
-        let mut writer = if many {
-            return None;
-        } else {
-            crate::Writer::new(&mut out, self.format)
-        };
-        for item in items {
-            writer.payload(
-                names.next()?,
-                Payload {
-                    format: self.format,
-                    bytes: item,
-                },
-            );
+        let mut writer = crate::Writer::new(&mut out, self.format);
+        for (at, (name, bytes)) in names.into_iter().zip(items).enumerate() {
+            if at == crate::writer::MAX_FIELDS {
+                return None;
+            }
+            let format = self.format;
+            writer.payload(name, Payload { format, bytes });
         }
         writer.end();
         Some(out)
@@ -193,7 +195,9 @@ mod tests {
             r#"{"a":1,"b":"x","c":{"y":[2]}}"#
         );
         assert_eq!(Payload::json("[]").named(["a"]).unwrap(), b"{}");
-        assert_eq!(Payload::json("[1,2]").named(["a"]), None);
+        assert_eq!(Payload::json("[1,2]").named(["a"]).unwrap(), br#"{"a":1}"#);
+        assert_eq!(Payload::json("[1,2]").list_len(), Some(2));
+        assert_eq!(Payload::json("{}").list_len(), None);
         assert_eq!(Payload::json("{}").named(["a"]), None);
         assert_eq!(
             Payload::cbor(b"\x82\x01\x61x").named(["a", "b"]).unwrap(),

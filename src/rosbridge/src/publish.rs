@@ -13,7 +13,7 @@ pub struct Publish<'a> {
     pub id: Option<Id<'a>>,
     /// The topic's name.
     pub topic: Cow<'a, str>,
-    /// The message; [`Payload::raw`] where `compression` is `cbor-raw`.
+    /// The message, an empty object where the client gave none; [`Payload::raw`] where `compression` is `cbor-raw`.
     pub msg: Payload<'a>,
     /// What `msg` holds. Upwards `cbor-raw` must be said; downwards the client knows what it asked for.
     pub compression: Compression,
@@ -59,7 +59,7 @@ impl<'a> Message<'a> for Publish<'a> {
         Ok(Self {
             id,
             topic: fields.required_text("topic", "a topic name")?,
-            msg: fields.object("msg")?,
+            msg: fields.object_or_empty("msg")?,
             compression: Compression::read(fields)?,
             latch: fields.boolean("latch")?.unwrap_or(false),
             type_name: fields.text("type", "a message type such as \"std_msgs/String\"")?,
@@ -115,14 +115,25 @@ mod tests {
     }
 
     #[test]
+    fn without_a_message_it_is_one_of_defaults() {
+        let empty = Publish {
+            msg: Payload::json("{}"),
+            ..hello()
+        };
+        reads(r#"{"op":"publish","topic":"/chatter"}"#, empty.clone());
+        reads(r#"{"op":"publish","topic":"/chatter","msg":null}"#, empty);
+        let frame = b"\xa2\x62op\x67publish\x65topic\x62/x";
+        let Op::Publish(read) = Op::parse(Frame::Binary(frame)).unwrap() else {
+            panic!("not a publish")
+        };
+        assert_eq!(read.msg, Payload::cbor(b"\xa0"));
+    }
+
+    #[test]
     fn publish_is_checked() {
         refuses(
             r#"{"op":"publish","msg":{}}"#,
             "publish: field \"topic\" is missing, a topic name is expected",
-        );
-        refuses(
-            r#"{"op":"publish","topic":"/x"}"#,
-            "publish: field \"msg\" is missing, an object with the message's fields is expected",
         );
         refuses(
             r#"{"op":"publish","topic":"/x","msg":[1,2]}"#,

@@ -11,8 +11,10 @@ use std::sync::Arc;
 use ros::bus::WireType;
 use ros::schema::{ActionDef, MessageType};
 use rosbridge::Id;
+use tokio_util::sync::CancellationToken;
 
 use super::Client;
+use crate::lacking::explain;
 use crate::names::plain_type;
 use crate::outlet::Outlet;
 use crate::shared::Shared;
@@ -25,9 +27,19 @@ pub(super) struct Actions {
     /// Those it sends goals to, by action name.
     used: HashMap<String, Arc<ActionClient>>,
     /// Goals under way, by the id the client gave.
-    goals: HashMap<Id<'static>, (String, String)>,
+    goals: HashMap<Id<'static>, UnderWayGoal>,
     /// Those it serves, by action name.
     served: HashMap<String, Arc<ActionServer>>,
+}
+
+/// A goal that the client can cancel.
+struct UnderWayGoal {
+    /// The action's name.
+    action: String,
+    /// What the server calls it.
+    goal_id: String,
+    /// Cancelled before it was sent.
+    recalled: CancellationToken,
 }
 
 impl Client {
@@ -41,7 +53,7 @@ impl Client {
                 Some(short) => registry.action(short),
                 None => Err(error),
             });
-        def.map_err(|error| format!("action {action}: {error}"))
+        def.map_err(|error| format!("action {action}: {}", explain(error)))
     }
 
     fn action_outlet(

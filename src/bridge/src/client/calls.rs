@@ -12,6 +12,7 @@ use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
 
 use super::publishing::decode_args;
 use super::{Client, Reply, print_format};
+use crate::lacking::explain;
 use crate::names::resolve;
 use crate::rosapi;
 use crate::sample::Frame;
@@ -30,6 +31,13 @@ struct Call {
 }
 
 impl Call {
+    fn reply(&self) -> Reply {
+        Reply {
+            id: self.id.clone(),
+            format: print_format(self.compression),
+        }
+    }
+
     fn args(&self) -> Option<Payload<'_>> {
         self.args.as_ref().map(|(format, bytes)| Payload {
             format: *format,
@@ -121,7 +129,7 @@ impl Client {
             .shared
             .registry
             .service(&service_type.name)
-            .map_err(|error| error.to_string());
+            .map_err(explain);
         let def =
             def.and_then(
                 |def| match def.md5 == service_type.md5 || service_type.md5 == "*" {
@@ -132,6 +140,9 @@ impl Client {
                     )),
                 },
             );
+        if let Ok(def) = &def {
+            self.tell_surplus(&call.reply(), "call_service", &def.request, call.args());
+        }
         let request = match (&def, call.compression, call.args()) {
             (Ok(def), compression, args) => decode_args(&def.request, args, compression)?,
             // ROS bytes both ways need no definition.

@@ -1,14 +1,15 @@
 //! `advertise`, `unadvertise`, `publish`.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use bytes::Bytes;
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::MessageType;
-use rosbridge::{Advertise, Compression, Format, Level, Payload, Publish, Unadvertise};
+use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Unadvertise};
 
 use super::{Client, Reply};
+use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::outlet::Outlet;
 use crate::tf;
@@ -25,11 +26,26 @@ const DEFAULT_QUEUE: u64 = 100;
 /// A client's topics, by their absolute names.
 #[derive(Default)]
 pub(super) struct Outlets {
-    open: HashMap<String, Arc<Outlet>>,
+    open: HashMap<String, Advertised>,
     untyped: HashMap<String, Vec<Untyped>>,
+    /// Topics of which the client has been told why nothing can be published on them.
+    told: HashSet<String>,
+}
+
+/// A topic that is published on until it has been unadvertised as often as it was advertised.
+struct Advertised {
+    outlet: Arc<Outlet>,
+    /// Those of its advertisements; none where it was only published on.
+    ids: HashSet<Option<Id<'static>>>,
 }
 
 impl Outlets {
+    /// How many advertisements there are.
+    fn count(&self) -> usize {
+        let known = self.open.values();
+        known.map(|known| known.ids.len().max(1)).sum()
+    }
+
     /// Names of the topics advertised.
     pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
         self.open.keys().map(String::as_str)
@@ -51,7 +67,11 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
-        let message_type = self.publishable_type(&topic, &op.type_name)?;
+        let message_type = self
+            .publishable_type(&topic, &op.type_name)
+            .inspect_err(|_| {
+                self.note_told(&topic);
+            })?;
         if let Some(md5) = op
             .md5sum
             .as_deref()
@@ -63,22 +83,38 @@ impl Client {
                 message_type.md5()
             ));
         }
-        self.open_outlet(&topic, message_type, op.latch, op.queue_size, reply)?;
+        self.open_outlet(&topic, message_type, op.latch, op.queue_size, reply, true)?;
         self.info(reply, &format!("advertise: advertised {topic}"));
         Ok(())
     }
 
     pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &Reply) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
-        let gone = self.outlets.lock().open.remove(&*topic);
-        match gone {
-            Some(_) => self.info(
+        let mut outlets = self.outlets.lock();
+        outlets.told.remove(&*topic);
+        let known = outlets.open.get_mut(&*topic);
+        // Without an id all of the client's advertisements are meant.
+        let left = known.map(|known| match reply.id {
+            None => Some(0),
+            Some(_) => known.ids.remove(&reply.id).then_some(known.ids.len()),
+        });
+        let (gone, warning) = match left {
+            None => (None, Some("this client does not advertise")),
+            Some(None) => (None, Some("no advertisement with this id is there of")),
+            Some(Some(0)) => (outlets.open.remove(&*topic), None),
+            Some(Some(_)) => (None, None),
+        };
+        // The outlet goes outside of the lock.
+        drop(outlets);
+        match (&gone, warning) {
+            (_, Some(warning)) => self.warn(reply, &format!("unadvertise: {warning} {topic}")),
+            (Some(_), None) => self.info(
                 reply,
                 &format!("unadvertise: {topic} is no longer advertised"),
             ),
-            None => self.warn(
+            (None, None) => self.info(
                 reply,
-                &format!("unadvertise: this client does not advertise {topic}"),
+                &format!("unadvertise: {topic} stays advertised, under another id"),
             ),
         }
         Ok(())
@@ -100,7 +136,26 @@ impl Client {
         self.shared
             .registry
             .message(&name)
-            .map_err(|error| format!("topic {topic}: {error}"))
+            .map_err(|error| format!("topic {topic}: {}", explain(error)))
+    }
+
+    /// The client is being told why nothing can be published on a topic. Gives whether it had been before.
+    fn note_told(&self, topic: &str) -> bool {
+        let mut outlets = self.outlets.lock();
+        // Topics whose names never end must not fill the memory.
+        if outlets.told.len() >= self.shared.options.max_advertisements {
+            outlets.told.clear();
+        }
+        !outlets.told.insert(topic.to_owned())
+    }
+
+    /// Gives the reason why a message cannot be published with the first such message of its topic: more of them may
+    /// come by the hundred.
+    fn tell_once(&self, topic: &str, reason: String) -> Result<(), String> {
+        match self.note_told(topic) {
+            false => Err(reason),
+            true => Ok(()),
+        }
     }
 
     fn open_outlet(
@@ -110,24 +165,39 @@ impl Client {
         latch: bool,
         queue_size: Option<u64>,
         reply: &Reply,
+        advertised: bool,
     ) -> Result<Arc<Outlet>, String> {
         let limit = self.shared.options.max_advertisements;
+        let id = advertised.then(|| reply.id.clone());
         let mut outlets = self.outlets.lock();
-        if let Some(known) = outlets.open.get(topic) {
-            if known.message_type.md5() != message_type.md5() {
-                let known = known.message_type.name();
-                return Err(format!(
-                    "this client advertises {topic} as {known}; unadvertise it first"
-                ));
-            }
-            if known.latch == latch {
-                return Ok(known.clone());
-            }
-        } else if outlets.open.len() >= limit {
+        let count = outlets.count();
+        let known = outlets.open.get_mut(topic);
+        if let Some(known) = &known
+            && known.outlet.message_type.md5() != message_type.md5()
+        {
+            let known = known.outlet.message_type.name();
+            return Err(format!(
+                "this client advertises {topic} as {known}; unadvertise it first"
+            ));
+        }
+        let is_new = known
+            .as_ref()
+            .is_none_or(|known| id.as_ref().is_some_and(|id| !known.ids.contains(id)));
+        if is_new && count >= limit {
             return Err(format!(
                 "this client advertises {limit} topics already; unadvertise one"
             ));
         }
+        let mut ids = HashSet::new();
+        if let Some(known) = known {
+            if known.outlet.latch == latch || !advertised {
+                known.ids.extend(id);
+                return Ok(known.outlet.clone());
+            }
+            ids = std::mem::take(&mut known.ids);
+        }
+        ids.extend(id);
+        outlets.told.remove(topic);
         let queue = queue_size
             .filter(|size| *size > 0)
             .unwrap_or(DEFAULT_QUEUE)
@@ -143,7 +213,11 @@ impl Client {
             self.shared.republisher.listen(&self.shared);
         }
         let outlet = Outlet::open(&self.shared, topic, message_type, latch, queue, failed);
-        let replaced = outlets.open.insert(topic.to_owned(), outlet.clone());
+        let opened = Advertised {
+            outlet: outlet.clone(),
+            ids,
+        };
+        let replaced = outlets.open.insert(topic.to_owned(), opened);
         drop(outlets);
         drop(replaced);
         Ok(outlet)
@@ -156,26 +230,32 @@ impl Client {
         source: Option<&Bytes>,
     ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
-        let known = self.outlets.lock().open.get(&*topic).cloned();
+        let known = self
+            .outlets
+            .lock()
+            .open
+            .get(&*topic)
+            .map(|known| known.outlet.clone());
         let outlet = match known {
             Some(outlet) => outlet,
-            None => match self.type_to_publish(&topic, &op)? {
-                Some(message_type) => {
-                    self.open_outlet(&topic, message_type, op.latch, None, reply)?
+            None => match self.type_to_publish(&topic, &op) {
+                Ok(Some(message_type)) => {
+                    self.open_outlet(&topic, message_type, op.latch, None, reply, false)?
                 }
-                None => return self.publish_later(&topic, &op, reply),
+                Ok(None) => return self.publish_later(&topic, &op, reply),
+                Err(reason) => return self.tell_once(&topic, reason),
             },
         };
         let bytes = decode(&outlet.message_type, op.msg, op.compression, source)
             .map_err(|reason| format!("topic {topic}: {reason}"))?;
         outlet.publish(bytes);
-        if op.compression != Compression::CborRaw && self.hears(Level::Info) {
+        if op.compression != Compression::CborRaw && self.hears(Level::Warning) {
             self.tell_defaults(&topic, &outlet.message_type, op.msg, reply);
         }
         Ok(())
     }
 
-    /// Names the message's own fields that were left out.
+    /// Names the message's own fields that were left out; not a header, which clients may leave to the server.
     fn tell_defaults(
         &self,
         topic: &str,
@@ -184,14 +264,16 @@ impl Client {
         reply: &Reply,
     ) {
         let Some(given) = msg.keys() else { return };
+        let headers = usize::from(message_type.has_header());
         let fields = message_type.fields().iter().map(|field| &field.name);
         let missing: Vec<_> = fields
+            .skip(headers)
             .filter(|name| !given.contains(name))
             .map(|name| format!("{name:?}"))
             .collect();
         if !missing.is_empty() {
             let missing = missing.join(", ");
-            self.info(
+            self.warn(
                 reply,
                 &format!("publish: topic {topic}: defaults stand for {missing}"),
             );
@@ -273,8 +355,14 @@ impl Client {
             let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
             for message in waiting {
                 let done = found.clone().and_then(|message_type| {
-                    let outlet =
-                        client.open_outlet(&topic, message_type, false, None, &message.reply)?;
+                    let outlet = client.open_outlet(
+                        &topic,
+                        message_type,
+                        false,
+                        None,
+                        &message.reply,
+                        false,
+                    )?;
                     let payload = Payload {
                         format: message.format,
                         bytes: &message.payload,
@@ -287,7 +375,9 @@ impl Client {
                     )?);
                     Ok(())
                 });
-                if let Err(reason) = done {
+                if let Err(reason) = done
+                    && !client.note_told(&topic)
+                {
                     client.error(&message.reply, &format!("publish: topic {topic}: {reason}"));
                 }
             }
@@ -327,7 +417,8 @@ pub(super) fn decode(
     Ok(Bytes::from(out))
 }
 
-/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults.
+/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults, and what a list
+/// has too many is left out.
 pub(super) fn decode_args(
     message_type: &MessageType,
     args: Option<Payload<'_>>,
@@ -342,13 +433,7 @@ pub(super) fn decode_args(
             let fields = message_type.fields();
             let named = list
                 .named(fields.iter().map(|field| field.name.as_str()))
-                .ok_or_else(|| {
-                    format!(
-                        "{} has {} fields, \"args\" has more",
-                        message_type.name(),
-                        fields.len()
-                    )
-                })?;
+                .ok_or("field \"args\" is a list of too many values; name them in an object")?;
             decode(
                 message_type,
                 Payload {

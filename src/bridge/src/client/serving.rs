@@ -13,6 +13,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::publishing::decode_args;
 use super::{Client, Reply, print_format};
+use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::sample::Frame;
 
@@ -147,7 +148,7 @@ impl Client {
             .shared
             .registry
             .service(&plain_type(&op.type_name))
-            .map_err(|error| format!("service {service}: {error}"))?;
+            .map_err(|error| format!("service {service}: {}", explain(error)))?;
         let limit = self.shared.options.max_advertisements;
         let number = self.shared.next_number();
         let stop = CancellationToken::new();
@@ -174,6 +175,7 @@ impl Client {
             );
         }
         drop(earlier);
+        self.warn_of_takeover(&service, reply);
         let handler = Arc::new(Handler {
             client: Arc::downgrade(self),
             service: service.clone(),
@@ -234,6 +236,22 @@ impl Client {
         Ok(())
     }
 
+    /// Who registers a service last has it: the node that served it until now is called no more.
+    fn warn_of_takeover(&self, service: &str, reply: &Reply) {
+        let bus = &self.shared.bus;
+        let graph = bus.graph().borrow().clone();
+        if let Some(node) = graph.services.get(service)
+            && node != bus.node()
+        {
+            self.warn(
+                reply,
+                &format!(
+                    "advertise_service: {service} was served by {node}, this client takes its place"
+                ),
+            );
+        }
+    }
+
     pub(super) fn unadvertise_service(
         &self,
         op: &UnadvertiseService<'_>,
@@ -270,6 +288,15 @@ impl Client {
             ),
         }
         Ok(())
+    }
+
+    /// The client's answer to that call is of no use: its caller waits no longer.
+    pub(super) fn response_is_lost(&self, id: &str, reason: &str) {
+        let request = self.services.lock().requests.remove(id);
+        if let Some(Request { answer, .. }) = request {
+            // The caller may have given up.
+            let _ = answer.send(Err(format!("the client's answer is of no use: {reason}")));
+        }
     }
 
     pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), String> {

@@ -8,6 +8,7 @@ use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 
 use super::{Client, Reply};
 use crate::hub::{Listener, Listening};
+use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::outbox::{Outbox, TopicKey};
 use crate::sample::Sample;
@@ -183,7 +184,7 @@ impl Client {
             // A publisher brings the definition along, and for ROS bytes none is needed.
             Err(_) if op.compression == Compression::CborRaw => Ok(None),
             Err(_) if nodes.is_some_and(|nodes| !nodes.publishers.is_empty()) => Ok(None),
-            Err(error) => Err(format!("topic {topic}: {error}")),
+            Err(error) => Err(format!("topic {topic}: {}", explain(error))),
         }
     }
 

@@ -17,6 +17,9 @@ use crate::{presence, tf};
 /// Services asked for their type at once.
 const ASKED_AT_ONCE: usize = 16;
 
+/// Where every node of ROS tells its log, rosapi's included.
+const ROSOUT: (&str, &str) = ("/rosout", "rosgraph_msgs/Log");
+
 /// Nobody has said yet: rosapi writes it so.
 fn type_of(nodes: &TopicNodes) -> &str {
     if nodes.type_name == "*" {
@@ -45,6 +48,12 @@ pub(super) fn with_own_topics(graph: &Graph) -> Graph {
             end.push(NODE.to_owned());
         }
     }
+    let (topic, type_name) = ROSOUT;
+    let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
+    if matches!(nodes.type_name.as_str(), "" | "*") {
+        nodes.type_name = type_name.to_owned();
+    }
+    nodes.publishers.push(NODE.to_owned());
     for topic in presence::TOPICS {
         let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
         if nodes.publishers.is_empty() {

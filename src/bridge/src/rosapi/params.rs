@@ -44,10 +44,19 @@ pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
 
 pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
     let value: ParamValue = serde_json::from_str(&args.value).map_err(|_| {
-        format!(
-            "field \"value\" is {:?}, JSON text (a boolean, number, string, list or object) is expected",
-            args.value.chars().take(48).collect::<String>()
-        )
+        let shown: String = args.value.chars().take(48).collect();
+        let given = serde_json::from_str::<Value>(&args.value);
+        match given.ok().and_then(|given| null_in(&given, String::new())) {
+            Some(place) if place.is_empty() => {
+                "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one".to_owned()
+            }
+            Some(place) => {
+                format!("field \"value\" holds null at {place}, which no ROS parameter can; leave it out")
+            }
+            None => format!(
+                "field \"value\" is {shown:?}, JSON text (a boolean, number, string, list or object) is expected"
+            ),
+        }
     })?;
     shared
         .bus
@@ -55,6 +64,21 @@ pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
         .await
         .map_err(failed)?;
     Ok(json!({}))
+}
+
+/// The place of the first null in a value, from its top: `/robot/arms/0`.
+fn null_in(value: &Value, place: String) -> Option<String> {
+    match value {
+        Value::Null => Some(place),
+        Value::Array(items) => items
+            .iter()
+            .enumerate()
+            .find_map(|(at, item)| null_in(item, format!("{place}/{at}"))),
+        Value::Object(members) => members
+            .iter()
+            .find_map(|(name, member)| null_in(member, format!("{place}/{name}"))),
+        _ => None,
+    }
 }
 
 pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {

@@ -7,6 +7,7 @@ use ros::schema::{Arity, Base, MessageType, Primitive, Registry};
 use serde_json::{Value, json};
 
 use super::with_own;
+use crate::lacking::explain;
 use crate::names::plain_type;
 
 pub(super) fn message(registry: &Registry, type_name: &str) -> Result<Value, String> {
@@ -18,17 +19,13 @@ pub(super) fn message(registry: &Registry, type_name: &str) -> Result<Value, Str
         return Ok(json!({ "typedefs": [] }));
     }
     let found = with_own(registry, |registry| registry.message(&name));
-    found
-        .map(|found| typedefs(&found))
-        .map_err(|error| error.to_string())
+    found.map(|found| typedefs(&found)).map_err(explain)
 }
 
 pub(super) fn request(registry: &Registry, type_name: &str) -> Result<Value, String> {
     let name = plain_type(type_name);
     let found = with_own(registry, |registry| registry.service(&name));
-    found
-        .map(|found| typedefs(&found.request))
-        .map_err(|error| error.to_string())
+    found.map(|found| typedefs(&found.request)).map_err(explain)
 }
 
 pub(super) fn response(registry: &Registry, type_name: &str) -> Result<Value, String> {
@@ -36,7 +33,7 @@ pub(super) fn response(registry: &Registry, type_name: &str) -> Result<Value, St
     let found = with_own(registry, |registry| registry.service(&name));
     found
         .map(|found| typedefs(&found.response))
-        .map_err(|error| error.to_string())
+        .map_err(explain)
 }
 
 fn typedefs(message: &Arc<MessageType>) -> Value {

@@ -80,6 +80,44 @@ async fn a_goal_goes_with_feedback_to_its_result() {
             (&answer["id"], &answer["status"], &answer["result"]),
             (&json!("h"), &json!(6), &json!(true))
         );
+        assert_eq!(answer.get("text"), None, "{answer}");
+
+        // It fails and says why, or how far it has come.
+        for (values, text, all) in [
+            (
+                json!("no more fingers"),
+                json!("no more fingers"),
+                json!([]),
+            ),
+            (json!({"all": [1]}), Value::Null, json!([1])),
+        ] {
+            user.send(goal("why", json!([5]))).await;
+            let asked = server.json().await;
+            server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": values, "result": false})).await;
+            let answer = user.json().await;
+            assert_eq!(
+                (&answer["id"], &answer["status"]),
+                (&json!("why"), &json!(6))
+            );
+            assert_eq!((&answer["text"], &answer["values"]["all"]), (&text, &all));
+        }
+
+        // What it says cannot be understood.
+        user.send(goal("lost", json!([5]))).await;
+        let asked = server.json().await;
+        server
+            .send(
+                json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {}}),
+            )
+            .await;
+        assert!(server.refusal().await.contains("\"result\" is missing"));
+        let answer = user.json().await;
+        assert_eq!(
+            (&answer["id"], &answer["status"]),
+            (&json!("lost"), &json!(6))
+        );
+        let text = answer["text"].as_str().unwrap();
+        assert!(text.contains("\"result\" is missing"), "{text}");
 
         // It is cancelled.
         user.send(goal("i", json!({"to": 9}))).await;
@@ -189,4 +227,63 @@ async fn the_topics_of_an_action_can_be_used_directly_too() {
     user.send(json!({"op": "call_service", "service": "/rosapi/action_servers"}))
         .await;
     assert_eq!(user.json().await["op"], "service_response");
+}
+
+#[tokio::test]
+async fn a_goal_that_is_cancelled_before_its_server_is_there_is_never_sent() {
+    let world = World::new().await;
+    let other = world.another_bridge().await;
+    let mut user = Client::connect(&other, SessionOptions::default()).await;
+    user.send(goal("g", json!({"to": 3}))).await;
+    user.send(json!({"op": "cancel_action_goal", "id": "g", "action": "/count"}))
+        .await;
+    assert_eq!(
+        user.json().await,
+        json!({"op": "action_result", "id": "g", "action": "/count", "values": {"all": []}, "status": 5, "result": true})
+    );
+    // The server comes, and hears of the next goal only.
+    let mut server = world.client().await;
+    serve(&mut server).await;
+    user.send(goal("h", json!({"to": 4}))).await;
+    let asked = server.json().await;
+    assert_eq!(
+        (&asked["op"], &asked["args"]),
+        (&json!("send_action_goal"), &json!({"to": 4}))
+    );
+    user.send(json!({"op": "cancel_action_goal", "id": "h", "action": "/count"}))
+        .await;
+    assert_eq!(server.json().await["op"], "cancel_action_goal");
+}
+
+#[tokio::test]
+async fn a_cancel_that_is_faster_than_its_goal_is_kept() {
+    let world = World::new().await;
+    let (mut server, mut user) = (world.client().await, world.client().await);
+    serve(&mut server).await;
+    user.send(
+        json!({"op": "subscribe", "topic": "/count/result", "type": "x_msgs/CountActionResult"}),
+    )
+    .await;
+    for (topic, type_name) in [
+        ("/count/cancel", "actionlib_msgs/GoalID"),
+        ("/count/goal", "x_msgs/CountActionGoal"),
+    ] {
+        user.send(json!({"op": "advertise", "topic": topic, "type": type_name}))
+            .await;
+    }
+    let id = |id: &str, secs: u32| json!({"stamp": {"secs": secs, "nsecs": 0}, "id": id});
+    let publish = |topic: &str, msg: Value| json!({"op": "publish", "topic": topic, "msg": msg});
+    let sent = |id: Value| publish("/count/goal", json!({"goal_id": id, "goal": {"to": 1}}));
+    // By its id, and by the time up to which all are cancelled.
+    user.send(publish("/count/cancel", id("early", 0))).await;
+    user.send(publish("/count/cancel", id("", 5))).await;
+    for (name, secs) in [("early", 7), ("old", 5)] {
+        user.send(sent(id(name, secs))).await;
+        let result = user.json().await;
+        assert_eq!(result["msg"]["status"]["goal_id"]["id"], name);
+        // Recalled: it was never begun.
+        assert_eq!(result["msg"]["status"]["status"], 8, "{result}");
+    }
+    user.send(sent(id("new", 6))).await;
+    assert_eq!(server.json().await["op"], "send_action_goal");
 }

@@ -19,7 +19,7 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
         (
             json!({"op": "publish", "topic": "/a", "msg": {"data": "x"}, "type": "std_msgs/String", "latch": false,
                 "compression": "none"}),
-            &["topic", "msg"],
+            &["topic"],
         ),
         (
             json!({"op": "subscribe", "topic": "/a", "type": "std_msgs/String", "throttle_rate": 1, "queue_length": 1,

@@ -51,15 +51,16 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
     assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
     // Who wants to know is told.
     client
-        .send(json!({"op": "set_level", "level": "info"}))
+        .send(json!({"op": "set_level", "level": "warning"}))
         .await;
     client
         .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": {"x": 2, "near": []}}))
         .await;
+    // The header is the server's affair, as the protocol says.
     assert_eq!(
         client.json().await,
-        json!({"op": "status", "id": "p", "level": "info",
-            "msg": "publish: topic /place: defaults stand for \"header\", \"tags\""})
+        json!({"op": "status", "id": "p", "level": "warning",
+            "msg": "publish: topic /place: defaults stand for \"tags\""})
     );
 }
 
@@ -209,7 +210,7 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "advertise: topic /lost: no definition of x_msgs/Lost is known, install the package that has it or supply its text"
+        "advertise: topic /lost: no definition of x_msgs/Lost is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too"
     );
     client
         .send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/Int32"}))
@@ -235,4 +236,130 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
             .starts_with("publish: topic /place: ")
     );
     client.settled().await;
+}
+
+#[tokio::test]
+async fn a_message_that_is_left_out_is_one_of_defaults() {
+    let world = World::new().await;
+    let mut heard = world.node_subscribes("/place", "x_msgs/Place").await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
+        .await;
+    client
+        .send(json!({"op": "publish", "topic": "/place"}))
+        .await;
+    let message = patiently(heard.messages.recv()).await.unwrap();
+    let value = world.json("x_msgs/Place", &message.bytes);
+    assert_eq!((&value["x"], &value["tags"]), (&json!(0.0), &json!([])));
+    assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
+    client.settled().await;
+}
+
+#[tokio::test]
+async fn stamps_may_be_written_as_in_ros_2() {
+    let world = World::new().await;
+    let mut heard = world.node_subscribes("/place", "x_msgs/Place").await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
+        .await;
+    for stamp in [
+        json!({"sec": 5, "nanosec": 6}),
+        json!({"nanosec": 6, "sec": 5}),
+        json!({"secs": 5, "nsecs": 6}),
+    ] {
+        let header = json!({"stamp": stamp});
+        client
+            .send(json!({"op": "publish", "topic": "/place", "msg": {"header": header}}))
+            .await;
+        let message = patiently(heard.messages.recv()).await.unwrap();
+        let value = world.json("x_msgs/Place", &message.bytes);
+        assert_eq!(value["header"]["stamp"], json!({"secs": 5, "nsecs": 6}));
+    }
+    client.settled().await;
+}
+
+#[tokio::test]
+async fn a_topic_stays_until_its_last_advertisement_is_taken_back() {
+    let world = World::new().await;
+    let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "set_level", "level": "warning"}))
+        .await;
+    for id in ["one", "two", "two"] {
+        client
+            .send(json!({"op": "advertise", "id": id, "topic": "/text", "type": "std_msgs/String"}))
+            .await;
+    }
+    let unadvertise = |id| json!({"op": "unadvertise", "id": id, "topic": "/text"});
+    client.send(unadvertise("other")).await;
+    assert_eq!(
+        client.json().await["msg"],
+        "unadvertise: no advertisement with this id is there of /text"
+    );
+    client.send(unadvertise("one")).await;
+    client
+        .send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}}))
+        .await;
+    patiently(heard.messages.recv()).await.unwrap();
+    client.settled().await;
+    world
+        .in_graph(|graph| !graph.topics["/text"].publishers.is_empty())
+        .await;
+    client.send(unadvertise("two")).await;
+    world
+        .in_graph(|graph| graph.topics["/text"].publishers.is_empty())
+        .await;
+    client.send(unadvertise("two")).await;
+    assert_eq!(
+        client.json().await["msg"],
+        "unadvertise: this client does not advertise /text"
+    );
+
+    // Without an id all of them are meant.
+    for id in ["one", "two"] {
+        client
+            .send(json!({"op": "advertise", "id": id, "topic": "/text", "type": "std_msgs/String"}))
+            .await;
+    }
+    world
+        .in_graph(|graph| !graph.topics["/text"].publishers.is_empty())
+        .await;
+    client
+        .send(json!({"op": "unadvertise", "topic": "/text"}))
+        .await;
+    world
+        .in_graph(|graph| graph.topics["/text"].publishers.is_empty())
+        .await;
+}
+
+#[tokio::test]
+async fn why_nothing_can_be_published_is_said_once() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "advertise", "topic": "/plan", "type": "nav_msgs/Path"}))
+        .await;
+    assert_eq!(
+        client.refusal().await,
+        "advertise: topic /plan: no definition of nav_msgs/Path is known here; \
+         whoever deploys this service can add it: cloudroidctl push … --with ros-nav-msgs"
+    );
+    let typed = json!({"op": "publish", "topic": "/route", "type": "nav_msgs/Path", "msg": {}});
+    let untyped = json!({"op": "publish", "topic": "/plan", "msg": {}});
+    for _ in 0..10 {
+        client.send(untyped.clone()).await;
+        client.send(typed.clone()).await;
+    }
+    // The one of the topic that was advertised has been said; of the other it is said now.
+    assert!(client.refusal().await.contains("--with ros-nav-msgs"));
+    client.settled().await;
+    // Who asks again is told again.
+    client
+        .send(json!({"op": "unadvertise", "topic": "/route"}))
+        .await;
+    client.send(typed).await;
+    client.refusal().await;
 }

@@ -59,6 +59,7 @@ async fn topics_nodes_and_services_are_found() {
             "/client_count",
             "/connected_clients",
             "/number",
+            "/rosout",
             "/text",
             "/tf2_web_republisher/cancel",
             "/tf2_web_republisher/feedback",
@@ -68,10 +69,10 @@ async fn topics_nodes_and_services_are_found() {
         ])
     );
     assert_eq!(topics["types"][2], "std_msgs/Int32");
-    assert_eq!(topics["types"][8], "actionlib_msgs/GoalStatusArray");
+    assert_eq!(topics["types"][9], "actionlib_msgs/GoalStatusArray");
     let raw = ask(&mut client, "topics_and_raw_types", json!({})).await;
     assert_eq!(raw["typedefs_full_text"][2], "int32 data\n");
-    assert_eq!(raw["typedefs_full_text"][3], "string data\n");
+    assert_eq!(raw["typedefs_full_text"][4], "string data\n");
     assert_eq!(
         ask(&mut client, "topic_type", json!({"topic": "/text"})).await,
         json!({"type": "std_msgs/String"})
@@ -265,6 +266,16 @@ async fn questions_that_make_no_sense_are_answered_with_the_reason() {
             json!({"name": "/p", "value": "{"}),
             "field \"value\" is \"{\", JSON text",
         ),
+        (
+            "set_param",
+            json!({"name": "/p", "value": "null"}),
+            "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one",
+        ),
+        (
+            "set_param",
+            json!({"name": "/p", "value": r#"{"arms": [1, null]}"#}),
+            "field \"value\" holds null at /arms/1, which no ROS parameter can; leave it out",
+        ),
         ("get_param", json!({}), "field \"name\" is missing"),
         (
             "get_param",
@@ -324,4 +335,24 @@ async fn rosapi_speaks_cbor_and_ros_bytes_too() {
             _ => assert_eq!(values.bytes, b"\xa2\x67version\x01\x66distro\x66noetic"),
         }
     }
+}
+
+#[tokio::test]
+async fn rosapi_tells_its_log_as_every_node_does() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    let rosout = json!({"topic": "/rosout"});
+    let publishers = ask(&mut client, "publishers", rosout.clone()).await;
+    assert_eq!(publishers["publishers"], json!(["/rosapi"]));
+    assert_eq!(
+        ask(&mut client, "topic_type", rosout).await["type"],
+        "rosgraph_msgs/Log"
+    );
+    let found = ask(
+        &mut client,
+        "topics_for_type",
+        json!({"type": "rosgraph_msgs/Log"}),
+    )
+    .await;
+    assert_eq!(found["topics"], json!(["/rosout"]));
 }

@@ -59,6 +59,8 @@ async fn a_service_is_called_with_names_by_position_and_with_nothing() {
         (json!([4, 5]), 9),
         (json!([7]), 7),
         (json!([]), 0),
+        // What is too much is left out, as rosbridge does.
+        (json!([1, 2, 3]), 3),
     ] {
         client.send(json!({"op": "call_service", "id": 5, "service": "add", "args": args, "type": "x_msgs/Add"})).await;
         assert_eq!(
@@ -91,10 +93,6 @@ async fn calls_fail_with_a_reason() {
         (
             json!({"service": "/add", "args": {"c": 1}}),
             "field c of x_msgs/AddRequest: there is no such field",
-        ),
-        (
-            json!({"service": "/add", "args": [1, 2, 3]}),
-            "x_msgs/AddRequest has 2 fields, \"args\" has more",
         ),
         (
             json!({"service": "/1add"}),
@@ -494,4 +492,123 @@ async fn services_are_advertised_anew_and_taken_back() {
     world
         .in_graph(|graph| !graph.services.contains_key("/s"))
         .await;
+}
+
+#[tokio::test]
+async fn arguments_that_are_too_many_are_told_as_a_warning() {
+    let world = World::new().await;
+    let _served = serves(&world, "/add", None).await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "set_level", "level": "warning"}))
+        .await;
+    client
+        .send(json!({"op": "call_service", "id": "c", "service": "/add", "args": [1, 2, 3, 4]}))
+        .await;
+    assert_eq!(
+        client.json().await,
+        json!({"op": "status", "id": "c", "level": "warning",
+            "msg": "call_service: x_msgs/AddRequest has 2 fields, the last 2 of \"args\" were left out"})
+    );
+    assert_eq!(client.json().await["values"], json!({"sum": 3}));
+}
+
+#[tokio::test]
+async fn a_call_that_cannot_be_read_is_answered_all_the_same() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    for (call, answer) in [
+        (
+            json!({"op": "call_service", "id": "c", "service": "/add", "args": 5}),
+            json!({"op": "service_response", "id": "c", "service": "/add"}),
+        ),
+        (
+            json!({"op": "call_service", "service": "/add#7", "timeout": "soon"}),
+            json!({"op": "service_response", "id": "7", "service": "/add"}),
+        ),
+        (
+            json!({"op": "call_service", "id": 3}),
+            json!({"op": "service_response", "id": 3}),
+        ),
+        (
+            json!({"op": "send_action_goal", "id": "g", "action": "/count", "args": {}}),
+            json!({"op": "action_result", "id": "g", "action": "/count", "status": 0}),
+        ),
+    ] {
+        client.send(call).await;
+        let reason = client.refusal().await;
+        let mut expected = answer;
+        expected["result"] = json!(false);
+        expected["values"] = json!(reason);
+        assert_eq!(client.json().await, expected);
+    }
+    client.settled().await;
+}
+
+#[tokio::test]
+async fn who_answers_with_nonsense_keeps_no_caller_waiting() {
+    let world = World::new().await;
+    let mut server = world.client().await;
+    let mut caller = world.client().await;
+    server
+        .send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"}))
+        .await;
+    world
+        .in_graph(|graph| graph.services.contains_key("/add"))
+        .await;
+    for (answer, reason) in [
+        (json!({"values": {"sum": 3}}), "field \"result\" is missing"),
+        (
+            json!({"values": {"sum": 3}, "result": "yes"}),
+            "field \"result\" is \"yes\"",
+        ),
+        (
+            json!({"service": "/other", "result": true}),
+            "not of /other",
+        ),
+    ] {
+        caller
+            .send(json!({"op": "call_service", "id": "c", "service": "/add"}))
+            .await;
+        let request = server.json().await;
+        let mut response =
+            json!({"op": "service_response", "id": request["id"], "service": "/add"});
+        for (field, value) in answer.as_object().unwrap() {
+            response[field] = value.clone();
+        }
+        server.send(response).await;
+        assert!(server.refusal().await.contains(reason), "{reason}");
+        let heard = caller.json().await;
+        assert_eq!(
+            (&heard["id"], &heard["result"]),
+            (&json!("c"), &json!(false))
+        );
+        let said = heard["values"].as_str().unwrap();
+        assert!(said.contains(reason), "{said}");
+    }
+}
+
+#[tokio::test]
+async fn who_takes_over_a_service_of_a_node_is_warned() {
+    let world = World::new().await;
+    let _served = serves(&world, "/add", None).await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "set_level", "level": "warning"}))
+        .await;
+    // The bridge knows of the node's service by then.
+    client
+        .send(json!({"op": "call_service", "id": "c", "service": "/add"}))
+        .await;
+    client.json().await;
+    while world.bridge.metrics().calls_failed.get() > 0 {
+        panic!("the bridge does not know of the service");
+    }
+    let advertise = json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"});
+    client.send(advertise).await;
+    assert_eq!(
+        client.json().await,
+        json!({"op": "status", "level": "warning",
+            "msg": "advertise_service: /add was served by /node, this client takes its place"})
+    );
 }

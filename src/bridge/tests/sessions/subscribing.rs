@@ -1,6 +1,8 @@
 //! Topics from nodes to clients.
 
-use bridge::SessionOptions;
+use std::time::Duration;
+
+use bridge::{BridgeOptions, SessionOptions};
 use ros::codec::{self, FillOptions};
 use rosbridge::{Frame, Op};
 use serde_json::json;
@@ -33,6 +35,8 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
                 let packed = client.json().await;
                 assert_eq!(packed["op"], "png");
                 let text = rosbridge::decode_png(packed["data"].as_str().unwrap(), 10_000).unwrap();
+                // Browsers take each byte for a character.
+                assert!(text.is_ascii(), "{text}");
                 let unpacked: serde_json::Value = serde_json::from_str(&text).unwrap();
                 assert_eq!(
                     unpacked,
@@ -209,7 +213,7 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "subscribe: topic /nothing: no definition of x_msgs/Lost is known, install the package that has it or supply its text"
+        "subscribe: topic /nothing: no definition of x_msgs/Lost is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too"
     );
     client
         .send(json!({"op": "subscribe", "topic": "/text", "type": "std_msgs/Int32"}))
@@ -398,4 +402,30 @@ async fn clients_hear_each_other_and_themselves_but_links_do_not() {
         );
     }
     link.settled().await;
+}
+
+#[tokio::test]
+async fn the_end_of_a_burst_comes_by_itself() {
+    // Nothing else wakes the session: no pings, no frames of the client.
+    let quiet = BridgeOptions {
+        ping_interval: Duration::ZERO,
+        idle_timeout: Duration::ZERO,
+        ..BridgeOptions::default()
+    };
+    let world = World::with(quiet).await;
+    let publisher = world
+        .node_publishes("/number", "std_msgs/Int32", false)
+        .await;
+    for _ in 0..10 {
+        let mut client = world.client().await;
+        client
+            .send(json!({"op": "subscribe", "topic": "/number", "throttle_rate": 20, "queue_length": 2}))
+            .await;
+        client.settled().await;
+        connected(publisher.as_ref(), 1).await;
+        for number in 1..=10 {
+            publisher.publish(world.message("std_msgs/Int32", json!({"data": number})));
+        }
+        while client.json().await["msg"] != json!({"data": 10}) {}
+    }
 }

@@ -257,7 +257,7 @@ impl<I: Input> Filler<'_, I> {
                 _ => self.input.number::<i32>().map(|part| part as u32),
             };
             let part = part.map_err(|fault| fault.in_field(&TIME_MEMBERS.list()[index].name))?;
-            self.out[begin + 4 * index..][..4].copy_from_slice(&part.to_le_bytes());
+            self.out[begin + 4 * (index % 2)..][..4].copy_from_slice(&part.to_le_bytes());
             expected = index + 1;
         }
         Ok(())
@@ -336,8 +336,8 @@ fn prefix_size(count: Count) -> usize {
     if count == Count::Variable { 4 } else { 0 }
 }
 
-/// The parts of a time or duration.
+/// The parts of a time or duration, by the names of ROS 1 and by those of ROS 2.
 static TIME_MEMBERS: LazyLock<Members> = LazyLock::new(|| {
     let part = |name| Member::new(name, Kind::Scalar(Scalar::U32), 4);
-    Members::new(vec![part("secs"), part("nsecs")])
+    Members::new(["secs", "nsecs", "sec", "nanosec"].map(part).into())
 });

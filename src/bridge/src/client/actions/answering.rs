@@ -60,6 +60,22 @@ impl Client {
         Ok(())
     }
 
+    /// The client's result of that goal is of no use: whoever has sent the goal waits no longer.
+    pub(in crate::client) fn result_is_lost(&self, request: &str, reason: &str) {
+        let servers: Vec<_> = self.actions.lock().served.values().cloned().collect();
+        let text = format!("the result is of no use: {reason}");
+        for server in servers {
+            let body = vec![0; server.def.result.min_size()];
+            // Most of them have no such goal.
+            if server
+                .end_goal(request, Status::Aborted, &text, &body)
+                .is_ok()
+            {
+                return;
+            }
+        }
+    }
+
     fn action_server(&self, action: &str) -> Result<Arc<ActionServer>, String> {
         let name = resolve(action)?;
         let server = self.actions.lock().served.get(&*name).cloned();
@@ -82,19 +98,22 @@ impl Client {
             .as_ref()
             .ok_or("field \"id\" is missing, the goal's id is expected")?
             .to_string();
-        if !op.result {
-            let text = op
-                .values
-                .and_then(|values| values.text())
-                .unwrap_or_default();
-            let body = vec![0; server.def.result.min_size()];
-            return server.end_goal(&request, Status::Aborted, &text, &body);
-        }
+        let text = match op.values {
+            _ if op.result => None,
+            None => Some("".into()),
+            Some(values) => values.text(),
+        };
         let status = match op.status {
             Some(GoalStatus::Canceled) => Status::Preempted,
             Some(GoalStatus::Aborted) => Status::Aborted,
+            _ if !op.result => Status::Aborted,
             _ => Status::Succeeded,
         };
+        // Who fails says why in a text, or gives a result all the same.
+        if let Some(text) = text {
+            let body = vec![0; server.def.result.min_size()];
+            return server.end_goal(&request, status, &text, &body);
+        }
         match decode_args(&server.def.result, op.values, op.compression) {
             Ok(body) => server.end_goal(&request, status, "", &body),
             Err(reason) => {

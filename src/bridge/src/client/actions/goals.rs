@@ -10,6 +10,7 @@ use ros::codec::Time;
 use ros::schema::{ActionDef, MessageType};
 use rosbridge::{Compression, GoalStatus, Id, Writer};
 use tokio::sync::{Notify, watch};
+use tokio::time::timeout;
 
 use super::{common_type, is_type};
 use crate::actionlib::{self, GoalId, Status};
@@ -20,6 +21,8 @@ use crate::sample::{Frame, Sample};
 
 /// A goal that the server has stopped speaking of is lost.
 const LOST_AFTER: Duration = Duration::from_secs(5);
+/// How long a cancel waits for a server that has taken the goal and is not connected for cancels yet.
+const CANCEL_WAITS: Duration = Duration::from_secs(10);
 /// Feedback is left out while so many answers wait.
 const FEEDBACK_WAITS: usize = 256;
 
@@ -46,7 +49,7 @@ pub(super) struct Goal {
     /// When the server last spoke of it.
     pub(super) seen: Instant,
     pub(super) done: Arc<Notify>,
-    pub(super) _under_way: UnderWay,
+    pub(super) _under_way: Option<UnderWay>,
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -119,6 +122,25 @@ impl ActionClient {
         ];
         *action.listening.lock() = listening;
         Ok(action)
+    }
+
+    /// Cancels a goal that was sent; its server hears of it as soon as it is connected.
+    pub(super) fn cancel(self: &Arc<Self>, id: &str) {
+        let cancel = actionlib::write_cancel(&GoalId {
+            stamp: Time::default(),
+            id: id.to_owned(),
+        });
+        if self.is_local() || self.cancel.has_subscriber() {
+            return self.cancel.publish(cancel);
+        }
+        let (action, id) = (self.clone(), id.to_owned());
+        tokio::spawn(async move {
+            // Not for ever: a server need not care for cancels.
+            let _ = timeout(CANCEL_WAITS, action.cancel.connected()).await;
+            if action.goals.lock().contains_key(&id) {
+                action.cancel.publish(cancel);
+            }
+        });
     }
 
     /// Ready when the server takes goals and will be heard.
@@ -202,6 +224,9 @@ impl ActionClient {
             &body,
             |writer| {
                 writer.integer("status", status as i64);
+                if !state.text.is_empty() {
+                    writer.text("text", &state.text);
+                }
                 writer.boolean("result", true);
             },
         );
@@ -299,6 +324,19 @@ impl Goal {
         }
         self.done.notify_one();
         client.send_as(frame, self.compression, self.fragment_size);
+    }
+
+    /// Answers that it was cancelled before its server has heard of it.
+    pub(super) fn recalled(self, client: &Client, def: &ActionDef) {
+        let body = vec![0; def.result.min_size()];
+        let frame = self.frame(client, "action_result", &def.result, &body, |writer| {
+            writer.integer("status", GoalStatus::Canceled as i64);
+            writer.boolean("result", true);
+        });
+        match frame {
+            Ok(frame) => self.answer(client, frame),
+            Err(reason) => self.fail(client, &reason),
+        }
     }
 
     pub(super) fn fail(self, client: &Client, reason: &str) {

@@ -9,7 +9,9 @@ use ros::codec::Time;
 use ros::schema::ActionDef;
 use rosbridge::{CancelActionGoal, Compression, Format, SendActionGoal};
 use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
 
+use super::UnderWayGoal;
 use super::goals::{ActionClient, Goal};
 use crate::actionlib::{self, GoalId};
 use crate::client::publishing::decode_args;
@@ -22,6 +24,7 @@ struct Prepared {
     name: String,
     goal_id: String,
     body: Bytes,
+    recalled: CancellationToken,
 }
 
 impl Client {
@@ -48,12 +51,24 @@ impl Client {
             fragment_size: op.fragment_size,
             seen: Instant::now(),
             done: Arc::default(),
-            _under_way: self.begin(op.args)?,
+            _under_way: None,
         };
-        match self.prepare_goal(&op, compression) {
-            Ok(prepared) => {
+        let prepared = self.begin(op.args).and_then(|guard| {
+            let prepared = self.prepare_goal(&op, reply, compression)?;
+            Ok((prepared, guard))
+        });
+        match prepared {
+            Ok((prepared, guard)) => {
+                let goal = Goal {
+                    _under_way: Some(guard),
+                    ..goal
+                };
                 if let Some(id) = &goal.id {
-                    let known = (prepared.name.clone(), prepared.goal_id.clone());
+                    let known = UnderWayGoal {
+                        action: prepared.name.clone(),
+                        goal_id: prepared.goal_id.clone(),
+                        recalled: prepared.recalled.clone(),
+                    };
                     self.actions.lock().goals.insert(id.clone(), known);
                 }
                 tokio::spawn(run_goal(Arc::downgrade(self), prepared, goal));
@@ -66,10 +81,12 @@ impl Client {
     fn prepare_goal(
         self: &Arc<Self>,
         op: &SendActionGoal<'_>,
+        reply: &Reply,
         compression: Compression,
     ) -> Result<Prepared, String> {
         let name = resolve(&op.action)?.into_owned();
         let def = self.action_def(&name, &op.action_type)?;
+        self.tell_surplus(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
         let action = self.action_client(&name, def)?;
         let goal_id = format!(
@@ -82,6 +99,7 @@ impl Client {
             name,
             goal_id,
             body,
+            recalled: CancellationToken::new(),
         })
     }
 
@@ -112,19 +130,19 @@ impl Client {
     ) -> Result<(), String> {
         let id = op.id.clone().into_owned();
         let actions = self.actions.lock();
-        let Some((name, goal_id)) = actions.goals.get(&id) else {
+        let Some(goal) = actions.goals.get(&id) else {
             return Err(format!("no goal with id {id} is under way"));
         };
-        let Some(action) = actions.used.get(name).cloned() else {
+        let Some(action) = actions.used.get(&goal.action).cloned() else {
             return Ok(());
         };
-        let goal = GoalId {
-            stamp: Time::default(),
-            id: goal_id.clone(),
-        };
+        let (goal_id, recalled) = (goal.goal_id.clone(), goal.recalled.clone());
         drop(actions);
-        // A goal that still waits for its server is sent first, and cancelled behind that.
-        action.cancel.publish(actionlib::write_cancel(&goal));
+        // One that still waits for its server need not be sent at all; `run_goal` looks at this last of all.
+        recalled.cancel();
+        if action.goals.lock().contains_key(&goal_id) {
+            action.cancel(&goal_id);
+        }
         Ok(())
     }
 }
@@ -136,6 +154,7 @@ async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
         name,
         goal_id,
         body,
+        recalled,
     } = prepared;
     let Some((patience, ended, graph)) = client.upgrade().map(|client| {
         let graph = client.shared.bus.graph();
@@ -149,6 +168,12 @@ async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
     };
     let there = tokio::select! {
         () = ended.cancelled() => return,
+        () = recalled.cancelled() => {
+            if let Some(client) = client.upgrade() {
+                goal.recalled(&client, &action.def);
+            }
+            return;
+        }
         there = tokio::time::timeout(patience, action.connected()) => there,
     };
     if there.is_err() && !action.goal.has_subscriber() && !action.is_local() {
@@ -166,7 +191,11 @@ async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
         seen: Instant::now(),
         ..goal
     };
-    action.goals.lock().insert(goal_id.clone(), goal);
+    let known_in_time = {
+        let mut goals = action.goals.lock();
+        goals.insert(goal_id.clone(), goal);
+        !recalled.is_cancelled()
+    };
     action.goal.publish(actionlib::write_goal(
         now,
         &GoalId {
@@ -175,6 +204,10 @@ async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
         },
         &body,
     ));
+    // Cancelled while it was being sent.
+    if !known_in_time {
+        action.cancel(&goal_id);
+    }
     let gone = server_gone(graph, format!("{name}/result"));
     tokio::select! {
         () = ended.cancelled() => {}

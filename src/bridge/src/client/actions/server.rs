@@ -36,6 +36,8 @@ pub(super) struct ActionServer {
     feedback: Arc<Outlet>,
     result: Arc<Outlet>,
     goals: Mutex<HashMap<String, Served>>,
+    /// Goals up to this stamp were cancelled, those that come after their cancel included.
+    cancelled_up_to: Mutex<Time>,
     /// Set once, right after it was made: the listeners need the server itself.
     listening: Mutex<Vec<Listening>>,
     client: Weak<Client>,
@@ -44,9 +46,20 @@ pub(super) struct ActionServer {
 
 struct Served {
     state: GoalState,
-    /// What the client calls it.
+    /// What the client calls it; empty where it was never told of it.
     request: String,
     ended: Option<Instant>,
+}
+
+impl Served {
+    /// A goal that the client is not told of.
+    fn unknown(state: GoalState) -> Self {
+        Self {
+            state,
+            request: String::new(),
+            ended: Some(Instant::now()),
+        }
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -109,6 +122,7 @@ impl ActionServer {
             feedback: client.action_outlet(format!("{name}/feedback"), &def.action_feedback, false),
             result: client.action_outlet(format!("{name}/result"), &def.action_result, false),
             goals: Mutex::default(),
+            cancelled_up_to: Mutex::default(),
             listening: Mutex::default(),
             client: Arc::downgrade(client),
             def: def.clone(),
@@ -146,8 +160,24 @@ impl ActionServer {
             goal.id = format!("{}-{number}", self.name);
         }
         let request = format!("action_goal:{}:{number}", self.name);
+        let cancelled_up_to = *self.cancelled_up_to.lock();
         let mut goals = self.goals.lock();
-        if goals.contains_key(&goal.id) {
+        let recalled = match goals.get(&goal.id) {
+            Some(known) if known.state.status == Status::Recalling => true,
+            Some(_) => return,
+            None => goal.stamp != Time::default() && goal.stamp <= cancelled_up_to,
+        };
+        if recalled {
+            // Its cancel came first: the client need not hear of it.
+            let state = GoalState {
+                goal: goal.clone(),
+                status: Status::Recalled,
+                text: "the goal was cancelled before it came".to_owned(),
+            };
+            goals.insert(goal.id, Served::unknown(state.clone()));
+            drop(goals);
+            self.publish_result(&state, &vec![0; self.def.result.min_size()]);
+            self.publish_status();
             return;
         }
         let frame = if goals.len() >= MAX_GOALS {
@@ -210,7 +240,8 @@ impl ActionServer {
         })
     }
 
-    /// actionlib's policy: an empty id means all goals up to the stamp, a zero stamp with it means all.
+    /// actionlib's policy: an empty id means all goals up to the stamp, a zero stamp with it means all. A cancel may be
+    /// faster than its goal, which comes on another topic: it is kept.
     fn cancel(&self, bytes: &[u8]) {
         let Some(wanted) = actionlib::read_cancel(bytes) else {
             return;
@@ -224,8 +255,21 @@ impl ActionServer {
                 || (wanted.id.is_empty() && zero)
                 || (!zero && goal.stamp <= wanted.stamp)
         };
+        {
+            let mut up_to = self.cancelled_up_to.lock();
+            *up_to = wanted.stamp.max(*up_to);
+        }
         let mut requests = Vec::new();
-        for served in self.goals.lock().values_mut() {
+        let mut goals = self.goals.lock();
+        if !wanted.id.is_empty() && !goals.contains_key(&wanted.id) && goals.len() < MAX_GOALS {
+            let state = GoalState {
+                goal: wanted.clone(),
+                status: Status::Recalling,
+                text: String::new(),
+            };
+            goals.insert(wanted.id.clone(), Served::unknown(state));
+        }
+        for served in goals.values_mut() {
             if served.ended.is_none()
                 && served.state.status == Status::Active
                 && matches(&served.state.goal)
@@ -234,6 +278,7 @@ impl ActionServer {
                 requests.push(served.request.clone());
             }
         }
+        drop(goals);
         self.publish_status();
         for request in requests {
             let op = CancelActionGoal {
