@@ -89,7 +89,7 @@ pub const ROUTES: &[Route] = &[
     at("GET", "/stubs", || get(stubs::list)),
     at("GET", "/stubs/{file}", || get(stubs::archive)),
     at("ANY", "/{service}", || any(robots::service)),
-    at("ANY", "/{service}/", || any(robots::service)),
+    at("ANY", "/{service}/", || any(robots::service_with_slash)),
 ];
 
 /// What is in no row.
