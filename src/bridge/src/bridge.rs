@@ -64,7 +64,8 @@ impl Bridge {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
-        let waiting = Waiting::new(io, &options.read_ahead, &self.shared.options);
+        let waiting = Waiting::new(io, &options.read_ahead, &self.shared.options)
+            .within(&options.budget);
         self.serve_waiting(waiting, options).await
     }
 
@@ -89,7 +90,7 @@ impl Bridge {
         let seat = Seat::take(shared.clone(), client.clone(), options.resume);
         tracing::debug!(client = %client.name, "session begins");
         let (socket, kept) = waiting.into_parts();
-        let end = Session::new(socket, kept, client.clone(), seat.socket)
+        let end = Session::new(socket, kept, client.clone(), seat.socket, &options.budget)
             .run()
             .await;
         tracing::debug!(client = %client.name, ?end, "session ends");

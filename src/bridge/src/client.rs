@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
 use std::time::Instant;
 
+use budget::{Budget, Exceeded, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::schema::MessageType;
@@ -59,15 +60,23 @@ pub(crate) struct Reply {
 pub(crate) struct Inbox {
     fragments: Fragments,
     pictures: Fragments,
+    permit: Permit,
 }
 
 impl Inbox {
-    pub(crate) fn new(shared: &Shared) -> Self {
+    pub(crate) fn new(shared: &Shared, budget: &Budget) -> Self {
         let limits = shared.options.fragments;
         Self {
             fragments: Fragments::new(limits),
             pictures: Fragments::new(limits),
+            permit: budget.permit(),
         }
+    }
+
+    /// Has what is not yet complete count.
+    pub(crate) fn count(&mut self) -> Result<(), Exceeded> {
+        let held = self.fragments.bytes() + self.pictures.bytes();
+        self.permit.resize(held)
     }
 }
 

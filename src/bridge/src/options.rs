@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use budget::Budget;
 use bytes::Bytes;
 use ros::codec::NonFinite;
 use rosbridge::{FragmentLimits, Level};
@@ -53,6 +54,13 @@ pub struct BridgeOptions {
     pub max_png: usize,
     /// How NaN and infinities are written in JSON.
     pub non_finite: NonFinite,
+    /// Most bytes of JSON or CBOR that one message from ROS may become; a longer one is not sent.
+    pub max_encoded: usize,
+    /// Where what big messages from ROS become counts, for as long as they wait for their clients. What does not fit is not
+    /// sent, and its clients are told.
+    pub budget: Budget,
+    /// A WebSocket message that was begun and is not complete after this time closes its connection (1008).
+    pub unfinished: Duration,
 }
 
 impl Default for BridgeOptions {
@@ -83,6 +91,9 @@ impl Default for BridgeOptions {
             },
             max_png: 32 << 20,
             non_finite: NonFinite::Null,
+            max_encoded: 64 << 20,
+            budget: Budget::unlimited(),
+            unfinished: Duration::from_secs(300),
         }
     }
 }
@@ -102,6 +113,8 @@ pub struct SessionOptions {
     /// Whether it receives what this bridge's own clients publish, as rosbridge's clients do. A robot's link does
     /// not: its ROS has those messages already.
     pub hears_clients: bool,
+    /// Where what the client has begun to send counts; what does not fit closes its connection (1013).
+    pub budget: Budget,
 }
 
 impl Default for SessionOptions {
@@ -112,6 +125,7 @@ impl Default for SessionOptions {
             read_ahead: Bytes::new(),
             level: Level::Error,
             hears_clients: true,
+            budget: Budget::unlimited(),
         }
     }
 }

@@ -3,15 +3,19 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use budget::Permit;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::WireType;
-use ros::codec::{self, CborOptions, JsonOptions, NonFinite, Time};
+use ros::codec::{self, CborOptions, JsonOptions, Time};
 use ros::schema::{MessageType, Registry};
 use rosbridge::{Compression, Format, Publish};
 
-use crate::Metrics;
+use crate::{BridgeOptions, Metrics};
 use ws::frame::{BINARY, TEXT};
+
+/// What becomes of a message counts in no budget up to this size: the lengths of queues bound it.
+const UNCOUNTED: usize = 64 * 1024;
 
 /// A whole WebSocket message, ready to be sent to anyone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -138,6 +142,7 @@ struct Encoded {
     compression: Compression,
     topic: Arc<str>,
     frame: Result<Frame, Arc<str>>,
+    _permit: Permit,
 }
 
 impl Sample {
@@ -159,7 +164,7 @@ impl Sample {
         &self,
         compression: Compression,
         topic: &Arc<str>,
-        non_finite: NonFinite,
+        options: &BridgeOptions,
         metrics: &Metrics,
     ) -> Result<Frame, Arc<str>> {
         // Held while encoding: a second subscriber waits for the first one's result instead of making its own.
@@ -169,11 +174,13 @@ impl Sample {
             return known.frame.clone();
         }
         metrics.encoded.add(1);
-        let frame = self.encode(compression, topic, non_finite);
+        let mut permit = options.budget.permit();
+        let frame = self.encode(compression, topic, options, &mut permit);
         encoded.push(Encoded {
             compression,
             topic: topic.clone(),
             frame: frame.clone(),
+            _permit: permit,
         });
         frame
     }
@@ -182,7 +189,8 @@ impl Sample {
         &self,
         compression: Compression,
         topic: &str,
-        non_finite: NonFinite,
+        options: &BridgeOptions,
+        permit: &mut Permit,
     ) -> Result<Frame, Arc<str>> {
         let slot = match compression {
             Compression::None | Compression::Png => 0,
@@ -193,6 +201,18 @@ impl Sample {
             .load(Ordering::Relaxed)
             .max(self.bytes.len())
             + 128;
+        let full = |full: budget::Exceeded| {
+            Arc::<str>::from(format!(
+                "a message from {} is left out: {full}",
+                self.publisher
+            ))
+        };
+        if hint > UNCOUNTED {
+            permit.resize(hint).map_err(full)?;
+        }
+        let max_bytes = options.max_encoded;
+        let left = permit.bytes().saturating_add(options.budget.left());
+        let max_bytes = max_bytes.min(left.max(UNCOUNTED));
         let mut out = Vec::with_capacity(hint);
         let failed = |error: codec::CodecError| {
             Arc::<str>::from(format!("{error} (from {})", self.publisher))
@@ -208,21 +228,28 @@ impl Sample {
             }
             Compression::Cbor => {
                 let message_type = self.types.find(&self.wire_type)?;
-                let write = |out: &mut Vec<u8>| {
-                    codec::to_cbor(&message_type, &self.bytes, out, &CborOptions::default())
+                let options = CborOptions {
+                    max_bytes,
+                    ..CborOptions::default()
                 };
+                let write =
+                    |out: &mut Vec<u8>| codec::to_cbor(&message_type, &self.bytes, out, &options);
                 Publish::print_with(&mut out, Format::Cbor, topic, write).map_err(failed)?;
             }
             Compression::None | Compression::Png => {
                 let message_type = self.types.find(&self.wire_type)?;
                 let options = JsonOptions {
-                    non_finite,
+                    non_finite: options.non_finite,
+                    max_bytes,
                     ..JsonOptions::default()
                 };
                 let write =
                     |out: &mut Vec<u8>| codec::to_json(&message_type, &self.bytes, out, &options);
                 Publish::print_with(&mut out, Format::Json, topic, write).map_err(failed)?;
             }
+        }
+        if out.capacity() > UNCOUNTED {
+            permit.resize(out.capacity()).map_err(full)?;
         }
         self.types.sizes[slot].store(out.len(), Ordering::Relaxed);
         let format = if slot == 0 {

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Instant;
 
+use budget::Budget;
 use bytes::Bytes;
 use rosbridge::{Compression, Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -77,13 +78,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         kept: VecDeque<Message>,
         client: Arc<Client>,
         number: u64,
+        budget: &Budget,
     ) -> Self {
         let now = Instant::now();
         let options = &client.shared.options;
         Self {
             socket,
             number,
-            inbox: Inbox::new(&client.shared),
+            inbox: Inbox::new(&client.shared, budget),
             kept,
             cuts: Cuts::default(),
             heard: now,
@@ -182,12 +184,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         now: Instant,
     ) -> Option<Frame> {
         let shared = &self.client.shared;
-        match sample.frame(
-            compression,
-            topic,
-            shared.options.non_finite,
-            &shared.metrics,
-        ) {
+        match sample.frame(compression, topic, &shared.options, &shared.metrics) {
             Ok(frame) => Some(frame),
             Err(reason) => {
                 if self.client.outbox.may_complain(key, now) {
@@ -287,7 +284,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             Message::Pong(payload) => self.acks.pong(&payload),
             Message::Close(code, reason) => return Err(Stop::Client { code, reason }),
         }
-        Ok(())
+        self.inbox.count().map_err(|full| Stop::Close {
+            code: 1013,
+            reason: format!("fragments cannot be kept: {full}"),
+            readable: true,
+        })
     }
 
     /// What the clock demands: a ping, a goodbye.
@@ -432,7 +433,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
 
     /// Queues what still waits in the control queue, and a close frame.
     fn last_words(&mut self, code: u16, reason: &str) {
-        if matches!(code, 1002 | 1007 | 1009) {
+        if matches!(code, 1002 | 1007 | 1009 | 1013) {
             self.client.status(Level::Error, None, Format::Json, reason);
         }
         // A client that reads nothing need not be told more, one that has another socket hears it there.

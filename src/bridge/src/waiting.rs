@@ -7,6 +7,7 @@ use std::pin::{Pin, pin};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
+use budget::Budget;
 use bytes::Bytes;
 use rosbridge::{Format, Level, Op, Status};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -27,6 +28,7 @@ pub struct Waiting<S> {
     socket: WebSocket<S>,
     kept: VecDeque<Message>,
     kept_bytes: usize,
+    unfinished: Duration,
     ping_interval: Duration,
     idle_timeout: Duration,
     close_timeout: Duration,
@@ -54,6 +56,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
             socket: WebSocket::new(io, read_ahead, options.max_frame, options.max_message),
             kept: VecDeque::new(),
             kept_bytes: 0,
+            unfinished: options.unfinished,
             ping_interval: interval,
             idle_timeout: options.idle_timeout,
             close_timeout: options.close_timeout,
@@ -62,6 +65,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
             timer: Box::pin(tokio::time::sleep_until(now.into())),
             ping_at: (!interval.is_zero()).then(|| now + interval),
         }
+    }
+
+    /// Has what the client sends count in `budget`, now and in the session.
+    pub fn within(mut self, budget: &Budget) -> Self {
+        self.socket = self.socket.within(budget, self.unfinished);
+        self
     }
 
     /// Waits for `ready`, and gives what that gives.

@@ -29,6 +29,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::Budget;
 use parking_lot::Mutex;
 use ros::bus::{Bus, ParamValue};
 use ros::schema::Registry;
@@ -93,6 +94,10 @@ pub struct HubOptions {
     pub call_timeout: Duration,
     /// How long first messages wait for the node to connect to their topic.
     pub warm_up: Duration,
+    /// Where what robots have begun to send counts; what does not fit ends its connection.
+    pub budget: Budget,
+    /// A frame that was begun and is not complete after this time ends its connection.
+    pub unfinished: Duration,
 }
 
 impl Default for HubOptions {
@@ -101,6 +106,8 @@ impl Default for HubOptions {
             grace: Duration::from_secs(30),
             call_timeout: Duration::from_secs(300),
             warm_up: Duration::from_secs(1),
+            budget: Budget::unlimited(),
+            unfinished: Duration::from_secs(300),
         }
     }
 }
@@ -210,7 +217,8 @@ impl Hub {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
-        let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD);
+        let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD)
+            .within(&self.options.budget, self.options.unfinished);
         let hello: Hello = match timeout(HELLO, receive_open(&mut socket, "hello")).await {
             Ok(Ok(hello)) => hello,
             Ok(Err(lost)) => return lost,

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 
+use budget::{Budget, Permit};
 use bytes::{Bytes, BytesMut};
 
 use crate::frame::Received;
@@ -13,12 +14,14 @@ const MAX_STREAMS: usize = 256;
 const MAX_PARTIAL: usize = MAX_RECORD + (64 << 20);
 /// Numbers that came before one still missing.
 const MAX_AHEAD: usize = 65_536;
-/// Set aside for a record before its bytes have come.
-const READ_AHEAD: usize = 4 << 20;
+/// Set aside for a record before its bytes have come; as they come it doubles.
+const READ_AHEAD: usize = 1 << 20;
 
 /// What has come over the life of a session.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Incoming {
+    /// Where records under way count.
+    budget: Budget,
     number: u32,
     ahead: BTreeSet<u32>,
     /// The first number on this connection, until the peer shows by using it that it knows what has come.
@@ -33,9 +36,29 @@ struct Partial {
     number: u32,
     total: usize,
     bytes: BytesMut,
+    permit: Permit,
+}
+
+impl Default for Incoming {
+    fn default() -> Self {
+        Self::within(&Budget::unlimited())
+    }
 }
 
 impl Incoming {
+    /// Nothing yet; what is under way is to count in `budget`.
+    pub(crate) fn within(budget: &Budget) -> Self {
+        Self {
+            budget: budget.clone(),
+            number: 0,
+            ahead: BTreeSet::new(),
+            next: None,
+            bytes: 0,
+            streams: HashMap::new(),
+            partial: 0,
+        }
+    }
+
     /// All numbers up to this one have come, and those.
     pub(crate) fn state(&self) -> (u32, Vec<u32>) {
         (self.number, self.ahead.iter().copied().collect())
@@ -92,7 +115,8 @@ impl Incoming {
         let partial = Partial {
             number,
             total,
-            bytes: BytesMut::with_capacity(total.min(READ_AHEAD)),
+            bytes: BytesMut::new(),
+            permit: self.budget.permit(),
         };
         self.streams.insert(stream, partial);
         self.more(stream, bytes)
@@ -106,6 +130,14 @@ impl Incoming {
         self.bytes += bytes.len() as u64;
         if partial.bytes.len() + bytes.len() > partial.total {
             return Err(Error::Protocol("a record longer than it said"));
+        }
+        let missing = partial.total - partial.bytes.len();
+        if partial.bytes.capacity() - partial.bytes.len() < bytes.len() {
+            // It grows with what comes, not with what was promised.
+            let room = partial.bytes.len().max(READ_AHEAD).max(bytes.len());
+            let room = room.min(missing);
+            partial.permit.grow_to(partial.bytes.len() + room)?;
+            partial.bytes.reserve(room);
         }
         partial.bytes.extend_from_slice(bytes);
         if partial.bytes.len() < partial.total {
@@ -150,5 +182,46 @@ fn too_much(what: &'static str, bytes: usize, limit: usize) -> Error {
         what,
         bytes: bytes as u64,
         limit: limit as u64,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn records_under_way_take_no_more_than_their_budget() {
+        let budget = Budget::new("servant x", 3 << 20);
+        let mut incoming = Incoming::within(&budget);
+        // Promises cost little.
+        for stream in 0..2 {
+            let begun = incoming.begin(stream, stream + 1, 200 << 20, b"x");
+            assert!(begun.expect("there is room").is_none());
+        }
+        assert_eq!(budget.used(), 2 * READ_AHEAD);
+        let more = vec![7; READ_AHEAD];
+        let refused = incoming
+            .more(0, &more)
+            .and_then(|_| incoming.more(1, &more));
+        let refused = refused.expect_err("both cannot grow");
+        assert!(
+            refused.to_string().contains("the memory for servant x"),
+            "{refused}"
+        );
+        incoming.reconnect(1);
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn a_whole_record_counts_no_longer() {
+        let budget = Budget::new("servant x", 3 << 20);
+        let mut incoming = Incoming::within(&budget);
+        let begun = incoming
+            .begin(1, 1, 1000, &[7; 400])
+            .expect("there is room");
+        assert!(begun.is_none() && budget.used() == 1000);
+        let whole = incoming.more(1, &[7; 600]).expect("there is room");
+        assert_eq!(whole, Some(vec![7; 1000].into()));
+        assert_eq!(budget.used(), 0);
     }
 }

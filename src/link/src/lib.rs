@@ -73,6 +73,17 @@ pub enum Error {
         /// How much may be.
         limit: u64,
     },
+    /// What is under way does not fit into the memory for it.
+    #[error("a record cannot be received: {0}")]
+    Exceeded(#[from] budget::Exceeded),
+    /// Its WebSocket frames are not taken.
+    #[error("the other end's frames are refused: {reason}")]
+    Refused {
+        /// WebSocket close code.
+        code: u16,
+        /// Why.
+        reason: String,
+    },
     /// JSON that is not what it should be.
     #[error("the other end sends a {what} that cannot be read: {reason}")]
     Json {

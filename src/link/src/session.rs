@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
+use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -142,6 +143,12 @@ impl Session {
             up: watch::Sender::new(false),
             next_call: AtomicU32::new(1),
         }
+    }
+
+    /// Has the records that are under way to this end count in `budget`; one that does not fit ends its connection.
+    pub fn within(self, budget: &Budget) -> Self {
+        self.state.lock().incoming = Incoming::within(budget);
+        self
     }
 
     /// Whether the peer is there, now and later.

@@ -4,6 +4,9 @@
 //! from where they were encoded (one vectored write for header and payload), and come from it in a buffer of their
 //! own that the ROS message is cut from. Reading and writing are polled separately, so one task can do both. A robot's
 //! link is the client's end of the same.
+//!
+//! What the peer has begun to send counts in a [`Budget`] of whoever it is: a message that does not fit ends the connection
+//! with close code 1013, one that is not complete in time with 1008.
 
 #![forbid(unsafe_code)]
 
@@ -14,9 +17,12 @@ use std::future::poll_fn;
 use std::io::{self, IoSlice};
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
+use std::time::Duration;
 
+use budget::{Budget, Permit};
 use bytes::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::{Instant, Sleep};
 use tokio_util::io::poll_read_buf;
 
 use frame::Header;
@@ -27,6 +33,8 @@ const COPIED: usize = 8 * 1024;
 const READ_SIZE: usize = 32 * 1024;
 /// Room made for a payload before any of it has come; more is added as it comes.
 const READ_AHEAD: usize = 4 << 20;
+/// Messages up to this size count in no budget: the number of connections bounds them.
+const UNCOUNTED: usize = 64 * 1024;
 /// Slices in one write.
 const MAX_SLICES: usize = 16;
 
@@ -81,6 +89,16 @@ impl WsError {
     }
 }
 
+/// What unfinished messages may take, besides their length.
+struct Unfinished {
+    /// For the message that is being received, until the next one is asked for.
+    permit: Permit,
+    patience: Duration,
+    /// When the message that is being received must be complete.
+    deadline: Option<Instant>,
+    timer: Option<Pin<Box<Sleep>>>,
+}
+
 /// A connection.
 pub struct WebSocket<S> {
     io: S,
@@ -97,6 +115,7 @@ pub struct WebSocket<S> {
     tail: BytesMut,
     queued: usize,
     received: u64,
+    unfinished: Option<Unfinished>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
@@ -115,7 +134,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             tail: BytesMut::new(),
             queued: 0,
             received: 0,
+            unfinished: None,
         }
+    }
+
+    /// Has what is received count in `budget`, from a message's first byte until the next message is asked for; and gives
+    /// each message so much time from its first byte to its last.
+    pub fn within(mut self, budget: &Budget, patience: Duration) -> Self {
+        self.unfinished = Some(Unfinished {
+            permit: budget.permit(),
+            patience,
+            deadline: None,
+            timer: None,
+        });
+        self
     }
 
     /// The client's end; `seed` is what its masks are made from, a random number.
@@ -139,6 +171,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
 
     /// The next message; after an error there is none.
     pub fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<Message, WsError>> {
+        if self.partial.is_none() && self.header.is_none() {
+            // The last message has been taken, or none was begun.
+            self.unfinished.iter_mut().for_each(Unfinished::over);
+        }
         loop {
             if self.header.is_none() {
                 self.header = self.next_header()?;
@@ -152,8 +188,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 }
                 continue;
             }
-            self.make_room();
-            let read = ready!(poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read))?;
+            self.make_room()?;
+            let Poll::Ready(read) = poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read)
+            else {
+                ready!(self.poll_late(cx));
+                return Poll::Ready(Err(self.late()));
+            };
+            let read = read?;
             if read == 0 {
                 return Poll::Ready(Err(WsError::Eof));
             }
@@ -184,7 +225,43 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Ok(Some(header))
     }
 
-    fn make_room(&mut self) {
+    /// Ready when the message that was begun should have been complete.
+    fn poll_late(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        let begun = self.header.is_some() || self.partial.is_some() || !self.read.is_empty();
+        let Some(unfinished) = self.unfinished.as_mut().filter(|_| begun) else {
+            return Poll::Pending;
+        };
+        let patience = unfinished.patience;
+        let now = || Instant::now() + patience;
+        let deadline = *unfinished.deadline.get_or_insert_with(now);
+        let timer = unfinished
+            .timer
+            .get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
+        // One timer for all messages: where it was set for an earlier one it is put off when it fires.
+        loop {
+            ready!(timer.as_mut().poll(cx));
+            if Instant::now() >= deadline {
+                return Poll::Ready(());
+            }
+            timer.as_mut().reset(deadline);
+        }
+    }
+
+    fn late(&self) -> WsError {
+        let patience = self
+            .unfinished
+            .as_ref()
+            .map(|unfinished| unfinished.patience);
+        WsError::Refused {
+            code: 1008,
+            reason: format!(
+                "a message is not complete after {} s",
+                patience.unwrap_or_default().as_secs_f32()
+            ),
+        }
+    }
+
+    fn make_room(&mut self) -> Result<(), WsError> {
         let missing = match self.header {
             Some(header) => {
                 (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len()))
@@ -193,8 +270,19 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         };
         let room = missing.max(READ_SIZE / 2);
         if self.read.capacity() - self.read.len() < room {
-            self.read.reserve(room.max(READ_SIZE));
+            let room = room.max(READ_SIZE);
+            let begun = self.partial.as_ref().map_or(0, |(_, begun)| begun.len());
+            let size = begun + self.read.len() + room;
+            if let Some(unfinished) = self.unfinished.as_mut().filter(|_| size > UNCOUNTED) {
+                let counted = unfinished.permit.grow_to(size);
+                counted.map_err(|full| WsError::Refused {
+                    code: 1013,
+                    reason: format!("a message cannot be received: {full}"),
+                })?;
+            }
+            self.read.reserve(room);
         }
+        Ok(())
     }
 
     fn accept(
@@ -345,6 +433,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 return Ok(());
             }
         }
+    }
+}
+
+impl Unfinished {
+    /// Nothing is unfinished now.
+    fn over(&mut self) {
+        let _ = self.permit.resize(0);
+        self.deadline = None;
     }
 }
 

@@ -200,3 +200,97 @@ async fn what_has_come_of_an_unfinished_message_is_counted() {
         assert_eq!((ours.received(), polled.is_ready()), (sent, sent == 11));
     }
 }
+
+/// The header of a client's frame, its mask zero.
+fn begun(length: u64, last: bool) -> Vec<u8> {
+    let mut header = vec![if last { 0x82 } else { 0x02 }, 0xff];
+    header.extend(length.to_be_bytes());
+    header.extend([0; 4]);
+    header
+}
+
+#[tokio::test]
+async fn unfinished_messages_take_no_more_than_their_budget() {
+    use tokio::io::AsyncWriteExt as _;
+    let budget = Budget::new("client x", 24 << 20);
+    let mut sockets = tokio::task::JoinSet::new();
+    // Twenty connections begin a message of 63 MB each, in frames of 3 MB.
+    for _ in 0..20 {
+        let (ours, mut theirs) = tokio::io::duplex(64 << 10);
+        let limit = 64 << 20;
+        let mut socket =
+            WebSocket::new(ours, b"", limit, limit).within(&budget, Duration::from_secs(3600));
+        sockets.spawn(async move {
+            let sending = async {
+                theirs.write_all(&begun(3 << 20, false)).await?;
+                theirs.write_all(&vec![7; 3 << 20]).await?;
+                std::future::pending::<io::Result<()>>().await
+            };
+            tokio::select! {
+                message = next(&mut socket) => message,
+                _ = sending => unreachable!("the socket is asked first"),
+            }
+        });
+    }
+    // Eight of them fit at most.
+    for _ in 0..12 {
+        let refused = sockets.join_next().await.unwrap().unwrap().unwrap_err();
+        let WsError::Refused { code: 1013, reason } = refused else {
+            panic!("{refused}");
+        };
+        assert!(reason.contains("the memory for client x"), "{reason}");
+        assert!(budget.used() <= budget.limit());
+    }
+    sockets.shutdown().await;
+    assert_eq!(budget.used(), 0);
+}
+
+#[tokio::test]
+async fn a_message_counts_until_the_next_is_asked_for() {
+    let budget = Budget::new("client x", 2 << 20);
+    let (ours, theirs) = tokio::io::duplex(4096);
+    let mut theirs = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
+    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).within(&budget, Duration::from_secs(60));
+    tokio::spawn(async move {
+        for size in [1 << 20, 10, 1 << 20] {
+            theirs.send(Theirs::binary(vec![7; size])).await.unwrap();
+        }
+        std::future::pending::<()>().await
+    });
+    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(big)) if big.len() == 1 << 20));
+    assert!(budget.used() >= 1 << 20, "it is being handled");
+    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(small)) if small.len() == 10));
+    assert_eq!(budget.used(), 0, "small ones do not count");
+    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(big)) if big.len() == 1 << 20));
+    drop(ours);
+    assert_eq!(budget.used(), 0);
+}
+
+#[tokio::test]
+async fn a_message_that_stays_unfinished_ends_the_connection() {
+    use tokio::io::AsyncWriteExt as _;
+    let (ours, mut theirs) = tokio::io::duplex(4096);
+    let patience = Duration::from_millis(30);
+    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).within(&Budget::unlimited(), patience);
+    // A whole message, and idleness as long as it likes.
+    let mut whole = begun(2, true);
+    whole.extend(b"ab");
+    theirs.write_all(&whole).await.unwrap();
+    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(_))));
+    let idle = tokio::time::timeout(patience * 3, next(&mut ours)).await;
+    assert!(idle.is_err(), "{idle:?}");
+    // Half a message, a byte of it now and then.
+    let dripping = tokio::spawn(async move {
+        theirs.write_all(&begun(100_000, true)).await.unwrap();
+        while theirs.write_all(b"x").await.is_ok() {
+            tokio::time::sleep(patience / 3).await;
+        }
+    });
+    let error = next(&mut ours).await.unwrap_err();
+    assert!(
+        matches!(&error, WsError::Refused { code: 1008, reason } if reason.contains("not complete")),
+        "{error}"
+    );
+    drop(ours);
+    dripping.await.unwrap();
+}

@@ -287,11 +287,16 @@ impl Client {
     ) -> Result<(), String> {
         let json = JsonOptions {
             non_finite: self.shared.options.non_finite,
+            max_bytes: self.shared.options.max_encoded,
             ..JsonOptions::default()
+        };
+        let cbor = CborOptions {
+            max_bytes: self.shared.options.max_encoded,
+            ..CborOptions::default()
         };
         let printed = match format {
             Format::Json => codec::to_json(message_type, bytes, out, &json),
-            Format::Cbor => codec::to_cbor(message_type, bytes, out, &CborOptions::default()),
+            Format::Cbor => codec::to_cbor(message_type, bytes, out, &cbor),
         };
         printed.map_err(|error| error.to_string())
     }

@@ -81,7 +81,7 @@ impl NodeLink {
             run: hello.run.clone(),
             machine: Machine::of(hello),
             id,
-            session: Session::new(options),
+            session: Session::new(options).within(&hub.options.budget),
             seat: tokio::sync::Mutex::default(),
             kick: watch::Sender::new(0),
             hub: Arc::downgrade(hub),

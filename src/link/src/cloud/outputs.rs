@@ -24,8 +24,9 @@ use crate::stamps::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;
-/// Between two questions whether a node sends a topic to us.
+/// Between two questions whether a node sends a topic to us, at first and at last.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
+const LONGEST_LOOK: std::time::Duration = std::time::Duration::from_millis(50);
 
 /// Outputs by channel.
 #[derive(Default)]
@@ -167,6 +168,7 @@ async fn heard(
     before: BTreeSet<(String, i32)>,
 ) {
     let _ = publishers.wait_for(|count| *count > 0).await;
+    let mut pause = LOOK;
     loop {
         let Ok(now) = bus.heard_over(topic).await else {
             return;
@@ -174,7 +176,8 @@ async fn heard(
         if now.difference(&before).any(|(of, _)| of == node) {
             return;
         }
-        tokio::time::sleep(LOOK).await;
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(LONGEST_LOOK);
     }
 }
 

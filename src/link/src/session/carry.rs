@@ -41,6 +41,8 @@ impl Session {
         self.up.send_replace(false);
         let goodbye = match &lost {
             Lost::Ended => self.state.lock().ending.clone(),
+            Lost::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
+            Lost::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
             Lost::Protocol(error) => Some((1002, error.to_string())),
             Lost::Full => Some((1008, lost.to_string())),
             _ => None,
@@ -332,9 +334,7 @@ impl Connection {
 
 pub(super) fn socket_lost(error: WsError) -> Lost {
     match error {
-        WsError::Refused { .. } => {
-            Lost::Protocol(Error::Protocol("its WebSocket frames are broken"))
-        }
+        WsError::Refused { code, reason } => Lost::Protocol(Error::Refused { code, reason }),
         error => Lost::Socket(error.to_string()),
     }
 }

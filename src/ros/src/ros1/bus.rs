@@ -34,6 +34,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -54,7 +55,8 @@ use crate::bus::{
     WireType,
 };
 use crate::net::Sockets;
-use crate::ros1::xmlrpc::{self, Limits, Value};
+use crate::ros1::tcpros::FrameBounds;
+use crate::ros1::xmlrpc::{self, Client, Limits, Value};
 
 /// For a peer to accept a connection and answer its header.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -72,6 +74,10 @@ pub struct Ros1Options {
     pub host: Option<String>,
     /// A message longer than this ends its connection.
     pub max_message: usize,
+    /// Where what is read from nodes counts until it is whole; what does not fit ends its connection.
+    pub budget: Budget,
+    /// A message that was begun and is not whole after this time ends its connection.
+    pub unfinished: Duration,
 }
 
 impl Ros1Options {
@@ -82,6 +88,8 @@ impl Ros1Options {
             node_name: node_name.to_owned(),
             host: None,
             max_message: tcpros::MAX_MESSAGE,
+            budget: Budget::unlimited(),
+            unfinished: tcpros::UNFINISHED,
         }
     }
 }
@@ -99,7 +107,7 @@ struct Inner {
     /// The host in our addresses, and the port of our TCPROS server.
     host: String,
     port: u16,
-    max_message: usize,
+    frames: FrameBounds,
     master: Arc<MasterClient>,
     registrar: Registrar,
     subscriptions: Mutex<HashMap<String, Arc<TopicIn>>>,
@@ -108,6 +116,7 @@ struct Inner {
     label: OnceLock<String>,
     lending: Lending,
     calls: CallPool,
+    asked: heard::Asked,
     graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
     param_watcher: Mutex<Option<mpsc::UnboundedSender<ParamChange>>>,
@@ -173,6 +182,7 @@ impl Ros1Bus {
             sockets.clone(),
             options.master,
             &options.node_name,
+            &options.budget,
         )?);
         let registrar = Registrar::new(
             master.clone(),
@@ -184,7 +194,11 @@ impl Ros1Bus {
             node: options.node_name,
             host,
             port,
-            max_message: options.max_message,
+            frames: FrameBounds {
+                max: options.max_message,
+                budget: options.budget.clone(),
+                unfinished: options.unfinished,
+            },
             master,
             registrar,
             subscriptions: Mutex::default(),
@@ -193,6 +207,7 @@ impl Ros1Bus {
             label: OnceLock::new(),
             lending: Lending::default(),
             calls: CallPool::default(),
+            asked: heard::Asked::default(),
             graph: watch::Sender::new(Arc::default()),
             shutdown: watch::Sender::new(None),
             param_watcher: Mutex::default(),
@@ -206,7 +221,13 @@ impl Ros1Bus {
             inner: inner.clone(),
         });
         let slave = Arc::new(slave::Slave { bus: inner.clone() });
-        inner.spawn(xmlrpc::serve(slave_listener, slave, Limits::default()));
+        let limits = Limits {
+            budget: options
+                .budget
+                .within("the XML-RPC of our node", xmlrpc::MAX_HELD),
+            ..Limits::default()
+        };
+        inner.spawn(xmlrpc::serve(slave_listener, slave, limits));
         inner.spawn(server::serve(inner.clone(), tcpros_listener));
         let watcher = watcher::start(inner.clone()).await?;
         inner.spawn(watcher.run());
@@ -267,6 +288,12 @@ impl Inner {
     /// A number for a connection or a local registration.
     fn id(&self) -> i32 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// A client of the node at `uri`.
+    fn client(&self, uri: &str) -> Result<Client, BusError> {
+        let client = Client::new(self.sockets.clone(), uri).map_err(master_client::to_bus_error)?;
+        Ok(client.within(&self.frames.budget))
     }
 
     /// Asks the Master for every change, if anybody watches.

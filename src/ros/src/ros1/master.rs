@@ -15,6 +15,7 @@ mod registry;
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{BuildHasher as _, RandomState};
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
@@ -33,6 +34,9 @@ use registry::Registry;
 const MAX_USES: usize = 10_000;
 /// Nodes remembered per key and kind of use, at most.
 const MAX_USERS: usize = 100;
+/// Nodes touch parameters by the hundred when they start. Whoever waits for the graph hears of all that is touched within
+/// this time at once: each answer holds the whole graph.
+const USES_TOGETHER: Duration = Duration::from_millis(100);
 /// Services remembered that were looked for in vain, at most.
 const MAX_SOUGHT: usize = 1000;
 
@@ -90,6 +94,8 @@ struct State {
     registry: Registry,
     params: Params,
     uses: HashMap<String, ParameterUse>,
+    /// A use was noted that is yet to be told.
+    uses_changed: bool,
     sought: BTreeMap<String, Vec<String>>,
 }
 
@@ -143,6 +149,7 @@ impl Master {
                     (key, used)
                 })
                 .collect(),
+            uses_changed: false,
             sought: BTreeMap::new(),
         };
         Self::with(options.uri, options.limits, snapshot.run_id, state, 1)
@@ -258,7 +265,7 @@ impl Inner {
     }
 
     /// Remembers that `node` used a parameter.
-    fn note_use(&self, state: &mut State, key: &str, node: &str, written: bool) {
+    fn note_use(self: &Arc<Self>, state: &mut State, key: &str, node: &str, written: bool) {
         if state.uses.len() >= MAX_USES && !state.uses.contains_key(key) {
             return;
         }
@@ -270,8 +277,27 @@ impl Inner {
         };
         if nodes.len() < MAX_USERS && nodes.iter().all(|known| known != node) {
             nodes.push(node.to_owned());
-            self.grow();
+            if !std::mem::replace(&mut state.uses_changed, true) {
+                let master = Arc::clone(self);
+                tokio::spawn(async move {
+                    tokio::time::sleep(USES_TOGETHER).await;
+                    let mut state = master.state.lock();
+                    state.uses_changed = false;
+                    master.grow();
+                });
+            }
         }
+    }
+
+    /// About how many bytes the graph takes; more than its share have only the parameters.
+    fn graph_weight(&self) -> usize {
+        let state = self.state.lock();
+        let uses = state.uses.iter().map(|(key, used)| {
+            let users = used.read_by.iter().chain(&used.written_by);
+            let names = users.map(|node| size_of::<Value>() + node.len());
+            3 * size_of::<Value>() + size_of::<String>() + key.len() + names.sum::<usize>()
+        });
+        uses.sum()
     }
 }
 

@@ -6,15 +6,18 @@ mod outbox;
 mod service;
 
 use std::io;
+use std::time::Duration;
 
 pub(crate) use frames::BIG;
-pub use frames::FrameReader;
+pub use frames::{FrameBounds, FrameReader};
 pub use header::{Header, MAX_HEADER};
 pub use outbox::{Outbox, write_messages};
 pub use service::{CallError, ServiceConnection, serve_calls};
 
 /// A message longer than this ends its connection, unless set otherwise.
 pub const MAX_MESSAGE: usize = 256 << 20;
+/// A message that was begun and is not whole after this time ends its connection, unless set otherwise.
+pub const UNFINISHED: Duration = Duration::from_secs(300);
 
 /// A TCPROS connection that broke.
 #[derive(Debug, thiserror::Error)]
@@ -32,6 +35,19 @@ pub enum Error {
         size: usize,
         /// The limit.
         max: usize,
+    },
+    /// A message that does not fit into the memory for its servant.
+    #[error("a message cannot be read: {0}")]
+    Exceeded(#[from] budget::Exceeded),
+    /// A message that was begun and never completed.
+    #[error("a message of {size} bytes is not complete after {after:?}; {read} of them came")]
+    Unfinished {
+        /// What its prefix says.
+        size: usize,
+        /// What came.
+        read: usize,
+        /// How long was waited.
+        after: Duration,
     },
     /// The peer answered the header with an error.
     #[error("the peer refused: {0}")]

@@ -17,7 +17,7 @@ pub use client::Client;
 pub use parse::{Call, MAX_DEPTH, MAX_ELEMENTS, parse_call, parse_response};
 pub(crate) use print::fault_value;
 pub use print::{print_call, print_fault, print_response};
-pub use server::{Handler, Limits, serve};
+pub use server::{Handler, Limits, MAX_HELD, serve};
 pub use value::Value;
 
 /// What the other side answered instead of a value.

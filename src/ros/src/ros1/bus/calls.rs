@@ -217,7 +217,7 @@ async fn open(
     let opening = async {
         let resolved = bus.sockets.resolve(&place.host, place.port).await;
         let address = resolved.map_err(Error::Io)?;
-        ServiceConnection::open(&*bus.sockets, address, &header, bus.max_message).await
+        ServiceConnection::open(&*bus.sockets, address, &header, bus.frames.clone()).await
     };
     match timeout(HANDSHAKE, opening).await {
         Ok(Ok(connection)) => Ok(connection),

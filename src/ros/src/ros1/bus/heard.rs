@@ -1,7 +1,11 @@
 //! Whom a topic's publishers send to, as they say themselves (`getBusInfo` of the slave API). A publisher answers a
 //! subscriber's header before it sends to it: what it publishes in between, the subscriber does not hear.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use parking_lot::Mutex;
 
 use super::master_client::to_bus_error;
 use super::{HANDSHAKE, Inner};
@@ -9,9 +13,47 @@ use crate::bus::BusError;
 use crate::ros1::reply::Reply;
 use crate::ros1::xmlrpc::{Client, Value};
 
+/// How long the connection to a publisher is kept after it was asked: whoever waits to be heard asks often.
+const KEPT: Duration = Duration::from_secs(1);
+
+/// Publishers that were asked a moment ago.
+#[derive(Default)]
+pub(super) struct Asked {
+    clients: Mutex<HashMap<String, (Arc<Client>, Instant)>>,
+}
+
+impl Asked {
+    /// A client of the publisher at `uri`, connected already where it was asked before.
+    fn client(&self, bus: &Arc<Inner>, uri: &str) -> Result<Arc<Client>, BusError> {
+        let mut clients = self.clients.lock();
+        if let Some((client, asked)) = clients.get_mut(uri) {
+            *asked = Instant::now();
+            return Ok(client.clone());
+        }
+        let client = Arc::new(bus.client(uri)?);
+        if clients.is_empty() {
+            bus.spawn(forget(bus.clone()));
+        }
+        clients.insert(uri.to_owned(), (client.clone(), Instant::now()));
+        Ok(client)
+    }
+}
+
+/// Closes the connections to those that are asked no more, until there is none left.
+async fn forget(bus: Arc<Inner>) {
+    loop {
+        tokio::time::sleep(KEPT).await;
+        let mut clients = bus.asked.clients.lock();
+        clients.retain(|_, (_, asked)| asked.elapsed() < KEPT);
+        if clients.is_empty() {
+            return;
+        }
+    }
+}
+
 /// The connections over which the topic's publishers send to `bus`: each publisher with its own number of it.
 pub(super) async fn connections(
-    bus: &Inner,
+    bus: &Arc<Inner>,
     topic: &str,
 ) -> Result<BTreeSet<(String, i32)>, BusError> {
     let graph = bus.graph.borrow().clone();
@@ -22,7 +64,7 @@ pub(super) async fn connections(
         let Some(uri) = graph.nodes.get(&node).filter(|_| node != bus.node) else {
             continue;
         };
-        let client = Client::new(bus.sockets.clone(), uri).map_err(to_bus_error)?;
+        let client = bus.asked.client(bus, uri)?;
         let caller = [bus.node.as_str().into()];
         let asked = client.call("getBusInfo", &caller, HANDSHAKE);
         let answer = asked.await.map_err(to_bus_error)?;

@@ -18,7 +18,7 @@ use super::{HANDSHAKE, Inner};
 use crate::bus::{BusError, Message, WireType};
 use crate::ros1::reply::Reply;
 use crate::ros1::tcpros::{self, FrameReader, Header};
-use crate::ros1::xmlrpc::{Client, Value};
+use crate::ros1::xmlrpc::Value;
 
 /// Between attempts, at first and at last.
 const PAUSE: Duration = Duration::from_millis(50);
@@ -218,7 +218,7 @@ pub(super) async fn connect(
     }
     Ok(Connection {
         stream,
-        frames: FrameReader::new(buffer, bus.max_message),
+        frames: FrameReader::new(buffer, bus.frames.clone()),
         publisher: answer.get("callerid").unwrap_or(uri).to_owned(),
         latching: answer.flag("latching"),
         wire_type,
@@ -227,7 +227,7 @@ pub(super) async fn connect(
 
 /// Where the node at `uri` serves the topic.
 async fn request_topic(bus: &Inner, topic: &str, uri: &str) -> Result<(String, u16), BusError> {
-    let client = Client::new(bus.sockets.clone(), uri).map_err(to_bus_error)?;
+    let client = bus.client(uri)?;
     let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
     let args = [bus.node.as_str().into(), topic.into(), protocols];
     let answer = client.call("requestTopic", &args, HANDSHAKE).await;

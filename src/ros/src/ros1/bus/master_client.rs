@@ -4,6 +4,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use budget::Budget;
+
 use crate::bus::BusError;
 use crate::net::Sockets;
 use crate::ros1::reply::Reply;
@@ -24,9 +26,12 @@ impl MasterClient {
         sockets: Arc<dyn Sockets>,
         address: SocketAddr,
         node: &str,
+        budget: &Budget,
     ) -> Result<Self, BusError> {
         let uri = format!("http://{address}/");
-        let client = Client::new(sockets, &uri).map_err(to_bus_error)?;
+        let client = Client::new(sockets, &uri)
+            .map_err(to_bus_error)?
+            .within(budget);
         Ok(Self {
             client,
             uri,

@@ -138,7 +138,7 @@ pub(super) async fn answer(
         buffer,
         (caller, header.flag("persistent")),
         &*served.handler,
-        bus.max_message,
+        bus.frames.clone(),
         served.ended.clone(),
     )
     .await

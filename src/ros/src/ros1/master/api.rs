@@ -71,6 +71,32 @@ impl Handler for Api {
             _ => self.simple(method, params),
         }
     }
+
+    fn weight(&self, method: &str, params: &[Value]) -> usize {
+        match (method, params) {
+            ("getParam" | "subscribeParam", [caller, rest @ ..]) => {
+                let key = rest.last().and_then(Value::as_str).unwrap_or_default();
+                let key = names::resolve(key, caller.as_str().unwrap_or_default());
+                let state = self.master.state.lock();
+                state.params.get(&key).map_or(0, Value::size)
+            }
+            ("system.multicall", [Value::Array(calls), ..]) => {
+                let each = calls.iter().map(|call| {
+                    let method = call.get("methodName").and_then(Value::as_str);
+                    let params = call.get("params").and_then(Value::as_array);
+                    match (method, params) {
+                        // It is not answered within itself.
+                        (Some("system.multicall"), _) | (None, _) | (_, None) => 0,
+                        (Some(method), Some(params)) => self.weight(method, params),
+                    }
+                });
+                each.fold(0, usize::saturating_add)
+            }
+            (WAIT_GRAPH, _) => self.master.graph_weight(),
+            ("getParamNames", _) => self.master.state.lock().params.size(),
+            _ => 0,
+        }
+    }
 }
 
 impl Api {
@@ -278,10 +304,12 @@ impl Api {
         let node = args.text("caller_id")?;
         let api = args.uri("caller_api", "http")?;
         args.end()?;
-        let lent = self
-            .master
-            .lending
-            .begin(&node, &api, self.master.sockets());
+        let lent = self.master.lending.begin(
+            &node,
+            &api,
+            self.master.sockets(),
+            &self.master.limits.budget,
+        );
         lent.map_err(|reason| Reply::mistake(reason, 0))?;
         Ok(Reply::done(format!("[{node}] lends services"), 1))
     }

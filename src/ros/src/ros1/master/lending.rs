@@ -10,6 +10,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use budget::Budget;
 use parking_lot::Mutex;
 use tokio::sync::Semaphore;
 
@@ -58,11 +59,12 @@ impl Lending {
         node: &str,
         api: &str,
         sockets: Arc<dyn Sockets>,
+        budget: &Budget,
     ) -> Result<(), String> {
         let client = Client::new(sockets, api).map_err(|error| error.to_string())?;
         *self.lender.lock() = Some(Lender {
             node: node.to_owned(),
-            client: Arc::new(client),
+            client: Arc::new(client.within(budget)),
         });
         Ok(())
     }

@@ -1,7 +1,8 @@
 //! Calls from the Master to nodes: in order per node, concurrently between nodes, newest wins.
 //!
 //! A node that hangs keeps its own news waiting and nobody else's; it gets the newest state once it answers
-//! again, or is forgotten with its registrations.
+//! again, or is forgotten with its registrations. What values of parameters take while they wait is bounded: the oldest
+//! of a node's are left out beyond, for a node that does not listen must not fill its Master's memory.
 
 use std::collections::{HashMap, VecDeque};
 use std::io::ErrorKind;
@@ -21,6 +22,10 @@ const CALLER: &str = "/master";
 const ANSWER: Duration = Duration::from_secs(10);
 /// After a node did not answer in time.
 const PAUSE: Duration = Duration::from_secs(2);
+/// Bytes of parameters' values that may wait for one node; the newest may, whatever its size.
+const WAITING: usize = 1 << 20;
+/// A value is in memory as such and as text that grows.
+const FORMS: usize = 3;
 /// How long the connection to a node is kept after the last news.
 const LINGER: Duration = Duration::from_secs(2);
 
@@ -31,6 +36,8 @@ pub(super) struct Notice {
     pub(super) api: String,
     subject: Subject,
     params: Vec<Value>,
+    /// About how many bytes the value of a parameter takes.
+    size: usize,
 }
 
 /// What a notice is about; a newer notice of the same subject replaces an older one.
@@ -61,6 +68,7 @@ impl Notice {
                 topic.into(),
                 Value::strings(publishers.iter().cloned()),
             ],
+            size: 0,
         }
     }
 
@@ -68,6 +76,7 @@ impl Notice {
         Self {
             api,
             subject: Subject::Parameter(key.clone()),
+            size: value.size(),
             params: vec![CALLER.into(), key.into(), value],
         }
     }
@@ -77,6 +86,7 @@ impl Notice {
             api: api.to_owned(),
             subject: Subject::Shutdown,
             params: vec![CALLER.into(), reason.into()],
+            size: 0,
         }
     }
 }
@@ -93,6 +103,25 @@ struct Queue {
     more: Arc<Notify>,
 }
 
+impl Queue {
+    fn push(&mut self, notice: Notice) {
+        self.notices.retain(|older| older.subject != notice.subject);
+        let is_value = |notice: &Notice| matches!(notice.subject, Subject::Parameter(_));
+        while is_value(&notice)
+            && notice.size + self.notices.iter().map(|n| n.size).sum::<usize>() > WAITING
+        {
+            let Some(oldest) = self.notices.iter().position(is_value) else {
+                break;
+            };
+            if let Some(lost) = self.notices.remove(oldest) {
+                tracing::warn!(api = lost.api, subject = ?lost.subject, "the node is too slow to be told");
+            }
+        }
+        self.notices.push_back(notice);
+        self.more.notify_one();
+    }
+}
+
 impl Notifier {
     /// Queues the notices, in this order, and starts the tasks that are missing.
     pub(super) fn send(master: &Arc<Inner>, notices: Vec<Notice>) {
@@ -104,10 +133,7 @@ impl Notifier {
                 tokio::spawn(work(master.clone(), notice.api.clone(), more));
                 queue
             });
-            let replaces = |older: &Notice| older.subject == notice.subject;
-            queue.notices.retain(|older| !replaces(older));
-            queue.notices.push_back(notice);
-            queue.more.notify_one();
+            queue.push(notice);
         }
     }
 
@@ -151,6 +177,8 @@ async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
         notifier.finish(&api, true);
         return;
     };
+    let budget = &master.limits.budget;
+    let client = client.within(budget);
     let mut recovering = false;
     loop {
         let Some(notice) = notifier.next(&api) else {
@@ -161,6 +189,14 @@ async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
             continue;
         };
         let method = notice.subject.method();
+        let weight = notice.size.saturating_mul(FORMS);
+        let _permit = match budget.wait(weight, ANSWER).await {
+            Ok(permit) => permit,
+            Err(full) => {
+                tracing::warn!(%api, method, %full, "the node was not told");
+                continue;
+            }
+        };
         match client.call(method, &notice.params, ANSWER).await {
             Ok(_) if recovering => {
                 // It may yet take up older calls that timed out: make this the last word.

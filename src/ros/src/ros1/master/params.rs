@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::ros1::names;
 use crate::ros1::xmlrpc::{MAX_DEPTH, Value};
 
-/// All parameters together, at most.
-const MAX_BYTES: usize = 64 << 20;
+/// All parameters together, at most. They are in the shim, whose memory is bounded, and whoever reads all of them has the
+/// shim hold them three times more.
+const MAX_BYTES: usize = 24 << 20;
 
 /// Nested structs, as ROS has it: `/a/b` is member `b` of member `a`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,6 +74,11 @@ impl Params {
         *place = value;
         self.size = size;
         Ok(())
+    }
+
+    /// About how many bytes the tree takes; never less than its values.
+    pub(super) fn size(&self) -> usize {
+        self.size
     }
 
     /// The value or namespace at `key`.

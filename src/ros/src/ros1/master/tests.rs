@@ -1,3 +1,7 @@
+use budget::Budget;
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpStream;
+
 use super::*;
 use crate::net::HostSockets;
 use crate::ros1::testing::{LONG, TestMaster, TestNode, args};
@@ -444,4 +448,121 @@ async fn a_node_gone_wild_finds_the_end_of_our_patience() {
     assert_eq!(refused, Some(registry::Refused::Full));
     let reason = refused.unwrap().to_string();
     assert!(reason.contains("50000"), "{reason}");
+}
+
+/// Asks for all parameters on a connection of its own, and does not read the answer.
+async fn ask_for_all(master: &TestMaster) -> TcpStream {
+    let body = xmlrpc::print_call("getParam", &args(["/x", "/"]));
+    let length = body.len();
+    let request = format!("POST / HTTP/1.1\r\nContent-Length: {length}\r\n\r\n{body}");
+    let mut stream = TcpStream::connect(master.address).await.unwrap();
+    stream.write_all(request.as_bytes()).await.unwrap();
+    stream
+}
+
+/// Which of the connections have some of their answer.
+fn answered(streams: &[TcpStream]) -> Vec<usize> {
+    let has = |stream: &TcpStream| stream.try_read(&mut [0]).is_ok();
+    (0..streams.len()).filter(|at| has(&streams[*at])).collect()
+}
+
+#[tokio::test]
+async fn answers_that_nobody_reads_take_no_more_than_their_share() {
+    let budget = Budget::new("the Master", 32 << 20);
+    let limits = Limits {
+        budget: budget.clone(),
+        ..Limits::default()
+    };
+    let options = MasterOptions {
+        limits,
+        ..MasterOptions::default()
+    };
+    let master = TestMaster::with(Master::new(options), None).await;
+    // More than the kernel takes for a connection that nobody reads.
+    let big = Value::from("x".repeat(9 << 20));
+    let set = ["/n".into(), "/big".into(), big];
+    assert_eq!(master.call("setParam", &set).await.0, 1);
+    let mut streams = Vec::new();
+    for _ in 0..10 {
+        streams.push(ask_for_all(&master).await);
+    }
+    let first = tokio::time::timeout(LONG, async {
+        loop {
+            if let Some(first) = answered(&streams).first() {
+                break *first;
+            }
+            tokio::task::yield_now().await;
+        }
+    });
+    let first = first.await.expect("one has an answer");
+    // The others wait, while other nodes are answered as ever.
+    for _ in 0..20 {
+        assert_eq!(master.call("hasParam", &args(["/y", "/big"])).await.0, 1);
+        assert!(budget.used() <= 32 << 20);
+    }
+    streams.remove(first);
+    // Whoever reads nothing and goes makes room for the next.
+    let next = tokio::time::timeout(LONG, async {
+        while answered(&streams).is_empty() {
+            tokio::task::yield_now().await;
+        }
+    });
+    next.await.expect("the next has an answer");
+    drop(streams);
+    let given_back = tokio::time::timeout(LONG, async {
+        while budget.used() > 0 {
+            tokio::task::yield_now().await;
+        }
+    });
+    given_back.await.expect("all is given back");
+}
+
+#[tokio::test]
+async fn what_can_never_be_answered_is_a_fault_at_once() {
+    let limits = Limits {
+        budget: Budget::new("the Master", 1 << 20),
+        ..Limits::default()
+    };
+    let options = MasterOptions {
+        limits,
+        parameters: [("/big".to_owned(), ParamValue::String("x".repeat(1 << 20)))].into(),
+        ..MasterOptions::default()
+    };
+    let master = TestMaster::with(Master::new(options), None).await;
+    let uri = format!("http://{}/", master.address);
+    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let calls = |count: usize| {
+        let call = [
+            ("methodName".to_owned(), "getParam".into()),
+            ("params".to_owned(), strings(&["/x", "/big"])),
+        ];
+        Value::Array(vec![Value::Struct(call.into()); count])
+    };
+    for (method, params) in [
+        ("getParam", args(["/x", "/"]).to_vec()),
+        ("system.multicall", vec![calls(1)]),
+    ] {
+        let fault = client.call(method, &params, LONG).await.unwrap_err();
+        assert!(
+            fault.to_string().contains("the memory for the Master"),
+            "{fault}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn parameters_used_one_by_one_are_told_together() {
+    let master = TestMaster::start().await;
+    let mut generation = master.master.generation();
+    let before = *generation.borrow_and_update();
+    let count = 300;
+    for number in 0..count {
+        let key = format!("/p{number}");
+        master.call("hasParam", &args(["/n", &key])).await;
+    }
+    master.until(|graph| graph.parameters.len() == count).await;
+    let told = tokio::time::timeout(LONG, generation.changed()).await;
+    told.expect("it is told").unwrap();
+    let grown = *generation.borrow() - before;
+    assert!(grown < count as u64 / 2, "{grown} generations");
 }

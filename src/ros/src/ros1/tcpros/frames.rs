@@ -1,11 +1,13 @@
 //! A stream of length-prefixed messages → one [`Bytes`] each.
 //!
 //! Small messages are cut out of a common buffer, which is read as full as the socket gives; a big one is read
-//! straight into an allocation of its own.
+//! straight into an allocation of its own. That grows with what comes, not with what the prefix promises, and counts in
+//! the connection's budget until the message is whole.
 
 use std::io;
 use std::time::Duration;
 
+use budget::{Budget, Permit};
 use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt as _};
 use tokio::time::timeout;
@@ -21,6 +23,30 @@ const MANY: usize = 128 << 10;
 const REUSED: usize = 8 << 20;
 /// ... unless that takes longer than this to come.
 const KEPT: Duration = Duration::from_secs(1);
+/// Room made for a big message before any of it has come; as it comes the room doubles.
+const AHEAD: usize = 1 << 20;
+
+/// What the messages of a connection may take.
+#[derive(Debug, Clone)]
+pub struct FrameBounds {
+    /// Bytes of one message.
+    pub max: usize,
+    /// Where unfinished messages count.
+    pub budget: Budget,
+    /// From a message's length prefix to its last byte.
+    pub unfinished: Duration,
+}
+
+impl From<usize> for FrameBounds {
+    /// Messages up to `max` bytes, in a budget of nobody else's.
+    fn from(max: usize) -> Self {
+        Self {
+            max,
+            budget: Budget::unlimited(),
+            unfinished: super::UNFINISHED,
+        }
+    }
+}
 
 /// Reads messages off one connection.
 #[derive(Debug)]
@@ -29,17 +55,21 @@ pub struct FrameReader {
     chunk: usize,
     /// The last big message's allocation, while it may be used again.
     big: Option<BytesMut>,
-    max: usize,
+    bounds: FrameBounds,
+    /// For the big message that is being read.
+    permit: Permit,
 }
 
 impl FrameReader {
-    /// A reader that begins with what was already read, and takes messages up to `max` bytes.
-    pub fn new(buffer: BytesMut, max: usize) -> Self {
+    /// A reader that begins with what was already read, and takes messages within `bounds`.
+    pub fn new(buffer: BytesMut, bounds: impl Into<FrameBounds>) -> Self {
+        let bounds = bounds.into();
         Self {
             buffer,
             chunk: FEW,
             big: None,
-            max,
+            permit: bounds.budget.permit(),
+            bounds,
         }
     }
 
@@ -56,7 +86,10 @@ impl FrameReader {
                 }
                 if size >= BIG {
                     self.buffer.advance(4);
-                    return self.own_allocation(stream, size).await.map(Some);
+                    let message = self.own_allocation(stream, size).await;
+                    // Whole, it counts where it is queued; given up, its connection ends.
+                    let _ = self.permit.resize(0);
+                    return message.map(Some);
                 }
             }
             if !self.fill(stream).await? {
@@ -91,11 +124,9 @@ impl FrameReader {
             return Ok(None);
         };
         let size = u32::from_le_bytes(*prefix) as usize;
-        if size > self.max {
-            return Err(Error::TooLarge {
-                size,
-                max: self.max,
-            });
+        let max = self.bounds.max;
+        if size > max {
+            return Err(Error::TooLarge { size, max });
         }
         Ok(Some(size))
     }
@@ -127,20 +158,44 @@ impl FrameReader {
         Ok(count > 0)
     }
 
+    /// Room for at least so many bytes more of a message of `size` bytes.
+    fn make_room(&mut self, big: &mut BytesMut, size: usize, least: usize) -> Result<(), Error> {
+        if big.capacity() - big.len() < least {
+            let room = (size - big.len()).min(big.len().max(AHEAD)).max(least);
+            self.permit.grow_to(big.len() + room)?;
+            big.reserve(room);
+        }
+        Ok(())
+    }
+
     async fn own_allocation(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         size: usize,
     ) -> Result<Bytes, Error> {
-        // The pages behind it are only taken as they are written to, whatever the prefix promised.
         let mut big = self.big.take().unwrap_or_default();
-        big.reserve(size);
         let first = self.buffer.len().min(size);
+        self.make_room(&mut big, size, first)?;
         big.put(self.buffer.split_to(first));
-        while big.len() < size {
-            let missing = size - big.len();
-            if stream.read_buf(&mut (&mut big).limit(missing)).await? == 0 {
-                return Err(ended_inside());
+        let patience = self.bounds.unfinished;
+        let reading = async {
+            while big.len() < size {
+                self.make_room(&mut big, size, 1)?;
+                let room = (big.capacity() - big.len()).min(size - big.len());
+                if stream.read_buf(&mut (&mut big).limit(room)).await? == 0 {
+                    return Err(ended_inside());
+                }
+            }
+            Ok(())
+        };
+        match timeout(patience, reading).await {
+            Ok(read) => read?,
+            Err(_) => {
+                return Err(Error::Unfinished {
+                    size,
+                    read: big.len(),
+                    after: patience,
+                });
             }
         }
         let message = big.split().freeze();
@@ -195,6 +250,85 @@ mod tests {
         });
         assert_eq!(all(receiver).await.unwrap(), messages);
         sending.await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn unfinished_messages_take_no_more_than_their_budget() {
+        use tokio::io::AsyncWriteExt as _;
+        let budget = Budget::new("servant x", 4 << 20);
+        let bounds = FrameBounds {
+            max: 250 << 20,
+            budget: budget.clone(),
+            unfinished: Duration::from_secs(3600),
+        };
+        // Eight connections each promise 250 MB and send the first 3 of it.
+        let mut reading = tokio::task::JoinSet::new();
+        for _ in 0..8 {
+            let (mut sender, mut receiver) = tokio::io::duplex(64 << 10);
+            let bounds = bounds.clone();
+            reading.spawn(async move {
+                let sending = async {
+                    sender.write_u32_le(250 << 20).await?;
+                    sender.write_all(&vec![7; 3 << 20]).await?;
+                    std::future::pending::<io::Result<()>>().await
+                };
+                let mut frames = FrameReader::new(BytesMut::new(), bounds);
+                tokio::select! {
+                    message = frames.next(&mut receiver) => message,
+                    _ = sending => unreachable!("the reader is asked first"),
+                }
+            });
+        }
+        // One at most can have its 3 MB; all others are told why not.
+        for _ in 0..7 {
+            let refused = timeout(Duration::from_secs(60), reading.join_next()).await;
+            let refused = refused.expect("it is refused").unwrap().unwrap();
+            let refused = refused.unwrap_err();
+            assert!(
+                refused.to_string().contains("the memory for servant x"),
+                "{refused}"
+            );
+            assert!(budget.used() <= 4 << 20);
+        }
+        reading.shutdown().await;
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[tokio::test]
+    async fn a_whole_message_counts_no_longer() {
+        let budget = Budget::new("servant x", 4 << 20);
+        let bounds = FrameBounds {
+            budget: budget.clone(),
+            ..FrameBounds::from(8 << 20)
+        };
+        let bytes = framed(&vec![vec![1; 3 << 20]; 3]);
+        let mut stream = bytes.as_slice();
+        let mut frames = FrameReader::new(BytesMut::new(), bounds);
+        let mut held = Vec::new();
+        while let Some(message) = frames.next(&mut stream).await.unwrap() {
+            assert_eq!(budget.used(), 0);
+            held.push(message);
+        }
+        assert_eq!(held, vec![vec![1; 3 << 20]; 3]);
+    }
+
+    #[tokio::test]
+    async fn a_message_that_stays_unfinished_ends_its_connection() {
+        use tokio::io::AsyncWriteExt as _;
+        let (mut sender, mut receiver) = tokio::io::duplex(64 << 10);
+        let bounds = FrameBounds {
+            unfinished: Duration::from_millis(20),
+            ..FrameBounds::from(250 << 20)
+        };
+        let bytes = &framed(&[vec![7; 100_000]])[..50_000];
+        sender.write_all(bytes).await.unwrap();
+        let mut frames = FrameReader::new(BytesMut::new(), bounds);
+        let given_up = timeout(Duration::from_secs(60), frames.next(&mut receiver)).await;
+        let error = given_up.expect("it is given up").unwrap_err();
+        assert!(
+            matches!(error, Error::Unfinished { size: 100_000, .. }),
+            "{error}"
+        );
     }
 
     #[tokio::test]

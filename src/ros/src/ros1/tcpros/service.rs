@@ -11,7 +11,7 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::sync::watch;
 
-use super::{Error, FrameReader, Header, write_messages};
+use super::{Error, FrameBounds, FrameReader, Header, write_messages};
 use crate::bus::ServiceHandler;
 use crate::net::Sockets;
 
@@ -43,14 +43,14 @@ impl ServiceConnection {
         sockets: &dyn Sockets,
         address: SocketAddr,
         header: &Header,
-        max: usize,
+        bounds: impl Into<FrameBounds>,
     ) -> Result<Self, Error> {
         let mut stream = sockets.connect(address).await?;
         let mut buffer = BytesMut::new();
         let header = header.exchange(&mut stream, &mut buffer).await?;
         Ok(Self {
             stream,
-            frames: FrameReader::new(buffer, max),
+            frames: FrameReader::new(buffer, bounds),
             header,
         })
     }
@@ -118,10 +118,10 @@ pub async fn serve_calls(
     buffer: BytesMut,
     (caller, persistent): (&str, bool),
     handler: &dyn ServiceHandler,
-    max: usize,
+    bounds: impl Into<FrameBounds>,
     mut ended: watch::Receiver<bool>,
 ) -> Result<(), Error> {
-    let mut frames = FrameReader::new(buffer, max);
+    let mut frames = FrameReader::new(buffer, bounds);
     loop {
         let request = tokio::select! {
             request = frames.next(&mut stream) => request?,

@@ -5,6 +5,7 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use budget::Budget;
 use parking_lot::Mutex;
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
@@ -25,6 +26,7 @@ pub struct Client {
     sockets: Arc<dyn Sockets>,
     uri: PeerUri,
     idle: Mutex<Vec<Connection>>,
+    budget: Budget,
 }
 
 struct Connection {
@@ -48,7 +50,16 @@ impl Client {
             sockets,
             uri,
             idle: Mutex::new(Vec::new()),
+            budget: Budget::unlimited(),
         })
+    }
+
+    /// Has responses count in this budget while they are read; one that does not fit fails its call.
+    pub fn within(self, budget: &Budget) -> Self {
+        Self {
+            budget: budget.clone(),
+            ..self
+        }
     }
 
     /// Calls `method`; the time-out covers everything.
@@ -159,7 +170,10 @@ impl Client {
                 let start: String = head.start.chars().take(80).collect();
                 return Err(HttpError::Bad(0, format!("it answered {start:?}")));
             }
-            let body = reader.body(&mut stream, &head, MAX_BODY, true).await?;
+            let mut permit = self.budget.permit();
+            let body = reader
+                .body(&mut stream, &head, MAX_BODY, true, &mut permit)
+                .await?;
             let version = head.start.split_whitespace().next().unwrap_or_default();
             let counted = head.field("content-length").is_some();
             Ok((body, counted && head.keeps_alive(version)))

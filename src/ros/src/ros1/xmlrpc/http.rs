@@ -2,6 +2,7 @@
 
 use std::io;
 
+use budget::Permit;
 use bytes::{Buf as _, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt as _};
 
@@ -11,6 +12,10 @@ const MAX_HEAD: usize = 16 << 10;
 const MAX_FIELDS: usize = 100;
 /// Bodies up to this size are read into what is at hand; bigger ones grow as they come.
 const READ_STEP: usize = 8 << 10;
+/// Bodies up to this size count in no budget: the number of connections bounds them.
+pub(super) const SMALL: usize = 64 << 10;
+/// Bigger ones count in steps of this size, as they come.
+const COUNTED: usize = 256 << 10;
 
 /// Why a message could not be read.
 #[derive(Debug, thiserror::Error)]
@@ -95,6 +100,16 @@ impl Reader {
         self.buffer.len()
     }
 
+    /// Has what was read of a body count, and what it is read into.
+    fn count(&self, before: usize, permit: &mut Permit) -> Result<(), HttpError> {
+        let size = before + self.buffer.len();
+        if size <= SMALL {
+            return Ok(());
+        }
+        let counted = permit.grow_to(size.next_multiple_of(COUNTED));
+        counted.map_err(|full| bad(503, full.to_string()))
+    }
+
     /// Reads more; false at the end of the stream.
     pub(super) async fn fill(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> io::Result<bool> {
         self.buffer.reserve(READ_STEP);
@@ -159,17 +174,18 @@ impl Reader {
     }
 
     /// The body that `head` announces. Without any length a response lasts until the stream ends
-    /// (`until_end`), a request has none.
+    /// (`until_end`), a request has none. `permit` grows with it.
     pub(super) async fn body(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         head: &Head,
         max: usize,
         until_end: bool,
+        permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         let too_large = || bad(413, format!("the body is over {max} bytes"));
         if head.chunked() {
-            return self.chunks(stream, max).await;
+            return self.chunks(stream, max, permit).await;
         }
         let Some(length) = head.content_length()? else {
             if !until_end {
@@ -179,13 +195,14 @@ impl Reader {
                 if self.buffer.len() > max {
                     return Err(too_large());
                 }
+                self.count(0, permit)?;
             }
             return Ok(std::mem::take(&mut self.buffer).into());
         };
         if length > max {
             return Err(too_large());
         }
-        self.exactly(stream, length).await
+        self.exactly(stream, length, 0, permit).await
     }
 
     /// Grows with what really comes, never with what was promised.
@@ -193,9 +210,12 @@ impl Reader {
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         length: usize,
+        before: usize,
+        permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         while self.buffer.len() < length {
             self.more(stream).await?;
+            self.count(before, permit)?;
         }
         if self.buffer.len() == length {
             // No copy, and no long buffer left behind on an idle connection.
@@ -210,6 +230,7 @@ impl Reader {
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         max: usize,
+        permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         let mut body = Vec::new();
         loop {
@@ -223,7 +244,7 @@ impl Reader {
             if length > max || body.len() + length > max {
                 return Err(bad(413, format!("the body is over {max} bytes")));
             }
-            body.extend(self.exactly(stream, length).await?);
+            body.extend(self.exactly(stream, length, body.len(), permit).await?);
             self.line(stream, &mut 2).await?;
         }
         let mut budget = MAX_HEAD;

@@ -1,17 +1,22 @@
 //! The server: one task per connection, requests of a connection in order.
+//!
+//! What big requests and answers take counts in a budget: a request waits for its share before its body is read, an
+//! answer before it is made, and gives it back when the last byte of it is written.
 
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::{Budget, Permit};
+use bytes::Buf as _;
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::http::{Head, HttpError, Reader};
+use super::http::{Head, HttpError, Reader, SMALL};
 use super::{Call, Fault, Value, parse_call, print_fault, print_response};
 
 /// Answers calls.
@@ -19,6 +24,11 @@ use super::{Call, Fault, Value, parse_call, print_fault, print_response};
 pub trait Handler: Send + Sync + 'static {
     /// Answers one call. Dropped half-way if the caller goes away.
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault>;
+
+    /// About how many bytes the answer's value will take, as far as that is known before it is made.
+    fn weight(&self, _method: &str, _params: &[Value]) -> usize {
+        0
+    }
 }
 
 /// What a server grants its clients.
@@ -32,7 +42,12 @@ pub struct Limits {
     pub transfer: Duration,
     /// How long an idle connection is kept.
     pub idle: Duration,
+    /// Where the memory of big requests and answers counts.
+    pub budget: Budget,
 }
+
+/// Bytes that big requests and answers of one server may take, unless set otherwise.
+pub const MAX_HELD: usize = 96 << 20;
 
 impl Default for Limits {
     fn default() -> Self {
@@ -41,22 +56,18 @@ impl Default for Limits {
             body: 16 << 20,
             transfer: Duration::from_secs(30),
             idle: Duration::from_secs(600),
+            budget: Budget::new("XML-RPC", MAX_HELD),
         }
     }
 }
 
-/// Requests above [`LARGE`] that are held in memory at a time; others wait their turn.
-const LARGE_AT_A_TIME: usize = 4;
-const LARGE: usize = 256 << 10;
+/// A request is in memory as text and as values, an answer as values and as text that grows.
+const FORMS: usize = 3;
 
 /// Serves until dropped, which also ends every connection.
 pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, limits: Limits) {
     let room = Arc::new(Semaphore::new(limits.connections));
-    let server = Arc::new(Server {
-        handler,
-        limits,
-        large: Semaphore::new(LARGE_AT_A_TIME),
-    });
+    let server = Arc::new(Server { handler, limits });
     let mut connections = JoinSet::new();
     loop {
         let Ok(permit) = room.clone().acquire_owned().await else {
@@ -89,7 +100,6 @@ pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, limits: Lim
 struct Server {
     handler: Arc<dyn Handler>,
     limits: Limits,
-    large: Semaphore,
 }
 
 impl Server {
@@ -104,7 +114,7 @@ impl Server {
                 }
             }
             let request = timeout(self.limits.transfer, self.request(&mut reader, &mut stream));
-            let (call, keep) = match request.await {
+            let (call, permit, keep) = match request.await {
                 Ok(Ok(request)) => request,
                 Ok(Err(HttpError::Io(error))) => return Err(error),
                 Ok(Err(HttpError::Bad(status, reason))) => {
@@ -114,11 +124,11 @@ impl Server {
                     return self.refuse(&mut stream, 408, "the request stalled").await;
                 }
             };
-            let body = {
-                let answer = self.answer(call);
+            let (body, _permit) = {
+                let answer = self.answer(call, permit);
                 tokio::select! {
                     biased;
-                    body = answer => body,
+                    answer = answer => answer,
                     // The caller of a long poll went away.
                     () = gone(&mut reader, &mut stream) => return Ok(()),
                 }
@@ -131,12 +141,12 @@ impl Server {
         }
     }
 
-    /// One request; whether the connection is kept after it.
+    /// One request and what it counts; whether the connection is kept after it.
     async fn request(
         &self,
         reader: &mut Reader,
         stream: &mut TcpStream,
-    ) -> Result<(Vec<u8>, bool), HttpError> {
+    ) -> Result<(Vec<u8>, Permit, bool), HttpError> {
         let head = reader.head(stream).await?;
         let mut words = head.start.split_whitespace();
         let method = words.next().unwrap_or_default();
@@ -149,15 +159,23 @@ impl Server {
             return Err(HttpError::Bad(405, reason));
         }
         let keep = head.keeps_alive(version);
-        let _large = match head.content_length()? {
-            Some(length) if length > LARGE => self.large.acquire().await.ok(),
-            _ => None,
-        };
+        let mut permit = self.limits.budget.permit();
+        if let Some(length) = head.content_length()?.filter(|length| *length > SMALL)
+            && length <= self.limits.body
+        {
+            let room = permit.wait(length * FORMS, self.limits.transfer).await;
+            room.map_err(|full| HttpError::Bad(503, full.to_string()))?;
+        }
         if head.expects_continue() {
             stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
         }
-        let body = self.body(reader, stream, &head).await?;
-        Ok((body, keep))
+        let body = self.body(reader, stream, &head, &mut permit).await?;
+        if body.len() > SMALL {
+            // Of a body without a length nobody knew before what it would take.
+            let counted = permit.grow_to(body.len() * FORMS);
+            counted.map_err(|full| HttpError::Bad(503, full.to_string()))?;
+        }
+        Ok((body, permit, keep))
     }
 
     async fn body(
@@ -165,19 +183,52 @@ impl Server {
         reader: &mut Reader,
         stream: &mut TcpStream,
         head: &Head,
+        permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
-        reader.body(stream, head, self.limits.body, false).await
+        let max = self.limits.body;
+        reader.body(stream, head, max, false, permit).await
     }
 
-    async fn answer(&self, body: Vec<u8>) -> String {
+    /// The answer, and the permit for it.
+    async fn answer(&self, body: Vec<u8>, request: Permit) -> (String, Permit) {
         let parsed = parse_call(&body);
         drop(body);
-        match parsed {
-            Ok(Call { method, params }) => match self.handler.call(&method, params).await {
-                Ok(value) => print_response(&value),
-                Err(fault) => print_fault(&fault),
-            },
-            Err(error) => print_fault(&Fault::new(error.to_string())),
+        let mut permit = self.limits.budget.permit();
+        let Call { method, params } = match parsed {
+            Ok(call) => call,
+            Err(error) => return (print_fault(&Fault::new(error.to_string())), permit),
+        };
+        if let Err(full) = self.weigh(&method, &params, &mut permit).await {
+            tracing::warn!(method, %full, "a call is not answered");
+            let reason = format!("{full}; ask for less, or read answers faster");
+            return (print_fault(&Fault::new(reason)), permit);
+        }
+        let answer = match self.handler.call(&method, params).await {
+            Ok(value) => print_response(&value),
+            Err(fault) => print_fault(&fault),
+        };
+        drop(request);
+        // What it really takes from now on, the buffer that it grew in included.
+        if answer.capacity() > SMALL {
+            let _ = permit.resize(answer.capacity());
+        }
+        (answer, permit)
+    }
+
+    /// Waits until there is room for the answer.
+    async fn weigh(
+        &self,
+        method: &str,
+        params: &[Value],
+        permit: &mut Permit,
+    ) -> Result<(), budget::Exceeded> {
+        loop {
+            let weight = self.handler.weight(method, params).saturating_mul(FORMS);
+            if weight <= permit.bytes().max(SMALL) {
+                return Ok(());
+            }
+            // It may have become more when there is room.
+            permit.wait(weight, self.limits.transfer).await?;
         }
     }
 
@@ -202,17 +253,19 @@ impl Server {
             411 => "Length Required",
             413 => "Content Too Large",
             431 => "Request Header Fields Too Large",
+            503 => "Service Unavailable",
             _ => "Bad Request",
         };
         let connection = if keep { "keep-alive" } else { "close" };
         // XmlRpcpp wants exactly one blank after the colon.
-        let mut message = format!(
+        let head = format!(
             "HTTP/1.1 {status} {phrase}\r\nServer: cloudroid\r\nContent-Type: {content_type}\r\n\
              Content-Length: {}\r\nConnection: {connection}\r\n\r\n",
             body.len()
         );
-        message.push_str(body);
-        match timeout(self.limits.transfer, stream.write_all(message.as_bytes())).await {
+        let mut message = head.as_bytes().chain(body.as_bytes());
+        let written = timeout(self.limits.transfer, stream.write_all_buf(&mut message));
+        match written.await {
             Ok(written) => written,
             Err(_) => Err(io::ErrorKind::TimedOut.into()),
         }

@@ -1,5 +1,8 @@
+use std::sync::atomic::AtomicUsize;
+
 use super::*;
 use crate::ros1::master::{Master, MasterOptions};
+use crate::ros1::testing::args;
 
 #[tokio::test]
 async fn messages_go_from_bus_to_bus_with_their_type() {
@@ -140,6 +143,42 @@ async fn a_publisher_says_whom_it_sends_to() {
         after.len() == 1 && after != before,
         "another connection: {after:?}"
     );
+}
+
+/// Stands before a node's XML-RPC server and counts the connections to it.
+async fn counted(to: std::net::SocketAddr) -> (String, Arc<AtomicUsize>) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let uri = format!("http://{}/", listener.local_addr().unwrap());
+    let count = Arc::new(AtomicUsize::new(0));
+    let counter = count.clone();
+    tokio::spawn(async move {
+        while let Ok((mut near, _)) = listener.accept().await {
+            counter.fetch_add(1, Ordering::Relaxed);
+            tokio::spawn(async move {
+                let mut far = tokio::net::TcpStream::connect(to).await?;
+                tokio::io::copy_bidirectional(&mut near, &mut far).await
+            });
+        }
+    });
+    (uri, count)
+}
+
+#[tokio::test]
+async fn a_publisher_is_asked_again_on_the_same_connection() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let _publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let address = one.uri().trim_start_matches("http://");
+    let address = address.trim_end_matches('/').to_owned();
+    let (uri, count) = counted(address.parse().unwrap()).await;
+    let as_three = args(["/three", "/chat", "std_msgs/String", &uri]);
+    master.call("registerPublisher", &as_three).await;
+    until(&two, |graph| graph.nodes.contains_key("/three")).await;
+    let before = count.load(Ordering::Relaxed);
+    for _ in 0..50 {
+        two.heard_over("/chat").await.unwrap();
+    }
+    assert_eq!(count.load(Ordering::Relaxed) - before, 1);
 }
 
 #[tokio::test]
