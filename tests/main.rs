@@ -34,6 +34,8 @@ mod isolation;
 mod launched;
 #[path = "stories/link.rs"]
 mod link;
+#[path = "stories/memory.rs"]
+mod memory;
 #[path = "stories/mishaps.rs"]
 mod mishaps;
 #[path = "stories/names.rs"]
@@ -160,6 +162,9 @@ fn main() -> ExitCode {
             who_has_just_connected_hears_what_the_node_answers,
             the_robot_s_master_starts_again,
         ],
+        stories![memory:
+            what_is_begun_and_never_ended_costs_its_owner,
+        ],
         stories![mishaps:
             a_later_revision_is_gone_on_with_unless_its_interface_differs,
             another_version_of_the_protocol_is_named,
@@ -225,6 +230,7 @@ fn main() -> ExitCode {
             an_answer_waits_for_one_big_message_at_most,
         ],
         stories![survival:
+            what_cannot_be_removed_keeps_no_daemon_down,
             a_killed_daemon_loses_nothing,
             a_daemon_that_is_ended_says_why_and_keeps_its_servants,
             a_killed_init_and_a_killed_shim_are_told,

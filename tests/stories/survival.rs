@@ -36,7 +36,7 @@ fn nothing_is_left(daemon: Daemon) -> Told {
 }
 
 /// Waits for an event of this kind whose message has all of these words.
-fn event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<Value> {
+pub(crate) fn event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<Value> {
     let deadline = Instant::now() + PATIENCE;
     loop {
         let events = daemon.deployer().asks(&["events"])?;
@@ -65,6 +65,22 @@ fn greet(robot: &mut Robot, name: &str) -> anyhow::Result<Value> {
 const GREETER: (&str, &[&str]) = ("greeter_cpp", &["--node", "greeter", "--param", "word=hi"]);
 const ADDER: (&str, &[&str]) = ("adder_py", &["--node", "adder.py"]);
 const BURGLAR: (&str, &[&str]) = ("burglar_cpp", &["--node", "burglar"]);
+
+pub fn what_cannot_be_removed_keeps_no_daemon_down() -> Told {
+    let (setup, first) = settled("stray", &[ADDER])?;
+    let mut robot = first.robot("adder_py?robot=r1")?;
+    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"] == 2);
+    let stray = first.home.join("servants/x");
+    first.is_killed()?;
+    std::fs::write(&stray, "somebody's")?;
+    let second = setup.start()?;
+    let mut robot = second.robot("adder_py?robot=r1")?;
+    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    ensure!(second.servants_of("adder_py")?.len() == 1, "it is the same");
+    event(&second, "servant-leftover", &["servants/x"])?;
+    std::fs::remove_file(&stray)?;
+    nothing_is_left(second)
+}
 
 pub fn a_killed_daemon_loses_nothing() -> Told {
     let (setup, first) = settled("killed", &[GREETER, ADDER, BURGLAR])?;

@@ -102,6 +102,7 @@ impl Servant for Container {
     fn follow_log(&self, _from_start: bool) -> mpsc::Receiver<LogLine> {
         let (sender, receiver) = mpsc::channel(1);
         let line = LogLine {
+            number: None,
             time: SystemTime::UNIX_EPOCH,
             node: "x".into(),
             stream: "stdout".into(),

@@ -38,7 +38,8 @@ impl Amount {
         }
     }
 
-    fn minus(self, other: Amount) -> Amount {
+    /// What is left of it, down to nothing.
+    pub fn minus(self, other: Amount) -> Amount {
         Amount {
             millicpus: self.millicpus.saturating_sub(other.millicpus),
             memory: self.memory.saturating_sub(other.memory),
@@ -234,6 +235,16 @@ impl Admission {
             .filter(|waiter| !waiter.admit.is_closed())
             .count();
         (book.capacity, book.taken, waiting)
+    }
+
+    /// How much more would have to be free for all who wait.
+    pub fn lacking(&self) -> Amount {
+        let book = self.book.lock();
+        let waiting = book.waiting.iter();
+        let wanted = waiting
+            .filter(|waiter| !waiter.admit.is_closed())
+            .fold(Amount::default(), |sum, waiter| sum.plus(waiter.wanted));
+        wanted.minus(book.capacity.minus(book.taken))
     }
 
     /// Refuses what would never fit.

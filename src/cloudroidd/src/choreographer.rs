@@ -22,6 +22,7 @@ mod limits;
 mod nodes;
 mod readiness;
 mod restart;
+mod room;
 mod spares;
 mod tail;
 
@@ -38,6 +39,7 @@ use crate::config::Config;
 use crate::definitions::Definitions;
 use crate::errors::Error;
 use crate::journal::Journal;
+use crate::memory::{Memory, SharedMemory};
 use crate::names;
 use crate::request_times::RequestTimes;
 use crate::state::{self, State};
@@ -45,7 +47,7 @@ use crate::state::{self, State};
 pub use handle::{Asked, Handle, Lease};
 pub use limits::engine_limits;
 pub(crate) use nodes::how_it_ended;
-pub use tail::{read as read_log, record as log_record};
+pub use tail::{last as last_log_lines, read as read_log, record as log_record};
 
 use driver::Beginning;
 use spares::Spares;
@@ -66,6 +68,7 @@ pub(crate) struct Inner {
     pub(crate) admission: Admission,
     pub(crate) definitions: Definitions,
     pub(crate) request_times: Arc<RequestTimes>,
+    pub(crate) memory: SharedMemory,
     servants: Mutex<Servants>,
     spares: Spares,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
@@ -91,7 +94,9 @@ impl Choreographer {
         admission: Admission,
     ) -> Choreographer {
         let journal = Journal::new(Arc::clone(&state));
+        let memory = Memory::new(&config.memory, journal.clone());
         let inner = Inner {
+            memory: Arc::new(memory),
             config,
             state,
             journal,
@@ -129,15 +134,17 @@ impl Choreographer {
         linked: bool,
     ) -> Result<Lease, Error> {
         let inner = &self.inner;
-        let Some(revision) = inner.state.current(service)? else {
-            return Err(Error::UnknownService {
-                name: service.to_owned(),
-                exists: inner.state.service_names()?,
-            });
-        };
         let key = (service.to_owned(), robot.to_owned());
         let (handle, lease, spare) = {
             let mut servants = inner.servants.lock();
+            // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
+            // followed by one of the revision before.
+            let Some(revision) = inner.state.current(service)? else {
+                return Err(Error::UnknownService {
+                    name: service.to_owned(),
+                    exists: inner.state.service_names()?,
+                });
+            };
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
@@ -270,6 +277,11 @@ impl Choreographer {
         self.inner.definitions.keep_only(images);
     }
 
+    /// What may be held for clients and servants.
+    pub fn memory(&self) -> &Memory {
+        &self.inner.memory
+    }
+
     /// What the machine promises.
     pub fn admission(&self) -> &Admission {
         &self.inner.admission
@@ -313,18 +325,6 @@ impl Inner {
             asked.cpus.unwrap_or(reserve.reserve_cpus),
             asked.memory.unwrap_or(reserve.reserve_memory).0,
         )
-    }
-
-    /// Ends the servant that has been idle longest, if there is one: someone waits for its room.
-    fn make_room(&self) {
-        let servants = self.servants.lock();
-        let idle = servants
-            .all
-            .values()
-            .filter(|handle| handle.idle_until().is_some() && !handle.is_ending());
-        if let Some(longest) = idle.min_by_key(|handle| handle.idle_until()) {
-            longest.end("its room was needed");
-        }
     }
 
     /// Takes the servant out of reach if nobody is connected; true when so.
@@ -407,3 +407,6 @@ pub async fn describe(handle: &Handle) -> api::Servant {
         dropped: works.map_or(0, |works| works.dropped()),
     }
 }
+
+#[cfg(test)]
+mod tests;

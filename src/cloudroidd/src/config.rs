@@ -40,6 +40,8 @@ pub struct Config {
     pub servant: Servant,
     /// What clients may do.
     pub portal: Portal,
+    /// What may be held for clients and servants.
+    pub memory: Memory,
     /// How big pushes may be.
     pub push: Push,
     /// What pushes may ask for beyond a container.
@@ -122,12 +124,32 @@ pub struct Portal {
     pub ping: Time,
     /// A connection from which nothing came for so long, not even a pong, is closed; 0: never.
     pub idle: Time,
+    /// Most JSON or CBOR that one message of a servant may become.
+    pub max_encoded: Size,
     /// How NaN and infinities are written in JSON.
     pub non_finite: NonFinite,
     /// For a request's header, and for the `auth` message where that is awaited.
     pub handshake: Time,
     /// For connections to end when the daemon does.
     pub drain: Time,
+}
+
+/// What may be held outside of servants' containers: in the daemon for clients and servants, and in shims.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Memory {
+    /// By the daemon for all together; by default a quarter of the machine's memory, at most 1G.
+    pub daemon: Option<Size>,
+    /// For one client: messages that it has begun to send, and bodies of its requests.
+    pub client: Size,
+    /// For one servant: messages that its nodes and links have begun to send, and JSON made of its messages.
+    pub servant: Size,
+    /// A message, frame or body that was begun must be complete within this time.
+    pub unfinished: Time,
+    /// By one servant's shim, in a cgroup of its own.
+    pub shim: Size,
+    /// Cores for one servant's shim; it never has more than its servant, and a tenth at least.
+    pub shim_cpus: f64,
 }
 
 /// What of this machine a service may be given; nothing by default.
@@ -181,6 +203,7 @@ impl Default for Config {
             room: Room::default(),
             servant: Servant::default(),
             portal: Portal::default(),
+            memory: Memory::default(),
             push: Push::default(),
             allow: Allow::default(),
         }
@@ -216,11 +239,25 @@ impl Default for Portal {
         Portal {
             max_message: Size(64 << 20),
             max_frame: Size(64 << 20),
+            max_encoded: Size(64 << 20),
             ping: Time::seconds(15),
             idle: Time::seconds(90),
             non_finite: NonFinite::Null,
             handshake: Time::seconds(10),
             drain: Time::seconds(10),
+        }
+    }
+}
+
+impl Default for Memory {
+    fn default() -> Self {
+        Memory {
+            daemon: None,
+            client: Size(256 << 20),
+            servant: Size(256 << 20),
+            unfinished: Time::seconds(300),
+            shim: Size(256 << 20),
+            shim_cpus: 0.5,
         }
     }
 }
@@ -318,7 +355,13 @@ impl Config {
         if let Some(robot) = &self.default_robot {
             crate::names::robot(robot).context("default_robot of the configuration")?;
         }
-        if self.portal.max_message.0 == 0 || self.portal.max_frame.0 == 0 {
+        self.memory
+            .check()
+            .context("[memory] of the configuration")?;
+        if self.portal.max_encoded.0 == 0
+            || self.portal.max_message.0 == 0
+            || self.portal.max_frame.0 == 0
+        {
             bail!(
                 "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
             );
@@ -330,6 +373,36 @@ impl Config {
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
             .unwrap_or_else(|| std::env::var_os("NOTIFY_SOCKET").is_some())
+    }
+}
+
+impl Memory {
+    /// What nothing could work with.
+    const LEAST: u64 = 1 << 20;
+    const LEAST_FOR_A_SHIM: u64 = 32 << 20;
+
+    fn check(&self) -> anyhow::Result<()> {
+        let daemon = ("daemon", self.daemon.unwrap_or(self.client), Self::LEAST);
+        let least = Self::LEAST_FOR_A_SHIM;
+        for (name, size, least) in [
+            daemon,
+            ("client", self.client, Self::LEAST),
+            ("servant", self.servant, Self::LEAST),
+            ("shim", self.shim, least),
+        ] {
+            if size.0 < least {
+                bail!("{name} = {size} is too little; at least {}", Size(least));
+            }
+        }
+        if self.unfinished.0.is_zero() {
+            bail!(
+                "unfinished = 0 would refuse whatever does not come at once; write a time such as \"5m\""
+            );
+        }
+        if !(self.shim_cpus.is_finite() && (0.1..=64.0).contains(&self.shim_cpus)) {
+            bail!("shim_cpus = {} is not between 0.1 and 64", self.shim_cpus);
+        }
+        Ok(())
     }
 }
 
@@ -407,6 +480,11 @@ mod tests {
         );
         assert_eq!(written.servant, Servant::default());
         assert_eq!(written.portal, Portal::default());
+        let memory = Memory {
+            daemon: Some(Size(1 << 30)),
+            ..Memory::default()
+        };
+        assert_eq!(written.memory, memory);
         assert_eq!(written.push, Push::default());
         assert_eq!(written.limits.memory, Config::default().limits.memory);
     }
@@ -471,6 +549,22 @@ mod tests {
             let config = Config::parse(&format!("[limits]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[limits]"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn memory_that_nothing_works_with_is_refused() {
+        for text in [
+            "client = \"10K\"",
+            "servant = 0",
+            "daemon = 0",
+            "shim = \"4M\"",
+            "shim_cpus = 0.0",
+            "unfinished = \"0s\"",
+        ] {
+            let config = Config::parse(&format!("[memory]\n{text}")).expect("well-formed");
+            let refused = format!("{:#}", config.check().expect_err(text));
+            assert!(refused.contains("[memory]"), "{refused}");
         }
     }
 

@@ -146,6 +146,21 @@ pub enum Error {
         /// What is allowed.
         limit: api::Size,
     },
+    /// Another body than an archive is too big.
+    #[error("the body is bigger than {limit}")]
+    BodyTooLarge {
+        /// What is allowed.
+        limit: api::Size,
+    },
+    /// What is sent does not fit into the memory for its sender.
+    #[error("the body cannot be held: {0}")]
+    Memory(#[from] budget::Exceeded),
+    /// What is sent does not come to its end.
+    #[error("the body is not complete after {} s", after.as_secs())]
+    Unfinished {
+        /// How long was waited.
+        after: std::time::Duration,
+    },
     /// The state database.
     #[error(transparent)]
     State(#[from] StateError),
@@ -203,7 +218,9 @@ impl Error {
             | Error::UnknownArchitecture { exists, .. } => problem.exists = exists.clone(),
             Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
             Error::Full(admission::Refused::TooBig { .. }) => {}
-            Error::Full(_) | Error::Ending => problem.retry_after = Some(RETRY_AFTER),
+            Error::Full(_) | Error::Memory(_) | Error::Ending => {
+                problem.retry_after = Some(RETRY_AFTER)
+            }
             _ => {}
         }
         problem
@@ -225,6 +242,9 @@ impl Error {
             Error::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
             Error::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
             Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
+            Error::BodyTooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
+            Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
+            Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body not complete"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
             Error::WebSocketVersion => (
                 S::UPGRADE_REQUIRED,
@@ -282,6 +302,7 @@ impl Error {
                 format!("see cloudroidctl events, and push {service} again when its package is mended")
             }
             Error::Push { next, .. } => return next.clone(),
+            Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
             Error::TooLarge { .. } => "leave out what is not needed, or raise archive in [push] of the configuration".into(),
             _ => return None,
         };

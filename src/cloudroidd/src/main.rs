@@ -21,6 +21,7 @@ mod grants;
 mod home;
 mod journal;
 mod linked;
+mod memory;
 mod names;
 mod portal;
 mod private;
@@ -311,6 +312,11 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
     let servants = home.path().join("servants");
     let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
     engine.default_limits = choreographer::engine_limits(&config.limits);
+    engine.shim_limits = servant::spec::Limits {
+        cpus: Some(config.memory.shim_cpus),
+        memory: Some(config.memory.shim.0),
+        ..servant::spec::Limits::default()
+    };
     engine.isolation = match config.isolation {
         IsolationMode::Require => Isolation::Require,
         IsolationMode::BestEffort => Isolation::BestEffort,

@@ -11,6 +11,7 @@
 
 mod api_v1;
 mod auth;
+mod body;
 mod guard;
 mod handshake;
 mod metrics;

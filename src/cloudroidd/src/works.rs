@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bridge::{Bridge, BridgeOptions};
 use link::cloud::{Hub, HubOptions};
 use ros::bus::{Bus, BusError};
-use ros::ros1::Ros1Bus;
+use ros::ros1::{Ros1Bus, Ros1Options};
 
 use crate::choreographer::Inner;
 use crate::config::{Config, NonFinite};
@@ -41,14 +41,23 @@ impl Works {
         container: &Arc<dyn servant::engine::Servant>,
     ) -> Result<Arc<Works>, BusError> {
         let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
+        let budget = inner.memory.servant(container.id());
+        let unfinished = inner.memory.unfinished;
+        let joining = Ros1Options {
+            budget: budget.clone(),
+            unfinished,
+            ..Ros1Options::new(MASTER, NODE)
+        };
         let (bus, registry) = tokio::join!(
-            Ros1Bus::connect(sockets, MASTER, NODE),
+            Ros1Bus::connect_with(sockets, joining),
             inner.definitions.registry(&inner.store, revision),
         );
         let bus: Arc<dyn Bus> = bus?;
         let nodes = Arc::new(LinkedNodes::new(inner, revision, container).await);
         let options = HubOptions {
             grace: inner.config.servant.grace.0,
+            budget: budget.clone(),
+            unfinished,
             ..HubOptions::default()
         };
         let hub = Hub::new(
@@ -64,7 +73,11 @@ impl Works {
             &inner.config.allow,
         )
         .await;
-        let bridge = Bridge::new(Arc::clone(&bus), registry, bridge_options(&inner.config));
+        let options = BridgeOptions {
+            budget,
+            ..bridge_options(&inner.config)
+        };
+        let bridge = Bridge::new(Arc::clone(&bus), registry, options);
         Ok(Arc::new(Works {
             bus,
             bridge,
@@ -87,6 +100,8 @@ pub fn bridge_options(config: &Config) -> BridgeOptions {
     BridgeOptions {
         max_frame: bytes(config.portal.max_frame),
         max_message: bytes(config.portal.max_message),
+        max_encoded: bytes(config.portal.max_encoded),
+        unfinished: config.memory.unfinished.0,
         ping_interval: config.portal.ping.0,
         idle_timeout: config.portal.idle.0,
         non_finite: match config.portal.non_finite {

@@ -89,6 +89,19 @@ pub fn config(spec: &Spec, staged: &Staged, uid: (u32, u32)) -> Result<OciSpec, 
         .build()
 }
 
+/// Whom the kernel ends first when the host runs out of memory. The daemon and its shims may be protected by their unit
+/// (OOMScoreAdjust), and that is inherited: what robots run is as any other process of the host, and a build, which can be
+/// made again, goes before.
+/// Who was made easier to end stays so: to go below takes a capability that we may lack.
+fn oom_score(profile: Profile) -> i32 {
+    let inherited = std::fs::read_to_string("/proc/self/oom_score_adj").unwrap_or_default();
+    let least = match profile {
+        Profile::Servant => 0,
+        Profile::Compile | Profile::Install => 500,
+    };
+    inherited.trim().parse().unwrap_or(0).max(least)
+}
+
 fn process(spec: &Spec) -> Result<Process, OciSpecError> {
     let user = if spec.profile == Profile::Compile {
         COMPILE_USER
@@ -125,6 +138,7 @@ fn process(spec: &Spec) -> Result<Process, OciSpecError> {
         .cwd("/")
         .capabilities(capabilities)
         .no_new_privileges(true)
+        .oom_score_adj(oom_score(spec.profile))
         .rlimits(vec![
             rlimit(PosixRlimitType::RlimitNofile, OPEN_FILES)?,
             rlimit(PosixRlimitType::RlimitCore, 0)?,

@@ -1,11 +1,14 @@
 //! Limits, usage and the certain end of a servant, by control groups of whichever version the host offers.
 //!
 //! ```text
-//!  v2   PARENT/             delegated to us, holds no process itself
-//!         shims/            every shim
-//!         ID/               one servant: its init and its nodes
-//!  v1   OWN/cloudroid/ID/   in each hierarchy that we use, below the cgroup we are in ourselves there
+//!  v2   PARENT/                  delegated to us, holds no process itself
+//!         ID/                    one servant: its init and its nodes
+//!         ID.shim/               its shim
+//!  v1   OWN/cloudroid/ID/        in each hierarchy that we use, below the cgroup we are in ourselves there
+//!       OWN/cloudroid/ID.shim/   in those of processor time and memory
 //! ```
+//! A servant drives its shim (it asks the ROS Master there, and prints), so the shim has limits, too. They are not the
+//! servant's own: the shim must be able to say that a servant ran out of memory.
 //!
 //! On a hybrid host the controllers are on v1, and the empty v2 hierarchy beside them is still of use: it has
 //! `cgroup.kill`, and counts processor time.
@@ -83,6 +86,31 @@ impl Cgroup {
         }
     }
 
+    /// Where the cgroup of a servant's shim is, or would be.
+    pub fn of_shim(parent: &Parent, id: &str) -> Self {
+        let limits = |hierarchy: &&hosts::Below| {
+            let limits = |name: &String| matches!(name.as_str(), "cpu" | "memory");
+            parent.version == 2 || hierarchy.controllers.iter().any(limits)
+        };
+        // No id has a dot in it.
+        let leaves = parent.hierarchies.iter().filter(limits).map(|hierarchy| {
+            let wanted = ["cpu", "memory"].map(str::to_owned);
+            Leaf {
+                controllers: wanted
+                    .into_iter()
+                    .filter(|name| hierarchy.controllers.contains(name))
+                    .collect(),
+                directory: hierarchy.directory.join(format!("{id}.shim")),
+                unified: hierarchy.unified,
+            }
+        });
+        Self {
+            version: parent.version,
+            leaves: leaves.collect(),
+            disk: None,
+        }
+    }
+
     /// Makes its directories.
     pub fn create(&self) -> Result<(), Error> {
         for leaf in &self.leaves {
@@ -101,6 +129,21 @@ impl Cgroup {
         for leaf in &self.leaves {
             let file = leaf.directory.join("cgroup.procs");
             fs::write(&file, pid.to_string()).map_err(Error::file("move a process into", &file))?;
+        }
+        Ok(())
+    }
+
+    /// Moves this process into it, which must have one thread.
+    pub fn enter_alone(&self) -> Result<(), Error> {
+        for leaf in &self.leaves {
+            // A thread that moves itself need not wait for a grace period of the kernel; v2 moves processes only.
+            let name = if leaf.unified {
+                "cgroup.procs"
+            } else {
+                "tasks"
+            };
+            let file = leaf.directory.join(name);
+            fs::write(&file, "0").map_err(Error::file("move the shim into", &file))?;
         }
         Ok(())
     }
@@ -125,6 +168,7 @@ impl Cgroup {
         Enforced {
             cgroup_version: self.version,
             limits,
+            shim: Limits::default(),
         }
     }
 

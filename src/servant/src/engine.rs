@@ -90,6 +90,9 @@ pub struct Enforced {
     pub cgroup_version: u8,
     /// The values in force; none: this host cannot limit it.
     pub limits: Limits,
+    /// Those of its shim.
+    #[serde(default)]
+    pub shim: Limits,
 }
 
 impl Enforced {
@@ -130,6 +133,9 @@ pub struct Pressure {
 /// One line that a process printed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LogLine {
+    /// Its place in the log, from 0; none for what is said about the log itself.
+    #[serde(default)]
+    pub number: Option<u64>,
     /// When the shim read it.
     pub time: SystemTime,
     /// Which node printed it.
@@ -176,11 +182,21 @@ pub trait Servant: Send + Sync + 'static {
     async fn stop(&self) -> Result<(), crate::Error>;
 }
 
+/// What an engine found of an earlier daemon's.
+#[derive(Default)]
+pub struct Adopted {
+    /// Servants that run.
+    pub running: Vec<std::sync::Arc<dyn Servant>>,
+    /// Leftovers that could not be removed, each with the reason. Nothing of them is in anybody's way.
+    pub failures: Vec<crate::Error>,
+}
+
 /// Starts and finds servants.
 #[async_trait]
 pub trait Engine: Send + Sync + 'static {
     /// Starts one; returns once its init runs and its endpoint can be used.
     async fn start(&self, spec: Spec) -> Result<std::sync::Arc<dyn Servant>, crate::Error>;
-    /// Those that an earlier daemon left running, adopted; leftovers of dead ones are swept.
-    async fn adopt(&self) -> Result<Vec<std::sync::Arc<dyn Servant>>, crate::Error>;
+    /// Those that an earlier daemon left running, adopted one by one; leftovers of dead ones are swept. Fails only where
+    /// nothing can be looked at.
+    async fn adopt(&self) -> Result<Adopted, crate::Error>;
 }

@@ -71,6 +71,12 @@ pub enum Error {
         /// The name asked for.
         node: String,
     },
+    /// Something stands among the servants' directories that is none.
+    #[error("{} is no servant's directory and was left alone; move it away", path.display())]
+    Stray {
+        /// Where.
+        path: PathBuf,
+    },
     /// Something of a servant is left after its end.
     #[error("servant {id} left {what}: remove it by hand and report this")]
     LeftOver {

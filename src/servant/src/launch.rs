@@ -24,7 +24,7 @@ use crate::engine::ContainerState;
 use crate::local::{Grace, Isolation};
 use crate::process::Identity;
 use crate::protocol::NodeStatus;
-use crate::spec::Spec;
+use crate::spec::{Limits, Spec};
 
 /// [`Launch`]'s file.
 pub const SPEC: &str = "spec.json";
@@ -37,6 +37,9 @@ pub const SOCKET: &str = "shim.sock";
 /// The shim's standard error.
 pub const SHIM_LOG: &str = "shim.log";
 
+/// Cores that a shim may use, however few its servant has.
+const SHIM_CPUS: f64 = 0.1;
+
 /// Everything a shim needs to know.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Launch {
@@ -46,12 +49,28 @@ pub struct Launch {
     pub uid_range: (u32, u32),
     /// Where its cgroup is made.
     pub parent: Parent,
+    /// The shim's own limits; of processor time it never has more than its servant.
+    #[serde(default)]
+    pub shim_limits: Limits,
     /// Whether every limit must be in force.
     pub isolation: Isolation,
     /// How long nodes have to end.
     pub grace: Grace,
     /// The static init.
     pub init: PathBuf,
+}
+
+impl Launch {
+    /// What the shim may take beside a servant with these limits.
+    pub fn limits_of_shim(&self, servant: &Limits) -> Limits {
+        // The Master must be able to answer at all.
+        let most = servant.cpus.map(|cpus| cpus.max(SHIM_CPUS));
+        let cpus = self.shim_limits.cpus.into_iter().chain(most);
+        Limits {
+            cpus: cpus.reduce(f64::min),
+            ..self.shim_limits
+        }
+    }
 }
 
 /// What is left when a shim is gone without a word.
@@ -61,6 +80,9 @@ pub struct Runtime {
     pub shim: Identity,
     /// The servant's cgroup.
     pub cgroup: Cgroup,
+    /// The shim's own; none where an earlier version started it.
+    #[serde(default)]
+    pub shim_cgroup: Option<Cgroup>,
     /// First host uid and how many.
     pub uid_range: (u32, u32),
 }

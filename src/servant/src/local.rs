@@ -10,7 +10,7 @@ use tokio::sync::oneshot;
 
 use crate::Error;
 use crate::cgroup::Parent;
-use crate::engine::{Engine, Servant};
+use crate::engine::{Adopted, Engine, Servant};
 use crate::launch::{self, Exit, Runtime};
 use crate::spec::{Limits, Spec};
 
@@ -80,6 +80,8 @@ pub struct LocalEngineConfig {
     pub init: PathBuf,
     /// For what a spec leaves open.
     pub default_limits: Limits,
+    /// For each servant's shim: memory and cores. Its processor time is bounded by its servant's, too.
+    pub shim_limits: Limits,
     /// First uid of the first range; see [`DEFAULT_UID_BASE`].
     pub uid_base: u32,
     /// Below which cgroup.
@@ -91,7 +93,8 @@ pub struct LocalEngineConfig {
 }
 
 impl LocalEngineConfig {
-    /// With defaults for everything else: 1 GiB of memory, 512 processes, no bound on cores.
+    /// With defaults for everything else: 1 GiB of memory, 512 processes, no bound on cores; for shims 256 MiB and half a
+    /// core.
     pub fn new(home_servants_dir: PathBuf, shim_command: Vec<OsString>, init: PathBuf) -> Self {
         Self {
             home_servants_dir,
@@ -100,6 +103,11 @@ impl LocalEngineConfig {
             default_limits: Limits {
                 memory: Some(1 << 30),
                 pids: Some(512),
+                ..Limits::default()
+            },
+            shim_limits: Limits {
+                cpus: Some(0.5),
+                memory: Some(256 << 20),
                 ..Limits::default()
             },
             uid_base: DEFAULT_UID_BASE,
@@ -218,7 +226,19 @@ impl LocalEngine {
         let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
         let mut adoption = Adoption::default();
         for entry in entries {
-            let directory = entry.map_err(Error::file("read", home))?.path();
+            let entry = match entry.map_err(Error::file("read", home)) {
+                Ok(entry) => entry,
+                Err(error) => {
+                    adoption.failures.push(error);
+                    continue;
+                }
+            };
+            let directory = entry.path();
+            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                // None of ours: it is left to whoever put it there.
+                adoption.failures.push(Error::Stray { path: directory });
+                continue;
+            }
             let id = directory
                 .file_name()
                 .unwrap_or_default()
@@ -274,18 +294,15 @@ impl Engine for LocalEngine {
         Ok(self.start_local(spec).await?)
     }
 
-    async fn adopt(&self) -> Result<Vec<Arc<dyn Servant>>, Error> {
+    async fn adopt(&self) -> Result<Adopted, Error> {
         let adoption = self.adopt_all().await?;
         for ended in &adoption.ended {
             tracing::info!(id = ended.id, exit = ?ended.exit, "a servant had ended; its leftovers are removed");
         }
-        if let Some(error) = adoption.failures.into_iter().next() {
-            return Err(error);
-        }
-        Ok(adoption
-            .running
-            .into_iter()
-            .map(|servant| servant as Arc<dyn Servant>)
-            .collect())
+        let running = adoption.running.into_iter();
+        Ok(Adopted {
+            running: running.map(|servant| servant as Arc<dyn Servant>).collect(),
+            failures: adoption.failures,
+        })
     }
 }

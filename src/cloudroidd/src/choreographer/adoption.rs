@@ -12,7 +12,12 @@ impl Choreographer {
     /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
     pub async fn adopt(&self) -> Result<usize, Error> {
         let inner = &self.inner;
-        let running = inner.engine.adopt().await?;
+        let found = inner.engine.adopt().await?;
+        for error in &found.failures {
+            let message = format!("what an earlier daemon left could not be removed: {error}");
+            let about = NewEvent::default();
+            inner.journal.warning("servant-leftover", &message, &about);
+        }
         let mut records: HashMap<String, ServantRecord> = inner
             .state
             .servants()?
@@ -20,7 +25,7 @@ impl Choreographer {
             .map(|record| (record.id.clone(), record))
             .collect();
         let mut adopted = 0;
-        for servant in running {
+        for servant in found.running {
             let record = records.remove(servant.id());
             let revision = match &record {
                 Some(record) => inner.state.revision(&record.service, record.revision)?,
@@ -33,7 +38,7 @@ impl Choreographer {
                 }
                 // A spare, or one that was killed before it had nodes: nobody misses it.
                 (None, _) if servant.processes().await.is_ok_and(|all| all.is_empty()) => {
-                    servant.stop().await?;
+                    self.end_unknown(&servant).await;
                 }
                 _ => {
                     inner.journal.warning(
@@ -47,7 +52,7 @@ impl Choreographer {
                             ..NewEvent::default()
                         },
                     );
-                    servant.stop().await?;
+                    self.end_unknown(&servant).await;
                     inner.state.remove_servant(servant.id());
                 }
             }
@@ -68,6 +73,19 @@ impl Choreographer {
             );
         }
         Ok(adopted)
+    }
+
+    /// Ends a servant that nobody needs. What cannot be removed of it is told, and is in nobody's way.
+    async fn end_unknown(&self, servant: &Arc<dyn servant::engine::Servant>) {
+        if let Err(error) = servant.stop().await {
+            let message = format!("servant {} could not be cleaned up: {error}", servant.id());
+            let about = NewEvent {
+                servant: Some(servant.id()),
+                ..NewEvent::default()
+            };
+            let journal = &self.inner.journal;
+            journal.error("servant-leftover", &message, &about);
+        }
     }
 
     fn adopt_one(

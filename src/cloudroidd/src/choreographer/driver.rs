@@ -41,7 +41,10 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     let mut permit = None;
     let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
-    let outcome = outcome.map_err(|failure| with_log(failure, &handle));
+    let outcome = match outcome {
+        Ok(reason) => Ok(reason),
+        Err(failure) => Err(with_log(failure, &handle).await),
+    };
     handle.set_over(&outcome);
     let farewell = tell_end(&inner, &handle, &outcome);
     if let Some(works) = handle.take_works() {
@@ -59,6 +62,8 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     inner.state.remove_servant(&handle.id);
     drop(permit);
     inner.forget(&handle);
+    // Whoever is first in the queue now may need more than that.
+    inner.make_room();
     if let Beginning::Asked(Some(spare)) = beginning {
         spares::give_back(&inner, spare).await;
     }
@@ -226,11 +231,11 @@ async fn run(
 async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
     let deadline = inner.config.room.deadline.0;
     let wanted = inner.promised(handle);
-    inner
+    let admitted = inner
         .admission
         .admit(wanted, deadline, || inner.make_room())
-        .await
-        .map_err(Failure::Full)
+        .await;
+    admitted.map_err(Failure::Full)
 }
 
 /// Comes back when nobody is connected.
@@ -441,6 +446,8 @@ async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
     loop {
         let _ = connections.wait_for(|count| *count == 0).await;
         handle.set_idle_until(Some(state::now() + grace.as_millis() as u64));
+        // Somebody may have been waiting for longer.
+        inner.make_room();
         let returned = tokio::time::timeout(grace, connections.wait_for(|count| *count > 0))
             .await
             .is_ok();
@@ -454,10 +461,10 @@ async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
     }
 }
 
-fn with_log(failure: Failure, handle: &Handle) -> Failure {
+async fn with_log(failure: Failure, handle: &Handle) -> Failure {
     match (failure, handle.container()) {
         (Failure::Broken { reason, log }, Some(container)) if log.is_empty() => {
-            let lines = tail::read(&container.log_path(), LOG_LINES, None);
+            let lines = tail::last(container.log_path(), LOG_LINES, None).await;
             let log = lines
                 .into_iter()
                 .map(|line| format!("{}: {}", line.node, line.line))

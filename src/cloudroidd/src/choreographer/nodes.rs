@@ -82,7 +82,7 @@ impl<'a> Nodes<'a> {
         loop {
             tokio::select! {
                 Some((node, began, exit)) = self.running.next() => {
-                    if let Err(failure) = self.ended(node, began, exit) {
+                    if let Err(failure) = self.ended(node, began, exit).await {
                         return failure;
                     }
                 }
@@ -147,7 +147,7 @@ impl<'a> Nodes<'a> {
         }
     }
 
-    fn ended(
+    async fn ended(
         &mut self,
         node: NodeSpec,
         began: Instant,
@@ -163,19 +163,25 @@ impl<'a> Nodes<'a> {
         if exit.out_of_memory {
             // What it knew is lost, and it would do the same again: its robot is told and begins anew.
             self.tell("out-of-memory", &format!("{} {how}", node.name));
-            return Err(self.failure(&node, format!("lost {}: it {how}", node.name)));
+            return Err(self
+                .failure(&node, format!("lost {}: it {how}", node.name))
+                .await);
         }
         let failed = exit.code != Some(0);
         if failed && self.handle.life().phase < Phase::Ready {
-            return Err(self.failure(&node, format!("did not become ready: {} {how}", node.name)));
+            return Err(self
+                .failure(&node, format!("did not become ready: {} {how}", node.name))
+                .await);
         }
         if failed && self.handle.revision.plan.restart {
             let backoff = self.backoffs.entry(node.name.clone()).or_default();
             let Some(pause) = backoff.failed(began.elapsed()) else {
-                return Err(self.failure(
-                    &node,
-                    format!("gave {} up: it {how}, again and again", node.name),
-                ));
+                return Err(self
+                    .failure(
+                        &node,
+                        format!("gave {} up: it {how}, again and again", node.name),
+                    )
+                    .await);
             };
             self.tell(
                 "node-failed",
@@ -193,7 +199,9 @@ impl<'a> Nodes<'a> {
         }
         self.alive -= 1;
         if self.alive == 0 {
-            return Err(self.failure(&node, format!("has no node left: {} {how}", node.name)));
+            return Err(self
+                .failure(&node, format!("has no node left: {} {how}", node.name))
+                .await);
         }
         self.tell("node-ended", &format!("{} {how}", node.name));
         Ok(())
@@ -205,15 +213,18 @@ impl<'a> Nodes<'a> {
                 self.watch(node);
                 Ok(())
             }
-            Err(error) => Err(self.failure(
-                &node,
-                format!("could not start {} again: {error}", node.name),
-            )),
+            Err(error) => Err(self
+                .failure(
+                    &node,
+                    format!("could not start {} again: {error}", node.name),
+                )
+                .await),
         }
     }
 
-    fn failure(&self, node: &NodeSpec, reason: String) -> Failure {
-        let lines = tail::read(&self.container.log_path(), LOG_LINES, Some(&node.name));
+    async fn failure(&mut self, node: &NodeSpec, reason: String) -> Failure {
+        let (path, name) = (self.container.log_path(), node.name.clone());
+        let lines = tail::last(path, LOG_LINES, Some(name)).await;
         Failure::Broken {
             reason,
             log: lines.into_iter().map(|line| line.line).collect(),

@@ -1,36 +1,74 @@
 //! Reading a servant's log from its file: JSON lines, rotated once.
 
-use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use servant::engine::LogLine;
 
 use crate::state;
 
+/// Bytes read at once, from the end of the file on.
+const BLOCK: usize = 64 * 1024;
+
+/// [`read`], where nobody may wait for a disk.
+pub async fn last(path: PathBuf, count: usize, node: Option<String>) -> Vec<LogLine> {
+    let read = move || read(&path, count, node.as_deref());
+    tokio::task::spawn_blocking(read).await.unwrap_or_default()
+}
+
 /// The last `count` lines of the log at `path`, oldest first; of one node alone where one is named. Lines that
-/// cannot be read are passed over.
+/// cannot be read are passed over. Of the files no more is read than it takes.
 pub fn read(path: &Path, count: usize, node: Option<&str>) -> Vec<LogLine> {
-    let mut last = VecDeque::new();
-    for file in [rotated(path), path.to_owned()] {
-        let Ok(file) = File::open(file) else { continue };
-        for line in BufReader::new(file).lines().map_while(Result::ok) {
-            let Ok(entry) = serde_json::from_str::<LogLine>(&line) else {
-                continue;
-            };
-            if node.is_some_and(|node| node != entry.node) {
-                continue;
+    let current = File::open(path).ok();
+    let inode = |file: &File| file.metadata().map(|data| (data.dev(), data.ino())).ok();
+    // Where the log was rotated in between it is the same file once more.
+    let same = current.as_ref().and_then(inode);
+    let older = File::open(rotated(path)).ok();
+    let older = older.filter(|older| same.is_none() || inode(older) != same);
+    let mut newest_first = Vec::new();
+    for file in current.into_iter().chain(older) {
+        // What cannot be read any further ends there.
+        let _ = backwards(file, |line| {
+            if newest_first.len() >= count {
+                return false;
             }
-            if last.len() == count {
-                last.pop_front();
-            }
-            if count > 0 {
-                last.push_back(entry);
+            let entry = serde_json::from_slice::<LogLine>(line).ok();
+            newest_first.extend(entry.filter(|entry| node.is_none_or(|node| node == entry.node)));
+            true
+        });
+    }
+    newest_first.reverse();
+    newest_first
+}
+
+/// Gives the lines of a file from the last to the first, for as long as more are wanted.
+fn backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<()> {
+    let mut start = file.metadata()?.len();
+    // What was read and not yet given: its first line may begin before it.
+    let mut rest = Vec::new();
+    while start > 0 {
+        let length = start.min(BLOCK as u64);
+        start -= length;
+        file.seek(SeekFrom::Start(start))?;
+        let mut block = vec![0; length as usize];
+        file.read_exact(&mut block)?;
+        block.append(&mut rest);
+        rest = block;
+        let first = match rest.iter().position(|byte| *byte == b'\n') {
+            Some(end) if start > 0 => end + 1,
+            None if start > 0 => continue,
+            _ => 0,
+        };
+        for line in rest[first..].rsplit(|byte| *byte == b'\n') {
+            if !more(line) {
+                return Ok(());
             }
         }
+        rest.truncate(first.saturating_sub(1));
     }
-    last.into()
+    Ok(())
 }
 
 /// A line as the API shows it.
@@ -57,6 +95,7 @@ mod tests {
 
     fn line(node: &str, text: &str) -> String {
         let entry = LogLine {
+            number: None,
             time: SystemTime::UNIX_EPOCH,
             node: node.into(),
             stream: "stdout".into(),
@@ -81,5 +120,27 @@ mod tests {
         assert_eq!(texts(2, None), ["2", "3"]);
         assert_eq!(texts(9, Some("/a")), ["1", "3"]);
         assert!(texts(0, None).is_empty());
+    }
+
+    #[test]
+    fn a_long_log_is_read_from_its_end_and_no_further_than_needed() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("log.jsonl");
+        let long = "x".repeat(BLOCK / 3);
+        let all: Vec<String> = (0..20).map(|number| format!("{number} {long}")).collect();
+        let text: String = all.iter().map(|text| line("/a", text)).collect();
+        std::fs::write(&path, &text).expect("written");
+        for count in [1, 2, 7, 20, 30] {
+            let seen = read(&path, count, None).into_iter().map(|line| line.line);
+            let expected = &all[20 - count.min(20)..];
+            assert!(seen.eq(expected.iter().cloned()), "the last {count}");
+        }
+        let mut given = 0;
+        backwards(File::open(&path).expect("it is there"), |_| {
+            given += 1;
+            given < 3
+        })
+        .expect("readable");
+        assert_eq!(given, 3);
     }
 }

@@ -3,16 +3,18 @@
 use std::sync::Arc;
 
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
-use axum::Json;
-use axum::body::{Body, Bytes};
+use axum::body::Body;
 use axum::extract::{OriginalUri, Path, Query, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use futures_util::StreamExt;
 use serde::Deserialize;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::App;
+use super::body::{self, Held};
+use super::guard::Caller;
 use crate::choreographer::{self, describe};
 use crate::errors::Error;
 use crate::trial::Material;
@@ -114,8 +116,10 @@ pub async fn remove_service(
 pub async fn rollback(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    body: Bytes,
+    Extension(caller): Extension<Caller>,
+    body: Body,
 ) -> Answer<ServiceDetail> {
+    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let asked: Rollback = if body.is_empty() {
         Rollback::default()
     } else {
@@ -127,7 +131,16 @@ pub async fn rollback(
 }
 
 /// The largest recording for a trial: it is held in memory.
-pub const LARGEST_TRIAL: usize = 512 << 20;
+const LARGEST_TRIAL: usize = 512 << 20;
+/// The longest of other bodies.
+const LARGEST_WORDS: usize = 64 << 10;
+
+/// A body, within what its sender may have held.
+async fn held(app: &App, caller: &Caller, body: Body, max: usize) -> Result<Held, Error> {
+    let memory = app.choreographer.memory();
+    let budget = memory.client(caller.peer, None);
+    body::read(body, max, &budget, memory.unfinished).await
+}
 
 /// With what a service is tried.
 #[derive(Debug, Deserialize)]
@@ -147,18 +160,23 @@ pub async fn trial(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Query(with): Query<With>,
-    body: Bytes,
+    Extension(caller): Extension<Caller>,
+    body: Body,
 ) -> Answer<api::trial::Trial> {
+    let Held { bytes, permit } = held(&app, &caller, body, LARGEST_TRIAL).await?;
     let material = tokio::task::spawn_blocking(move || match with.kind {
-        Kind::Image => crate::trial::Picture::read(&body).map(Material::Picture),
-        Kind::Bag => ros::bag::read(&body, crate::trial::RECORDED)
+        Kind::Image => crate::trial::Picture::read(&bytes).map(Material::Picture),
+        Kind::Bag => ros::bag::read(&bytes, crate::trial::RECORDED)
             .map(Material::Bag)
             .map_err(|error| Error::BadRequest(error.to_string())),
     });
     let material = material
         .await
         .map_err(|_| Error::Internal("reading what a service is tried with"))??;
-    Ok(Json(crate::trial::run(&app, &name, material).await?))
+    let trial = crate::trial::run(&app, &name, material).await;
+    // Messages of a recording were cut from the body.
+    drop(permit);
+    Ok(Json(trial?))
 }
 
 /// All servants.
@@ -176,8 +194,10 @@ pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Ans
 pub async fn set_limits(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
-    body: Bytes,
+    Extension(caller): Extension<Caller>,
+    body: Body,
 ) -> Answer<api::Servant> {
+    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
     crate::config::check_limits(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
@@ -246,19 +266,17 @@ pub async fn logs(
     let Some(container) = handle.container() else {
         return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
     };
-    // Following begins before the past is read, so that no line falls between; one may come twice instead.
+    // Following begins before the past is read, so that no line falls between. One may come twice instead, and is known by
+    // its place: the clock may have been set back.
     let following = part.follow.then(|| container.follow_log(false));
-    let path = container.log_path();
     let count = part.tail.unwrap_or(LOG_LINES);
-    let past = tokio::task::spawn_blocking(move || choreographer::read_log(&path, count, None))
-        .await
-        .map_err(|_| Error::Internal("reading a log"))?;
-    let last = past.last().map(|line| line.time);
+    let past = choreographer::last_log_lines(container.log_path(), count, None).await;
+    let last = past.last().and_then(|line| line.number);
     let past = futures_util::stream::iter(past).map(choreographer::log_record);
     match following {
         Some(future) => {
             let new =
-                move |line: &servant::engine::LogLine| last.is_none_or(|last| line.time > last);
+                move |line: &servant::engine::LogLine| line.number.is_none() || line.number > last;
             let future =
                 ReceiverStream::new(future).filter(move |line| std::future::ready(new(line)));
             // A follower must not keep the daemon from ending.

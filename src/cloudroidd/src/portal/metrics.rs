@@ -46,6 +46,23 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
         ],
     );
     room(&mut out, &app.choreographer);
+    let memory = app.choreographer.memory().whole();
+    gauge(
+        &mut out,
+        "cloudroid_memory_bytes",
+        "Bytes held for clients and servants, and how many may be.",
+        [
+            (labels(&[("what", "held")]), memory.used() as f64),
+            (labels(&[("what", "limit")]), memory.limit() as f64),
+        ],
+    );
+    family(
+        &mut out,
+        "cloudroid_memory_refused_total",
+        "counter",
+        "How often a client or servant was refused memory.",
+        [(String::new(), app.choreographer.memory().refused() as f64)],
+    );
     let exists = |name: &str| services.iter().any(|service| service == name);
     app.choreographer
         .request_times()

@@ -345,7 +345,10 @@ async fn session<S>(
             }
         }
     }
-    let mut waiting = Waiting::new(io, &read_ahead, &bridge_options(&app.config));
+    let memory = app.choreographer.memory();
+    let budget = memory.client(caller.peer, asked.robot.as_deref());
+    let mut waiting =
+        Waiting::new(io, &read_ahead, &bridge_options(&app.config)).within(&budget);
     let taking = servant(&app, &asked, &caller, lease);
     let (lease, works) = match waiting.until(taking).await {
         Ok(Ok(taken)) => taken,
@@ -362,6 +365,7 @@ async fn session<S>(
         (None, Peer::Unix(uid)) => format!("user {uid}"),
     };
     let options = SessionOptions {
+        budget,
         client,
         resume: asked.bound_resume(&caller),
         ..SessionOptions::default()

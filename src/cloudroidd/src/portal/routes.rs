@@ -57,7 +57,7 @@ pub const ROUTES: &[Route] = &[
         post(api_v1::rollback)
     }),
     at("POST", "/api/v1/services/{name}/trial", || {
-        post(api_v1::trial).layer(DefaultBodyLimit::max(api_v1::LARGEST_TRIAL))
+        post(api_v1::trial)
     }),
     at("GET", "/api/v1/servants", || get(api_v1::servants)),
     at("DELETE", "/api/v1/servants", || {

@@ -81,16 +81,11 @@ impl Parent {
         names
     }
 
-    /// Where shims go: on v2 away from the daemon's own unit, which systemd could not restart otherwise.
-    pub fn shims(&self) -> Option<PathBuf> {
-        let first = self.hierarchies.first().filter(|_| self.version == 2)?;
-        Some(first.directory.join("shims"))
-    }
-
     /// Removes the place if it is one that we chose and no servant is left in it.
     pub fn remove_if_unused(&self) {
-        if let Some(shims) = self.shims() {
-            // Refused while a shim is in it.
+        if let Some(first) = self.hierarchies.first().filter(|_| self.version == 2) {
+            // Where earlier versions put all shims; refused while one is in it.
+            let shims = first.directory.join("shims");
             let _ = fs::remove_dir(&shims);
             remove_if_unused(&shims);
         }
@@ -138,8 +133,7 @@ impl Parent {
             CgroupParent::Path(path) => unified.mount.join(path.strip_prefix("/").unwrap_or(path)),
             CgroupParent::Auto => choose_v2(unified),
         };
-        fs::create_dir_all(directory.join("shims"))
-            .map_err(Error::file("make the cgroup", &directory))?;
+        fs::create_dir_all(&directory).map_err(Error::file("make the cgroup", &directory))?;
         // From the place just above down: each directory hands to the next what it was handed itself.
         let mut reason = String::new();
         let above = directory

@@ -75,6 +75,7 @@ pub(super) async fn started(
     let runtime = Runtime {
         shim,
         cgroup: Cgroup::planned(&launch.parent, &launch.spec),
+        shim_cgroup: Some(Cgroup::of_shim(&launch.parent, &launch.spec.id)),
         uid_range: launch.uid_range,
     };
     let servant = connect(
@@ -208,13 +209,30 @@ async fn watch_over(
     );
     if !over {
         let lost = || ContainerState::Failed {
-            reason: "its shim was killed".into(),
+            reason: how_it_was_lost(&directory),
         };
         let state = exit.map_or_else(lost, |exit| {
             known.nodes.send_replace(exit.nodes);
             exit.state
         });
         known.state.send_replace(state);
+    }
+}
+
+/// Why a shim ended without a word.
+fn how_it_was_lost(directory: &Path) -> String {
+    let runtime: Option<Runtime> =
+        launch::read(&directory.join(launch::RUNTIME)).unwrap_or_default();
+    let cgroup = runtime.and_then(|runtime| runtime.shim_cgroup);
+    match cgroup.filter(|cgroup| cgroup.oom_kills() > 0) {
+        Some(cgroup) => {
+            let limit = cgroup.enforced().limits.memory.unwrap_or_default();
+            format!(
+                "its shim was killed: it needed more than its {limit} bytes of memory, for parameters, registrations or what \
+                 nodes do not read"
+            )
+        }
+        None => "its shim was killed".into(),
     }
 }
 

@@ -49,6 +49,7 @@ async fn start_in(
     let launch = Launch {
         uid_range: (first, uids::RANGE),
         parent: shared.parent.clone(),
+        shim_limits: shared.config.shim_limits,
         isolation: shared.config.isolation,
         grace: shared.config.grace,
         init: shared.config.init.clone(),

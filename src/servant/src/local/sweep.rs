@@ -7,6 +7,7 @@ use std::os::fd::AsFd;
 use std::path::Path;
 use std::time::Duration;
 
+use crate::cgroup::Cgroup;
 use crate::launch::{self, Launch, Runtime};
 use crate::{Error, process, rootfs, sys};
 
@@ -30,7 +31,9 @@ fn sweep_now(id: &str, directory: &Path) -> Result<(), Error> {
     if let Some(runtime) = runtime {
         outcomes.push(end_shim(&runtime));
         outcomes.push(runtime.cgroup.destroy(PATIENCE));
-        if runtime.cgroup.exists() {
+        let shim = runtime.shim_cgroup.as_ref();
+        outcomes.extend(shim.map(|cgroup| cgroup.destroy(PATIENCE)));
+        if runtime.cgroup.exists() || shim.is_some_and(Cgroup::exists) {
             outcomes.push(Err(Error::LeftOver {
                 id: id.to_owned(),
                 what: "a cgroup".into(),

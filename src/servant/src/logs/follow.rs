@@ -238,6 +238,7 @@ impl Cutter {
                     )));
                 }
                 lines.push(LogLine {
+                    number: Some(record.number),
                     time: record.time,
                     node: record.node.into_owned(),
                     stream: record.stream.into_owned(),
@@ -265,6 +266,7 @@ fn inode(file: &File) -> io::Result<(u64, u64)> {
 
 fn note(line: String) -> LogLine {
     LogLine {
+        number: None,
         time: SystemTime::now(),
         node: "cloudroid".into(),
         stream: "stderr".into(),

@@ -31,6 +31,8 @@ pub(super) struct Begun {
     pub(super) launch: Launch,
     pub(super) identity: Identity,
     pub(super) cgroup: Cgroup,
+    /// Our own.
+    pub(super) shim_cgroup: Cgroup,
     pub(super) enforced: Enforced,
     /// The daemon that started us.
     pub(super) control: UnixStream,
@@ -63,13 +65,15 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     let own = std::process::id() as i32;
     let identity = Identity::of(own).map_err(Error::call("reading our own start time"))?;
     let cgroup = Cgroup::planned(&launch.parent, &launch.spec);
+    let shim_cgroup = Cgroup::of_shim(&launch.parent, &launch.spec.id);
     let runtime = Runtime {
         shim: identity,
         cgroup: cgroup.clone(),
+        shim_cgroup: Some(shim_cgroup.clone()),
         uid_range: launch.uid_range,
     };
     launch::write(&directory.join(launch::RUNTIME), &runtime)?;
-    let begun = prepare(directory, &launch, &cgroup, &network);
+    let begun = prepare(directory, &launch, [&cgroup, &shim_cgroup], &network);
     // The creator has its own: held here they would keep what they are on from being unmounted.
     for mount in &mut launch.spec.mounts {
         mount.opened = None;
@@ -85,6 +89,7 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
             launch,
             identity,
             cgroup,
+            shim_cgroup,
             enforced,
             control,
             listener,
@@ -172,7 +177,7 @@ struct Prepared {
 fn prepare(
     directory: &Path,
     launch: &Launch,
-    cgroup: &Cgroup,
+    cgroups: [&Cgroup; 2],
     network: &NetNs,
 ) -> Result<Prepared, Error> {
     network.enter()?;
@@ -185,7 +190,7 @@ fn prepare(
     .map_err(Error::nix("socketpair for init"))?;
     let listener = listen(directory)?;
     let waiting = create::fork(directory, launch, theirs)?;
-    let enforced = match confine(launch, cgroup, waiting.pid) {
+    let enforced = match confine(launch, cgroups, waiting.pid) {
         Ok(enforced) => enforced,
         Err(error) => {
             waiting.end();
@@ -200,17 +205,27 @@ fn prepare(
     })
 }
 
-/// Makes the cgroup, sets its limits, and moves the creator into it.
-fn confine(launch: &Launch, cgroup: &Cgroup, creator: u32) -> Result<Enforced, Error> {
-    if let Some(shims) = launch.parent.shims() {
-        std::fs::create_dir_all(&shims).map_err(Error::file("make the cgroup", &shims))?;
-        let file = shims.join("cgroup.procs");
-        std::fs::write(&file, std::process::id().to_string())
-            .map_err(Error::file("move the shim into", &file))?;
-    }
+/// Makes the cgroups, sets their limits, and moves the creator and this process into theirs.
+fn confine(launch: &Launch, [cgroup, own]: [&Cgroup; 2], creator: u32) -> Result<Enforced, Error> {
+    own.create()?;
+    let asked = launch.limits_of_shim(&launch.spec.limits);
+    let of_shim = own.set(&asked).limits;
+    own.enter_alone()?;
     cgroup.create()?;
-    let enforced = cgroup.set(&launch.spec.limits);
-    let missing = cgroup::missing(&launch.spec.limits, &enforced.limits);
+    let enforced = Enforced {
+        shim: of_shim,
+        ..cgroup.set(&launch.spec.limits)
+    };
+    let mut missing = cgroup::missing(&launch.spec.limits, &enforced.limits);
+    // Where a controller is lacking altogether, that is told of the host, once.
+    let controllers = launch.parent.controllers();
+    let has = |name: &str| controllers.iter().any(|known| known == name);
+    let of_shim = cgroup::missing(&asked, &of_shim).into_iter();
+    missing.extend(of_shim.filter_map(|name| match name {
+        "memory" if has("memory") => Some("the shim's memory"),
+        "cpus" if has("cpu") => Some("the shim's cpus"),
+        _ => None,
+    }));
     if launch.isolation == Isolation::Require && !missing.is_empty() {
         let reason = match launch.parent.reason.as_str() {
             "" => format!("cgroup v{}", launch.parent.version),

@@ -24,6 +24,7 @@ use super::nodes::Nodes;
 use super::streams::Streams;
 use crate::engine::{ContainerState, Enforced, NodeEvent};
 use crate::protocol::{Command, FromShim, Request};
+use crate::spec::Limits;
 use crate::{Error, cgroup, logs};
 
 /// What happens.
@@ -194,7 +195,7 @@ impl Driver {
             }
             Command::SignalNode { node, signal } => Some(self.signal(&node, signal).await),
             Command::SetLimits(limits) => {
-                let enforced = self.begun.cgroup.set(&limits);
+                let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();
                 self.clients.tell(&FromShim::Enforced {
                     enforced: enforced.clone(),
@@ -204,6 +205,16 @@ impl Driver {
                     unmet => Err(format!("cannot be set: {}", unmet.join(", "))),
                 })
             }
+        }
+    }
+
+    /// The servant's limits, and with them what the shim may take beside it.
+    fn set_limits(&self, limits: &Limits) -> Enforced {
+        let enforced = self.begun.cgroup.set(limits);
+        let of_shim = self.begun.launch.limits_of_shim(&enforced.limits);
+        Enforced {
+            shim: self.begun.shim_cgroup.set(&of_shim).limits,
+            ..enforced
         }
     }
 

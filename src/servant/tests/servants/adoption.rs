@@ -17,8 +17,8 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     drop(first);
     let engine = world.restarted();
     let mut adopted = within(engine.adopt()).await.unwrap();
-    let second = adopted.pop().expect("one");
-    assert!(adopted.is_empty());
+    let second = adopted.running.pop().expect("one");
+    assert!(adopted.running.is_empty() && adopted.failures.is_empty());
     assert_eq!(second.id(), id);
     assert!(matches!(
         *second.state().borrow(),
@@ -38,6 +38,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let third = within(world.restarted().adopt())
         .await
         .unwrap()
+        .running
         .pop()
         .expect("one");
     assert_eq!(
@@ -45,6 +46,26 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
         Some(libc::SIGTERM)
     );
     world.stop(third).await;
+}
+
+#[tokio::test]
+async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
+    let world = World::new();
+    let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    let id = servant.id().to_owned();
+    drop(servant);
+    let stray = world.servant_directory("x");
+    std::fs::write(&stray, "somebody's").unwrap();
+    let mut adopted = within(world.restarted().adopt()).await.unwrap();
+    let told: Vec<_> = adopted.failures.iter().map(ToString::to_string).collect();
+    assert!(
+        told.len() == 1 && told[0].contains(&*stray.to_string_lossy()),
+        "{told:?}"
+    );
+    assert_eq!(std::fs::read_to_string(&stray).unwrap(), "somebody's");
+    let servant = adopted.running.pop().expect("the servant beside it");
+    assert_eq!(servant.id(), id);
+    world.stop(servant).await;
 }
 
 #[tokio::test]

@@ -230,3 +230,119 @@ async fn where_isolation_is_required_a_limit_that_does_not_hold_is_refused() {
     );
     assert!(!world.servant_directory(&id).exists());
 }
+
+/// The number in a control file of the shim's cgroup, in whichever hierarchy it is.
+fn of_shim(world: &World, id: &str, names: [&str; 2]) -> Option<u64> {
+    let cgroup = std::fs::read_to_string(format!("/proc/{}/cgroup", world.runtime(id).shim.pid));
+    let cgroup = cgroup.expect("the shim runs");
+    let mounts = [
+        "/sys/fs/cgroup/memory",
+        "/sys/fs/cgroup/cpu,cpuacct",
+        "/sys/fs/cgroup/cpu",
+        "/sys/fs/cgroup",
+    ];
+    let paths = cgroup.lines().filter_map(|line| line.rsplit(':').next());
+    let ours: Vec<&str> = paths
+        .filter(|path| path.ends_with(&format!("{id}.shim")))
+        .collect();
+    assert!(
+        !ours.is_empty(),
+        "the shim is in no cgroup of its own: {cgroup}"
+    );
+    let files = mounts.iter().flat_map(|mount| {
+        let ours = ours.iter();
+        ours.flat_map(move |path| names.map(|name| format!("{mount}{path}/{name}")))
+    });
+    let text = files
+        .filter_map(|file| std::fs::read_to_string(file).ok())
+        .next()?;
+    text.split_whitespace().next()?.parse().ok()
+}
+
+#[tokio::test]
+async fn the_shim_has_limits_of_its_own() {
+    let world = World::with(|config| {
+        config.shim_limits = Limits {
+            cpus: Some(0.5),
+            memory: Some(96 << 20),
+            ..Limits::default()
+        };
+    });
+    let mut spec = spec(vec![node("/a", &["sleep"])]);
+    spec.limits.cpus = Some(0.2);
+    let servant = world.start(spec).await;
+    let controllers = world.engine.cgroups().controllers();
+    let has = |name: &str| controllers.iter().any(|known| known == name);
+    let id = servant.id().to_owned();
+    if has("memory") {
+        assert_eq!(servant.enforced().shim.memory, Some(96 << 20));
+        let names = ["memory.max", "memory.limit_in_bytes"];
+        assert_eq!(of_shim(&world, &id, names), Some(96 << 20));
+    }
+    if has("cpu") {
+        // No more than its servant has, and more when that is given more.
+        assert_eq!(servant.enforced().shim.cpus, Some(0.2));
+        assert_eq!(
+            of_shim(&world, &id, ["cpu.max", "cpu.cfs_quota_us"]),
+            Some(20_000)
+        );
+        let more = Limits {
+            cpus: Some(1.5),
+            ..Limits::default()
+        };
+        assert_eq!(servant.set_limits(more).await.unwrap().shim.cpus, Some(0.5));
+    }
+    // The next daemon finds them as they are, and leaves nothing of them.
+    let enforced = servant.enforced();
+    drop(servant);
+    let mut adopted = within(world.restarted().adopt()).await.unwrap();
+    let servant = adopted.running.pop().expect("one");
+    assert_eq!(servant.enforced(), enforced);
+    let own = world.runtime(&id).shim_cgroup.expect("it has one");
+    assert!(own.exists());
+    world.stop(servant).await;
+    assert!(!own.exists(), "the shim's cgroup is left");
+}
+
+#[tokio::test]
+async fn a_shim_that_takes_too_much_ends_its_servant_and_says_why() {
+    let world = World::with(|config| config.shim_limits.memory = Some(48 << 20));
+    let mut spec = spec(vec![node("/a", &["sleep"])]);
+    spec.resident = serde_json::json!({ "eat": true });
+    let servant = world.start(spec).await;
+    if servant.enforced().shim.memory.is_none() {
+        return world.stop(servant).await;
+    }
+    // The resident takes memory as soon as somebody connects.
+    let _ = hear(&*servant, 11311).await;
+    let ContainerState::Failed { reason } = ended(&*servant).await else {
+        panic!("it did not fail")
+    };
+    assert!(
+        reason.contains("its shim was killed") && reason.contains(&(48 << 20).to_string()),
+        "{reason}"
+    );
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn what_protects_the_daemon_does_not_protect_nodes() {
+    let score = |pid: i32| -> i32 {
+        let path = format!("/proc/{pid}/oom_score_adj");
+        let text = std::fs::read_to_string(path).expect("it runs");
+        text.trim().parse().expect("a number")
+    };
+    let own = score(std::process::id() as i32);
+    // As a unit with OOMScoreAdjust= has it; where that is not to be had there is nothing to inherit.
+    let protects = std::fs::write("/proc/self/oom_score_adj", "-500").is_ok();
+    let world = World::new();
+    let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    let shim = world.runtime(servant.id()).shim.pid;
+    let expected = if protects { -500 } else { own };
+    assert_eq!(score(shim), expected, "the shim is part of the daemon");
+    for pid in processes(&*servant, 1).await {
+        assert_eq!(score(pid), own.max(0), "a node");
+    }
+    let _ = std::fs::write("/proc/self/oom_score_adj", own.to_string());
+    world.stop(servant).await;
+}

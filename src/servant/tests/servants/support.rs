@@ -61,6 +61,9 @@ impl Resident for Greeter {
             tokio::task::spawn_local(async move {
                 use tokio::io::AsyncWriteExt;
                 while let Ok((mut stream, _)) = listener.accept().await {
+                    if config.get("eat").is_some() {
+                        std::hint::black_box(vec![7_u8; 256 << 20]);
+                    }
                     let text = format!("{config} {}", ended.get());
                     let _ = stream.write_all(text.as_bytes()).await;
                 }
@@ -157,6 +160,11 @@ impl World {
             "the directory is left"
         );
         assert!(!runtime.cgroup.exists(), "the cgroup is left");
+        let of_shim = runtime.shim_cgroup.as_ref();
+        assert!(
+            !of_shim.is_some_and(servant::cgroup::Cgroup::exists),
+            "the shim's cgroup is left"
+        );
         assert!(runtime.shim.open().unwrap().is_none(), "the shim is left");
         for pid in processes {
             let cgroup = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
@@ -181,7 +189,9 @@ impl Drop for World {
             if let Ok(Some(pidfd)) = runtime.shim.open() {
                 kill(&pidfd);
             }
-            let _ = runtime.cgroup.destroy(Duration::from_secs(5));
+            for cgroup in runtime.shim_cgroup.iter().chain([&runtime.cgroup]) {
+                let _ = cgroup.destroy(Duration::from_secs(5));
+            }
         }
     }
 }

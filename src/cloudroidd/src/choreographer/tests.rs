@@ -1,0 +1,153 @@
+use std::time::Duration;
+
+use async_trait::async_trait;
+use servant::engine::{Adopted, Servant};
+use servant::spec::Spec;
+
+use super::*;
+use crate::state::{Plan, RevisionRecord};
+
+/// No servant is started here.
+struct NoEngine;
+
+#[async_trait]
+impl Engine for NoEngine {
+    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, servant::Error> {
+        Err(servant::Error::Start {
+            id: spec.id,
+            reason: "there is no engine".to_owned(),
+        })
+    }
+
+    async fn adopt(&self) -> Result<Adopted, servant::Error> {
+        Ok(Adopted::default())
+    }
+}
+
+fn revision(image: &str, cpus: f64) -> RevisionRecord {
+    RevisionRecord {
+        service: "detect".into(),
+        number: 0,
+        image: image.into(),
+        published: state::now(),
+        package: "detect".into(),
+        source: "a test".into(),
+        plan: Plan {
+            limits: api::Limits {
+                cpus: Some(cpus),
+                memory: Some(api::Size(0)),
+                ..api::Limits::default()
+            },
+            ..Plan::default()
+        },
+        interface: Default::default(),
+    }
+}
+
+/// A choreographer of a machine with two cores.
+fn choreographer() -> (tempfile::TempDir, Choreographer) {
+    let home = tempfile::tempdir().expect("a directory");
+    let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+    let store = image::Store::open(home.path()).expect("a store");
+    let choreographer = Choreographer::new(
+        Arc::new(Config::default()),
+        Arc::new(state),
+        Arc::new(store),
+        Arc::new(NoEngine),
+        Admission::new(Amount::new(2.0, 0), 16),
+    );
+    (home, choreographer)
+}
+
+/// A servant that runs, promised so many cores, and idle since then.
+async fn runs(
+    choreographer: &Choreographer,
+    id: &str,
+    cpus: f64,
+    idle_until: Option<u64>,
+) -> Arc<Handle> {
+    let inner = &choreographer.inner;
+    let revision = Arc::new(revision("sha256:1", cpus));
+    let asked = Asked::new(revision.plan.limits, inner.config.limits);
+    let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
+    let permit = inner.admission.adopt(inner.promised(&handle));
+    handle.set_promise(permit.promise());
+    std::mem::forget(permit);
+    handle.set_idle_until(idle_until);
+    let handle = Arc::new(handle);
+    let mut servants = inner.servants.lock();
+    servants.all.insert(id.into(), Arc::clone(&handle));
+    handle
+}
+
+#[tokio::test(start_paused = true)]
+async fn as_many_idle_servants_end_as_it_takes() {
+    let (_home, choreographer) = choreographer();
+    let inner = &choreographer.inner;
+    let oldest = runs(&choreographer, "oldest", 0.5, Some(10)).await;
+    let middle = runs(&choreographer, "middle", 0.5, Some(20)).await;
+    let newest = runs(&choreographer, "newest", 0.5, Some(30)).await;
+    let busy = runs(&choreographer, "busy", 0.5, None).await;
+    let ending = |handle: &Arc<Handle>| handle.is_ending();
+    inner.make_room();
+    assert!(!ending(&oldest), "nobody waits");
+    let wanted = Amount::new(1.0, 0);
+    let deadline = Duration::from_secs(1);
+    let waiting = inner
+        .admission
+        .admit(wanted, deadline, || inner.make_room());
+    let refused = waiting.await;
+    assert!(refused.is_err(), "none of them ends in this test");
+    assert!(
+        ending(&oldest) && ending(&middle),
+        "one of them has not enough"
+    );
+    assert!(!ending(&newest) && !ending(&busy), "more is not needed");
+    // One that waited for more than is idle finds the next as soon as that is idle.
+    let wanted = Amount::new(2.0, 0);
+    let waiting = inner
+        .admission
+        .admit(wanted, deadline, || inner.make_room());
+    let left = async {
+        tokio::time::sleep(deadline / 2).await;
+        assert!(ending(&newest) && !ending(&busy));
+        busy.set_idle_until(Some(40));
+        inner.make_room();
+        assert!(ending(&busy));
+    };
+    let _ = tokio::join!(waiting, left);
+}
+
+#[tokio::test]
+async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
+    let (_home, choreographer) = choreographer();
+    let state = &choreographer.inner.state;
+    let first = state
+        .publish(&revision("sha256:1", 9.0))
+        .expect("published");
+    // Somebody asks while others are being given theirs, and meanwhile there is a new revision.
+    let held = choreographer.inner.servants.lock();
+    let (sender, thread) = std::sync::mpsc::channel();
+    let asking = {
+        let choreographer = choreographer.clone();
+        let runtime = tokio::runtime::Handle::current();
+        std::thread::spawn(move || {
+            let _entered = runtime.enter();
+            sender.send(nix::unistd::gettid()).expect("it is awaited");
+            let lease = choreographer.ensure("detect", "r", false);
+            lease.expect("a lease").handle().revision.number
+        })
+    };
+    // As far as it can come: it sleeps until the servants are free.
+    let thread = thread.recv().expect("it runs");
+    let state_of = || std::fs::read_to_string(format!("/proc/self/task/{thread}/stat"));
+    while !state_of().expect("it runs").contains(") S ") {
+        std::thread::yield_now();
+    }
+    let second = state
+        .publish(&revision("sha256:2", 9.0))
+        .expect("published");
+    drop(held);
+    let given = asking.join().expect("no panic");
+    assert_eq!((first, given), (1, second));
+}

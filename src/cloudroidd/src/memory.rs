@@ -1,0 +1,125 @@
+//! How many bytes robots and servants may have the daemon hold for them. What is refused becomes an event.
+//!
+//! ```text
+//!  the daemon ─┬─ client 10.0.0.7    messages that it has begun to send, bodies of its requests
+//!              └─ servant cam-1      frames of its nodes, records of its links, JSON made of its messages
+//! ```
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use budget::{Budget, Exceeded, Shares};
+use parking_lot::Mutex;
+
+use crate::config;
+use crate::journal::Journal;
+use crate::portal::Peer;
+use crate::state::NewEvent;
+use crate::supervision;
+
+/// Of the machine's memory the daemon takes no more than this part, and no more than so much, unless told otherwise.
+const PART: u64 = 4;
+const MOST: u64 = 1 << 30;
+/// Whoever is refused again and again becomes an event no more often than this.
+const TOLD_AGAIN: Duration = Duration::from_secs(60);
+/// Names that are remembered for that.
+const REMEMBERED: usize = 1000;
+
+/// The daemon's budgets.
+#[derive(Debug)]
+pub struct Memory {
+    whole: Budget,
+    clients: Shares,
+    servants: Shares,
+    refused: Arc<AtomicU64>,
+    /// What was begun must be complete within this time.
+    pub unfinished: Duration,
+}
+
+impl Memory {
+    /// As configured; refusals are written to the journal.
+    pub fn new(config: &config::Memory, journal: Journal) -> Memory {
+        let bytes = |size: api::Size| usize::try_from(size.0).unwrap_or(usize::MAX);
+        let whole = config
+            .daemon
+            .unwrap_or_else(|| api::Size((supervision::machine_memory() / PART).min(MOST)));
+        let refused = Arc::<AtomicU64>::default();
+        let count = Arc::clone(&refused);
+        let told: Mutex<HashMap<String, Instant>> = Mutex::default();
+        let observer = move |who: &str, full: &Exceeded| {
+            count.fetch_add(1, Ordering::Relaxed);
+            tracing::debug!(who, %full, "memory was refused");
+            let mut told = told.lock();
+            let known = told.get(who);
+            if known.is_some_and(|at| at.elapsed() < TOLD_AGAIN) {
+                return;
+            }
+            told.retain(|_, at| at.elapsed() < TOLD_AGAIN);
+            if told.len() < REMEMBERED {
+                told.insert(who.to_owned(), Instant::now());
+                drop(told);
+                tell(&journal, who, full);
+            }
+        };
+        let whole = Budget::observed("the daemon", bytes(whole), Box::new(observer));
+        Memory {
+            clients: Shares::new(&whole, "client", bytes(config.client)),
+            servants: Shares::new(&whole, "servant", bytes(config.servant)),
+            whole,
+            refused,
+            unfinished: config.unfinished.0,
+        }
+    }
+
+    /// That of a robot or another client. Behind a proxy on this machine all have the same address, and robots their names.
+    pub fn client(&self, peer: Peer, robot: Option<&str>) -> Budget {
+        match (peer, robot) {
+            (Peer::Tcp(address), _) if !address.ip().is_loopback() => {
+                self.clients.of(&address.ip().to_string())
+            }
+            (_, Some(robot)) => self.clients.of(robot),
+            (Peer::Tcp(address), None) => self.clients.of(&address.ip().to_string()),
+            (Peer::Unix(uid), None) => self.clients.of(&format!("user {uid}")),
+        }
+    }
+
+    /// That of a servant.
+    pub fn servant(&self, id: &str) -> Budget {
+        self.servants.of(id)
+    }
+
+    /// How often somebody was refused.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+
+    /// All of it.
+    pub fn whole(&self) -> &Budget {
+        &self.whole
+    }
+}
+
+fn tell(journal: &Journal, who: &str, full: &Exceeded) {
+    let journal = journal.clone();
+    let servant = who.strip_prefix("servant ").map(str::to_owned);
+    let message = format!(
+        "{who} was refused memory: {full}; what it was for is lost ([memory] of the configuration)"
+    );
+    // The database may make whoever writes wait; who asks for memory must not.
+    let write = move || {
+        let about = NewEvent {
+            servant: servant.as_deref(),
+            ..NewEvent::default()
+        };
+        journal.warning("memory-refused", &message, &about);
+    };
+    match tokio::runtime::Handle::try_current() {
+        Ok(runtime) => drop(runtime.spawn_blocking(write)),
+        Err(_) => write(),
+    }
+}
+
+/// Shared by all that hold bytes for somebody.
+pub type SharedMemory = Arc<Memory>;

@@ -1,0 +1,101 @@
+//! What robots make the daemon hold for them is bounded: whoever exceeds it is told, and others notice nothing.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+
+use anyhow::{Context, bail, ensure};
+use serde_json::json;
+use support::Told;
+use support::daemon::Daemon;
+use support::robot::{PATIENCE, Robot};
+use support::world::world;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::frame::Frame;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
+
+/// Three megabytes of a message that goes on.
+fn begins(robot: &mut Robot) -> Told {
+    let bytes = vec![7_u8; 3 << 20];
+    let frame = Frame::message(bytes, OpCode::Data(Data::Binary), false);
+    robot.sends(Message::Frame(frame))
+}
+
+/// Asks for a trial with a recording of which only three megabytes come.
+fn begins_a_trial(daemon: &Daemon) -> anyhow::Result<TcpStream> {
+    let mut stream = TcpStream::connect(&daemon.address)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    let head = format!(
+        "POST /api/v1/services/adder_py/trial?kind=bag HTTP/1.1\r\nHost: {}\r\nContent-Length: {}\r\n\r\n",
+        daemon.address,
+        100 << 20
+    );
+    stream.write_all(head.as_bytes())?;
+    // Refused meanwhile it is not read to its end.
+    let _ = stream.write_all(&vec![7; 3 << 20]);
+    Ok(stream)
+}
+
+pub fn what_is_begun_and_never_ended_costs_its_owner() -> Told {
+    let daemon = world()
+        .own("memory")
+        .config("[memory]\nclient = \"8M\"\nunfinished = \"3s\"\n")
+        .start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let mut polite = daemon.robot("adder_py?robot=polite")?;
+    let mut answered = |sum: i64| -> Told {
+        let answer = polite.calls("/add_two", json!({"a": sum - 1, "b": 1}))?;
+        ensure!(answer["values"]["sum"] == sum, "{answer}");
+        Ok(())
+    };
+    answered(1)?;
+    // Behind a proxy of this machine a client is a robot.
+    let greedy = || daemon.robot("adder_py?robot=greedy");
+    let mut robots = [greedy()?, greedy()?, greedy()?, greedy()?];
+    for robot in &mut robots {
+        begins(robot)?;
+    }
+    // Two of them have room, and both of those are late; the others are told at once.
+    let closes = robots.iter_mut().map(Robot::hears_close);
+    let closes = closes.collect::<anyhow::Result<Vec<_>>>()?;
+    let of = |code: u16| {
+        closes
+            .iter()
+            .filter(move |close| u16::from(close.code) == code)
+    };
+    ensure!(
+        of(1013).count() >= 2 && of(1013).count() + of(1008).count() == 4,
+        "{closes:?}"
+    );
+    for close in of(1013) {
+        ensure!(close.reason.contains("client greedy"), "{close:?}");
+    }
+    answered(2)?;
+    crate::survival::event(&daemon, "memory-refused", &["client greedy"])?;
+    // Bodies count as much.
+    let mut trials = Vec::new();
+    for _ in 0..4 {
+        trials.push(begins_a_trial(&daemon)?);
+    }
+    let mut refused = 0;
+    for mut trial in trials {
+        let mut answer = [0; 12];
+        match trial.read_exact(&mut answer) {
+            Ok(()) if &answer == b"HTTP/1.1 503" => refused += 1,
+            Ok(()) if &answer == b"HTTP/1.1 408" => {}
+            // What was sent and not read resets the connection.
+            Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => refused += 1,
+            other => bail!("{other:?}: {}", String::from_utf8_lossy(&answer)),
+        }
+    }
+    ensure!(refused >= 2, "{refused} were refused");
+    answered(3)?;
+    let (_, metrics) = daemon.get("/metrics")?;
+    let held = metrics
+        .lines()
+        .find(|line| line.starts_with("cloudroid_memory_bytes{what=\"held\"}"));
+    ensure!(held.context("it is told")?.ends_with(" 0"), "{held:?}");
+    Ok(())
+}
