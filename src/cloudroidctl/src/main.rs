@@ -19,6 +19,7 @@ mod set;
 mod status;
 mod stop;
 mod stub;
+mod terminal;
 mod trial;
 
 use std::process::ExitCode;
@@ -125,18 +126,18 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
 /// What went wrong, what explains it, and what to do.
 fn complain(error: &anyhow::Error) {
     let Some(problem) = error.downcast_ref::<Problem>() else {
-        eprintln!("error: {error:#}");
+        output::complain(&format!("error: {error:#}"));
         return;
     };
     for line in &problem.log {
-        eprintln!("  | {line}");
+        output::complain(&format!("  | {line}"));
     }
-    eprintln!("error: {problem}");
+    output::complain(&format!("error: {problem}"));
     if !problem.exists.is_empty() {
-        eprintln!("there are: {}", problem.exists.join(", "));
+        output::complain(&format!("there are: {}", problem.exists.join(", ")));
     }
     if let Some(next) = &problem.next {
-        eprintln!("next: {next}");
+        output::complain(&format!("next: {next}"));
     }
 }
 

@@ -1,10 +1,12 @@
 //! Printing: tables for people, JSON for programs.
 
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use api::{Limits, Millis};
 use serde::Serialize;
+
+use crate::terminal;
 
 /// How to print.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -17,16 +19,27 @@ pub enum Format {
 
 /// Prints a value as indented JSON.
 pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
-    line(&serde_json::to_string_pretty(value)?)
+    write_line(&terminal::safe_json(&serde_json::to_string_pretty(value)?))
 }
 
 /// Prints a value as one line of JSON.
 pub fn json_line(value: &impl Serialize) -> anyhow::Result<()> {
-    line(&serde_json::to_string(value)?)
+    write_line(&terminal::safe_json(&serde_json::to_string(value)?))
 }
 
-/// Prints a line, at once.
+/// Prints a line, at once, as it may be printed.
 pub fn line(text: &str) -> anyhow::Result<()> {
+    write_line(&terminal::safe(text, std::io::stdout().is_terminal()))
+}
+
+/// Prints a line on standard error, as it may be printed.
+pub fn complain(text: &str) {
+    let shown = terminal::safe(text, std::io::stderr().is_terminal());
+    // There is nobody left to tell.
+    let _ = writeln!(std::io::stderr().lock(), "{shown}");
+}
+
+fn write_line(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     writeln!(out, "{text}")?;
     out.flush()?;

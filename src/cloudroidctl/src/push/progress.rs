@@ -8,6 +8,7 @@ use api::{PushEvent, Size};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::output::{self, Format};
+use crate::terminal;
 
 /// On a plain output, progress is said at most so often.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(5);
@@ -73,7 +74,7 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_style(ProgressStyle::with_template("{spinner} {msg} {elapsed}")?);
             bar.reset_elapsed();
-            bar.set_message(title.to_owned());
+            bar.set_message(terminal::safe(title, false).into_owned());
         }
         Ok(())
     }
@@ -99,7 +100,7 @@ impl Progress {
                     bar.set_length(total);
                     bar.set_position(done);
                 }
-                bar.set_message(text);
+                bar.set_message(terminal::safe(&text, false).into_owned());
                 Ok(())
             }
             None if self.said.elapsed() >= PLAIN_INTERVAL => {

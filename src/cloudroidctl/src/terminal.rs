@@ -1,0 +1,121 @@
+//! Text of strangers on a terminal. What nodes and compilers print passes through here, and a terminal obeys what is
+//! in it: sequences can rename the window, put words on the command line, or make a line look like another one.
+//!
+//! Control characters are shown as what they are. Colours (SGR, `ESC [ … m`) are kept on a terminal, because compilers'
+//! are of use, and are ended with their line.
+
+use std::borrow::Cow;
+
+/// How many characters of parameters a colour may have.
+const LONGEST_COLOUR: usize = 32;
+
+/// `text` as it may be printed. Lines and tabs stay; `colours`: so do colours.
+pub fn safe(text: &str, colours: bool) -> Cow<'_, str> {
+    if !text.contains(is_dangerous) {
+        return Cow::Borrowed(text);
+    }
+    let mut out = String::with_capacity(text.len() + 16);
+    let mut coloured = false;
+    let mut rest = text;
+    while let Some(c) = rest.chars().next() {
+        if colours && let Some(colour) = colour(rest) {
+            out.push_str(colour);
+            coloured = true;
+            rest = &rest[colour.len()..];
+            continue;
+        }
+        if c == '\n' && coloured {
+            out.push_str("\x1b[0m");
+            coloured = false;
+        }
+        if is_dangerous(c) {
+            out.extend(c.escape_default());
+        } else {
+            out.push(c);
+        }
+        rest = &rest[c.len_utf8()..];
+    }
+    if coloured {
+        out.push_str("\x1b[0m");
+    }
+    Cow::Owned(out)
+}
+
+/// JSON as it may be printed: control characters that its own rules let through are written as `\u…`, which means the
+/// same. (They can only stand in its texts.)
+pub fn safe_json(json: &str) -> Cow<'_, str> {
+    if !json.contains(is_dangerous) {
+        return Cow::Borrowed(json);
+    }
+    let mut out = String::with_capacity(json.len() + 16);
+    for c in json.chars() {
+        if is_dangerous(c) {
+            out.push_str(&format!("\\u{:04x}", u32::from(c)));
+        } else {
+            out.push(c);
+        }
+    }
+    Cow::Owned(out)
+}
+
+/// Control characters (C0, DEL, C1) but for lines and tabs, and those that change the direction of what follows.
+fn is_dangerous(c: char) -> bool {
+    (c.is_control() && c != '\n' && c != '\t')
+        || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{200e}' | '\u{200f}' | '\u{61c}')
+}
+
+/// The colour that `text` begins with.
+fn colour(text: &str) -> Option<&str> {
+    let parameters = text.strip_prefix("\x1b[")?;
+    let end = parameters.find(|c: char| !(c.is_ascii_digit() || c == ';'))?;
+    let ends_as_one = parameters[end..].starts_with('m');
+    (ends_as_one && end <= LONGEST_COLOUR).then(|| &text[.."\x1b[".len() + end + 1])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_terminal_is_told_nothing_by_a_log() {
+        for (text, shown) in [
+            ("plain äöü\tand\nlines", "plain äöü\tand\nlines"),
+            ("\x1b]0;title\x07", "\\u{1b}]0;title\\u{7}"),
+            ("\x1b[2J\x1b[1;1H", "\\u{1b}[2J\\u{1b}[1;1H"),
+            ("safe\rEVIL", "safe\\rEVIL"),
+            ("\u{9b}31m\u{9d}0;x\u{9c}", "\\u{9b}31m\\u{9d}0;x\\u{9c}"),
+            ("a\u{202e}b", "a\\u{202e}b"),
+            ("back\x08\x7f", "back\\u{8}\\u{7f}"),
+            // Not ended, or not a colour.
+            ("\x1b[31", "\\u{1b}[31"),
+            ("\x1b[?25lm", "\\u{1b}[?25lm"),
+        ] {
+            assert_eq!(safe(text, true), shown);
+            assert_eq!(safe(text, false), shown);
+        }
+    }
+
+    #[test]
+    fn colours_stay_on_a_terminal_and_end_with_their_line() {
+        let text = "\x1b[01;31merror\x1b[0m: x\nnext \x1b[1mbold\nplain";
+        assert_eq!(
+            safe(text, true),
+            "\x1b[01;31merror\x1b[0m: x\x1b[0m\nnext \x1b[1mbold\x1b[0m\nplain"
+        );
+        assert_eq!(
+            safe("\x1b[31mred", false),
+            "\\u{1b}[31mred",
+            "a file has no colours"
+        );
+    }
+
+    #[test]
+    fn json_means_the_same() {
+        let value = serde_json::json!({"line": "a\u{9b}b\u{7f}\u{202e}\x1b[2J", "tab": "\t"});
+        let text = serde_json::to_string_pretty(&value).expect("json");
+        let printed = safe_json(&text);
+        assert!(!printed.contains(is_dangerous), "{printed:?}");
+        let read: serde_json::Value = serde_json::from_str(&printed).expect("json");
+        assert_eq!(read, value);
+    }
+}
