@@ -206,6 +206,7 @@ async fn run() -> Result<(), Failure> {
         sources: Sources::Automatic,
         store: store.clone(),
         engine: engine.clone(),
+        limits: servant::spec::Limits::default(),
     })?;
     if let Some(path) = &wish.path {
         // In the build's own directory, as the daemon unpacks it: it goes with all the rest.

@@ -105,12 +105,18 @@ impl Apt {
         }
         // One daemon at a time; the others then find the lists fresh.
         let path = self.root.join("lock");
-        let file = fs::File::create(&path).at("opening", &path)?;
+        let mut file = fs::File::create(&path).at("opening", &path)?;
         // Whoever could open it could hold it.
         crate::install::set_mode(&path, 0o600)?;
-        let locked =
-            tokio::task::spawn_blocking(move || Flock::lock(file, FlockArg::LockExclusive)).await?;
-        let _lock = locked.map_err(|(_, error)| Error::io("locking", &path, error.into()))?;
+        // Asked for again and again, not waited for on a thread: whoever gives up leaves no thread behind.
+        let _lock = loop {
+            match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
+                Ok(lock) => break lock,
+                Err((again, nix::errno::Errno::EWOULDBLOCK)) => file = again,
+                Err((_, error)) => return Err(Error::io("locking", &path, error.into())),
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        };
         let age = age(&stamp);
         if !force && self.is_fresh() {
             return Ok(None);

@@ -39,7 +39,7 @@ impl Archive {
             return Err(Error::NoContents { sources });
         }
         let root = apt.root().to_owned();
-        let contents = tokio::task::spawn_blocking(move || Contents::open(&root, &lists)).await??;
+        let contents = crate::blocking::spawn(move || Contents::open(&root, &lists)).await??;
         let names = apt.names().await?;
         let stamp = apt.stamp();
         Ok(Self {

@@ -109,7 +109,7 @@ pub(crate) async fn make(
         .arg(&base.suite)
         .arg(&tree)
         .arg(&list);
-    let (lines, mut told) = tokio::sync::mpsc::unbounded_channel::<String>();
+    let (mut lines, mut told) = crate::lines::channel();
     let forward = async {
         while let Some(line) = told.recv().await {
             progress.log(&line).await;
@@ -117,7 +117,7 @@ pub(crate) async fn make(
     };
     let work = async {
         let result = process::run(command, "mmdebstrap", |_, line| {
-            let _ = lines.send(line.to_owned());
+            lines.send(line.to_owned());
         })
         .await;
         drop(lines);
@@ -129,10 +129,10 @@ pub(crate) async fn make(
     progress.step("packing the base layer").await;
     let store = shop.layers.store().clone();
     let options = tree_options(base);
-    let layer = tokio::task::spawn_blocking(move || -> Result<_, Error> {
+    let layer = crate::blocking::spawn(move || -> Result<_, Error> {
         normalise(&tree)?;
         let layer = store.layer_from_tree(&tree, &options)?;
-        fs::remove_dir_all(&root).at("removing", &root)?;
+        foreign::remove(&root)?;
         Ok(layer)
     })
     .await??;

@@ -19,6 +19,9 @@ use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
 use crate::workshop::Workshop;
 
+/// Where dpkg writes down what is installed.
+const STATUS: &str = "var/lib/dpkg/status";
+
 /// A push that is being built, its base layer made.
 pub(crate) struct Build<'a> {
     pub(crate) shop: Workshop,
@@ -93,8 +96,9 @@ impl Build<'_> {
         let status = trees
             .iter()
             .rev()
-            .map(|tree| tree.join("var/lib/dpkg/status"))
-            .find(|path| path.is_file());
+            // In the layer itself: apt, which reads it out here, would follow a link to the host.
+            .find(|tree| foreign::Tree::open(tree).is_ok_and(|tree| tree.has_file(STATUS)))
+            .map(|tree| tree.join(STATUS));
         let debs = self
             .archive
             .apt
@@ -200,8 +204,7 @@ impl Build<'_> {
         }
         let shares = pushed::shares(made.prefix.as_deref());
         let definitions =
-            tokio::task::spawn_blocking(move || package::definitions::read(&trees, &shares))
-                .await??;
+            crate::blocking::spawn(move || package::definitions::read(&trees, &shares)).await??;
         let package = made.packages.first().cloned().unwrap_or_default();
         let spec = ImageSpec {
             layers: infos,
@@ -220,7 +223,7 @@ impl Build<'_> {
             ..ImageSpec::default()
         };
         let store = self.shop.layers.store().clone();
-        let image = tokio::task::spawn_blocking(move || store.put_image(&spec)).await??;
+        let image = crate::blocking::spawn(move || store.put_image(&spec)).await??;
         // A log that tells of no failure is of no use to anyone.
         let _ = fs::remove_file(&self.log);
         Ok(BuildOutcome {

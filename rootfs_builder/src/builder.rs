@@ -8,6 +8,7 @@ use std::sync::Arc;
 use image::{Digest, Store};
 use package::workspace::Pushed;
 use servant::engine::Engine;
+use servant::spec::Limits;
 use tokio::sync::mpsc;
 
 use crate::apt::{Deb, Sources};
@@ -19,10 +20,11 @@ use crate::cache::Layers;
 use crate::error::{Error, IoAt};
 use crate::event::{BuildEvent, Progress};
 use crate::install::Made;
+use crate::removal::Removals;
 use crate::request::{BuildOutcome, PushRequest, Source};
-use crate::sandbox::Site;
+use crate::sandbox::{self, Site};
 use crate::workshop::{Turns, Workshop};
-use crate::{keys, packaged, prebuilt, pushed, source, sources};
+use crate::{blocking, keys, packaged, prebuilt, pushed, seal, source, sources};
 
 /// The base taken when none is named.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -47,6 +49,9 @@ pub struct Config {
     pub store: Arc<Store>,
     /// What runs sandboxes.
     pub engine: Arc<dyn Engine>,
+    /// Of each sandbox. Where it says nothing: half of the machine's memory, 4096 processes, and cores as far as
+    /// servants leave some.
+    pub limits: Limits,
 }
 
 /// Makes images. Cheap to share in an `Arc`; several builds may run at once.
@@ -54,6 +59,7 @@ pub struct Builder {
     config: Config,
     layers: Layers,
     turns: Turns,
+    removals: Removals,
     archives: tokio::sync::Mutex<HashMap<String, Arc<Archive>>>,
 }
 
@@ -78,19 +84,34 @@ impl Builder {
             config,
             layers,
             turns: Turns::default(),
+            removals: Removals::default(),
             archives: Default::default(),
         })
     }
 
-    /// Makes the image of a push. To cancel, drop the future: containers are ended and the build's directory is
-    /// removed. Nothing is tagged, so a failed build changes nothing for anyone.
+    /// Makes the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
+    /// directory is removed ([`Builder::removed`]). Nothing is tagged, so a failed build changes nothing for anyone.
     pub async fn build(
         &self,
         request: &PushRequest,
         events: mpsc::Sender<BuildEvent>,
     ) -> Result<BuildOutcome, Error> {
+        blocking::cancellable(self.make(request, events)).await
+    }
+
+    /// Comes back when the containers of a build have ended and its directory is gone.
+    pub async fn removed(&self, id: &str) {
+        self.removals.done(id).await;
+    }
+
+    async fn make(
+        &self,
+        request: &PushRequest,
+        events: mpsc::Sender<BuildEvent>,
+    ) -> Result<BuildOutcome, Error> {
         let progress = &Progress::new(events);
-        let hold = self.config.store.hold()?;
+        let store = self.config.store.clone();
+        let hold = blocking::spawn(move || store.hold()).await??;
         let base = base::load(
             &self.config.bases_dir,
             request.base.as_deref().unwrap_or(DEFAULT_BASE),
@@ -99,6 +120,8 @@ impl Builder {
             &self.config.build_dir,
             &request.id,
             self.config.engine.clone(),
+            self.config.limits.or(&sandbox::default_limits()),
+            self.removals.clone(),
         )?;
         let shop = Workshop {
             site,
@@ -107,7 +130,14 @@ impl Builder {
         };
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
-            Source::Tree(path) => What::Tree(pushed::inspect(path, &base)?),
+            Source::Tree(path) => {
+                let pushed = pushed::inspect(path, &base)?;
+                if matches!(pushed, Pushed::Source(_)) {
+                    let tree = path.clone();
+                    blocking::spawn(move || seal::seal(&tree)).await??;
+                }
+                What::Tree(pushed)
+            }
             Source::Packaged(name) => What::Packaged(name),
         };
         let archive = self.archive(&shop, &base, progress).await?;

@@ -5,11 +5,14 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use foreign::Visit;
 use image::{LayerInfo, TreeOptions};
+use rustix::fs::{AtFlags, FileType, Gid, Mode, Uid};
 use serde::Serialize;
 use servant::spec::{Mount, Profile};
 
 use crate::base::Base;
+use crate::blocking;
 use crate::bootstrap::{EPOCH, tree_options};
 use crate::error::{Error, IoAt};
 use crate::event::Progress;
@@ -17,6 +20,9 @@ use crate::install::{lay_out, set_mode};
 use crate::process::Tail;
 use crate::sandbox::Run;
 use crate::workshop::Workshop;
+
+/// Bytes of a log that are kept.
+const LOG_LIMIT: u64 = 64 << 20;
 
 /// One package to compile.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -94,12 +100,12 @@ pub(crate) async fn compile(
 
     let mut file = fs::File::create(log).at("making", log)?;
     crate::install::set_mode(log, 0o600)?;
-    let mut writing = Ok(());
+    let (mut writing, mut logged) = (Ok(()), 0);
     let mut package = units
         .first()
         .map_or_else(String::new, |unit| unit.name.clone());
     let mut tail = Tail::default();
-    let (lines, mut told) = tokio::sync::mpsc::unbounded_channel::<String>();
+    let (mut lines, mut told) = crate::lines::channel();
     let forward = async {
         while let Some(line) = told.recv().await {
             match title(&line, units) {
@@ -131,7 +137,9 @@ pub(crate) async fn compile(
                         .into(),
                 },
                 |line| {
-                    if writing.is_ok() {
+                    // The beginning says most; a build that prints without end must not fill the disk.
+                    if writing.is_ok() && logged < LOG_LIMIT {
+                        logged += line.len() as u64 + 1;
                         writing = writeln!(file, "{line}");
                     }
                     if let Some(name) = line.strip_prefix("::package ") {
@@ -139,7 +147,7 @@ pub(crate) async fn compile(
                     } else if worth_showing(line) {
                         tail.push(line);
                     }
-                    let _ = lines.send(line.to_owned());
+                    lines.send(line.to_owned());
                 },
             )
             .await;
@@ -169,7 +177,7 @@ pub(crate) async fn compile(
     let prefix = base.build.prefix.clone();
     let tree = room.join("tree");
     let result = tree.clone();
-    tokio::task::spawn_blocking(move || take_out(&upper, &prefix, &tree)).await??;
+    blocking::spawn(move || take_out(&upper, &prefix, &tree)).await??;
     Ok(result)
 }
 
@@ -193,26 +201,21 @@ fn worth_showing(line: &str) -> bool {
 
 /// What was pushed may be readable by its owner alone; the compiling user is another.
 pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
-    use std::os::unix::fs::PermissionsExt;
-    for entry in walkdir::WalkDir::new(source) {
-        let entry = entry.map_err(|error| Error::io("reading", source, error.into()))?;
-        if entry.file_type().is_symlink() {
-            continue;
-        }
-        let about = entry
-            .metadata()
-            .map_err(|error| Error::io("reading", entry.path(), error.into()))?;
-        let mode = about.permissions().mode() & 0o777;
-        let run = if about.is_dir() || mode & 0o100 != 0 {
+    foreign::walk(source, |entry| {
+        let mode = entry.stat.st_mode & 0o777;
+        let run = if entry.kind() == FileType::Directory || mode & 0o100 != 0 {
             0o111
         } else {
             0
         };
-        if mode != mode | 0o444 | run {
-            set_mode(entry.path(), mode | 0o444 | run)?;
+        if entry.kind() != FileType::Symlink && mode != mode | 0o444 | run {
+            let (parent, name) = entry.place();
+            let mode = Mode::from_raw_mode(mode | 0o444 | run);
+            rustix::fs::chmodat(parent, name, mode, AtFlags::empty())
+                .map_err(|error| Error::io("opening up", entry.shown(), error.into()))?;
         }
-    }
-    Ok(())
+        Ok::<_, Error>(Visit::Into)
+    })
 }
 
 /// Moves the prefix out of the container's upper directory into a tree of its own that belongs to root.
@@ -229,12 +232,13 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
     }
     let from = upper.join(inside);
     fs::rename(&from, &target).at("moving", &from)?;
-    for entry in walkdir::WalkDir::new(&target) {
-        let entry = entry.map_err(|error| Error::io("reading", &target, error.into()))?;
-        std::os::unix::fs::lchown(entry.path(), Some(0), Some(0))
-            .at("changing the owner of", entry.path())?;
-    }
-    Ok(())
+    foreign::walk(&target, |entry| {
+        let (parent, name) = entry.place();
+        let root = (Some(Uid::ROOT), Some(Gid::ROOT));
+        rustix::fs::chownat(parent, name, root.0, root.1, AtFlags::SYMLINK_NOFOLLOW)
+            .map_err(|error| Error::io("changing the owner of", entry.shown(), error.into()))?;
+        Ok::<_, Error>(Visit::Into)
+    })
 }
 
 /// Packs an install space.
@@ -248,7 +252,7 @@ pub(crate) async fn pack(shop: &Workshop, base: &Base, tree: &Path) -> Result<La
             ..tree_options(base)
         },
     );
-    Ok(tokio::task::spawn_blocking(move || store.layer_from_tree(&tree, &options)).await??)
+    Ok(blocking::spawn(move || store.layer_from_tree(&tree, &options)).await??)
 }
 
 #[cfg(test)]

@@ -5,6 +5,9 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
+use foreign::Visit;
+use rustix::fs::FileType;
+
 use crate::error::{Error, IoAt};
 
 /// The names in the dynamic section.
@@ -31,8 +34,7 @@ struct Segment {
 }
 
 /// Reads a file; none where it is not a dynamically linked ELF file for little-endian machines.
-pub(crate) fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
-    let mut file = File::open(path).at("reading", path)?;
+fn read_open(mut file: File, path: &Path) -> Result<Option<Dynamic>, Error> {
     let mut magic = Vec::new();
     (&mut file)
         .take(64)
@@ -144,24 +146,29 @@ fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
 /// Libraries that ELF files below `root` need and that are not below it themselves.
 pub(crate) fn needed_below(root: &Path) -> Result<BTreeSet<String>, Error> {
     let (mut needed, mut present) = (BTreeSet::new(), BTreeSet::new());
-    for entry in walkdir::WalkDir::new(root) {
-        let entry = entry.map_err(|error| Error::io("reading", root, error.into()))?;
-        if !entry.file_type().is_dir() {
-            present.insert(entry.file_name().to_string_lossy().into_owned());
+    foreign::walk(root, |entry| {
+        if entry.kind() != FileType::Directory {
+            present.insert(entry.name().to_string_lossy().into_owned());
         }
-        if entry.file_type().is_file()
-            && let Some(dynamic) = read(entry.path())?
+        if entry.kind() == FileType::RegularFile
+            && let Some(dynamic) = read_open(entry.open()?, &entry.shown())?
         {
             needed.extend(dynamic.needed);
         }
-    }
-    needed.retain(|name| !present.contains(name));
+        Ok::<_, Error>(Visit::Into)
+    })?;
+    // One with a slash is a path, not a library that a package could be looked up for.
+    needed.retain(|name| !name.contains('/') && !present.contains(name));
     Ok(needed)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
+        read_open(File::open(path).at("reading", path)?, path)
+    }
 
     #[test]
     fn a_program_tells_what_it_needs() {

@@ -112,6 +112,14 @@ pub enum Error {
         /// The last lines it printed.
         last_lines: String,
     },
+    /// The package's code put something else in the place of the plan of what to run.
+    #[error(
+        "the plan of what to run is refused, because its container's answer cannot be one: {problem}"
+    )]
+    BadPlan {
+        /// What is wrong with it.
+        problem: String,
+    },
     /// roslaunch refused the launch file.
     #[error("roslaunch cannot load {file}: {words}")]
     Launch {
@@ -193,6 +201,9 @@ pub enum Error {
         /// Why it failed.
         source: io::Error,
     },
+    /// What a sandbox left, or what was pushed, is not what is read.
+    #[error(transparent)]
+    Foreign(foreign::Error),
     /// A thread of this process panicked.
     #[error("an internal task ended early: {0}")]
     Task(#[from] tokio::task::JoinError),
@@ -235,6 +246,19 @@ impl Error {
             Self::DiskFull { path, what }
         } else {
             Self::Io { what, path, source }
+        }
+    }
+}
+
+impl From<foreign::Error> for Error {
+    fn from(error: foreign::Error) -> Self {
+        match error {
+            foreign::Error::File {
+                action,
+                path,
+                source,
+            } => Self::io(format!("cannot {action}"), path, source),
+            other => Self::Foreign(other),
         }
     }
 }

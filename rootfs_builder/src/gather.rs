@@ -68,10 +68,9 @@ pub(crate) async fn gather(
         let debs = archive.apt.candidates(&round).await?;
         let files = archive.apt.download(&debs, progress).await?;
         for (deb, file) in debs.iter().zip(files) {
-            let members = tokio::task::spawn_blocking(move || {
-                deb::members(&file, deb::wanted_of_development)
-            })
-            .await??;
+            let members =
+                crate::blocking::spawn(move || deb::members(&file, deb::wanted_of_development))
+                    .await??;
             let told = tell(&members, base);
             next.extend(told.ros_packages);
             wanted.warnings.extend(told.warnings);

@@ -205,9 +205,9 @@ async fn make(
         overlay_upper: true,
         ..tree_options(base)
     };
-    let layer = tokio::task::spawn_blocking(move || -> Result<_, Error> {
+    let layer = crate::blocking::spawn(move || -> Result<_, Error> {
         let layer = store.layer_from_tree(&upper, &options)?;
-        fs::remove_dir_all(&room).at("removing", &room)?;
+        foreign::remove(&room)?;
         Ok(layer)
     })
     .await??;

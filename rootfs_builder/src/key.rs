@@ -1,12 +1,11 @@
 //! Keys: names of results by what they were made from.
 
-use std::ffi::OsStr;
-use std::fs::File;
 use std::io::Read;
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
+use foreign::Visit;
+use rustix::fs::FileType;
 use sha2::{Digest, Sha256};
 
 use crate::error::{Error, IoAt};
@@ -57,70 +56,51 @@ impl Key {
     }
 }
 
-/// A file tree's names, kinds, execute bits and contents. Owners and times do not matter.
+/// A file tree's names, kinds, execute bits, links and contents. Owners and times do not matter.
 pub(crate) fn tree(root: &Path) -> Result<String, Error> {
-    hash(root, |_| true)
-}
-
-/// The same without what version control keeps beside the sources.
-pub(crate) fn sources(root: &Path) -> Result<String, Error> {
-    hash(root, |name| {
-        ![".git", ".hg", ".svn"].iter().any(|kept| name == *kept)
-    })
-}
-
-fn hash(root: &Path, wanted: impl Fn(&OsStr) -> bool) -> Result<String, Error> {
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 64 * 1024];
     let add = |hash: &mut Sha256, part: &[u8]| {
         hash.update((part.len() as u64).to_le_bytes());
         hash.update(part);
     };
-    let entries = walkdir::WalkDir::new(root).sort_by_file_name().into_iter();
-    for entry in entries.filter_entry(|entry| entry.depth() == 0 || wanted(entry.file_name())) {
-        let entry = entry.map_err(|error| Error::io("reading", root, error.into()))?;
-        let path = entry.path();
-        let relative = path.strip_prefix(root).unwrap_or(path);
-        add(&mut hash, relative.as_os_str().as_bytes());
-        let kind = entry.file_type();
-        if kind.is_symlink() {
-            add(&mut hash, b"link");
-            add(
-                &mut hash,
-                std::fs::read_link(path)
-                    .at("reading", path)?
-                    .as_os_str()
-                    .as_bytes(),
-            );
-        } else if kind.is_file() {
-            let mut file = File::open(path).at("reading", path)?;
-            let about = file.metadata().at("reading", path)?;
-            add(
-                &mut hash,
-                if about.permissions().mode() & 0o111 != 0 {
-                    b"executable"
-                } else {
-                    b"file"
-                },
-            );
-            hash.update(about.len().to_le_bytes());
-            loop {
-                let read = file.read(&mut buffer).at("reading", path)?;
-                if read == 0 {
-                    break;
-                }
-                hash.update(&buffer[..read]);
+    foreign::walk(root, |entry| {
+        add(&mut hash, entry.path.as_os_str().as_bytes());
+        match entry.kind() {
+            FileType::Symlink => {
+                add(&mut hash, b"link");
+                add(&mut hash, &entry.link()?);
             }
-        } else {
-            add(&mut hash, b"directory");
+            FileType::RegularFile => {
+                let runs = entry.stat.st_mode & 0o111 != 0;
+                add(&mut hash, if runs { b"executable" } else { b"file" });
+                let mut file = entry.open()?;
+                hash.update((entry.stat.st_size as u64).to_le_bytes());
+                loop {
+                    foreign::cancel::check().map_err(foreign::Error::from)?;
+                    let read = file.read(&mut buffer).at("reading", entry.shown())?;
+                    if read == 0 {
+                        break;
+                    }
+                    hash.update(&buffer[..read]);
+                }
+            }
+            _ => add(&mut hash, b"directory"),
         }
-    }
+        Ok::<_, Error>(Visit::Into)
+    })?;
     Ok(hex::encode(hash.finalize()))
+}
+
+/// The sources that a build sees: all of a tree that was sealed ([`crate::seal`]).
+pub(crate) fn sources(root: &Path) -> Result<String, Error> {
+    tree(root)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::PermissionsExt;
 
     #[test]
     fn parts_do_not_run_into_each_other() {
@@ -144,19 +124,5 @@ mod tests {
         assert_eq!(first, make("x", 0o600));
         assert_ne!(first, make("y", 0o644));
         assert_ne!(first, make("x", 0o755));
-    }
-
-    #[test]
-    fn a_commit_changes_no_sources() {
-        let root = tempfile::tempdir().expect("a directory");
-        std::fs::create_dir(root.path().join(".git")).expect("made");
-        std::fs::write(root.path().join("CMakeLists.txt"), "project(x)").expect("written");
-        let before = (
-            sources(root.path()).expect("hashed"),
-            tree(root.path()).expect("hashed"),
-        );
-        std::fs::write(root.path().join(".git/HEAD"), "x").expect("written");
-        assert_eq!(sources(root.path()).expect("hashed"), before.0);
-        assert_ne!(tree(root.path()).expect("hashed"), before.1);
     }
 }

@@ -12,6 +12,7 @@ use crate::error::{Error, IoAt};
 use crate::install::{lay_out, set_mode};
 use crate::sandbox::Run;
 use crate::workshop::Workshop;
+use crate::{blocking, plan};
 
 /// What to run. Independent of how it was asked for.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -180,15 +181,19 @@ pub(crate) async fn ask(
             |_| {},
         )
         .await?;
-    let path = out.join("plan.json");
-    if !finished.success() || !path.is_file() {
+    let text = match finished.success() {
+        true => blocking::spawn(move || plan::read(&out)).await??,
+        false => None,
+    };
+    let Some(text) = text else {
         return Err(Error::Inside {
             what: "resolving what to run",
             last_lines: finished.last_words(),
         });
-    }
-    let text = fs::read(&path).at("reading", &path)?;
-    understand(&text)
+    };
+    let answer = understand(&text)?;
+    plan::check(&answer)?;
+    Ok(answer)
 }
 
 fn understand(text: &[u8]) -> Result<Answer, Error> {

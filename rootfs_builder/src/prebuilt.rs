@@ -65,7 +65,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
 async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<Made, Error> {
     let root = space.root.clone();
     let hashed = root.clone();
-    let content = tokio::task::spawn_blocking(move || key::tree(&hashed)).await??;
+    let content = crate::blocking::spawn(move || key::tree(&hashed)).await??;
     let key = Key::new("prebuilt")
         .with("content", content)
         .with("prefix", prefix.as_os_str().as_encoded_bytes())
@@ -92,7 +92,7 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
     // The pushed tree is this build's own: moving it costs nothing.
     fs::rename(&root, &target).at("moving", &root)?;
     let opened = target.clone();
-    tokio::task::spawn_blocking(move || compile::open_up(&opened)).await??;
+    crate::blocking::spawn(move || compile::open_up(&opened)).await??;
     let layer = compile::pack(shop, &build.base, &tree).await?;
     let made_from = pushed::names(&space.packages).into_iter().collect();
     shop.keep(

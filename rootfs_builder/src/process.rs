@@ -5,6 +5,8 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::Stdio;
 
+use nix::sys::signal::{Signal, killpg};
+use nix::unistd::Pid;
 use tokio::io::{AsyncBufReadExt, AsyncRead, BufReader};
 use tokio::process::Command;
 
@@ -43,8 +45,22 @@ pub(crate) fn command(program: &str) -> Command {
         .env("LC_ALL", "C.UTF-8")
         .env("DEBIAN_FRONTEND", "noninteractive")
         .stdin(Stdio::null())
+        // Its own, so that all that it starts can be ended with it.
+        .process_group(0)
         .kill_on_drop(true);
     command
+}
+
+/// A program and all that it has started, killed when this is dropped before it has ended: apt's methods and
+/// mmdebstrap's dpkg would go on for a build that nobody wants any more.
+struct Group(Option<Pid>);
+
+impl Drop for Group {
+    fn drop(&mut self) {
+        if let Some(group) = self.0.take() {
+            let _ = killpg(group, Signal::SIGKILL);
+        }
+    }
 }
 
 /// Runs it to its end; every line of either stream goes to `on_line` as it comes. The error has the last lines,
@@ -59,6 +75,8 @@ pub(crate) async fn run(
     let mut child = command
         .spawn()
         .map_err(|error| spawn_error(&program, package, error))?;
+    let id = child.id().and_then(|id| i32::try_from(id).ok());
+    let mut group = Group(id.map(Pid::from_raw));
     let out = child.stdout.take().map(BufReader::new);
     let err = child.stderr.take().map(BufReader::new);
     let mut tail = Tail::default();
@@ -78,6 +96,7 @@ pub(crate) async fn run(
         .wait()
         .await
         .map_err(|error| spawn_error(&program, package, error))?;
+    group.0 = None;
     if status.success() {
         return Ok(());
     }
@@ -193,6 +212,29 @@ mod tests {
         assert!(
             text.contains("sh failed (exit status: 3)") && text.contains('b'),
             "{text}"
+        );
+    }
+
+    #[tokio::test]
+    async fn what_a_program_has_started_ends_with_it() {
+        let place = tempfile::tempdir().expect("a directory");
+        let pipe = place.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
+        // The grandchild holds the pipe open for writing as long as it lives.
+        let script = format!("(sleep 1000 > '{}') & wait", pipe.display());
+        let running = tokio::spawn(run(shell(&script), "dash", |_, _| {}));
+        let (opened, open) = tokio::sync::oneshot::channel();
+        let reading = tokio::task::spawn_blocking(move || {
+            let mut file = std::fs::File::open(pipe).expect("opened with the other end");
+            let _ = opened.send(());
+            std::io::Read::read(&mut file, &mut [0]).expect("read")
+        });
+        open.await.expect("the grandchild runs");
+        running.abort();
+        assert_eq!(
+            reading.await.expect("no panic"),
+            0,
+            "the other end is closed"
         );
     }
 

@@ -1,13 +1,14 @@
 //! What was pushed, as far as a build asks.
 
 use std::collections::BTreeSet;
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use foreign::Visit;
 use package::condition::Variables;
 use package::manifest::Kind;
 use package::workspace::{self, Package, Pushed};
+use rustix::fs::FileType;
 
 use crate::base::Base;
 use crate::error::Error;
@@ -112,14 +113,15 @@ pub(crate) fn has_python(root: &Path) -> bool {
                 .iter()
                 .any(|name| parent == *name)
     };
-    let runs = |path: &Path| {
-        let extension = path.extension().unwrap_or_default();
+    let runs = |entry: &foreign::Entry<'_>| {
+        let extension = entry.path.extension().unwrap_or_default();
         if extension == "py" {
-            return std::fs::metadata(path).is_ok_and(|about| about.len() > 0);
+            return entry.stat.st_size > 0;
         }
         let mut start = [0; 64];
-        let read = File::open(path)
-            .and_then(|mut file| file.read(&mut start))
+        let read = entry
+            .open()
+            .and_then(|mut file| Ok(file.read(&mut start).unwrap_or(0)))
             .unwrap_or(0);
         let first = start[..read]
             .split(|byte| *byte == b'\n')
@@ -129,11 +131,14 @@ pub(crate) fn has_python(root: &Path) -> bool {
             && first.starts_with(b"#!")
             && first.windows(6).any(|word| word == b"python")
     };
-    walkdir::WalkDir::new(root)
-        .into_iter()
-        .flatten()
-        .filter(|entry| entry.file_type().is_file() && !generated(entry.path()))
-        .any(|entry| runs(entry.path()))
+    let mut found = false;
+    // What cannot be read here is told by those who need it.
+    let _ = foreign::walk(root, |entry| {
+        let regular = entry.kind() == FileType::RegularFile;
+        found |= regular && !found && !generated(entry.path) && runs(entry);
+        Ok::<_, foreign::Error>(if found { Visit::Skip } else { Visit::Into })
+    });
+    found
 }
 
 /// Where definitions are looked for, the package's own first.

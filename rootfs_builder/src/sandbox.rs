@@ -13,12 +13,15 @@ use tokio::task::JoinHandle;
 
 use crate::error::{Error, IoAt};
 use crate::process::Tail;
+use crate::removal::Removals;
 
 /// The directory of one build and the containers that run for it. Dropping it ends them and removes it.
 pub(crate) struct Site {
     id: String,
     directory: PathBuf,
     engine: Arc<dyn Engine>,
+    limits: Limits,
+    removals: Removals,
     running: Arc<Mutex<Vec<JoinHandle<()>>>>,
 }
 
@@ -80,8 +83,14 @@ impl Finished {
 
 impl Site {
     /// Makes the directory below `root`, named `id`. The caller may have put the pushed tree there already; it
-    /// goes with all the rest.
-    pub(crate) fn new(root: &Path, id: &str, engine: Arc<dyn Engine>) -> Result<Self, Error> {
+    /// goes with all the rest. `limits` are those of each container.
+    pub(crate) fn new(
+        root: &Path,
+        id: &str,
+        engine: Arc<dyn Engine>,
+        limits: Limits,
+        removals: Removals,
+    ) -> Result<Self, Error> {
         let directory = root.join(id);
         fs::create_dir_all(&directory).at("making", &directory)?;
         // What others may read in it is nobody's business out here.
@@ -90,6 +99,8 @@ impl Site {
             id: id.to_owned(),
             directory,
             engine,
+            limits,
+            removals,
             running: Arc::default(),
         })
     }
@@ -105,7 +116,7 @@ impl Site {
     pub(crate) fn fresh(&self, name: &str) -> Result<PathBuf, Error> {
         let path = self.directory.join(name);
         if path.exists() {
-            fs::remove_dir_all(&path).at("removing", &path)?;
+            foreign::remove(&path)?;
         }
         self.directory(name)
     }
@@ -121,7 +132,7 @@ impl Site {
             layers: run.layers,
             writable: run.writable,
             profile: run.profile,
-            limits: limits(),
+            limits: self.limits,
             environment: run.environment,
             nodes: vec![NodeSpec {
                 name: run.name.to_owned(),
@@ -211,8 +222,9 @@ async fn to_its_end(
     let _ = result.send(outcome);
 }
 
-/// A build may use the machine, but not all of its memory.
-fn limits() -> Limits {
+/// What a container of a build gets where nothing else was configured: half of the machine's memory, and cores when
+/// servants leave some.
+pub(crate) fn default_limits() -> Limits {
     let memory = fs::read_to_string("/proc/meminfo").ok().and_then(|text| {
         let line = text
             .lines()
@@ -220,8 +232,8 @@ fn limits() -> Limits {
         line.trim().split(' ').next()?.parse::<u64>().ok()
     });
     Limits {
-        cpus: None,
-        memory: memory.map(|kib| kib * 1024 / 4 * 3),
+        cpu_weight: Some(20),
+        memory: memory.map(|kib| kib * 1024 / 2),
         pids: Some(4096),
         ..Limits::default()
     }
@@ -231,26 +243,11 @@ impl Drop for Site {
     fn drop(&mut self) {
         let running =
             std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));
-        let directory = std::mem::take(&mut self.directory);
-        let remove = move || {
-            if let Err(error) = fs::remove_dir_all(&directory)
-                && error.kind() != std::io::ErrorKind::NotFound
-            {
-                tracing::warn!(path = %directory.display(), %error, "a build's directory could not be removed");
-            }
-        };
-        let Ok(runtime) = tokio::runtime::Handle::try_current() else {
-            return remove();
-        };
-        if running.iter().all(JoinHandle::is_finished) {
-            return remove();
-        }
-        runtime.spawn(async move {
-            for task in running {
-                let _ = task.await;
-            }
-            let _ = tokio::task::spawn_blocking(remove).await;
-        });
+        let (id, directory) = (
+            std::mem::take(&mut self.id),
+            std::mem::take(&mut self.directory),
+        );
+        self.removals.start(id, running, directory);
     }
 }
 

@@ -86,7 +86,7 @@ async fn compiled(
         .await?;
     let below: Vec<_> = below.into_iter().chain(more.layer).collect();
     let hashed = root.to_owned();
-    let sources = tokio::task::spawn_blocking(move || key::sources(&hashed)).await??;
+    let sources = crate::blocking::spawn(move || key::sources(&hashed)).await??;
     let key = Key::new("compiled")
         .with("build", build.base.build_key())
         .with("sources", sources)
@@ -142,7 +142,7 @@ pub(crate) async fn needed_by(
         .shop
         .extracted(layer.map_or(&[], std::slice::from_ref))
         .await?;
-    tokio::task::spawn_blocking(move || {
+    crate::blocking::spawn(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {
             needed.extend(elf::needed_below(tree)?);

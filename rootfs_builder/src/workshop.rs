@@ -21,19 +21,19 @@ impl Workshop {
     /// The cached layer of a key.
     pub(crate) async fn cached(&self, key: &str) -> Result<Option<Entry>, Error> {
         let (layers, key) = (self.layers.clone(), key.to_owned());
-        tokio::task::spawn_blocking(move || layers.get(&key)).await?
+        crate::blocking::spawn(move || layers.get(&key)).await?
     }
 
     /// Keeps a layer under a key.
     pub(crate) async fn keep(&self, key: &str, entry: Entry) -> Result<(), Error> {
         let (layers, key) = (self.layers.clone(), key.to_owned());
-        tokio::task::spawn_blocking(move || layers.put(&key, &entry)).await?
+        crate::blocking::spawn(move || layers.put(&key, &entry)).await?
     }
 
     /// Trees of these layers.
     pub(crate) async fn extracted(&self, layers: &[LayerInfo]) -> Result<Vec<PathBuf>, Error> {
         let (store, layers) = (self.layers.store().clone(), layers.to_vec());
-        tokio::task::spawn_blocking(move || {
+        crate::blocking::spawn(move || {
             layers
                 .iter()
                 .map(|layer| Ok(store.extracted(&layer.diff_id)?))

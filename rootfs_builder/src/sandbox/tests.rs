@@ -152,6 +152,32 @@ fn run() -> Run {
     }
 }
 
+fn site(root: &Path, id: &str, engine: &Arc<Pretended>, removals: &Removals) -> Site {
+    Site::new(root, id, engine.clone(), default_limits(), removals.clone()).expect("made")
+}
+
+#[tokio::test]
+async fn a_build_as_deep_as_can_be_is_removed() {
+    let root = tempfile::tempdir().expect("a directory");
+    let (engine, removals) = (Arc::new(Pretended::default()), Removals::default());
+    let site = site(root.path(), "b3", &engine, &removals);
+    let directory = root.path().join("b3");
+    tokio::task::spawn_blocking(move || {
+        let flags = rustix::fs::OFlags::RDONLY | rustix::fs::OFlags::DIRECTORY;
+        let none = rustix::fs::Mode::empty();
+        let mut at = rustix::fs::open(&directory, flags, none).expect("opened");
+        for _ in 0..15_000 {
+            rustix::fs::mkdirat(&at, "d", rustix::fs::Mode::RWXU).expect("made");
+            at = rustix::fs::openat(&at, "d", flags, none).expect("opened");
+        }
+    })
+    .await
+    .expect("nested");
+    drop(site);
+    removals.done("b3").await;
+    assert!(!root.path().join("b3").exists());
+}
+
 #[tokio::test]
 async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
     let root = tempfile::tempdir().expect("a directory");
@@ -159,7 +185,8 @@ async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
         code: Some(3),
         ..Pretended::default()
     });
-    let site = Site::new(root.path(), "b1", engine.clone()).expect("made");
+    let removals = Removals::default();
+    let site = site(root.path(), "b1", &engine, &removals);
     let mut heard = Vec::new();
     let finished = site
         .run(run(), |line| heard.push(line.to_owned()))
@@ -172,6 +199,7 @@ async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
     );
     assert!(engine.stopped.load(Ordering::SeqCst));
     drop(site);
+    removals.done("b1").await;
     assert!(!root.path().join("b1").exists());
 }
 
@@ -181,7 +209,8 @@ async fn a_dropped_build_ends_its_container_before_its_directory_goes() {
     let directory = root.path().join("b2");
     let engine = Arc::new(Pretended::default());
     *engine.saw.lock().expect("not poisoned") = Some((directory.clone(), false));
-    let site = Site::new(root.path(), "b2", engine.clone()).expect("made");
+    let removals = Removals::default();
+    let site = site(root.path(), "b2", &engine, &removals);
     tokio::select! {
         _ = site.run(run(), |_| {}) => panic!("it runs until it is stopped"),
         () = engine.started.notified() => {}
@@ -190,13 +219,7 @@ async fn a_dropped_build_ends_its_container_before_its_directory_goes() {
     let running = site.running.clone();
     assert_eq!(running.lock().expect("not poisoned").len(), 1);
     drop(site);
-    for _ in 0..1000 {
-        if !directory.exists() {
-            break;
-        }
-        tokio::task::yield_now().await;
-        tokio::task::spawn_blocking(|| {}).await.expect("a thread");
-    }
+    removals.done("b2").await;
     assert!(engine.stopped.load(Ordering::SeqCst));
     assert!(!directory.exists(), "the directory is removed");
     assert_eq!(

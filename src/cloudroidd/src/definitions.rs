@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use foreign::{Found, Tree};
 use parking_lot::Mutex;
 use ros::schema::Registry;
 
@@ -94,7 +95,8 @@ pub fn layers(store: &image::Store, image: &str) -> Result<Vec<PathBuf>, Error> 
         .collect::<Result<_, _>>()?)
 }
 
-/// Where ROS packages keep what they share: install spaces below `/opt` before the distribution.
+/// Where ROS packages keep what they share: install spaces below `/opt` before the distribution. (Those that are none
+/// are no harm: nothing is found in them.)
 fn shares(layers: &[PathBuf]) -> Vec<String> {
     let mut shares = BTreeSet::new();
     for layer in layers {
@@ -107,25 +109,31 @@ fn shares(layers: &[PathBuf]) -> Vec<String> {
             shares.insert(format!("{space}/share"));
         }
     }
-    shares.retain(|share| layers.iter().any(|layer| is_directory(&layer.join(share))));
+    let trees: Vec<Tree> = layers
+        .iter()
+        .filter_map(|layer| Tree::open(layer).ok())
+        .collect();
+    shares.retain(|share| trees.iter().any(|tree| is_directory(tree, share)));
     shares.into_iter().chain(["usr/share".to_owned()]).collect()
 }
 
-/// Directories below `parent`, links not followed: an absolute link in a layer points into the host.
-fn directories(layer: &Path, parent: &str) -> Vec<String> {
-    let Ok(entries) = std::fs::read_dir(layer.join(parent)) else {
+/// Directories below `parent` in a layer, behind no link: an absolute link in a layer points into the host.
+pub fn directories(layer: &Path, parent: &str) -> Vec<String> {
+    let Ok(Found::Directory(parent_directory)) =
+        Tree::open(layer).and_then(|tree| tree.directory(parent))
+    else {
         return Vec::new();
     };
-    let below = entries
-        .flatten()
-        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
+    let names = parent_directory.names().unwrap_or_default();
+    let below = names.iter().filter_map(|name| name.to_str());
     below
-        .filter_map(|entry| Some(format!("{parent}/{}", entry.file_name().to_str()?)))
+        .filter(|name| is_directory(&parent_directory, name))
+        .map(|name| format!("{parent}/{name}"))
         .collect()
 }
 
-fn is_directory(path: &Path) -> bool {
-    path.symlink_metadata().is_ok_and(|found| found.is_dir())
+fn is_directory(tree: &Tree, path: &str) -> bool {
+    matches!(tree.directory(path), Ok(Found::Directory(_)))
 }
 
 #[cfg(test)]
@@ -144,8 +152,13 @@ mod tests {
             std::fs::create_dir_all(directory).expect("made");
         }
         std::os::unix::fs::symlink("/usr", package.join("opt/linked")).expect("a link");
+        // Of a layer whose /opt is a link to the host's root, nothing is listed.
+        let linked = place.path().join("linked");
+        std::fs::create_dir(&linked).expect("made");
+        std::os::unix::fs::symlink("/", linked.join("opt")).expect("a link");
+        assert_eq!(directories(&linked, "opt"), Vec::<String>::new());
         assert_eq!(
-            shares(&[base, package]),
+            shares(&[base, package, linked]),
             ["opt/mine/share", "opt/ros/noetic/share", "usr/share"]
         );
     }

@@ -171,7 +171,7 @@ impl Home {
             .flatten()
             .map(|entry| entry.path())
         {
-            match std::fs::remove_dir_all(&half_made) {
+            match foreign::remove(&half_made) {
                 Ok(()) => tracing::info!("swept the half-made build {}", half_made.display()),
                 Err(error) => tracing::error!("cannot sweep {}: {error}", half_made.display()),
             }

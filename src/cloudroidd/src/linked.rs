@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
+use foreign::Tree;
 use futures_util::FutureExt;
 use link::cloud::Nodes;
 use link::control::{Decision, Exit, Node, Request, Sla};
@@ -95,11 +96,8 @@ impl LinkedNodes {
     /// Where the image has a file, as seen from inside.
     fn has(&self, path: &Path) -> bool {
         let below = path.strip_prefix("/").unwrap_or(path);
-        let found = self
-            .layers
-            .iter()
-            .rev()
-            .find_map(|layer| layer.join(below).symlink_metadata().ok());
+        let mut layers = self.layers.iter().rev();
+        let found = layers.find_map(|layer| Tree::open(layer).ok()?.kind_in_root(below));
         // A character device is a whiteout.
         found.is_some_and(|found| found.is_file() || found.is_dir() || found.is_symlink())
     }
@@ -118,12 +116,8 @@ impl LinkedNodes {
         );
         prefixes.push("/usr".into());
         for layer in &self.layers {
-            let distributions = std::fs::read_dir(layer.join("opt/ros"))
-                .into_iter()
-                .flatten()
-                .flatten();
-            prefixes
-                .extend(distributions.map(|entry| Path::new("/opt/ros").join(entry.file_name())));
+            let distributions = definitions::directories(layer, "opt/ros");
+            prefixes.extend(distributions.iter().map(|path| Path::new("/").join(path)));
         }
         let mut seen = BTreeSet::new();
         let below = |prefix: &PathBuf| {

@@ -97,6 +97,7 @@ impl Pusher {
             sources: rootfs_builder::Sources::default(),
             store: Arc::clone(&store),
             engine: Arc::clone(&engine),
+            limits: servant::spec::Limits::default(),
         })
         .context("cannot prepare for building images")?;
         Ok(Pusher {

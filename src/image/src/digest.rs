@@ -74,7 +74,8 @@ impl<'de> Deserialize<'de> for Digest {
     }
 }
 
-/// Passes bytes on, in either direction, and knows their digest and number.
+/// Passes bytes on, in either direction, and knows their digest and number. All that is packed, extracted or copied
+/// passes here, so this is where such work ends when it is cancelled.
 pub(crate) struct Hashing<T> {
     inner: T,
     hasher: sha2::Sha256,
@@ -102,6 +103,7 @@ impl<T> Hashing<T> {
 
 impl<W: Write> Write for Hashing<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        foreign::cancel::check()?;
         let written = self.inner.write(bytes)?;
         self.hasher.update(&bytes[..written]);
         self.bytes += written as u64;
@@ -115,6 +117,7 @@ impl<W: Write> Write for Hashing<W> {
 
 impl<R: Read> Read for Hashing<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        foreign::cancel::check()?;
         let read = self.inner.read(buffer)?;
         self.hasher.update(&buffer[..read]);
         self.bytes += read as u64;

@@ -5,6 +5,7 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use rustix::fs::FlockOperation;
 use rustix::io::Errno;
@@ -35,14 +36,14 @@ pub(crate) struct Lock {
 }
 
 impl Lock {
-    /// Waits until nobody else holds it alone.
+    /// Waits until nobody else holds it alone, or this thread's work is cancelled.
     pub(crate) fn shared(path: &Path) -> Result<Self, Error> {
-        Self::take(path, FlockOperation::LockShared)
+        Self::take(path, FlockOperation::NonBlockingLockShared)
     }
 
-    /// Waits until nobody else holds it.
+    /// Waits until nobody else holds it, or this thread's work is cancelled.
     pub(crate) fn alone(path: &Path) -> Result<Self, Error> {
-        Self::take(path, FlockOperation::LockExclusive)
+        Self::take(path, FlockOperation::NonBlockingLockExclusive)
     }
 
     /// None when somebody else holds it.
@@ -57,10 +58,19 @@ impl Lock {
 
     fn take(path: &Path, operation: FlockOperation) -> Result<Self, Error> {
         let file = open(path)?;
+        // Asked again and again: a thread that waits in the kernel hears of no cancellation.
+        let mut pause = Duration::from_millis(1);
         loop {
             match rustix::fs::flock(&file, operation) {
                 Ok(()) => return Ok(Self { _file: file }),
                 Err(Errno::INTR) => {}
+                Err(Errno::WOULDBLOCK) => {
+                    foreign::cancel::check().map_err(|cancelled| {
+                        Error::file("lock", path, io::Error::from(cancelled))
+                    })?;
+                    std::thread::sleep(pause);
+                    pause = (pause * 2).min(Duration::from_millis(50));
+                }
                 Err(error) => return Err(Error::file("lock", path, error)),
             }
         }
@@ -205,33 +215,9 @@ pub(crate) fn make_private_directory(path: &Path) -> Result<(), Error> {
         .map_err(|error| Error::file("create", path, error))
 }
 
-/// Removes a tree, also one whose directories do not let their owner write. One that is gone is fine.
+/// Removes a tree of any depth, also one whose directories do not let their owner write. One that is gone is fine.
 pub(crate) fn remove_tree(path: &Path) -> Result<(), Error> {
-    let gone = |result: io::Result<()>| match result {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        other => other,
-    };
-    let removed = gone(std::fs::remove_dir_all(path)).or_else(|error| {
-        if error.kind() != io::ErrorKind::PermissionDenied {
-            return Err(error);
-        }
-        open_up(path)?;
-        gone(std::fs::remove_dir_all(path))
-    });
-    removed.map_err(|error| Error::file("remove", path, error))
-}
-
-/// Gives the owner all rights on every directory of a tree.
-fn open_up(directory: &Path) -> io::Result<()> {
-    use std::os::unix::fs::PermissionsExt;
-    std::fs::set_permissions(directory, std::fs::Permissions::from_mode(0o700))?;
-    for entry in std::fs::read_dir(directory)? {
-        let entry = entry?;
-        if entry.file_type()?.is_dir() {
-            open_up(&entry.path())?;
-        }
-    }
-    Ok(())
+    foreign::remove(path).map_err(|error| Error::file("remove", path, io::Error::from(error)))
 }
 
 /// Removes what a crash left in `directory`: half-made files and trees that no living process has locked.
@@ -300,6 +286,18 @@ mod tests {
             .collect();
         names.sort();
         assert_eq!(names, ["done", "other"]);
+    }
+
+    #[test]
+    fn waiting_for_a_lock_ends_when_it_is_cancelled() {
+        let directory = tempfile::tempdir().unwrap();
+        let _held = Lock::alone(directory.path()).unwrap();
+        let cancel = foreign::cancel::Cancel::default();
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| cancel.during(|| Lock::shared(directory.path())));
+            cancel.cancel();
+            waiting.join().unwrap().unwrap_err();
+        });
     }
 
     #[test]

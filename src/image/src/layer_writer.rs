@@ -306,8 +306,8 @@ impl LayerWriter {
             use std::os::unix::ffi::OsStrExt;
             let within = format!("/proc/self/fd/{}", parent.as_raw_fd());
             let within = Path::new(&within).join(std::ffi::OsStr::from_bytes(name));
-            std::fs::remove_dir_all(within)
-                .map_err(|error| Failed::File("replace", path.to_vec(), error))?;
+            foreign::remove(&within)
+                .map_err(|error| Failed::File("replace", path.to_vec(), error.into()))?;
         } else {
             rustix::fs::unlinkat(parent, name, AtFlags::empty()).map_err(failed)?;
         }

@@ -4,7 +4,7 @@ use crate::Refusal;
 use crate::entry::shown;
 
 /// Directories within directories that a tree may have. Each level costs an open file while a tree is walked.
-pub(crate) const MAX_DEPTH: usize = 256;
+pub(crate) const MAX_DEPTH: usize = foreign::MAX_DEPTH;
 
 /// The longest path that the kernel takes, less its final NUL.
 pub(crate) const MAX_PATH: usize = 4095;

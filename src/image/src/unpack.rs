@@ -419,6 +419,7 @@ struct Metered<R> {
 
 impl<R: Read> Read for Metered<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        foreign::cancel::check()?;
         // One byte more than allowed tells "just fits" from "too long".
         let most = usize::try_from(self.left.saturating_add(1))
             .unwrap_or(usize::MAX)

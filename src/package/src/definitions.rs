@@ -93,7 +93,7 @@ impl Reader {
         let Some(file) = level.file(name.as_bytes(), MAX_BYTES)? else {
             return Ok(None);
         };
-        let (path, bytes) = (level.path.join(name), file.bytes);
+        let (path, bytes) = (level.path().join(name), file.bytes);
         self.total += bytes.len();
         if self.total > MAX_TOTAL || self.definitions.len() >= MAX_FILES {
             return Err(Error::TooMany {

@@ -125,3 +125,36 @@ pub enum Error {
         package: String,
     },
 }
+
+impl From<foreign::Error> for Error {
+    fn from(error: foreign::Error) -> Self {
+        match error {
+            foreign::Error::File {
+                action,
+                path,
+                source,
+            } => Self::File {
+                action,
+                path,
+                source,
+            },
+            foreign::Error::TooLarge { path, limit } => Self::TooLarge { path, limit },
+            foreign::Error::Outside { path, root } => Self::Outside { path, root },
+            foreign::Error::TooDeep { path, limit } => Self::TooMany {
+                path,
+                what: "directories in each other",
+                limit,
+            },
+            foreign::Error::NotAFile { path } => Self::File {
+                action: "read",
+                path,
+                source: io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"),
+            },
+            foreign::Error::Cancelled(cancelled) => Self::File {
+                action: "read",
+                path: PathBuf::new(),
+                source: cancelled.into(),
+            },
+        }
+    }
+}

@@ -85,6 +85,16 @@ impl Manifest {
         Self::parse(&read::text(path, MAX_BYTES)?, path, variables)
     }
 
+    /// Reads `path` in the foreign tree `root`, through links that stay in it.
+    pub(crate) fn read_inside(
+        root: &Path,
+        path: &Path,
+        variables: &Variables,
+    ) -> Result<Self, Error> {
+        let text = read::text_inside(root, path, MAX_BYTES)?;
+        Self::parse(&text, path, variables)
+    }
+
     /// Parses the text of a file, whose path is for messages.
     pub fn parse(text: &str, path: &Path, variables: &Variables) -> Result<Self, Error> {
         let document = Document::parse(text).map_err(|error| malformed(path, &error))?;

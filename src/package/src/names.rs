@@ -68,6 +68,15 @@ pub fn is_type(name: &str) -> bool {
         && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
+/// The name of a program in a package: that of a file, which commands and scripts can hold without surprises.
+pub fn is_executable(name: &str) -> bool {
+    (1..=255).contains(&name.len())
+        && !name.starts_with(['.', '-'])
+        && name
+            .chars()
+            .all(|c| !c.is_control() && !"'\"`$\\/".contains(c))
+}
+
 /// `package/Type`.
 pub fn is_full_type(name: &str) -> bool {
     name.split_once('/')

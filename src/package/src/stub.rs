@@ -54,6 +54,17 @@ pub struct About<'a> {
     pub stateful: bool,
 }
 
+/// What the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a robot's
+/// token would get its rights, and its content would be taken for a setting.
+const OURS: [&str; 6] = [
+    "token",
+    "ca.pem",
+    "install.sh",
+    "stub.toml",
+    "interface.toml",
+    "revision.toml",
+];
+
 /// The files of a stub, by path in the install space.
 pub type Files = BTreeMap<String, Content>;
 
@@ -83,6 +94,10 @@ pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
     }
     let refused = nodelets::plugin_lists(&contents.share);
     for (path, content) in contents.share {
+        // Below such a name, too: then it is a directory.
+        if OURS.contains(&path.split('/').next().unwrap_or_default()) {
+            continue;
+        }
         let content = if refused.contains(&path) {
             nodelets::refusing(about, content)
         } else {
@@ -154,12 +169,17 @@ fn launcher(about: &About<'_>, node: &str, up: &str) -> Content {
     };
     let text = template
         .replace("@PACKAGE@", about.package)
-        .replace("@NODE@", node)
+        .replace("@NODE@", &quoted(node))
         .replace("@UP@", up);
     Content::File {
         bytes: text.into_bytes(),
         executable: true,
     }
+}
+
+/// One word of a shell's command, whatever is in it.
+fn quoted(word: &str) -> String {
+    format!("'{}'", word.replace('\'', "'\\''"))
 }
 
 fn plain(text: &str) -> Content {

@@ -185,8 +185,8 @@ fn is_result_space(directory: &Path) -> bool {
 
 /// The package in `root/path`.
 fn package(root: &Path, path: PathBuf, variables: &Variables) -> Result<Package, Error> {
-    let file = inside(root, &root.join(&path).join("package.xml"))?;
-    let manifest = Manifest::read(&file, variables)?;
+    let file = root.join(&path).join("package.xml");
+    let manifest = Manifest::read_inside(root, &file, variables)?;
     Ok(Package { path, manifest })
 }
 
@@ -205,7 +205,7 @@ fn inside(root: &Path, path: &Path) -> Result<PathBuf, Error> {
 }
 
 fn install_space(root: &Path, space: &Path, variables: &Variables) -> Result<InstallSpace, Error> {
-    let marker = read::text(&inside(root, &space.join(MARKER))?, MAX_BYTES)?;
+    let marker = read::text_inside(root, &space.join(MARKER), MAX_BYTES)?;
     if !marker.trim().is_empty() {
         return Err(Error::DevelSpace {
             path: space.to_owned(),
@@ -248,9 +248,9 @@ fn package_below(
     path: PathBuf,
     variables: &Variables,
 ) -> Result<Package, Error> {
-    let file = inside(root, &space.join(&path).join("package.xml"))?;
+    let file = space.join(&path).join("package.xml");
     Ok(Package {
-        manifest: Manifest::read(&file, variables)?,
+        manifest: Manifest::read_inside(root, &file, variables)?,
         path,
     })
 }
@@ -261,7 +261,7 @@ fn prefix(root: &Path, space: &Path) -> Result<Option<PathBuf>, Error> {
     if !script.is_file() {
         return Ok(None);
     }
-    let text = read::text(&inside(root, &script)?, MAX_BYTES)?;
+    let text = read::text_inside(root, &script, MAX_BYTES)?;
     let after = text
         .split_once("_CATKIN_SETUP_DIR:=")
         .map(|(_, after)| after);

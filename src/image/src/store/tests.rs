@@ -1005,3 +1005,31 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     // There is room again for small things.
     files::write_whole(&disk.join("small"), &[0; 4096]).unwrap();
 }
+
+#[test]
+fn packing_and_extracting_end_when_they_are_cancelled() {
+    let world = World::new();
+    let tree = world.path("tree");
+    write(&tree.join("a/b"), "content");
+    let layer = world
+        .store
+        .layer_from_tree(&tree, &TreeOptions::default())
+        .unwrap();
+    let cancel = foreign::cancel::Cancel::default();
+    cancel.cancel();
+    write(&tree.join("a/c"), "more");
+    cancel.during(|| {
+        world
+            .store
+            .layer_from_tree(&tree, &TreeOptions::default())
+            .unwrap_err();
+        world.store.extracted(&layer.diff_id).unwrap_err();
+    });
+    assert_eq!(world.leftovers(), Vec::<String>::new());
+    // What was cancelled is done when it is wanted again.
+    let extracted = world.store.extracted(&layer.diff_id).unwrap();
+    assert_eq!(
+        std::fs::read_to_string(extracted.join("a/b")).unwrap(),
+        "content"
+    );
+}

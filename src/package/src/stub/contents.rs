@@ -81,20 +81,13 @@ fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
         let Ok(text) = String::from_utf8(name.clone()) else {
             continue;
         };
-        if is_plain(&text) && (level.is_executable(&name) || level.link(&name).is_some()) {
+        if names::is_executable(&text)
+            && (level.is_executable(&name) || level.link(&name).is_some())
+        {
             found.insert(text);
         }
     }
     Ok(found)
-}
-
-/// A name that can stand in a script between single quotes.
-fn is_plain(name: &str) -> bool {
-    !name.is_empty()
-        && !name.starts_with(['.', '-'])
-        && name
-            .chars()
-            .all(|c| !c.is_control() && !"'\"\\/".contains(c))
 }
 
 struct Reader<'a> {
@@ -131,7 +124,7 @@ impl Reader<'_> {
         }
         if self.total > MAX_TOTAL || self.share.len() >= MAX_FILES {
             return Err(Error::TooMany {
-                path: level.path.join(path),
+                path: level.path().join(path),
                 what: "shared files before it",
                 limit: self.share.len(),
             });
@@ -230,6 +223,22 @@ mod tests {
         assert_eq!(contents.share.len(), 1);
         assert_eq!(layers.read("q"), Contents::default());
         assert_eq!(layers.read("../p"), Contents::default());
+    }
+
+    #[test]
+    fn a_prefix_cannot_lead_out_of_the_layers() {
+        let layers = layers();
+        layers
+            .file("secret/share/p/package.xml", "the host's", 0o600)
+            .file("secret/lib/p/tool", "", 0o755);
+        let stack = [layers.0.path().join("low"), layers.0.path().join("high")];
+        for prefix in ["../secret", "usr/../../secret", "/../../../secret"] {
+            let contents = Contents::read(&stack, &[prefix], "p").expect("read");
+            assert_eq!(contents, Contents::default(), "{prefix}");
+        }
+        // As a process in the image would find it.
+        let contents = Contents::read(&stack, &["opt/../usr", "../usr"], "p").expect("read");
+        assert!(contents.share.contains_key("package.xml"));
     }
 
     #[test]

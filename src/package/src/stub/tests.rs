@@ -44,6 +44,10 @@ fn contents() -> Contents {
 }
 
 fn composed(outsourced: &[&str]) -> Files {
+    composed_of(outsourced, contents())
+}
+
+fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
     let outsourced = outsourced.iter().map(|name| (*name).to_owned()).collect();
     let mut interface = Interface {
         topics: vec![Topic {
@@ -71,7 +75,7 @@ fn composed(outsourced: &[&str]) -> Files {
         interface: &interface,
         stateful: true,
     };
-    compose(&about, contents()).expect("a stub")
+    compose(&about, contents).expect("a stub")
 }
 
 #[test]
@@ -203,4 +207,86 @@ fn without_a_manifest_there_is_no_stub() {
     };
     let error = compose(&about, Contents::default()).expect_err("refused");
     assert!(error.to_string().contains("no package.xml of p"), "{error}");
+}
+
+/// A stub as it lies on a robot, with a program that prints what it was called with.
+fn unpacked(files: &Files) -> tempfile::TempDir {
+    use std::os::unix::fs::PermissionsExt;
+    let place = tempfile::tempdir().expect("a directory");
+    let write = |path: &str, bytes: &[u8], mode: u32| {
+        let path = place.path().join(path);
+        std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+        std::fs::write(&path, bytes).expect("written");
+        std::fs::set_permissions(&path, PermissionsExt::from_mode(mode)).expect("set");
+    };
+    for (path, content) in files {
+        if let Content::File { bytes, executable } = content {
+            write(path, bytes, if *executable { 0o755 } else { 0o644 });
+        }
+    }
+    let program = b"#!/bin/sh\nfor word; do printf '%s\\n' \"$word\"; done\n";
+    write(&format!("lib/p/{PROGRAM}"), program, 0o755);
+    place
+}
+
+fn run(script: &std::path::Path, arguments: &[&str]) -> std::process::Output {
+    let mut shell = std::process::Command::new("sh");
+    let directory = script.parent().expect("in a directory");
+    shell
+        .arg(script)
+        .args(arguments)
+        .current_dir(directory)
+        .env("PATH", "/usr/bin:/bin");
+    shell.output().expect("a shell")
+}
+
+#[test]
+fn a_launcher_gives_its_nodes_name_on_whatever_is_in_it() {
+    let name = "x'$(touch ran)'y";
+    let stub = unpacked(&composed(&["node", name]));
+    let output = run(&stub.path().join("lib/p").join(name), &["--flag"]);
+    let words = String::from_utf8(output.stdout).expect("text");
+    assert!(words.lines().any(|word| word == name), "{words}");
+    assert!(!stub.path().join("lib/p/ran").exists(), "the name was run");
+}
+
+#[test]
+fn a_robots_token_is_its_own_whatever_the_package_brings() {
+    use std::os::unix::fs::PermissionsExt;
+    let stub = unpacked(&composed(&["node"]));
+    let brought = stub.path().join("share/p/token");
+    std::fs::write(&brought, "the package's").expect("written");
+    std::fs::set_permissions(&brought, PermissionsExt::from_mode(0o644)).expect("set");
+    let prefix = tempfile::tempdir().expect("a directory");
+    let target = prefix.path().join("overlay");
+    let target = target.to_str().expect("text");
+    let output = run(
+        &stub.path().join("install.sh"),
+        &["--prefix", target, "--token", "secret"],
+    );
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{told}");
+    let installed = prefix.path().join("overlay/share/p/token");
+    assert_eq!(
+        std::fs::read_to_string(&installed).expect("there"),
+        "secret\n"
+    );
+    let mode = installed.metadata().expect("there").permissions().mode() & 0o777;
+    assert_eq!(mode, 0o600);
+}
+
+#[test]
+fn a_package_brings_no_settings_and_no_token() {
+    let mut contents = contents();
+    for name in ["token", "ca.pem", "token/below", "launch/token"] {
+        contents
+            .share
+            .insert(name.into(), file("the package's", false));
+    }
+    let files = composed_of(&["node"], contents);
+    let brought: Vec<&String> = files
+        .keys()
+        .filter(|path| path.contains("token") || path.contains("ca.pem"))
+        .collect();
+    assert_eq!(brought, ["share/p/launch/token"]);
 }

@@ -146,6 +146,8 @@ cp -R "$here/share/$package" "$share"
 cp "$here/install.sh" "$share/install.sh"
 cat "$settings" > "$share/stub.toml"
 if [ -s "$secret" ]; then
+  # A file of this name that came with the package would keep its rights.
+  rm -rf "$share/token"
   (umask 077 && cat "$secret" > "$share/token")
 fi
 if [ -n "$ca" ]; then cat "$ca" > "$share/ca.pem"; fi

@@ -1,0 +1,56 @@
+//! Blocking work of a build, which ends when the build does.
+//!
+//! Dropping a build's future ends its containers, but not the threads that pack, hash and extract for it: those would
+//! go on for minutes, and keep the daemon from ending. So such work is started here, under the build's
+//! [`foreign::cancel::Cancel`], which its loops ask.
+
+use std::future::Future;
+
+use foreign::cancel::Cancel;
+use tokio::task::JoinHandle;
+
+tokio::task_local! {
+    static CANCEL: Cancel;
+}
+
+/// Awaits `future`; blocking work that it has started is cancelled when it ends or is dropped.
+pub async fn cancellable<F: Future>(future: F) -> F::Output {
+    let cancel = Cancel::default();
+    let _ended = cancel.on_drop();
+    CANCEL.scope(cancel.clone(), future).await
+}
+
+/// `work` on a thread where it may block, cancelled with the [`cancellable`] future that this is called in.
+pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();
+    tokio::task::spawn_blocking(move || cancel.during(work))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn work_ends_with_the_future_that_started_it() {
+        let (started, on) = tokio::sync::oneshot::channel();
+        let (ended, end) = mpsc::channel();
+        let build = tokio::spawn(cancellable(async move {
+            let work = spawn(move || {
+                let _ = started.send(());
+                while foreign::cancel::check().is_ok() {
+                    std::thread::yield_now();
+                }
+                let _ = ended.send(());
+            });
+            let _ = work.await;
+        }));
+        on.await.expect("it runs");
+        build.abort();
+        tokio::task::spawn_blocking(move || end.recv())
+            .await
+            .expect("no panic")
+            .expect("the work has ended");
+    }
+}

@@ -1,0 +1,226 @@
+//! The plan of what to run, as it comes out of the package's own container.
+//!
+//! The script that resolves launch files runs beside the package's code, which can put anything in its answer's place.
+//! So the answer is read beneath a descriptor and up to a limit, and believed in nothing: what is no plan that the
+//! script could have made is refused as a whole.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use package::names;
+
+use crate::error::Error;
+use crate::launch::{Answer, LaunchNode};
+
+/// The answer's file, in the directory that the container may write.
+pub(crate) const FILE: &str = "plan.json";
+/// The largest answer. Launch files with robot descriptions among their parameters have some megabytes.
+const MAX_BYTES: u64 = 32 << 20;
+const MAX_NODES: usize = 256;
+const MAX_PARAMETERS: usize = 20_000;
+const MAX_WARNINGS: usize = 1000;
+/// What an `execve` takes at most is 2 MiB, arguments and environment together.
+const MAX_WORDS: usize = 1 << 20;
+/// The longest that a node may wait before it comes again: a day, in seconds.
+const MAX_DELAY: f64 = 86_400.0;
+
+/// The bytes of the answer in `out`; none when there is none.
+pub(crate) fn read(out: &Path) -> Result<Option<Vec<u8>>, Error> {
+    let file = foreign::Tree::open(out)?.file(FILE, MAX_BYTES)?;
+    Ok(file.map(|file| file.bytes))
+}
+
+/// Refuses what cannot be a plan.
+pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
+    let refused = |problem: String| Err(Error::BadPlan { problem });
+    for (what, count, limit) in [
+        ("nodes", answer.nodes.len(), MAX_NODES),
+        ("parameters", answer.parameters.len(), MAX_PARAMETERS),
+        ("warnings", answer.warnings.len(), MAX_WARNINGS),
+    ] {
+        if count > limit {
+            return refused(format!("it has {count} {what}, and {limit} are possible"));
+        }
+    }
+    let mut seen = BTreeSet::new();
+    for node in &answer.nodes {
+        if let Some(problem) = wrong_with(node) {
+            return refused(format!("node {:?} {problem}", node.name));
+        }
+        if !seen.insert(&node.name) {
+            return refused(format!("two nodes are named {}", node.name));
+        }
+    }
+    if let Some(problem) = wrong_with_environment(&answer.environment) {
+        return refused(problem);
+    }
+    let bad = |name: &&String| !names::is_graph_name(name) && !is_parameter(name);
+    if let Some(name) = answer.parameters.keys().find(bad) {
+        return refused(format!("{name:?} is no absolute name of a parameter"));
+    }
+    Ok(())
+}
+
+/// Parameters may have names that no topic can have, such as `/camera/1st`.
+fn is_parameter(name: &str) -> bool {
+    name.len() <= 1024 && name.starts_with('/') && name.chars().all(|c| !c.is_control())
+}
+
+fn wrong_with(node: &LaunchNode) -> Option<String> {
+    if !names::is_graph_name(&node.name) {
+        return Some("has no name that a ROS node can have".into());
+    }
+    if !names::is_package(&node.package) {
+        return Some(format!("is of {:?}, which is no package", node.package));
+    }
+    if !node.executable.split('/').all(names::is_executable) {
+        return Some(format!(
+            "runs {:?}, and a program of such a name cannot be run; rename it, without quotes, $, \\ and control characters",
+            node.executable
+        ));
+    }
+    if node.argv.first().is_none_or(String::is_empty) {
+        return Some("runs nothing".into());
+    }
+    let words = node.argv.iter().map(String::len).sum::<usize>();
+    if words > MAX_WORDS {
+        return Some(format!(
+            "has {words} bytes of arguments, and {MAX_WORDS} are possible"
+        ));
+    }
+    if node.argv.iter().any(|word| word.contains('\0')) {
+        return Some("has an argument with a NUL byte".into());
+    }
+    if let Some(directory) = &node.directory
+        && (!directory.starts_with('/') || directory.contains('\0') || directory.len() > 4095)
+    {
+        return Some(format!("runs in {directory:?}, which is no absolute path"));
+    }
+    if !(0.0..=MAX_DELAY).contains(&node.respawn_delay) {
+        return Some(format!(
+            "waits {} s before it comes again",
+            node.respawn_delay
+        ));
+    }
+    wrong_with_environment(&node.environment)
+        .map(|problem| format!("has an environment where {problem}"))
+}
+
+fn wrong_with_environment(environment: &BTreeMap<String, String>) -> Option<String> {
+    let size: usize = environment
+        .iter()
+        .map(|(name, value)| name.len() + value.len() + 2)
+        .sum();
+    if size > MAX_WORDS {
+        return Some(format!(
+            "the environment has {size} bytes, and {MAX_WORDS} are possible"
+        ));
+    }
+    environment.iter().find_map(|(name, value)| {
+        if name.is_empty() || name.contains(['=', '\0']) {
+            Some(format!("{name:?} is no name of a variable"))
+        } else if value.contains('\0') {
+            Some(format!("{name} holds a NUL byte"))
+        } else {
+            None
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn node() -> LaunchNode {
+        LaunchNode {
+            name: "/a".into(),
+            package: "p".into(),
+            executable: "x".into(),
+            argv: vec!["/usr/lib/p/x".into(), "__name:=a".into()],
+            remaps: BTreeMap::new(),
+            environment: BTreeMap::from([("A".into(), "b c".into())]),
+            directory: Some("/usr/lib/p".into()),
+            respawn: false,
+            respawn_delay: 0.5,
+            required: false,
+        }
+    }
+
+    fn answer(nodes: Vec<LaunchNode>) -> Answer {
+        Answer {
+            nodes,
+            ..Answer::default()
+        }
+    }
+
+    #[test]
+    fn what_the_script_makes_is_accepted() {
+        let mut good = answer(vec![node()]);
+        good.parameters
+            .insert("/camera/1st".into(), ros::bus::ParamValue::Bool(true));
+        good.environment
+            .insert("CMAKE_PREFIX_PATH".into(), "/opt/x:/usr".into());
+        check(&good).expect("a plan");
+    }
+
+    #[test]
+    fn what_no_launch_file_says_is_refused_as_a_whole() {
+        let changes: [(&str, fn(&mut LaunchNode)); 8] = [
+            ("name", |node| node.name = "/a'$(cmd)'".into()),
+            ("package", |node| node.package = "../p".into()),
+            ("x'$(cmd)'y", |node| node.executable = "x'$(cmd)'y".into()),
+            ("nothing", |node| node.argv.clear()),
+            ("NUL", |node| node.argv.push("a\0b".into())),
+            ("arguments", |node| node.argv.push("a".repeat(MAX_WORDS))),
+            ("absolute", |node| node.directory = Some("../../etc".into())),
+            ("before it comes", |node| node.respawn_delay = f64::NAN),
+        ];
+        for (words, change) in changes {
+            let mut bad = node();
+            change(&mut bad);
+            let text = check(&answer(vec![node(), bad]))
+                .expect_err(words)
+                .to_string();
+            assert!(text.contains(words), "{text}");
+        }
+        let twice = check(&answer(vec![node(), node()])).expect_err("twice");
+        assert!(twice.to_string().contains("two nodes"), "{twice}");
+        let mut many = answer(Vec::new());
+        for number in 0..=MAX_NODES {
+            many.nodes.push(LaunchNode {
+                name: format!("/n{number}"),
+                ..node()
+            });
+        }
+        assert!(check(&many).is_err());
+        let mut environment = answer(vec![node()]);
+        environment.environment.insert("A=B".into(), String::new());
+        assert!(check(&environment).is_err());
+        let mut parameter = answer(vec![node()]);
+        parameter
+            .parameters
+            .insert("relative".into(), ros::bus::ParamValue::Bool(true));
+        assert!(check(&parameter).is_err());
+    }
+
+    #[test]
+    fn an_answer_that_is_a_link_to_a_host_file_is_not_read() {
+        let place = tempfile::tempdir().expect("a directory");
+        let out = place.path().join("out");
+        std::fs::create_dir(&out).expect("made");
+        assert_eq!(read(&out).expect("looked"), None);
+        std::fs::write(place.path().join("secret"), "{\"nodes\":[]}").expect("written");
+        std::os::unix::fs::symlink("../secret", out.join(FILE)).expect("linked");
+        let refused = read(&out).expect_err("a link").to_string();
+        assert!(refused.contains("is not a regular file"), "{refused}");
+    }
+
+    #[test]
+    fn an_answer_larger_than_memory_is_not_read() {
+        let out = tempfile::tempdir().expect("a directory");
+        let file = std::fs::File::create(out.path().join(FILE)).expect("made");
+        file.set_len(1 << 40).expect("set");
+        let refused = read(out.path()).expect_err("large").to_string();
+        assert!(refused.contains("larger than"), "{refused}");
+    }
+}

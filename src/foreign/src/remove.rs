@@ -1,0 +1,237 @@
+//! Removing a tree of any depth.
+//!
+//! The standard library's `remove_dir_all` calls itself for each level and keeps a file open for each: fifteen thousand
+//! directories in each other overflow a thread's stack, which ends the process. Here the way back up is `..`, checked
+//! against the directory that was left, so depth costs some bytes of the heap.
+
+use std::ffi::CString;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{AtFlags, FileType, Mode, OFlags, ResolveFlags, Stat};
+use rustix::io::Errno;
+
+use crate::Error;
+use crate::tree::DIRECTORY;
+use crate::walk::names;
+
+/// Below this directory, through no link, and not into what is mounted there.
+const HERE: ResolveFlags = ResolveFlags::BENEATH
+    .union(ResolveFlags::NO_SYMLINKS)
+    .union(ResolveFlags::NO_MAGICLINKS)
+    .union(ResolveFlags::NO_XDEV);
+
+/// Removes `path` and all below it. Links are removed, not followed; what is mounted in the tree is refused; one that
+/// is gone is fine. Directories that their owner may not write are opened up.
+///
+/// The tree must be at rest: where directories are moved meanwhile, this ends with an error.
+pub fn remove(path: &Path) -> Result<(), Error> {
+    let failed = |action, error: Errno| Error::file(action, path, error);
+    let above = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    let Some(name) = path.file_name() else {
+        return Err(failed("remove", Errno::INVAL));
+    };
+    let name = CString::new(name.as_encoded_bytes()).map_err(|_| failed("remove", Errno::INVAL))?;
+    // The way to the tree is ours.
+    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+    let parent = match rustix::fs::open(above, flags, Mode::empty()) {
+        Ok(parent) => parent,
+        Err(Errno::NOENT) => return Ok(()),
+        Err(error) => return Err(failed("open the directory of", error)),
+    };
+    Remover { root: path }.run(parent, name)
+}
+
+struct Remover<'a> {
+    root: &'a Path,
+}
+
+/// A directory that is being emptied.
+struct Level {
+    name: CString,
+    /// Device and inode of the directory above it.
+    above: (u64, u64),
+    /// Directories in it that are left; everything else is gone.
+    left: Vec<CString>,
+}
+
+impl Remover<'_> {
+    fn run(&self, parent: OwnedFd, name: CString) -> Result<(), Error> {
+        let mut stack: Vec<Level> = Vec::new();
+        let mut at = parent;
+        let mut next = Some(name);
+        loop {
+            if let Some(name) = next.take() {
+                if let Some((directory, left)) = self.enter(&at, &name, &stack)? {
+                    let above = identity(&self.stat(&at, &stack)?);
+                    at = directory;
+                    stack.push(Level { name, above, left });
+                }
+            }
+            let Some(level) = stack.last_mut() else {
+                return Ok(());
+            };
+            if let Some(below) = level.left.pop() {
+                next = Some(below);
+                continue;
+            }
+            let Some(level) = stack.pop() else {
+                return Ok(());
+            };
+            let up = rustix::fs::openat(&at, c"..", DIRECTORY, Mode::empty())
+                .map_err(|error| self.failed("leave", &stack, &level.name, error))?;
+            if identity(&self.stat(&up, &stack)?) != level.above {
+                return Err(self.failed("leave", &stack, &level.name, Errno::STALE));
+            }
+            at = up;
+            match rustix::fs::unlinkat(&at, &level.name, AtFlags::REMOVEDIR) {
+                Ok(()) | Err(Errno::NOENT) => {}
+                Err(error) => return Err(self.failed("remove", &stack, &level.name, error)),
+            }
+        }
+    }
+
+    /// Removes `name` unless it is a directory; of one, everything but directories. Gives the directory, and what is
+    /// left in it.
+    fn enter(
+        &self,
+        at: &OwnedFd,
+        name: &CString,
+        stack: &[Level],
+    ) -> Result<Option<(OwnedFd, Vec<CString>)>, Error> {
+        let failed = |action, error| self.failed(action, stack, name, error);
+        match rustix::fs::statat(at, name, AtFlags::SYMLINK_NOFOLLOW) {
+            Ok(stat) if FileType::from_raw_mode(stat.st_mode) == FileType::Directory => {}
+            Ok(_) => {
+                return match rustix::fs::unlinkat(at, name, AtFlags::empty()) {
+                    Ok(()) | Err(Errno::NOENT) => Ok(None),
+                    Err(error) => Err(failed("remove", error)),
+                };
+            }
+            Err(Errno::NOENT) => return Ok(None),
+            Err(error) => return Err(failed("look at", error)),
+        }
+        let open = || rustix::fs::openat2(at, name, DIRECTORY, Mode::empty(), HERE);
+        let directory = match open() {
+            Err(Errno::ACCESS) => {
+                // Only somebody who is not root is ever refused; the second look says whether it was this.
+                let _ = rustix::fs::chmodat(at, name, Mode::RWXU, AtFlags::empty());
+                open()
+            }
+            opened => opened,
+        };
+        let directory = match directory {
+            Ok(directory) => directory,
+            Err(Errno::NOENT) => return Ok(None),
+            Err(error) => return Err(failed("open", error)),
+        };
+        let mut left = Vec::new();
+        for entry in names(&directory).map_err(|error| failed("list", error))? {
+            let mut removed = rustix::fs::unlinkat(&directory, &entry, AtFlags::empty());
+            if removed == Err(Errno::ACCESS) {
+                let _ = rustix::fs::fchmod(&directory, Mode::RWXU);
+                removed = rustix::fs::unlinkat(&directory, &entry, AtFlags::empty());
+            }
+            match removed {
+                Ok(()) | Err(Errno::NOENT) => {}
+                // What Linux says of a directory, and what POSIX does.
+                Err(Errno::ISDIR | Errno::PERM) => left.push(entry),
+                Err(error) => return Err(self.failed("remove", stack, &entry, error)),
+            }
+        }
+        if !left.is_empty() {
+            // Removing a directory needs the right to write the one it is in.
+            let _ = self.stat(&directory, stack).map(|stat| {
+                if stat.st_mode & 0o700 != 0o700 {
+                    let _ = rustix::fs::fchmod(&directory, Mode::RWXU);
+                }
+            });
+        }
+        Ok(Some((directory, left)))
+    }
+
+    fn stat(&self, directory: &OwnedFd, stack: &[Level]) -> Result<Stat, Error> {
+        rustix::fs::fstat(directory).map_err(|error| self.failed("look at", stack, c".", error))
+    }
+
+    fn failed(
+        &self,
+        action: &'static str,
+        stack: &[Level],
+        name: &std::ffi::CStr,
+        error: Errno,
+    ) -> Error {
+        use std::os::unix::ffi::OsStrExt;
+        let mut path = PathBuf::from(self.root);
+        let shown = stack.iter().skip(1).map(|level| level.name.as_c_str());
+        for name in shown.chain(if stack.is_empty() { None } else { Some(name) }) {
+            path.push(std::ffi::OsStr::from_bytes(name.to_bytes()));
+        }
+        Error::file(action, &path, error)
+    }
+}
+
+fn identity(stat: &Stat) -> (u64, u64) {
+    (stat.st_dev, stat.st_ino)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    #[test]
+    fn a_tree_of_any_depth_is_removed() {
+        let place = tempfile::tempdir().expect("a directory");
+        let root = place.path().join("root");
+        std::fs::create_dir(&root).expect("made");
+        let mut at = rustix::fs::open(&root, DIRECTORY, Mode::empty()).expect("opened");
+        for _ in 0..15_000 {
+            rustix::fs::mkdirat(&at, "d", Mode::RWXU).expect("made");
+            at = rustix::fs::openat(&at, "d", DIRECTORY, Mode::empty()).expect("opened");
+        }
+        drop(at);
+        // A small stack, so that one frame for each level would not fit.
+        let removed = root.clone();
+        std::thread::Builder::new()
+            .stack_size(128 << 10)
+            .spawn(move || remove(&removed))
+            .expect("a thread")
+            .join()
+            .expect("no panic")
+            .expect("removed");
+        assert!(!root.exists());
+    }
+
+    #[test]
+    fn all_kinds_of_entries_go_and_what_links_point_to_stays() {
+        let place = tempfile::tempdir().expect("a directory");
+        let (root, outside) = (place.path().join("root"), place.path().join("outside"));
+        std::fs::create_dir_all(root.join("a/b")).expect("made");
+        std::fs::create_dir_all(root.join("a/c")).expect("made");
+        std::fs::create_dir(&outside).expect("made");
+        std::fs::write(outside.join("f"), "").expect("written");
+        std::fs::write(root.join("a/b/f"), "").expect("written");
+        symlink(&outside, root.join("a/link")).expect("linked");
+        symlink("nowhere", root.join("dangling")).expect("linked");
+        std::fs::set_permissions(root.join("a/b"), PermissionsExt::from_mode(0o500)).expect("set");
+        std::fs::set_permissions(root.join("a/c"), PermissionsExt::from_mode(0)).expect("set");
+        remove(&root).expect("removed");
+        assert!(!root.exists() && outside.join("f").exists());
+        remove(&root).expect("gone already");
+        remove(&root.join("below/nothing")).expect("gone already");
+    }
+
+    #[test]
+    fn a_link_in_the_trees_place_is_removed_itself() {
+        let place = tempfile::tempdir().expect("a directory");
+        let (root, outside) = (place.path().join("root"), place.path().join("outside"));
+        std::fs::create_dir_all(outside.join("d")).expect("made");
+        symlink(&outside, &root).expect("linked");
+        remove(&root).expect("removed");
+        assert!(!root.is_symlink() && outside.join("d").exists());
+    }
+}

@@ -1,0 +1,337 @@
+//! Reading single files of a tree.
+
+use std::ffi::OsString;
+use std::io::Read;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::ffi::OsStringExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FileType, Mode, OFlags, ResolveFlags};
+use rustix::io::Errno;
+
+use crate::Error;
+
+/// Neither out of the tree nor through a link.
+pub(crate) const INSIDE: ResolveFlags = ResolveFlags::BENEATH
+    .union(ResolveFlags::NO_SYMLINKS)
+    .union(ResolveFlags::NO_MAGICLINKS);
+/// Not blocking: a pipe of this name must not stop us.
+pub(crate) const FILE: OFlags = OFlags::RDONLY
+    .union(OFlags::NOFOLLOW)
+    .union(OFlags::NONBLOCK)
+    .union(OFlags::NOCTTY)
+    .union(OFlags::CLOEXEC);
+pub(crate) const DIRECTORY: OFlags = OFlags::RDONLY
+    .union(OFlags::DIRECTORY)
+    .union(OFlags::NOFOLLOW)
+    .union(OFlags::CLOEXEC);
+
+/// A directory of a tree, by its descriptor: whatever happens to names above it, this one is meant.
+#[derive(Debug)]
+pub struct Tree {
+    directory: OwnedFd,
+    path: PathBuf,
+}
+
+/// What has a name where a directory is looked for.
+#[derive(Debug)]
+pub enum Found {
+    /// One.
+    Directory(Tree),
+    /// A file, a link, a device; or the path leads out of the tree.
+    SomethingElse,
+    /// Nothing.
+    Nothing,
+}
+
+/// A regular file's content.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct File {
+    /// All of it.
+    pub bytes: Vec<u8>,
+    /// Somebody may execute it.
+    pub executable: bool,
+}
+
+impl Tree {
+    /// Opens the tree's root. This one path is ours, and may lead through links.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+        let directory = rustix::fs::open(path, flags, Mode::empty())
+            .map_err(|error| Error::file("open", path, error))?;
+        Ok(Self {
+            directory,
+            path: path.to_owned(),
+        })
+    }
+
+    /// Where it was opened, for messages.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The descriptor.
+    pub fn as_fd(&self) -> BorrowedFd<'_> {
+        self.directory.as_fd()
+    }
+
+    /// The same directory once more.
+    pub fn try_clone(&self) -> Result<Self, Error> {
+        let directory = self.directory.try_clone();
+        Ok(Self {
+            directory: directory.map_err(|error| Error::file("open", &self.path, error))?,
+            path: self.path.clone(),
+        })
+    }
+
+    /// What is at `path` in it, where a directory is looked for.
+    pub fn directory(&self, path: impl AsRef<Path>) -> Result<Found, Error> {
+        let shown = self.path.join(path.as_ref());
+        match rustix::fs::openat2(
+            &self.directory,
+            path.as_ref(),
+            DIRECTORY,
+            Mode::empty(),
+            INSIDE,
+        ) {
+            Ok(directory) => Ok(Found::Directory(Self {
+                directory,
+                path: shown,
+            })),
+            Err(Errno::NOENT) => Ok(Found::Nothing),
+            Err(error) if is_something_else(error) => Ok(Found::SomethingElse),
+            Err(error) => Err(Error::file("open", &shown, error)),
+        }
+    }
+
+    /// The regular file at `path` in it, of at most `limit` bytes; none when nothing has the name.
+    ///
+    /// # Errors
+    /// [`Error::NotAFile`] for everything that is there and no regular file, or behind a link, [`Error::Outside`] for a
+    /// path that leaves the tree; [`Error::TooLarge`] for a larger one, of which no more than the limit is read.
+    pub fn file(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
+        self.open_and_read(path.as_ref(), limit, INSIDE)
+    }
+
+    /// What a process whose root this tree is finds at `path`, itself not followed where it is a link; none when there is
+    /// nothing.
+    pub fn kind_in_root(&self, path: impl AsRef<Path>) -> Option<FileType> {
+        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let resolve = ResolveFlags::IN_ROOT | ResolveFlags::NO_MAGICLINKS;
+        rustix::fs::openat2(
+            &self.directory,
+            path.as_ref(),
+            flags,
+            Mode::empty(),
+            resolve,
+        )
+        .and_then(rustix::fs::fstat)
+        .ok()
+        .map(|stat| FileType::from_raw_mode(stat.st_mode))
+    }
+
+    /// Names in it, without `.` and `..`, in no order.
+    pub fn names(&self) -> Result<Vec<OsString>, Error> {
+        let names = crate::walk::names(&self.directory)
+            .map_err(|error| Error::file("list", &self.path, error))?;
+        let names = names.into_iter();
+        Ok(names
+            .map(|name| OsString::from_vec(name.into_bytes()))
+            .collect())
+    }
+
+    /// Whether a regular file is at `path`, behind no link.
+    pub fn has_file(&self, path: impl AsRef<Path>) -> bool {
+        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        rustix::fs::openat2(&self.directory, path.as_ref(), flags, Mode::empty(), INSIDE)
+            .and_then(rustix::fs::fstat)
+            .is_ok_and(|stat| FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile)
+    }
+
+    /// The same, through symbolic links as long as they stay in the tree.
+    pub fn file_following(
+        &self,
+        path: impl AsRef<Path>,
+        limit: u64,
+    ) -> Result<Option<File>, Error> {
+        let resolve = ResolveFlags::BENEATH | ResolveFlags::NO_MAGICLINKS;
+        self.open_and_read(path.as_ref(), limit, resolve)
+    }
+
+    fn open_and_read(
+        &self,
+        path: &Path,
+        limit: u64,
+        resolve: ResolveFlags,
+    ) -> Result<Option<File>, Error> {
+        let shown = self.path.join(path);
+        let flags = if resolve.contains(ResolveFlags::NO_SYMLINKS) {
+            FILE
+        } else {
+            FILE.difference(OFlags::NOFOLLOW)
+        };
+        let file = match rustix::fs::openat2(&self.directory, path, flags, Mode::empty(), resolve) {
+            Ok(file) => file,
+            Err(Errno::NOENT) => return Ok(None),
+            Err(Errno::XDEV) => {
+                return Err(Error::Outside {
+                    path: shown,
+                    root: self.path.clone(),
+                });
+            }
+            Err(error) if is_something_else(error) => return Err(Error::NotAFile { path: shown }),
+            Err(error) => return Err(Error::file("open", &shown, error)),
+        };
+        read(file, &shown, limit).map(Some)
+    }
+}
+
+/// What `openat2` says where a name is a link, no directory, outside, or a device or socket that cannot be opened.
+pub(crate) fn is_something_else(error: Errno) -> bool {
+    matches!(
+        error,
+        Errno::NOENT | Errno::LOOP | Errno::NOTDIR | Errno::XDEV | Errno::NXIO | Errno::NODEV
+    )
+}
+
+/// The bytes of an open regular file, at most `limit`.
+pub(crate) fn read(file: OwnedFd, path: &Path, limit: u64) -> Result<File, Error> {
+    let stat = rustix::fs::fstat(&file).map_err(|error| Error::file("look at", path, error))?;
+    if FileType::from_raw_mode(stat.st_mode) != FileType::RegularFile {
+        return Err(Error::NotAFile {
+            path: path.to_owned(),
+        });
+    }
+    let too_large = || Error::TooLarge {
+        path: path.to_owned(),
+        limit,
+    };
+    if u64::try_from(stat.st_size).is_ok_and(|size| size > limit) {
+        return Err(too_large());
+    }
+    let mut bytes = Vec::new();
+    std::fs::File::from(file)
+        .take(limit + 1)
+        .read_to_end(&mut bytes)
+        .map_err(|error| Error::file("read", path, error))?;
+    if bytes.len() as u64 > limit {
+        return Err(too_large());
+    }
+    Ok(File {
+        bytes,
+        executable: stat.st_mode & 0o111 != 0,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::symlink;
+
+    fn world() -> (tempfile::TempDir, Tree) {
+        let place = tempfile::tempdir().expect("a directory");
+        let inside = place.path().join("tree");
+        std::fs::create_dir_all(inside.join("d")).expect("made");
+        std::fs::write(place.path().join("secret"), "the host's").expect("written");
+        std::fs::write(inside.join("d/f"), "mine").expect("written");
+        symlink("../secret", inside.join("out")).expect("linked");
+        symlink(place.path().join("secret"), inside.join("absolute")).expect("linked");
+        symlink("d", inside.join("into")).expect("linked");
+        symlink("/proc/self/cwd", inside.join("magic")).expect("linked");
+        let tree = Tree::open(&inside).expect("opened");
+        (place, tree)
+    }
+
+    #[test]
+    fn nothing_is_read_but_what_is_in_the_tree() {
+        let (_place, tree) = world();
+        let found = tree.file("d/f", 10).expect("read").expect("there");
+        assert_eq!((&found.bytes[..], found.executable), (&b"mine"[..], false));
+        assert!(tree.file("d/none", 10).expect("looked").is_none());
+        let there = ["d/f", "d", "into/f", "out", "d/none"].map(|path| tree.has_file(path));
+        assert_eq!(there, [true, false, false, false, false]);
+        for path in [
+            "out",
+            "absolute",
+            "into/f",
+            "../secret",
+            "/etc/passwd",
+            "d",
+            "d/../../secret",
+            "magic",
+        ] {
+            let refused = tree.file(path, 10).expect_err(path);
+            let expected = if path.contains("..") || path.starts_with('/') {
+                matches!(refused, Error::Outside { .. })
+            } else {
+                matches!(refused, Error::NotAFile { .. })
+            };
+            assert!(expected, "{path}: {refused}");
+        }
+        for (path, expected) in [
+            ("into", "else"),
+            ("..", "else"),
+            ("x", "nothing"),
+            ("d", "it"),
+        ] {
+            let found = match tree.directory(path).expect(path) {
+                Found::Directory(_) => "it",
+                Found::SomethingElse => "else",
+                Found::Nothing => "nothing",
+            };
+            assert_eq!(found, expected, "{path}");
+        }
+    }
+
+    #[test]
+    fn a_path_is_looked_up_as_if_the_tree_were_the_root() {
+        let (_place, tree) = world();
+        for (path, kind) in [
+            ("d/f", Some(FileType::RegularFile)),
+            ("into/f", Some(FileType::RegularFile)),
+            ("../../d", Some(FileType::Directory)),
+            ("out", Some(FileType::Symlink)),
+            ("../secret", None),
+            ("out/x", None),
+            ("/etc/passwd", None),
+        ] {
+            assert_eq!(tree.kind_in_root(path), kind, "{path}");
+        }
+    }
+
+    #[test]
+    fn links_that_stay_inside_are_followed_where_that_is_asked_for() {
+        let (_place, tree) = world();
+        let found = tree.file_following("into/f", 10).expect("read");
+        assert_eq!(found.expect("there").bytes, b"mine");
+        for path in ["out", "absolute", "magic/f"] {
+            tree.file_following(path, 10).expect_err(path);
+        }
+    }
+
+    #[test]
+    fn a_file_larger_than_allowed_is_not_read() {
+        let (place, tree) = world();
+        let file = std::fs::File::create(place.path().join("tree/sparse")).expect("made");
+        // Were it read, this test would end for want of memory.
+        file.set_len(1 << 42).expect("set");
+        let refused = tree.file("sparse", 1 << 20).expect_err("too large");
+        assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
+    }
+
+    #[test]
+    fn a_pipe_stops_nobody() {
+        let (place, tree) = world();
+        let mode = Mode::from_raw_mode(0o600);
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            place.path().join("tree/pipe"),
+            FileType::Fifo,
+            mode,
+            0,
+        )
+        .expect("made");
+        let refused = tree.file("pipe", 10).expect_err("no file");
+        assert!(matches!(refused, Error::NotAFile { .. }), "{refused}");
+    }
+}
