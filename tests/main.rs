@@ -8,6 +8,8 @@ use support::Told;
 
 #[path = "stories/answer.rs"]
 mod answer;
+#[path = "stories/bounds.rs"]
+mod bounds;
 #[path = "stories/burglary.rs"]
 mod burglary;
 #[path = "stories/calls.rs"]
@@ -193,6 +195,12 @@ fn main() -> ExitCode {
             health_and_metrics_are_told,
             a_slash_behind_a_service_leads_to_the_same_service,
             a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong,
+        ],
+        stories![bounds:
+            a_build_that_takes_too_much_is_ended_and_leaves_nothing,
+            a_push_nobody_waits_for_ends_with_its_daemon,
+            a_second_signal_ends_the_daemon_at_once,
+            a_probe_waits_for_room_like_any_servant,
         ],
         stories![push:
             a_cpp_package_is_compiled_and_greets,

@@ -29,12 +29,13 @@ mod tail;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use api::Phase;
 use parking_lot::Mutex;
 use servant::engine::Engine;
 
-use crate::admission::{Admission, Amount};
+use crate::admission::{Admission, Amount, Permit, Refused};
 use crate::config::Config;
 use crate::definitions::Definitions;
 use crate::errors::Error;
@@ -285,6 +286,24 @@ impl Choreographer {
     /// What the machine promises.
     pub fn admission(&self) -> &Admission {
         &self.inner.admission
+    }
+
+    /// Room for something that is started like a servant of these limits. Calls `on_wait` when there is none at once.
+    pub async fn admit_like_a_servant(
+        &self,
+        asked: &api::Limits,
+        deadline: Duration,
+        on_wait: impl FnOnce(),
+    ) -> Result<Permit, Refused> {
+        let wanted = self.inner.promised_for(asked);
+        let make_room = || {
+            on_wait();
+            self.inner.make_room();
+        };
+        self.inner
+            .admission
+            .admit(wanted, deadline, make_room)
+            .await
     }
 
     /// Refuses limits that would never be admitted.

@@ -164,7 +164,7 @@ pub struct Allow {
     pub egress: Vec<String>,
 }
 
-/// How big pushes may be.
+/// How big pushes may be, and what building them may take.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Push {
@@ -176,6 +176,22 @@ pub struct Push {
     pub entries: u64,
     /// How long the nodes may take to show their interface.
     pub probe: Time,
+    /// How long nothing of the archive may come before the push is ended.
+    pub stall: Time,
+    /// Pushes that are built at once; others wait.
+    pub at_once: usize,
+    /// Pushes that may wait.
+    pub queue: usize,
+    /// From a push's turn to its end.
+    pub time: Time,
+    /// The files of a push while it is built.
+    pub disk: Size,
+    /// Cores of each container of a build; as many as servants leave when not set.
+    pub cpus: Option<f64>,
+    /// Memory of each; half of the machine's when not set.
+    pub memory: Option<Size>,
+    /// Processes and threads of each.
+    pub pids: u64,
 }
 
 /// A duration: `"500ms"`, `"30s"`, `"5m"`, `"1h"`, or a number of seconds.
@@ -269,7 +285,42 @@ impl Default for Push {
             unpacked: Size(8 << 30),
             entries: 500_000,
             probe: Time::seconds(30),
+            stall: Time::seconds(60),
+            at_once: 2,
+            queue: 16,
+            time: Time::seconds(2 * 3600),
+            disk: Size(20 << 30),
+            cpus: None,
+            memory: None,
+            pids: 4096,
         }
+    }
+}
+
+impl Push {
+    /// Of each container of a build.
+    pub fn limits(&self) -> servant::spec::Limits {
+        servant::spec::Limits {
+            cpus: self.cpus,
+            memory: self.memory.map(|memory| memory.0),
+            pids: Some(self.pids),
+            ..servant::spec::Limits::default()
+        }
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        if self.at_once == 0 {
+            bail!("at_once = 0 would let no push be built; write at least 1");
+        }
+        if self.disk.0 == 0 || self.time.0.is_zero() || self.stall.0.is_zero() {
+            bail!("a disk, time or stall of 0 would end every push");
+        }
+        check_limits(&Limits {
+            cpus: self.cpus,
+            memory: self.memory,
+            pids: Some(self.pids),
+            ..Limits::default()
+        })
     }
 }
 
@@ -349,6 +400,7 @@ impl Config {
         check_limits(&self.limits).context("[limits] of the configuration")?;
         crate::grants::check_egress(&self.allow)
             .context("egress in [allow] of the configuration")?;
+        self.push.check().context("[push] of the configuration")?;
         if let Some(service) = &self.default_service {
             crate::names::service(service).context("default_service of the configuration")?;
         }
@@ -485,7 +537,14 @@ mod tests {
             ..Memory::default()
         };
         assert_eq!(written.memory, memory);
-        assert_eq!(written.push, Push::default());
+        assert_eq!(
+            written.push,
+            Push {
+                cpus: Some(2.0),
+                memory: Some(Size(4 << 30)),
+                ..Push::default()
+            }
+        );
         assert_eq!(written.limits.memory, Config::default().limits.memory);
     }
 
@@ -565,6 +624,22 @@ mod tests {
             let config = Config::parse(&format!("[memory]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[memory]"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn bounds_that_no_push_could_meet_are_refused() {
+        for text in [
+            "at_once = 0",
+            "disk = 0",
+            "time = 0",
+            "stall = 0",
+            "pids = 1",
+            "memory = \"1K\"",
+        ] {
+            let config = Config::parse(&format!("[push]\n{text}")).expect("well-formed");
+            let refused = format!("{:#}", config.check().expect_err(text));
+            assert!(refused.contains("[push]"), "{refused}");
         }
     }
 

@@ -44,6 +44,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::{Parser, Subcommand};
@@ -90,6 +91,9 @@ enum Verb {
     },
 }
 
+/// How long blocking work may take to end, once everything else has.
+const LAST_WORK: Duration = Duration::from_secs(1);
+
 fn main() -> ExitCode {
     // A servant's shim forks: it must begin before any thread does.
     let mut words = std::env::args_os().skip(1);
@@ -112,7 +116,11 @@ fn main() -> ExitCode {
             let runtime = tokio::runtime::Builder::new_multi_thread()
                 .enable_all()
                 .build()?;
-            runtime.block_on(run(config, home, machine))
+            let outcome = runtime.block_on(run(config, home, machine));
+            // Threads that still work for a cancelled push are not waited for: what they make is half-made, and the
+            // next daemon sweeps it.
+            runtime.shutdown_timeout(LAST_WORK);
+            outcome
         }),
     };
     match outcome {
@@ -209,7 +217,10 @@ fn as_root() -> String {
 }
 
 async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Result<()> {
-    let mut signals = supervision::Signals::new()?;
+    let socket = home.socket();
+    let asked = supervision::end_asked(move || {
+        let _ = std::fs::remove_file(socket);
+    })?;
     let listener = listen(config.listen).await?;
     let socket = home.listen()?;
     let app = build(config, &home, machine, listener.local_addr()?)?;
@@ -242,12 +253,9 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
     supervision::ready();
     app.choreographer.read_definitions().await?;
     app.choreographer.keep_spares();
-    signals.end_asked().await;
+    asked.cancelled().await;
     supervision::stopping();
-    tokio::select! {
-        () = drain(&app) => {}
-        () = signals.end_asked() => tracing::warn!("ending at once"),
-    }
+    drain(&app).await;
     app.ending.cancel();
     let _ = tokio::join!(tcp, unix);
     let _ = std::fs::remove_file(home.socket());

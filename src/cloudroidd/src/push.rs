@@ -9,6 +9,8 @@
 //! Until the database has the revision nothing of it can be seen, so whatever fails, and whenever the client goes
 //! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
 
+mod bounds;
+mod patience;
 mod probe;
 mod publish;
 mod receive;
@@ -31,6 +33,7 @@ use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use bounds::Places;
 use request::Tell;
 pub use request::handle;
 
@@ -60,6 +63,7 @@ pub struct Pusher {
     choreographer: Choreographer,
     builder: Builder,
     journal: Journal,
+    places: Places,
     turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
     published: AtomicU64,
     failed: AtomicU64,
@@ -97,7 +101,7 @@ impl Pusher {
             sources: rootfs_builder::Sources::default(),
             store: Arc::clone(&store),
             engine: Arc::clone(&engine),
-            limits: servant::spec::Limits::default(),
+            limits: config.push.limits(),
         })
         .context("cannot prepare for building images")?;
         Ok(Pusher {
@@ -109,6 +113,7 @@ impl Pusher {
             engine,
             choreographer,
             builder,
+            places: Places::new(&config.push),
             turns: Mutex::default(),
             published: AtomicU64::new(0),
             failed: AtomicU64::new(0),
@@ -125,11 +130,18 @@ impl Pusher {
         )
     }
 
-    /// Cancels every push and waits until nothing is left of them.
+    /// Cancels every push and waits until nothing is left of them, for a while: what is left then is swept by the
+    /// next daemon.
     pub async fn cancel_all(&self) {
         self.cancel.cancel();
         self.tasks.close();
-        self.tasks.wait().await;
+        let patience = self.config.portal.drain.0;
+        if tokio::time::timeout(patience, self.tasks.wait())
+            .await
+            .is_err()
+        {
+            tracing::warn!("what cancelled pushes left is removed at the next start");
+        }
     }
 
     async fn push(
@@ -179,7 +191,7 @@ impl Pusher {
         for warning in granted.unfulfilled {
             tell.warning(warning).await;
         }
-        let found = probe::interface(self, id, &built, &plan, options).await?;
+        let found = probe::interface(self, id, &built, &plan, options, tell).await?;
         for warning in found.warnings {
             tell.warning(warning).await;
         }
@@ -188,6 +200,7 @@ impl Pusher {
             supplement::add(&mut interface, text, &built.definitions)
                 .map_err(|error| Error::BadRequest(format!("the interface supplement: {error}")))?;
         }
+        bounds::check_interface(&interface)?;
         let record = RevisionRecord {
             service: name.clone(),
             number: 0,

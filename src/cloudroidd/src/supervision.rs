@@ -3,30 +3,31 @@
 use std::time::Duration;
 
 use sd_notify::NotifyState;
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
 
-/// Signals that ask for the daemon's end.
-pub struct Signals {
-    terminate: Signal,
-    interrupt: Signal,
-}
-
-impl Signals {
-    /// From now on.
-    pub fn new() -> std::io::Result<Signals> {
-        Ok(Signals {
-            terminate: signal(SignalKind::terminate())?,
-            interrupt: signal(SignalKind::interrupt())?,
-        })
-    }
-
-    /// Comes back when one has come.
-    pub async fn end_asked(&mut self) {
-        tokio::select! {
-            _ = self.terminate.recv() => {}
-            _ = self.interrupt.recv() => {}
+/// Hears of signals that ask for the daemon's end: the first cancels what this gives. The second ends the process at
+/// once, whatever it is doing, after `at_once`; servants go on, and the next daemon sweeps what was half-made.
+pub fn end_asked(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<CancellationToken> {
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let asked = CancellationToken::new();
+    let first = asked.clone();
+    tokio::spawn(async move {
+        for time in 0..2 {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+            if time == 0 {
+                first.cancel();
+            }
         }
-    }
+        tracing::warn!("asked a second time: ending at once");
+        at_once();
+        std::process::exit(1);
+    });
+    Ok(asked)
 }
 
 /// Tells systemd that requests are answered, and keeps its watchdog quiet from now on.

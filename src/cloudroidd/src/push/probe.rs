@@ -6,8 +6,8 @@ use std::time::Duration;
 use api::PushOptions;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
-use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::{Found, ProbeOptions, Work};
+use rootfs_builder::{BuildOutcome, blocking};
 use ros::bus::Bus;
 use ros::ros1::Ros1Bus;
 use ros::schema::Registry;
@@ -15,8 +15,9 @@ use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::{Profile, Spec};
 use tokio_util::task::TaskTracker;
 
-use super::{Pusher, blocking};
-use crate::admission::Amount;
+use super::Pusher;
+use super::request::Tell;
+use crate::admission::Permit;
 use crate::choreographer;
 use crate::errors::Error;
 use crate::grants::Relays;
@@ -36,20 +37,11 @@ pub(super) async fn interface(
     built: &BuildOutcome,
     plan: &Plan,
     options: &PushOptions,
+    tell: &Tell,
 ) -> Result<Found, Error> {
     let spec = spec(pusher, id, built, plan, options).await?;
-    let limits = spec.limits;
-    let room = Amount::new(
-        limits.cpus.unwrap_or_default(),
-        limits.memory.unwrap_or_default(),
-    );
-    let _promised = pusher.choreographer.admission().adopt(room);
-    let servant = pusher.engine.start(spec).await?;
-    // Ended however this function is left: a push can be cancelled at any await.
-    let trial = Trial {
-        servant: Some(Arc::clone(&servant)),
-        tasks: pusher.tasks.clone(),
-    };
+    let _room = room(pusher, options, tell).await?;
+    let (servant, trial) = start(pusher, spec).await?;
     let endpoint = servant.endpoint();
     let _ways_out = Relays::open(&endpoint, &plan.grants, &pusher.config.allow).await;
     let unmet = servant
@@ -61,6 +53,44 @@ pub(super) async fn interface(
     let warn = |what| format!("servants will run without a limit that was asked for: {what}");
     found.warnings.extend(unmet.into_iter().map(warn));
     Ok(found)
+}
+
+/// Starts it; it is ended however the trial is dropped: a push can be cancelled at any await. Starting itself is not
+/// interrupted, because what is half-started has no handle to end it by.
+async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servant>, Trial), Error> {
+    let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
+    let starting = pusher.tasks.spawn(async move {
+        let servant = engine.start(spec).await?;
+        let trial = Trial {
+            servant: Some(Arc::clone(&servant)),
+            tasks,
+        };
+        Ok::<_, servant::Error>((servant, trial))
+    });
+    let started = starting.await;
+    Ok(started.map_err(|_| Error::Internal("starting the image once"))??)
+}
+
+/// Room for it, as for any servant of these limits: waited for where there is none.
+async fn room(pusher: &Pusher, options: &PushOptions, tell: &Tell) -> Result<Permit, Error> {
+    let (full, is_full) = tokio::sync::oneshot::channel();
+    let patience = pusher.config.push.time.0;
+    let admitted = pusher
+        .choreographer
+        .admit_like_a_servant(&options.limits, patience, || {
+            let _ = full.send(());
+        });
+    let told = async {
+        if is_full.await.is_ok() {
+            tell.step("waiting for room to start it: this machine is full")
+                .await;
+        }
+        std::future::pending::<()>().await;
+    };
+    tokio::select! {
+        admitted = admitted => Ok(admitted?),
+        () = told => Err(Error::Ending),
+    }
 }
 
 async fn look(
@@ -182,13 +212,15 @@ async fn spec(
 ) -> Result<Spec, Error> {
     let store = Arc::clone(&pusher.store);
     let infos: Vec<_> = built.layers.iter().map(|layer| layer.info).collect();
-    let layers = blocking("extracting layers", move || {
-        Ok(infos
+    let extracted = blocking::spawn(move || {
+        infos
             .iter()
             .map(|layer| store.extracted(&layer.diff_id))
-            .collect::<Result<_, _>>()?)
-    })
-    .await?;
+            .collect::<Result<_, _>>()
+    });
+    let layers = extracted
+        .await
+        .map_err(|_| Error::Internal("extracting layers"))??;
     let granted = crate::grants::resolve(&plan.grants, &pusher.config.allow)?;
     Ok(Spec {
         id: format!("{id}-probe"),

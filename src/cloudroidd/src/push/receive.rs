@@ -8,10 +8,12 @@ use std::time::Duration;
 
 use api::{PushEvent, Size};
 use axum::body::Body;
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::StreamExt;
+use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
+use super::patience::{self, Stalled};
 use super::request::Tell;
 use crate::config::Push;
 use crate::errors::Error;
@@ -22,6 +24,8 @@ const TOLD_EVERY: Duration = Duration::from_millis(500);
 const DISCARD_FOR: Duration = Duration::from_secs(60);
 /// How deep a package.xml is looked for.
 const DEPTH: usize = 6;
+/// The largest package.xml that is looked at, in bytes.
+const MANIFEST: u64 = 1 << 20;
 
 /// Unpacks the body into `tree`, which is made.
 pub(super) async fn unpack(
@@ -31,7 +35,12 @@ pub(super) async fn unpack(
     tell: &Tell,
 ) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
-    let stream = StreamReader::new(body.into_data_stream().map_err(io::Error::other).boxed());
+    // However this is left, the thread that reads the body hears of it.
+    let ended = CancellationToken::new();
+    let _ended = ended.clone().drop_guard();
+    let stalled = Stalled::default();
+    let chunks = patience::chunks(body, limits.stall.0, stalled.clone(), ended);
+    let stream = StreamReader::new(chunks.boxed());
     let mut archive = Counted {
         inner: SyncIoBridge::new(stream),
         received: Arc::clone(&received),
@@ -43,9 +52,9 @@ pub(super) async fn unpack(
         bytes: limits.unpacked.0,
         ..image::Limits::default()
     };
-    let limit = limits.archive;
+    let (limit, patience) = (limits.archive, limits.stall.0);
     let destination = tree.to_owned();
-    let work = tokio::task::spawn_blocking(move || {
+    let work = blocking::spawn(move || {
         let parent = destination.parent().unwrap_or(&destination);
         crate::private::make_directory(parent).map_err(|error| Error::Push {
             message: format!("cannot make {}: {error}", parent.display()),
@@ -55,6 +64,16 @@ pub(super) async fn unpack(
         let outcome = image::unpack(&mut archive, &destination, &unpacked);
         if archive.exceeded {
             return Err(Error::TooLarge { limit });
+        }
+        if stalled.is() {
+            return Err(Error::Push {
+                message: format!("nothing of the archive came for {} s", patience.as_secs()),
+                next: Some(
+                    "look at the connection and push again, or raise stall in [push] of the configuration"
+                        .to_owned(),
+                ),
+                log: Vec::new(),
+            });
         }
         outcome.map(|_| ()).map_err(refused)
     });
@@ -121,8 +140,10 @@ pub(super) fn packages_of(tree: &Path) -> Vec<String> {
 }
 
 fn collect_packages(directory: &Path, depth: usize, names: &mut Vec<String>) {
-    if let Ok(text) = std::fs::read_to_string(directory.join("package.xml")) {
-        names.extend(name_in(&text));
+    let manifest = foreign::Tree::open(directory)
+        .and_then(|tree| tree.file_following("package.xml", MANIFEST));
+    if let Ok(Some(file)) = manifest {
+        names.extend(name_in(&String::from_utf8_lossy(&file.bytes)));
         return;
     }
     if depth == 0 {
@@ -176,6 +197,7 @@ mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
+    use crate::config::Time;
 
     fn archive(files: &[(&str, &str)]) -> Vec<u8> {
         let mut builder = tar::Builder::new(Vec::new());
@@ -229,6 +251,51 @@ mod tests {
         };
         let refused = unpacked(bytes, &limits).await.expect_err("too big");
         assert_eq!(refused.problem().status, 413, "{refused}");
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_body_that_stops_coming_is_not_waited_for() {
+        let place = tempfile::tempdir().expect("a directory");
+        let tree = place.path().join("build/pushed");
+        let (sender, _receiver) = mpsc::channel(16);
+        let beginning = archive(&[("package.xml", &"x".repeat(10_000))])[..2000].to_vec();
+        let chunks = futures_util::stream::iter([Ok::<_, io::Error>(beginning)]);
+        let body = Body::from_stream(chunks.chain(futures_util::stream::pending()));
+        let limits = Push {
+            stall: Time(Duration::from_millis(50)),
+            ..Push::default()
+        };
+        let refused = unpack(body, &tree, &limits, &Tell(sender))
+            .await
+            .expect_err("it never ends");
+        assert!(
+            refused.to_string().contains("nothing of the archive came"),
+            "{refused}"
+        );
+        assert!(!tree.exists());
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn the_thread_that_unpacks_ends_with_the_push() {
+        let place = tempfile::tempdir().expect("a directory");
+        let tree = place.path().join("build/pushed");
+        let (sender, _receiver) = mpsc::channel(16);
+        // What the thread reads from is dropped when it ends.
+        let (held, dropped) = tokio::sync::oneshot::channel::<()>();
+        let (asked, waiting) = tokio::sync::oneshot::channel::<()>();
+        let mut asked = Some(asked);
+        let never = futures_util::stream::poll_fn(move |_| {
+            let _ = &held;
+            asked.take().map(|asked| asked.send(()));
+            std::task::Poll::<Option<io::Result<Vec<u8>>>>::Pending
+        });
+        let push = tokio::spawn(async move {
+            let body = Body::from_stream(never);
+            unpack(body, &tree, &Push::default(), &Tell(sender)).await
+        });
+        waiting.await.expect("it reads");
+        push.abort();
+        dropped.await.expect_err("the body is let go");
     }
 
     #[tokio::test(flavor = "multi_thread")]

@@ -2,18 +2,19 @@
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use api::{PushEvent, PushOptions};
 use axum::body::Body;
 use axum::extract::{OriginalUri, State as Extracted};
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
+use rootfs_builder::blocking;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 
-use super::{EVENTS_AHEAD, PUSHED, Pusher, receive};
+use super::{EVENTS_AHEAD, Published, Pusher, bounds, receive};
 use crate::config;
 use crate::errors::Error;
 use crate::grants;
@@ -21,6 +22,9 @@ use crate::names;
 use crate::portal::App;
 use crate::state::NewEvent;
 use crate::views;
+
+/// How long the last event waits for a client that does not read.
+const FAREWELL: Duration = Duration::from_secs(5);
 
 /// Tells the client what is being done. It may have gone away: that cancels the push by itself.
 #[derive(Clone)]
@@ -40,6 +44,11 @@ impl Tell {
 
     pub(super) async fn event(&self, event: PushEvent) {
         let _ = self.0.send(event).await;
+    }
+
+    /// The last event. A client that does not read it must not keep the push, and with it the daemon, from ending.
+    async fn farewell(&self, event: PushEvent) {
+        let _ = tokio::time::timeout(FAREWELL, self.event(event)).await;
     }
 }
 
@@ -70,7 +79,8 @@ pub async fn handle(
     let tracker = app.pusher.tasks.clone();
     tracker.spawn(async move {
         let pusher = Arc::clone(&app.pusher);
-        if !pusher.run(&app, options, body, Tell(sender), cancel).await {
+        let published = pusher.run(&app, options, body, Tell(sender), cancel).await;
+        if !published && !pusher.cancel.is_cancelled() {
             // What the failed push had made is of no use any more.
             pusher.collect_garbage().await;
         }
@@ -108,6 +118,22 @@ impl Pusher {
         self.choreographer.check_limits(&options.limits)
     }
 
+    /// Pushes when it is its turn, within what a push may use.
+    async fn bounded(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        body: Body,
+        tell: &Tell,
+    ) -> Result<Published, Error> {
+        let _place = self.places.take(tell).await?;
+        let directory = self.home.join("build").join(id);
+        tokio::select! {
+            outcome = self.push(id, options, body, tell) => outcome,
+            error = bounds::exceeded(&self.config.push, &directory) => Err(error),
+        }
+    }
+
     /// Pushes from beginning to end; whether it was published.
     async fn run(
         &self,
@@ -120,23 +146,23 @@ impl Pusher {
         let began = Instant::now();
         let id = format!("push-{}", names::random(8));
         let outcome = tokio::select! {
-            outcome = self.push(&id, &options, body, &tell) => outcome,
+            outcome = blocking::cancellable(self.bounded(&id, &options, body, &tell)) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
         };
+        // First what the builder has in there: it goes when its containers have ended.
+        self.builder.removed(&id).await;
         let build = self.home.join("build").join(&id);
-        let _ = tokio::task::spawn_blocking(move || {
-            std::fs::remove_dir_all(build.join(PUSHED))?;
-            // What the builder still has in there goes when its containers have ended.
-            std::fs::remove_dir(build)
-        })
-        .await;
+        let removed = tokio::task::spawn_blocking(move || foreign::remove(&build)).await;
+        if let Ok(Err(error)) = removed {
+            tracing::warn!("what the push {id} left remains until the next start: {error}");
+        }
         let finished = outcome
             .and_then(|published| Ok((views::service(app, &published.service)?, published.layers)));
         match finished {
             Ok((service, layers)) => {
                 self.published.fetch_add(1, Ordering::Relaxed);
                 let took = began.elapsed().as_millis() as u64;
-                tell.event(PushEvent::Done {
+                tell.farewell(PushEvent::Done {
                     service: Box::new(service),
                     layers,
                     took,
@@ -161,7 +187,7 @@ impl Pusher {
                         ..NewEvent::default()
                     },
                 );
-                tell.event(PushEvent::Error {
+                tell.farewell(PushEvent::Error {
                     problem: error.problem(),
                 })
                 .await;
