@@ -258,6 +258,58 @@ mod tests {
     }
 
     #[test]
+    fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
+        let base = load(&ours(), "bookworm-ros1").expect("valid");
+        // As dpkg matches (fnmatch without flags): a star goes over slashes.
+        fn matches(pattern: &[u8], path: &[u8]) -> bool {
+            match (pattern.first(), path.first()) {
+                (None, None) => true,
+                (Some(b'*'), _) => {
+                    matches(&pattern[1..], path)
+                        || (!path.is_empty() && matches(pattern, &path[1..]))
+                }
+                (Some(a), Some(b)) if a == b => matches(&pattern[1..], &path[1..]),
+                _ => false,
+            }
+        }
+        let excluded = |path: &str| {
+            let rules = base.strip.unpacked.iter();
+            rules
+                .filter_map(|rule| rule.strip_prefix("path-exclude="))
+                .any(|rule| matches(rule.as_bytes(), path.as_bytes()))
+        };
+        assert!(!excluded("/usr/share/man/man1"));
+        assert!(excluded("/usr/share/man/man1/java.1.gz"));
+        assert!(excluded("/usr/share/man/de/man1/apt.1.gz"));
+    }
+
+    #[test]
+    fn what_packages_of_strangers_asked_for_is_known() {
+        let base = load(&ours(), "bookworm-ros1").expect("valid");
+        for key in [
+            "bfl",
+            "liborocos-bfl-dev",
+            "libgsl",
+            "libcairo2-dev",
+            "python3-cairosvg",
+            "python3-joblib",
+            "lm-sensors",
+        ] {
+            assert!(base.keys.contains_key(key), "{key}");
+        }
+    }
+
+    #[test]
+    fn tools_that_only_check_have_a_stand_in_and_are_not_missed() {
+        let base = load(&ours(), "bookworm-ros1").expect("valid");
+        for tool in ["roslint", "code_coverage", "ros_pytest"] {
+            let config = format!("/usr/share/{tool}/cmake/{tool}Config.cmake");
+            assert!(base.build.files.contains_key(Path::new(&config)), "{tool}");
+            assert!(base.ros_packages.ignore.contains(tool), "{tool}");
+        }
+    }
+
+    #[test]
     fn an_unknown_base_is_answered_with_those_known() {
         for name in ["nonesuch", "../images/bookworm-ros1", ""] {
             let error = load(&ours(), name).expect_err("not there").to_string();

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use image::{ImageSpec, LayerInfo};
 
+use crate::advice;
 use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
@@ -186,7 +187,8 @@ impl Build<'_> {
             self.base.environment.clone(),
             &ask,
         )
-        .await?;
+        .await
+        .map_err(|error| advice::on(error, &self.archive.contents))?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }

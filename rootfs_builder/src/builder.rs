@@ -170,6 +170,15 @@ impl Builder {
         build.finish(made, hold).await
     }
 
+    /// What `words` (of a node of an image on this base) say is missing, and the options of a push that add it. Empty
+    /// where they say nothing of the kind.
+    pub async fn advice(&self, base: &str, words: &str) -> Vec<String> {
+        let archives = self.archives.lock().await;
+        archives.get(base).map_or_else(Vec::new, |archive| {
+            crate::advice::for_words(words, &archive.contents)
+        })
+    }
+
     /// Layers that no image needs and the next build will: bases and toolchains, by diff-id. For the store's garbage
     /// collector to keep; without them they are imported from the cache again.
     pub fn keep(&self) -> BTreeSet<Digest> {

@@ -172,6 +172,7 @@ pub(crate) async fn compile(
             package,
             log: log.to_owned(),
             last_lines,
+            advice: Vec::new(),
         });
     }
     let prefix = base.build.prefix.clone();

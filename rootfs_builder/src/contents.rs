@@ -1,5 +1,5 @@
 //! Which Debian package holds which file: the archive's Contents lists, boiled down once to what is asked of them
-//! (ROS packages and shared libraries) in one small sorted file.
+//! (ROS packages and their programs, shared libraries, what CMake and Python look for) in one small sorted file.
 //!
 //! The lists are 670 MB of text for bookworm; the result is 4 MB and is searched in place.
 
@@ -16,7 +16,9 @@ use crate::error::{Error, IoAt};
 /// The searchable result.
 #[derive(Debug)]
 pub struct Contents {
-    /// Sorted lines: `lNAME\tDEB` for libraries, `rNAME\tDEB\tKINDS` for ROS packages.
+    /// Sorted lines: `lNAME\tDEB` for libraries, `rNAME\tDEB\tKINDS` for ROS packages, `cNAME\tDEB` for configuration
+    /// files of CMake (NAME in lower case), `mNAME\tDEB` for Python modules, `pNAME\tDEB\tROSPACKAGE` for programs of
+    /// ROS packages.
     lines: Vec<String>,
 }
 
@@ -59,7 +61,7 @@ impl Part {
 pub type Carriers = BTreeMap<String, BTreeSet<Part>>;
 
 /// Raise it when the file's format or what is kept changes.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 impl Contents {
     /// Opens the boiled-down file of these lists, made now below `cache` if it is not there. Blocking: a few
@@ -103,6 +105,24 @@ impl Contents {
             .min_by_key(|deb| (deb.ends_with("-dev"), !deb.starts_with("lib"), deb.len()))
     }
 
+    /// Versions of this library (`libfoo.so.1` of `libfoo.so`) with their Debian packages, the shortest name first.
+    pub fn library_versions(&self, name: &str) -> Vec<(String, &str)> {
+        let prefix = format!("l{name}.");
+        let start = self
+            .lines
+            .partition_point(|line| line.as_str() < prefix.as_str());
+        let of_name = self.lines[start..]
+            .iter()
+            .map_while(|line| line.strip_prefix(prefix.as_str()));
+        let mut versions: Vec<(String, &str)> = of_name
+            .filter_map(|rest| rest.split_once('\t'))
+            .filter(|(_, deb)| !deb.ends_with("-dev"))
+            .map(|(version, deb)| (format!("{name}.{version}"), deb))
+            .collect();
+        versions.sort_by_key(|(name, _)| name.len());
+        versions
+    }
+
     /// Debian packages that hold something of this ROS package; empty where it is not packaged.
     pub fn ros_package(&self, name: &str) -> Carriers {
         let prefix = format!("r{name}\t");
@@ -116,6 +136,39 @@ impl Contents {
             carriers.insert(deb.to_owned(), parts.collect());
         }
         carriers
+    }
+
+    /// Debian packages by which CMake's `find_package(NAME)` is satisfied.
+    pub fn cmake_config(&self, name: &str) -> BTreeSet<&str> {
+        self.debs('c', &name.to_lowercase())
+    }
+
+    /// Debian packages with this Python module (its first name: `numpy` of `numpy.linalg`).
+    pub fn python_module(&self, name: &str) -> BTreeSet<&str> {
+        self.debs('m', name)
+    }
+
+    /// ROS packages with a program of this name, and their Debian packages.
+    pub fn programs(&self, name: &str) -> BTreeSet<(&str, &str)> {
+        let of_name = self.with_kind('p', name);
+        of_name
+            .filter_map(|rest| rest.split_once('\t'))
+            .map(|(deb, package)| (package, deb))
+            .collect()
+    }
+
+    fn debs(&self, kind: char, name: &str) -> BTreeSet<&str> {
+        self.with_kind(kind, name).collect()
+    }
+
+    fn with_kind(&self, kind: char, name: &str) -> impl Iterator<Item = &str> {
+        let prefix = format!("{kind}{name}\t");
+        let start = self
+            .lines
+            .partition_point(|line| line.as_str() < prefix.as_str());
+        self.lines[start..]
+            .iter()
+            .map_while(move |line| line.strip_prefix(prefix.as_str()))
     }
 
     /// ROS packages of which this Debian package holds something.
@@ -163,6 +216,10 @@ enum What<'a> {
     Library(&'a [u8]),
     /// If there is a ROS package of this name, it is one of its parts.
     Ros(&'a [u8], Part),
+    Config(&'a [u8]),
+    Module(&'a [u8]),
+    /// Its name, and a directory: a program if that is a ROS package.
+    Program(&'a [u8], &'a [u8]),
 }
 
 /// The same, kept.
@@ -170,6 +227,31 @@ enum What<'a> {
 enum Kept {
     Library(Vec<u8>),
     Ros(Vec<u8>, Part),
+    Config(Vec<u8>),
+    Module(Vec<u8>),
+    Program(Vec<u8>, Vec<u8>),
+}
+
+impl Kept {
+    fn of(what: What<'_>) -> Self {
+        match what {
+            What::Library(name) => Self::Library(name.to_owned()),
+            What::Ros(name, part) => Self::Ros(name.to_owned(), part),
+            What::Config(name) => Self::Config(name.to_ascii_lowercase()),
+            What::Module(name) => Self::Module(name.to_owned()),
+            What::Program(name, package) => Self::Program(name.to_owned(), package.to_owned()),
+        }
+    }
+
+    fn is(&self, what: What<'_>) -> bool {
+        match (self, what) {
+            (Self::Library(name), What::Library(new)) => name == new,
+            (Self::Ros(name, part), What::Ros(new, new_part)) => *part == new_part && name == new,
+            (Self::Config(name), What::Config(new)) => name.eq_ignore_ascii_case(new),
+            (Self::Module(name), What::Module(new)) => name == new,
+            _ => false,
+        }
+    }
 }
 
 /// One pass over all lists at once, one thread each. Which names are ROS packages is known only at the end; what
@@ -214,6 +296,16 @@ fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
                         .insert(*part);
                 }
                 Kept::Ros(..) => {}
+                Kept::Config(name) => {
+                    lines.insert(format!("c{}\t{deb}", text(name)));
+                }
+                Kept::Module(name) => {
+                    lines.insert(format!("m{}\t{deb}", text(name)));
+                }
+                Kept::Program(name, package) if ros.contains(package.as_slice()) => {
+                    lines.insert(format!("p{}\t{deb}\t{}", text(name), text(package)));
+                }
+                Kept::Program(..) => {}
             }
         }
     }
@@ -253,31 +345,43 @@ fn scan(list: &Path) -> Result<Vec<(Kept, Vec<u8>)>, Error> {
     Ok(kept)
 }
 
-/// Keeps a line if it is of interest and says something that the one before did not.
+/// Keeps what a line says that the one before did not.
 fn keep(line: &[u8], kept: &mut Vec<(Kept, Vec<u8>)>) {
-    let Some(what) = classify(line) else { return };
     let Some(space) = memchr::memrchr2(b' ', b'\t', line) else {
         return;
     };
     let debs = &line[space + 1..];
-    let same = kept.last().is_some_and(|(last, of)| {
-        of == debs
-            && match (last, what) {
-                (Kept::Library(name), What::Library(new)) => name == new,
-                (Kept::Ros(name, part), What::Ros(new, new_part)) => {
-                    *part == new_part && name == new
-                }
-                _ => false,
-            }
-    });
-    if same {
-        return;
+    for what in [classify(line), looked_for(line)].into_iter().flatten() {
+        let mut last = kept.iter().rev().take(2);
+        if !last.any(|(last, of)| of == debs && last.is(what)) {
+            kept.push((Kept::of(what), debs.to_owned()));
+        }
     }
-    let what = match what {
-        What::Library(name) => Kept::Library(name.to_owned()),
-        What::Ros(name, part) => Kept::Ros(name.to_owned(), part),
-    };
-    kept.push((what, debs.to_owned()));
+}
+
+/// What a build or a program looks for by a name: configurations of CMake, Python modules, programs.
+fn looked_for(line: &[u8]) -> Option<What<'_>> {
+    let rest = line.strip_prefix(b"usr/")?;
+    let path = &rest[..memchr::memchr2(b' ', b'\t', rest)?];
+    for end in [&b"Config.cmake"[..], b"-config.cmake"] {
+        if let Some(stem) = path.strip_suffix(end) {
+            let name = stem.rsplit(|byte| *byte == b'/').next()?;
+            return (!name.is_empty()).then_some(What::Config(name));
+        }
+    }
+    if let Some(module) = path.strip_prefix(b"lib/python3/dist-packages/") {
+        let name = match cut(module) {
+            Some((name, b"__init__.py")) => name,
+            Some(_) => return None,
+            None if module.ends_with(b".py") => &module[..module.len() - 3],
+            None if module.ends_with(b".so") => module.split(|byte| *byte == b'.').next()?,
+            None => return None,
+        };
+        return Some(What::Module(name));
+    }
+    let (package, program) = cut(path.strip_prefix(b"lib/")?)?;
+    let plain = !program.contains(&b'/') && package != triplet().as_bytes();
+    plain.then_some(What::Program(program, package))
 }
 
 /// Up to the first `/`, and after it.

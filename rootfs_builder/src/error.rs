@@ -89,7 +89,8 @@ pub enum Error {
         sources: String,
     },
     /// The package's build failed.
-    #[error("the build of {package} failed; the complete log is {log}\n{last_lines}", log = log.display())]
+    #[error("the build of {package} failed; the complete log is {log}\n{last_lines}{advice}", log = log.display(),
+        advice = advice.iter().map(|line| format!("\n{line}")).collect::<String>())]
     BuildFailed {
         /// The ROS package that failed.
         package: String,
@@ -97,12 +98,14 @@ pub enum Error {
         log: PathBuf,
         /// Its last lines, the compiler's own words among them.
         last_lines: String,
+        /// What is missing, and the options that add it.
+        advice: Vec<String>,
     },
     /// dpkg failed inside the sandbox.
-    #[error("installing packages failed: {last_lines}")]
+    #[error("installing packages failed: {first_error}")]
     InstallFailed {
-        /// dpkg's last lines.
-        last_lines: String,
+        /// dpkg's first error and what led to it; its last lines where it named none.
+        first_error: String,
     },
     /// Something of ours that runs inside a container failed.
     #[error("{what} failed: {last_lines}")]
@@ -129,7 +132,7 @@ pub enum Error {
         words: String,
     },
     /// No such launch file or executable in the image.
-    #[error("there is no {what} {name:?} in the package; there are: {known}")]
+    #[error("there is no {what} {name:?} in the package; there are: {known}{elsewhere}")]
     NotInPackage {
         /// `launch file` or `executable`.
         what: &'static str,
@@ -137,6 +140,8 @@ pub enum Error {
         name: String,
         /// Those that there are.
         known: String,
+        /// Where it is instead, with the option that adds it.
+        elsewhere: String,
     },
     /// Nothing says what to run.
     #[error(

@@ -20,7 +20,7 @@ use crate::contents::Part;
 use crate::deb::{self, Content, Member};
 use crate::error::Error;
 use crate::event::Progress;
-use crate::manifest;
+use crate::manifest::{self, PluginLibrary};
 
 /// What is wanted.
 #[derive(Debug, Default, Clone, PartialEq)]
@@ -31,6 +31,8 @@ pub(crate) struct Wanted {
     pub(crate) extras: Vec<Member>,
     /// Things to know.
     pub(crate) warnings: Vec<String>,
+    /// What a package.xml asks for and nothing provides.
+    pub(crate) unknown: BTreeSet<String>,
 }
 
 /// Walks from `roots` (ROS packages). `python`: whether the roots' Python modules are wanted.
@@ -72,7 +74,20 @@ pub(crate) async fn gather(
                 crate::blocking::spawn(move || deb::members(&file, deb::wanted_of_development))
                     .await??;
             let told = tell(&members, base);
-            next.extend(told.ros_packages);
+            let itself = matches!(depth, Depth::Itself { .. });
+            for name in told.needed {
+                match provided(archive, base, &name) {
+                    Provided::Ros => {
+                        next.insert(name);
+                    }
+                    // Further away, Debian's own dependencies say it.
+                    Provided::Debs(debs) if itself => wanted.install.extend(debs),
+                    Provided::Nothing if itself => {
+                        wanted.unknown.insert(name);
+                    }
+                    Provided::Debs(_) | Provided::Nothing => {}
+                }
+            }
             wanted.warnings.extend(told.warnings);
             for library in told.plugins {
                 want_plugin(archive, &library, &members, &mut wanted);
@@ -102,12 +117,37 @@ pub(crate) async fn gather(
     Ok(wanted)
 }
 
+/// Where the name in an exec dependency leads.
+#[derive(Debug, PartialEq)]
+enum Provided {
+    Ros,
+    Debs(Vec<String>),
+    Nothing,
+}
+
+/// A ROS package, or a rosdep key, or a Debian package of that name. Development packages are not for running.
+fn provided(archive: &Archive, base: &Base, name: &str) -> Provided {
+    if !archive.contents.ros_package(name).is_empty() || base.ros_packages.ignore.contains(name) {
+        return Provided::Ros;
+    }
+    let debs = match base.keys.get(name) {
+        Some(debs) => debs.clone(),
+        None if archive.names.contains(name) => vec![name.to_owned()],
+        None => return Provided::Nothing,
+    };
+    Provided::Debs(
+        debs.into_iter()
+            .filter(|deb| !deb.ends_with("-dev"))
+            .collect(),
+    )
+}
+
 /// What the package.xml files and plugin lists among these members say.
 #[derive(Debug, Default, PartialEq)]
 struct Told {
-    ros_packages: BTreeSet<String>,
-    /// `libx.so` of the plugin lists.
-    plugins: BTreeSet<String>,
+    /// ROS packages and rosdep keys.
+    needed: BTreeSet<String>,
+    plugins: BTreeSet<PluginLibrary>,
     warnings: Vec<String>,
 }
 
@@ -128,7 +168,7 @@ fn tell(members: &[Member], base: &Base) -> Told {
             && path.components().count() == 4
         {
             match manifest::run_dependencies(text, path, base) {
-                Ok(names) => told.ros_packages.extend(names),
+                Ok(names) => told.needed.extend(names),
                 Err(problem) => told.warnings.push(format!("in the archive: {problem}")),
             }
         } else if path.extension().is_some_and(|extension| extension == "xml") {
@@ -140,26 +180,51 @@ fn tell(members: &[Member], base: &Base) -> Told {
 }
 
 /// A plugin list names `libx`; the file with that name is a link in a development package to `libx.so.1`, which is
-/// in another one.
-fn want_plugin(archive: &Archive, library: &str, members: &[Member], wanted: &mut Wanted) {
-    let link = members
-        .iter()
-        .find(|member| member.path.file_name().is_some_and(|name| name == library));
+/// in another one. Where it says `lib/libx`, pluginlib looks in `/usr/lib` and not where Debian's libraries are: what
+/// works on other distributions fails there, so that it gets a link.
+fn want_plugin(
+    archive: &Archive,
+    library: &PluginLibrary,
+    members: &[Member],
+    wanted: &mut Wanted,
+) {
+    let link = members.iter().find(|member| {
+        member
+            .path
+            .file_name()
+            .is_some_and(|name| name == library.name.as_str())
+    });
     let target: Option<PathBuf> = link.and_then(|member| match &member.content {
         Content::Link(target) => Some(target.clone()),
         Content::File(_) => None,
     });
-    let name = target
-        .as_deref()
-        .and_then(Path::file_name)
-        .map_or(library.into(), |name| name.to_string_lossy());
-    match archive.contents.library(&name) {
-        Some(deb) if !deb.ends_with("-dev") => {
-            wanted.install.insert(deb.to_owned());
-        }
-        _ => wanted
-            .warnings
-            .push(format!("no package holds the plugin library {name}")),
+    let linked = target.as_deref().and_then(Path::file_name);
+    let mut name = linked.map_or(library.name.clone(), |name| {
+        name.to_string_lossy().into_owned()
+    });
+    let mut deb = archive.contents.library(&name);
+    if deb.is_none_or(|deb| deb.ends_with("-dev"))
+        && let Some((version, of)) = archive.contents.library_versions(&library.name).first()
+    {
+        // The list and the link are in different packages.
+        (name, deb) = (version.clone(), Some(*of));
+    }
+    let Some(deb) = deb.filter(|deb| !deb.ends_with("-dev")) else {
+        let text = format!("no package holds the plugin library {name}");
+        return wanted.warnings.push(text);
+    };
+    wanted.install.insert(deb.to_owned());
+    let triplet = crate::contents::triplet();
+    let mut link = |directory: &str, target: String| {
+        wanted.extras.push(Member {
+            path: Path::new(directory).join(&library.name),
+            mode: 0o777,
+            mtime: 0,
+            content: Content::Link(target.into()),
+        });
+    };
+    if library.in_directory {
+        link("usr/lib", format!("{triplet}/{name}"));
     }
 }
 
@@ -195,9 +260,85 @@ mod tests {
         ];
         let told = tell(&members, &base);
         assert!(
-            told.ros_packages.contains("nodelet") && !told.ros_packages.contains("rostest"),
+            told.needed.contains("nodelet") && !told.needed.contains("rostest"),
             "{told:?}"
         );
-        assert_eq!(told.plugins, ["libx_nodelets.so".to_owned()].into());
+        let plugin = PluginLibrary {
+            name: "libx_nodelets.so".to_owned(),
+            in_directory: true,
+        };
+        assert_eq!(told.plugins, [plugin].into());
+    }
+
+    fn archive(directory: &Path, contents: &str, names: &[&str]) -> Archive {
+        let lists = [crate::contents::tests::list(directory, "c.gz", contents)];
+        let contents = crate::contents::Contents::open(directory, &lists).expect("read");
+        Archive {
+            apt: crate::apt::Apt::open(directory, "").expect("prepared"),
+            contents: std::sync::Arc::new(contents),
+            names: names.iter().map(|&name| name.to_owned()).collect(),
+            stamp: String::new(),
+            sources: String::new(),
+        }
+    }
+
+    #[test]
+    fn a_plugin_library_is_found_where_its_list_says_a_directory() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let triplet = crate::contents::triplet();
+        let text = format!(
+            "usr/lib/{triplet}/libpcl_ros_filters.so libdevel/libpcl-ros-dev\n\
+             usr/lib/{triplet}/libpcl_ros_filters.so.0d libs/libpcl-ros-filters0d\n\
+             usr/lib/{triplet}/libpcl_ros_filters.so.1.7.5 libs/libpcl-ros-filters0d\n"
+        );
+        let archive = archive(directory.path(), &text, &[]);
+        for in_directory in [false, true] {
+            let library = PluginLibrary {
+                name: "libpcl_ros_filters.so".to_owned(),
+                in_directory,
+            };
+            let mut wanted = Wanted::default();
+            want_plugin(&archive, &library, &[], &mut wanted);
+            assert_eq!(wanted.install, ["libpcl-ros-filters0d".to_owned()].into());
+            assert!(wanted.warnings.is_empty(), "{wanted:?}");
+            let links: Vec<_> = wanted
+                .extras
+                .iter()
+                .map(|member| (&member.path, &member.content))
+                .collect();
+            let path = PathBuf::from("usr/lib/libpcl_ros_filters.so");
+            let content = Content::Link(format!("{triplet}/libpcl_ros_filters.so.0d").into());
+            let expected = if in_directory {
+                vec![(&path, &content)]
+            } else {
+                Vec::new()
+            };
+            assert_eq!(links, expected);
+        }
+    }
+
+    #[test]
+    fn what_a_package_xml_asks_for_is_found_as_ros_package_as_key_and_by_its_debian_name() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let text = "usr/share/tf/package.xml libdevel/libtf-dev\n";
+        let archive = archive(
+            directory.path(),
+            text,
+            &["python3-numpy", "libeigen3-dev", "opencv-data"],
+        );
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        let debs =
+            |names: &[&str]| Provided::Debs(names.iter().map(|&name| name.to_owned()).collect());
+        for (name, expected) in [
+            ("tf", Provided::Ros),
+            ("python-numpy", debs(&["python3-numpy"])),
+            ("eigen", debs(&[])),
+            ("opencv-data", debs(&["opencv-data"])),
+            ("rviz", Provided::Ros),
+            ("warp", Provided::Nothing),
+        ] {
+            assert_eq!(provided(&archive, &base, name), expected, "{name}");
+        }
     }
 }

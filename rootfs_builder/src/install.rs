@@ -13,6 +13,7 @@ use crate::archive::Archive;
 use crate::base::Base;
 use crate::bootstrap::{EPOCH, tree_options};
 use crate::cache::Entry;
+use crate::complaint::Complaint;
 use crate::deb::{self, Content, Member};
 use crate::error::{Error, IoAt};
 use crate::event::Progress;
@@ -162,6 +163,7 @@ async fn make(
     );
     let total = addition.debs.len() as u64;
     let mut done = 0;
+    let mut complaint = Complaint::default();
     let finished = shop
         .site
         .run(
@@ -184,6 +186,7 @@ async fn make(
                     .into(),
             },
             |line| {
+                complaint.hear(line);
                 if line.starts_with("Setting up ") {
                     done += 1;
                     progress.count("packages", done, Some(total));
@@ -193,7 +196,7 @@ async fn make(
         .await?;
     if !finished.success() {
         return Err(Error::InstallFailed {
-            last_lines: finished.last_words(),
+            first_error: complaint.text().unwrap_or_else(|| finished.last_words()),
         });
     }
     progress

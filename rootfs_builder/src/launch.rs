@@ -46,6 +46,14 @@ pub struct LaunchNode {
     pub respawn_delay: f64,
     /// When it ends, all do.
     pub required: bool,
+    /// The program is told its name (`__name:=`). Otherwise it has the one that its author gave it, and `name` is a
+    /// guess by the executable's.
+    #[serde(default = "yes")]
+    pub named: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 impl LaunchNode {
@@ -216,6 +224,7 @@ fn understand(text: &[u8]) -> Result<Answer, Error> {
                 },
                 name,
                 known: list(&known),
+                elsewhere: String::new(),
             },
             Refusal::Nothing {
                 executables,

@@ -18,6 +18,7 @@
 
 #![forbid(unsafe_code)]
 
+mod advice;
 mod apt;
 mod archive;
 pub mod base;
@@ -27,6 +28,7 @@ mod build;
 mod builder;
 mod cache;
 mod compile;
+mod complaint;
 mod contents;
 mod deb;
 mod elf;

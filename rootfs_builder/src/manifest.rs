@@ -22,9 +22,17 @@ pub(crate) fn run_dependencies(
         .collect())
 }
 
-/// File names (`libx.so`) of the libraries of a plugin list (pluginlib: one `library`, or several in
-/// `class_libraries`). Anything else names none.
-pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<String> {
+/// A library of a plugin list.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct PluginLibrary {
+    /// `libx.so`
+    pub(crate) name: String,
+    /// The list says a directory (`lib/libx`), so pluginlib looks nowhere else.
+    pub(crate) in_directory: bool,
+}
+
+/// Libraries of a plugin list (pluginlib: one `library`, or several in `class_libraries`). Anything else names none.
+pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<PluginLibrary> {
     let Ok(document) = roxmltree::Document::parse(text) else {
         return BTreeSet::new();
     };
@@ -38,10 +46,12 @@ pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<String> {
     let paths = libraries
         .iter()
         .filter_map(|library| library.attribute("path"));
-    paths
-        .filter_map(|path| path.rsplit('/').next())
-        .filter(|name| !name.is_empty())
-        .map(file_name)
+    let cut = paths.map(|path| (path.rsplit('/').next().unwrap_or(path), path.contains('/')));
+    cut.filter(|(name, _)| !name.is_empty())
+        .map(|(name, in_directory)| PluginLibrary {
+            name: file_name(name),
+            in_directory,
+        })
         .collect()
 }
 
@@ -59,15 +69,19 @@ mod tests {
 
     #[test]
     fn libraries_of_either_form_are_found() {
+        let library = |name: &str, in_directory| PluginLibrary {
+            name: name.to_owned(),
+            in_directory,
+        };
         let one = "<library path=\"lib/libimage_proc\"><class/></library>";
         assert_eq!(
             plugin_libraries(one),
-            ["libimage_proc.so".to_owned()].into()
+            [library("libimage_proc.so", true)].into()
         );
         let many = "<class_libraries><library path=\"liba\"/><library path=\"lib/libb.so\"/></class_libraries>";
         assert_eq!(
             plugin_libraries(many),
-            ["liba.so".to_owned(), "libb.so".to_owned()].into()
+            [library("liba.so", false), library("libb.so", true)].into()
         );
         for other in ["<launch><library path=\"x\"/></launch>", "not xml", ""] {
             assert!(plugin_libraries(other).is_empty(), "{other}");

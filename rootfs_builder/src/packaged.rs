@@ -80,6 +80,7 @@ struct Note {
     install: BTreeSet<String>,
     extras: Vec<Member>,
     warnings: Vec<String>,
+    unknown: BTreeSet<String>,
 }
 
 /// Gathers from these ROS packages.
@@ -91,8 +92,10 @@ pub(crate) async fn wanted(
     if roots.is_empty() {
         return Ok(Wanted::default());
     }
-    let key = Key::new("gathered")
+    let keys = serde_json::to_string(&build.base.keys).unwrap_or_default();
+    let key = Key::new("gathered with keys")
         .with("archive", &build.archive.stamp)
+        .with("keys", keys)
         .with_all("ignore", &build.base.ros_packages.ignore)
         .with("python", [u8::from(python)])
         .with_all("root", roots)
@@ -106,6 +109,7 @@ pub(crate) async fn wanted(
                 install: found.install,
                 extras: found.extras,
                 warnings: found.warnings,
+                unknown: found.unknown,
             };
             build.shop.layers.keep_note(&key, &note)?;
             note
@@ -114,10 +118,19 @@ pub(crate) async fn wanted(
     for warning in &note.warnings {
         build.progress.warn(warning.as_str()).await;
     }
+    for name in &note.unknown {
+        if !build.request.map.contains_key(name) {
+            let text = format!(
+                "package.xml asks for {name}, which nothing provides; name its Debian package with `--map {name}=DEB`"
+            );
+            build.progress.warn(text).await;
+        }
+    }
     Ok(Wanted {
         install: note.install,
         extras: note.extras,
         warnings: note.warnings,
+        unknown: note.unknown,
     })
 }
 

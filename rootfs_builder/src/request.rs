@@ -29,7 +29,7 @@ pub struct PushRequest {
     pub remaps: BTreeMap<String, String>,
     /// Dependencies by hand: rosdep key or ROS package → Debian package.
     pub map: BTreeMap<String, String>,
-    /// More to have at run time: Debian or ROS packages.
+    /// More to have, while compiling and at run time: Debian or ROS packages.
     pub with: Vec<String>,
 }
 

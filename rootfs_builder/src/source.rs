@@ -21,7 +21,7 @@ use crate::error::Error;
 use crate::install::Made;
 use crate::key::{self, Key};
 use crate::keys::{self, Resolved};
-use crate::{elf, packaged, pushed};
+use crate::{advice, elf, packaged, pushed};
 
 /// Compiles and packs.
 pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Parts, Error> {
@@ -81,8 +81,12 @@ async fn compiled(
         .shop
         .layers
         .keep_note(&kept(&build.base.name), &keep)?;
+    // What the deployer adds may be what package.xml forgot, for compiling as well as for running.
+    let (ros, mut wanted) = build.extra_packages()?;
+    wanted.extend(ros.iter().flat_map(|name| build.archive.to_build(name)));
+    wanted.extend(resolved.build.iter().cloned());
     let more = build
-        .add("build-dependencies", &below, &resolved.build, Vec::new())
+        .add("build-dependencies", &below, &wanted, Vec::new())
         .await?;
     let below: Vec<_> = below.into_iter().chain(more.layer).collect();
     let hashed = root.to_owned();
@@ -115,7 +119,8 @@ async fn compiled(
         &build.log,
         build.progress,
     )
-    .await?;
+    .await
+    .map_err(|error| advice::on(error, &build.archive.contents))?;
     build.progress.step("packing the package").await;
     let layer = compile::pack(shop, &build.base, &tree).await?;
     let made_from = units.iter().map(|unit| unit.name.clone()).collect();
@@ -161,6 +166,8 @@ pub(crate) async fn dependencies(
 ) -> Result<Made, Error> {
     let below = build.on_base();
     let (mut roots, mut debs) = build.extra_packages()?;
+    // Those are for compiling; the libraries that they bring are found by what the result needs.
+    debs.retain(|deb| !deb.ends_with("-dev"));
     roots.extend(resolved.run_ros.iter().cloned());
     let wanted = packaged::wanted(build, &roots, python).await?;
     debs.extend(wanted.install);

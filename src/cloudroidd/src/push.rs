@@ -337,13 +337,16 @@ fn push_event(event: BuildEvent) -> PushEvent {
 }
 
 fn push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error {
+    let mut next = None;
     let (message, log) = match error {
         // The complete log has been sent line by line.
         rootfs_builder::Error::BuildFailed {
             package,
             last_lines,
+            advice,
             ..
         } => {
+            next = (!advice.is_empty()).then(|| advice.join("; "));
             let lines = last_lines.lines().map(str::to_owned).collect();
             (format!("the build of {package} failed"), lines)
         }
@@ -352,11 +355,7 @@ fn push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error
             Vec::new(),
         ),
     };
-    Error::Push {
-        message,
-        next: None,
-        log,
-    }
+    Error::Push { message, next, log }
 }
 
 /// Names what was pushed as the pusher did (`source`), and leaves out where the build is: that means nothing to him.
@@ -419,6 +418,9 @@ mod tests {
             package: "broken".into(),
             log: "/home/build/push-1/log".into(),
             last_lines: "main.cpp:3: error: expected ;\nmake: *** [all] Error 2".into(),
+            advice: vec![
+                "the CMake package warp is missing: push with `--with libwarp-dev`".into(),
+            ],
         };
         let problem = push_error(&failed, Path::new("/home"), "broken").problem();
         assert_eq!(problem.detail, "the build of broken failed");
@@ -426,5 +428,7 @@ mod tests {
             problem.log,
             ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]
         );
+        let next = problem.next.expect("what to do");
+        assert!(next.contains("`--with libwarp-dev`"), "{next}");
     }
 }
