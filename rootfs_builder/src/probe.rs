@@ -3,14 +3,22 @@
 //! ```text
 //!   nodes register ──▶ graph still ──▶ subscribe to all that is published ──▶ graph still? ──▶ ask for types,
 //!        │ (or exit, or never)                    ▲                              │ no            parameters
-//!        ▼                                        └──────────────────────────────┘
-//!      error
+//!        ▼                                        ├──────────────────────────────┘                   │
+//!      error                                      └── graph changed? ◀── feed what is waited for ◀───┘
 //! ```
 //!
-//! Many nodes register their inputs only while an output is subscribed to; those are the lazy ones. An interface is
-//! described from the package's point of view: what it subscribes to is an input.
+//! Many nodes register their inputs only while an output is subscribed to; those are the lazy ones. Others wait for
+//! transforms, time, services or messages before they register the rest: they are given all that. What appears only
+//! then is lazy as well, since a servant without a robot does not have it. An interface is described from the
+//! package's point of view: what it subscribes to is an input.
 
 mod describe;
+mod feed;
+mod frames;
+mod incomplete;
+mod lender;
+mod plausible;
+mod settle;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::Future;
@@ -19,10 +27,16 @@ use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
+use parking_lot::Mutex;
 use ros::bus::{Bus, Graph, SubscribeOptions, Subscription, TopicNodes};
 use ros::schema::Registry;
 use tokio::sync::watch;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::Instant;
+
+use feed::Feed;
+
+/// Each round gives what the one before has made a node ask for.
+const MOST_ROUNDS: usize = 12;
 
 /// What can go wrong while looking.
 #[derive(Debug, thiserror::Error)]
@@ -92,6 +106,8 @@ pub struct ProbeOptions {
     pub settle: Duration,
     /// At most so long for it to become still, each time.
     pub restless: Duration,
+    /// Types of topics as the deployer states them, for inputs that take any.
+    pub types: BTreeMap<String, String>,
     /// Tells how much the nodes have worked: those that work have not settled (they load models, say). None: not
     /// known.
     pub work: Option<Work>,
@@ -126,6 +142,7 @@ impl ProbeOptions {
             patience: Duration::from_secs(60),
             settle: Duration::from_millis(700),
             restless: Duration::from_secs(15),
+            types: BTreeMap::new(),
             work: None,
         }
     }
@@ -155,11 +172,15 @@ pub async fn probe(
     options: &ProbeOptions,
     exited: impl Future<Output = String> + Send,
 ) -> Result<Found, ProbeError> {
+    let unfed = Mutex::new(None);
     tokio::select! {
         // First: of a node that ended, nothing else is worth saying.
         biased;
-        words = exited => Err(ProbeError::Exited(words)),
-        found = look(bus, registry, definitions, options) => found,
+        words = exited => match unfed.into_inner() {
+            Some(found) => Ok(incomplete::ended(found, &words)),
+            None => Err(ProbeError::Exited(words)),
+        },
+        found = look(bus, registry, definitions, options, &unfed) => found,
     }
 }
 
@@ -168,205 +189,134 @@ async fn look(
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
     options: &ProbeOptions,
+    unfed: &Mutex<Option<Found>>,
 ) -> Result<Found, ProbeError> {
     let mut watch = bus.graph();
-    registered(&mut watch, options).await?;
-    let mut warnings = Vec::new();
-    if !still(&mut watch, options).await? {
-        warnings.push(format!(
+    settle::registered(&mut watch, options).await?;
+    let mut feed = Feed::begin(bus, registry, options).await;
+    let mut look = Look {
+        bus,
+        registry,
+        definitions,
+        options,
+        watch,
+        warnings: Vec::new(),
+        subscriptions: BTreeMap::new(),
+        tried: BTreeSet::new(),
+        eager: BTreeSet::new(),
+        latched: BTreeSet::new(),
+    };
+    if !settle::still(&mut look.watch, options).await? {
+        look.warnings.push(format!(
             "topics kept changing for {:?}: some may be missing",
             options.restless
         ));
     }
-    let eager = inputs(&watch.borrow_and_update(), &options.own_name);
-    // Subscribing may wake inputs, and those may make the node publish more.
-    let mut subscriptions: BTreeMap<String, Subscription> = BTreeMap::new();
-    let mut tried = BTreeSet::new();
-    loop {
-        let graph = watch.borrow_and_update().clone();
-        let mut new = outputs(&graph, &options.own_name);
-        new.retain(|topic| tried.insert(topic.clone()));
-        if new.is_empty() {
+    look.listen().await?;
+    let bare = look.describe(&feed).await?;
+    // From here on a node may end of what it is given; then this is what is known of it.
+    *unfed.lock() = Some(bare.clone());
+    let mut found = bare.clone();
+    for _ in 0..MOST_ROUNDS {
+        let before = settle::shape(&look.graph());
+        let Some(settle) = feed.give(&look.graph()).await else {
             break;
+        };
+        let options = ProbeOptions {
+            settle,
+            ..options.clone()
+        };
+        settle::still(&mut look.watch, &options).await?;
+        if settle::shape(&look.graph()) == before {
+            continue;
         }
-        let asked = Instant::now();
-        for topic in &new {
-            match bus
-                .subscribe(
-                    topic,
-                    SubscribeOptions {
-                        wire_type: None,
-                        queue: 1,
-                    },
-                )
-                .await
-            {
-                Ok(subscription) => {
-                    subscriptions.insert(topic.clone(), subscription);
-                }
-                Err(error) => warnings.push(format!("{topic} cannot be subscribed to: {error}")),
-            }
-        }
-        // A publisher that answers this has been connected to; what it then does takes about as long as it took to
-        // answer. On a busy machine that is more than usual.
-        for topic in &new {
-            let _ = bus.topic_type(topic).await;
-        }
-        let settle = (asked.elapsed() * 2).clamp(options.settle, options.restless);
-        still(
-            &mut watch,
-            &ProbeOptions {
-                settle,
-                ..options.clone()
-            },
-        )
-        .await?;
+        look.listen().await?;
+        found = look.describe(&feed).await?;
+        incomplete::mark_late(&mut found.interface, &bare.interface);
+        *unfed.lock() = Some(found.clone());
     }
-    let graph = watch.borrow_and_update().clone();
-    let latched = subscriptions
-        .iter_mut()
-        .filter_map(|(topic, subscription)| {
-            let message = subscription.messages.try_recv()?;
-            message.latching.then(|| topic.clone())
-        });
-    let seen = describe::Seen {
-        latched: latched.collect(),
-        eager,
-        graph,
-        own_name: &options.own_name,
-    };
-    let mut found = describe::describe(bus, registry, definitions, &seen).await?;
-    found.warnings.splice(..0, warnings);
+    incomplete::warn(&mut found, options, &mut feed);
+    found.warnings.splice(..0, look.warnings);
     Ok(found)
 }
 
-async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeError> {
-    watch.changed().await.map_err(|_| ProbeError::MasterGone)
+/// One look at a running package.
+struct Look<'a> {
+    bus: &'a dyn Bus,
+    registry: &'a Registry,
+    definitions: &'a BTreeMap<String, String>,
+    options: &'a ProbeOptions,
+    watch: watch::Receiver<Arc<Graph>>,
+    warnings: Vec<String>,
+    subscriptions: BTreeMap<String, Subscription>,
+    tried: BTreeSet<String>,
+    eager: BTreeSet<String>,
+    latched: BTreeSet<String>,
 }
 
-/// Waits until all nodes that must register have.
-async fn registered(
-    watch: &mut watch::Receiver<Arc<Graph>>,
-    options: &ProbeOptions,
-) -> Result<(), ProbeError> {
-    let deadline = Instant::now() + options.patience;
-    loop {
-        let missing: Vec<String> = {
-            let graph = watch.borrow_and_update();
-            options
-                .nodes
-                .iter()
-                .filter(|node| !graph.nodes.contains_key(*node))
-                .cloned()
-                .collect()
-        };
-        if missing.is_empty() {
-            return Ok(());
-        }
-        match timeout_at(deadline, changed(watch)).await {
-            Ok(result) => result?,
-            Err(_) => {
-                return Err(ProbeError::NeverRegistered {
-                    nodes: missing,
-                    after: options.patience,
-                    sought: {
-                        let needs = describe::needs(&watch.borrow(), &options.own_name);
-                        needs.into_iter().map(|need| need.name).collect()
-                    },
-                });
-            }
-        }
+impl Look<'_> {
+    fn graph(&mut self) -> Arc<Graph> {
+        self.watch.borrow_and_update().clone()
     }
-}
 
-/// Waits until nothing changes any more; false when it did not come to rest in time.
-///
-/// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to.
-async fn still(
-    watch: &mut watch::Receiver<Arc<Graph>>,
-    options: &ProbeOptions,
-) -> Result<bool, ProbeError> {
-    let begun = Instant::now();
-    let limit = begun + options.restless;
-    // Some nodes work all the time; that alone is not worth the whole wait.
-    let working_limit = begun + options.restless / 3;
-    let mut shape = shape(&watch.borrow_and_update());
-    let mut since = Instant::now();
-    let mut worked = options.worked().await;
-    loop {
-        match timeout_at((since + options.settle).min(limit), changed(watch)).await {
-            Ok(result) => {
-                result?;
-                // Parameters that a node reads again and again change the graph's generation and nothing here.
-                let now = self::shape(&watch.borrow_and_update());
-                if now == shape {
-                    continue;
-                }
-                shape = now;
+    /// Subscribes to everything that is published: that may wake inputs, and those may make the node publish more.
+    async fn listen(&mut self) -> Result<(), ProbeError> {
+        let graph = self.graph();
+        self.eager.extend(inputs(&graph, &self.options.own_name));
+        loop {
+            let graph = self.graph();
+            let mut new = outputs(&graph, &self.options.own_name);
+            new.retain(|topic| self.tried.insert(topic.clone()));
+            if new.is_empty() {
+                return Ok(());
             }
-            Err(_) => {
-                let now = Instant::now();
-                let work = options.worked().await;
-                let busy = match (worked, work) {
-                    (Some(before), Some(after)) => after.saturating_sub(before) * 3 > now - since,
-                    _ => false,
+            let asked = Instant::now();
+            for topic in &new {
+                let any = SubscribeOptions {
+                    wire_type: None,
+                    queue: 1,
                 };
-                worked = work;
-                let bare = shows_nothing(&watch.borrow(), options);
-                if now >= limit {
-                    return Ok(bare || !busy);
-                }
-                if !bare && (!busy || now >= working_limit) {
-                    return Ok(true);
+                match self.bus.subscribe(topic, any).await {
+                    Ok(subscription) => {
+                        self.subscriptions.insert(topic.clone(), subscription);
+                    }
+                    Err(error) => self
+                        .warnings
+                        .push(format!("{topic} cannot be subscribed to: {error}")),
                 }
             }
+            // A publisher that answers this has been connected to; what it then does takes about as long as it took
+            // to answer. On a busy machine that is more than usual.
+            for topic in &new {
+                let _ = self.bus.topic_type(topic).await;
+            }
+            let settle = (asked.elapsed() * 2).clamp(self.options.settle, self.options.restless);
+            let options = ProbeOptions {
+                settle,
+                ..self.options.clone()
+            };
+            settle::still(&mut self.watch, &options).await?;
         }
-        since = Instant::now();
     }
-}
 
-/// Whether nobody has registered anything yet but what every node has. (Of several nodes some may never show
-/// anything, such as those that load nodelets into others.)
-fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
-    const SERVICES: [&str; 5] = [
-        "get_loggers",
-        "set_logger_level",
-        "load_nodelet",
-        "unload_nodelet",
-        "list",
-    ];
-    let own = |node: &String| *node == options.own_name;
-    let topics = graph.topics.iter().any(|(name, topic)| {
-        let mut ends = topic.publishers.iter().chain(&topic.subscribers);
-        !is_plumbing(name, topic) && ends.any(|node| !own(node))
-    });
-    let services = graph.services.iter().any(|(name, server)| {
-        !own(server)
-            && name
-                .rsplit('/')
-                .next()
-                .is_some_and(|last| !SERVICES.contains(&last))
-    });
-    !topics && !services
-}
-
-type Shape = (
-    BTreeMap<String, TopicNodes>,
-    BTreeMap<String, String>,
-    BTreeSet<String>,
-    usize,
-    usize,
-);
-
-fn shape(graph: &Graph) -> Shape {
-    let nodes = graph.nodes.keys().cloned().collect();
-    (
-        graph.topics.clone(),
-        graph.services.clone(),
-        nodes,
-        graph.parameters.len(),
-        graph.sought.len(),
-    )
+    async fn describe(&mut self, feed: &Feed<'_>) -> Result<Found, ProbeError> {
+        for (topic, subscription) in &mut self.subscriptions {
+            if let Some(message) = subscription.messages.try_recv()
+                && message.latching
+            {
+                self.latched.insert(topic.clone());
+            }
+        }
+        let seen = describe::Seen {
+            latched: self.latched.clone(),
+            eager: self.eager.clone(),
+            graph: self.graph(),
+            own_name: &self.options.own_name,
+            asked: feed.asked(),
+            any: feed.any().clone(),
+        };
+        describe::describe(self.bus, self.registry, self.definitions, &seen).await
+    }
 }
 
 /// ROS's own plumbing, which no robot asks for: logs, statistics, simulated time, the life lines of nodelets.

@@ -24,6 +24,10 @@ pub(super) struct Seen<'a> {
     pub(super) graph: Arc<Graph>,
     /// The looking node.
     pub(super) own_name: &'a str,
+    /// Services that were looked for and lent, with the nodes that did.
+    pub(super) asked: BTreeMap<String, BTreeSet<String>>,
+    /// Inputs of any type.
+    pub(super) any: BTreeSet<String>,
 }
 
 /// Asks and compares.
@@ -46,7 +50,14 @@ pub(super) async fn describe(
     ] {
         for name in names {
             match ask(&name, bus.topic_type(&name)).await {
-                Ok(wire) => topics.push(topic(registry, seen, name, direction, wire, &mut texts)?),
+                Ok(wire) => {
+                    let wire = if follows_any(seen, &name, direction, &wire) {
+                        any_type()
+                    } else {
+                        wire
+                    };
+                    topics.push(topic(registry, seen, name, direction, wire, &mut texts)?);
+                }
                 Err(problem) => found.warnings.push(problem),
             }
         }
@@ -97,7 +108,8 @@ pub(super) async fn describe(
         services,
         actions,
         parameters,
-        needs: needs(graph, seen.own_name),
+        needs: needs_of(seen),
+        late: Vec::new(),
         definitions: texts.used,
     };
     for need in &found.interface.needs {
@@ -122,6 +134,55 @@ pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
             .collect(),
     });
     needs.filter(|need| !need.nodes.is_empty()).collect()
+}
+
+/// Those, and the services that were lent.
+fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
+    let mut needs = needs(&seen.graph, seen.own_name);
+    for (name, nodes) in &seen.asked {
+        if seen.graph.services.contains_key(name) {
+            continue;
+        }
+        match needs.iter_mut().find(|need| need.name == *name) {
+            Some(need) => {
+                let new = nodes.iter().filter(|node| !need.nodes.contains(node));
+                let new: Vec<String> = new.cloned().collect();
+                need.nodes.extend(new);
+            }
+            None => needs.push(Need {
+                name: name.clone(),
+                nodes: nodes.iter().cloned().collect(),
+            }),
+        }
+    }
+    needs.sort_by(|a, b| a.name.cmp(&b.name));
+    needs
+}
+
+/// Whether an output has its type only because an input that takes any was given a message of that type.
+fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireType) -> bool {
+    let fed = |topic: &String| {
+        let ends = (seen.graph.topics.get(topic), seen.graph.topics.get(name));
+        let (Some(input), Some(output)) = ends else {
+            return false;
+        };
+        output
+            .publishers
+            .iter()
+            .any(|node| node != seen.own_name && input.subscribers.contains(node))
+    };
+    match direction {
+        Direction::Input => seen.any.contains(name),
+        Direction::Output => wire.name == super::feed::ANY && seen.any.iter().any(fed),
+    }
+}
+
+fn any_type() -> WireType {
+    WireType {
+        name: "*".to_owned(),
+        md5: "*".to_owned(),
+        definition: String::new(),
+    }
 }
 
 async fn ask<T>(
@@ -264,7 +325,8 @@ fn take_actions(
                 .name
                 .strip_prefix(action.name.as_str())
                 .and_then(|rest| rest.strip_prefix('/'));
-            end.is_some_and(|end| ENDS.contains(&(end, topic.direction)))
+            // In either direction: a server may well be its own client (move_base is).
+            end.is_some_and(|end| ENDS.iter().any(|(name, _)| *name == end))
         })
     });
     Ok(actions)

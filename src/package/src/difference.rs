@@ -210,6 +210,7 @@ mod tests {
             written_by: vec![],
         };
         Interface {
+            late: Vec::new(),
             topics: vec![
                 topic("/in", Direction::Input, false),
                 topic("/out", Direction::Output, true),

@@ -8,6 +8,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Interface {
+    /// Names of services and actions that nodes register only once they have been given what they wait for, such as
+    /// transforms or a map. (Topics have [`Topic::lazy`].)
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub late: Vec<String>,
     /// Topics, by name.
     pub topics: Vec<Topic>,
     /// Services, by name.
@@ -54,7 +58,7 @@ pub struct Topic {
     /// Outputs: newcomers get the last message.
     #[serde(default)]
     pub latched: bool,
-    /// Inputs: registered only while an output is subscribed to.
+    /// Registered only while an output is subscribed to, or once the node has been given what it waits for.
     #[serde(default)]
     pub lazy: bool,
 }

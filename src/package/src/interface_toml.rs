@@ -12,7 +12,8 @@ use crate::{Error, names, read};
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Keys that may stand in each table of a file.
-const KEYS: [(&str, &[&str]); 5] = [
+const KEYS: [(&str, &[&str]); 6] = [
+    ("late", &[]),
     (
         "topics",
         &[
@@ -100,7 +101,9 @@ impl Interface {
                     format!("{name:?} is not an absolute name such as \"/camera/image\""),
                 ));
             }
-            let bad = of_type.filter(|of_type| !names::is_full_type(of_type))?;
+            // Some nodes take any type, such as relays.
+            let fits = |of_type: &str| of_type == "*" || names::is_full_type(of_type);
+            let bad = of_type.filter(|of_type| !fits(of_type))?;
             Some((
                 bad.as_str(),
                 format!("{bad:?} is not a type such as \"sensor_msgs/Image\""),

@@ -127,7 +127,8 @@ impl Interface {
 
 /// Fills in what is not known; what is known must be the same.
 fn agree(what: impl Fn() -> String, stated: &str, found: &mut String) -> Result<(), Error> {
-    if found.is_empty() {
+    // A node that takes any type shows `*`; the deployer knows what it is used with.
+    if found.is_empty() || (found == "*" && !stated.is_empty()) {
         stated.clone_into(found);
     }
     if stated.is_empty() || stated == found {

@@ -136,6 +136,12 @@ pub type ParamChanges = mpsc::UnboundedReceiver<ParamChange>;
 pub trait ServiceHandler: Send + Sync + 'static {
     /// Takes a serialized request, gives a serialized response or the reason why not.
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String>;
+
+    /// What answers a caller that expects the type with this md5, for a handler that serves several types (its own
+    /// md5 is `*`); itself by default.
+    fn for_md5(&self, _md5: &str) -> Option<Arc<dyn ServiceHandler>> {
+        None
+    }
 }
 
 /// A service's types as its server announced them.

@@ -28,14 +28,15 @@ pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
             missing.push(format!("the {what} of {}", topic.name));
         }
     }
+    let late = |name: &String| interface.late.contains(name);
     for service in &interface.services {
-        if !graph.services.contains_key(&service.name) {
+        if !late(&service.name) && !graph.services.contains_key(&service.name) {
             missing.push(format!("the service {}", service.name));
         }
     }
     for action in &interface.actions {
         let goal = graph.topics.get(&format!("{}/goal", action.name));
-        if goal.is_none_or(|ends| ends.subscribers.is_empty()) {
+        if !late(&action.name) && goal.is_none_or(|ends| ends.subscribers.is_empty()) {
             missing.push(format!("the action {}", action.name));
         }
     }

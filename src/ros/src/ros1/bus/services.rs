@@ -133,11 +133,12 @@ pub(super) async fn answer(
         return Ok(stream.shutdown().await?);
     }
     let caller = header.get("callerid").unwrap_or("unknown");
+    let handler = served.handler.for_md5(asked);
     serve_calls(
         stream,
         buffer,
         (caller, header.flag("persistent")),
-        &*served.handler,
+        handler.as_deref().unwrap_or(&*served.handler),
         bus.frames.clone(),
         served.ended.clone(),
     )

@@ -1,0 +1,354 @@
+//! Gives nodes what they may be waiting for before they show all of themselves.
+//!
+//! ```text
+//!   surroundings:  transforms (an identity tree), /clock, services that are looked for
+//!        │ nothing new of these is asked for any more
+//!        ▼
+//!   inputs:        one default message each, kept for late connections (latched)
+//! ```
+//!
+//! Whatever appears after that is looked at again, and may ask for more. A goal of an action is no such input: a
+//! server is not told to begin anything.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use parking_lot::Mutex;
+use ros::bus::{
+    AdvertiseOptions, Bus, Graph, ParamValue, Publisher, SubscribeOptions, Subscription, WireType,
+};
+use ros::codec::{self, FillOptions, JsonOptions, Time};
+use ros::schema::{MessageType, Registry};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, timeout};
+
+use super::frames::{self, Frames};
+use super::lender::AnyService;
+use super::{ProbeOptions, is_plumbing, plausible};
+
+/// For a node to say the type of an input.
+const ANSWER: Duration = Duration::from_secs(5);
+/// Between two messages of transforms and time.
+const BEAT: Duration = Duration::from_millis(50);
+/// Transforms are stamped so far ahead: a node that asks for those of this moment has them.
+const AHEAD: Duration = Duration::from_millis(100);
+/// More inputs than this are not fed: nobody waits for all of them.
+const MOST_INPUTS: usize = 200;
+/// What an input of any type is given where nobody says its type.
+pub(super) const ANY: &str = "std_msgs/Empty";
+
+const TRANSFORMS: [&str; 2] = ["/tf", "/tf_static"];
+const CLOCK: &str = "/clock";
+const LOG: &str = "/rosout";
+
+/// What was given so far, and goes on being given until this is dropped.
+pub(super) struct Feed<'a> {
+    bus: &'a dyn Bus,
+    registry: &'a Registry,
+    options: &'a ProbeOptions,
+    frames: Arc<Mutex<Frames>>,
+    parameters: BTreeSet<String>,
+    log: Option<Subscription>,
+    /// What nodes said last, at level WARN and above.
+    said: BTreeMap<String, String>,
+    lender: Option<Arc<AnyService>>,
+    beats: BTreeMap<&'static str, Beat>,
+    given: BTreeMap<String, Box<dyn Publisher>>,
+    refused: BTreeMap<String, String>,
+    goals: BTreeSet<String>,
+    any: BTreeSet<String>,
+}
+
+/// A topic that is published to again and again.
+struct Beat(JoinHandle<()>);
+
+impl Drop for Beat {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+impl Drop for Feed<'_> {
+    fn drop(&mut self) {
+        if let Some(lender) = &self.lender {
+            lender.end();
+        }
+    }
+}
+
+impl<'a> Feed<'a> {
+    /// Listens to what nodes say from now on.
+    pub(super) async fn begin(
+        bus: &'a dyn Bus,
+        registry: &'a Registry,
+        options: &'a ProbeOptions,
+    ) -> Self {
+        let listen = SubscribeOptions {
+            wire_type: None,
+            queue: 200,
+        };
+        Self {
+            bus,
+            registry,
+            options,
+            frames: Arc::default(),
+            parameters: BTreeSet::new(),
+            log: bus.subscribe(LOG, listen).await.ok(),
+            said: BTreeMap::new(),
+            lender: None,
+            beats: BTreeMap::new(),
+            given: BTreeMap::new(),
+            refused: BTreeMap::new(),
+            goals: BTreeSet::new(),
+            any: BTreeSet::new(),
+        }
+    }
+
+    /// Gives what the nodes of this graph ask for and have not been given; how long they may take to make something
+    /// of it, or none if there was nothing to give.
+    pub(super) async fn give(&mut self, graph: &Graph) -> Option<Duration> {
+        let began = Instant::now();
+        let patience = if self.surroundings(graph).await {
+            // Whoever waits for these asks again now and then.
+            self.options.settle * 3
+        } else if self.inputs(graph).await {
+            self.options.settle
+        } else {
+            return None;
+        };
+        // On a busy machine everything takes longer.
+        Some(patience.max(began.elapsed() * 3).min(self.options.restless))
+    }
+
+    /// Services that were looked for since, with the nodes that did.
+    pub(super) fn asked(&self) -> BTreeMap<String, BTreeSet<String>> {
+        self.lender
+            .as_ref()
+            .map(|lender| lender.asked())
+            .unwrap_or_default()
+    }
+
+    /// Inputs that take any type, of which nobody said which.
+    pub(super) fn any(&self) -> &BTreeSet<String> {
+        &self.any
+    }
+
+    /// Inputs that could not be fed, with the reason.
+    pub(super) fn refused(&self) -> &BTreeMap<String, String> {
+        &self.refused
+    }
+
+    /// What each node said last of waiting for something.
+    pub(super) fn said(&mut self) -> BTreeMap<String, String> {
+        self.listen();
+        self.said.clone()
+    }
+
+    async fn surroundings(&mut self, graph: &Graph) -> bool {
+        let heard = self.listen() | self.frames_of_parameters(graph).await;
+        let (clock, timed) = ends(graph, CLOCK, &self.options.own_name);
+        let listens = |topic: &&str| ends(graph, topic, &self.options.own_name).0;
+        let mut new = false;
+        if clock && !timed {
+            new |= self.beat(CLOCK, "rosgraph_msgs/Clock").await;
+        }
+        if TRANSFORMS.iter().any(listens) {
+            // Transforms that move: a node may well look at how old one is.
+            new |= heard | self.beat(TRANSFORMS[0], "tf2_msgs/TFMessage").await;
+        }
+        let looked_for = graph.sought.iter().any(|(name, nodes)| {
+            !graph.services.contains_key(name)
+                && nodes.iter().any(|node| *node != self.options.own_name)
+        });
+        if looked_for && self.lender.is_none() {
+            let lender = AnyService::new(self.registry, &self.options.own_name);
+            match self.bus.lend(lender.clone()).await {
+                Ok(()) => new = true,
+                Err(error) => tracing::warn!("services cannot be lent to a package: {error}"),
+            }
+            self.lender = Some(lender);
+        }
+        new
+    }
+
+    /// Hears frames in what nodes say; whether there are new ones.
+    fn listen(&mut self) -> bool {
+        let Some(log) = &mut self.log else {
+            return false;
+        };
+        let mut new = false;
+        while let Some(message) = log.messages.try_recv() {
+            let Some((level, node, text)) = read_log(self.registry, &message.bytes) else {
+                continue;
+            };
+            if node == self.options.own_name {
+                continue;
+            }
+            new |= self.frames.lock().hear(&text);
+            if level >= 4 && text.to_lowercase().contains("wait") {
+                self.said.insert(node, text);
+            }
+        }
+        new
+    }
+
+    async fn frames_of_parameters(&mut self, graph: &Graph) -> bool {
+        let mut new = false;
+        for key in graph
+            .parameters
+            .keys()
+            .filter(|key| frames::is_parameter(key))
+        {
+            if !self.parameters.insert(key.clone()) {
+                continue;
+            }
+            if let Ok(ParamValue::String(name)) = self.bus.get_param(key).await {
+                new |= self.frames.lock().add(&name);
+            }
+        }
+        new
+    }
+
+    /// Publishes again and again; whether that is new.
+    async fn beat(&mut self, topic: &'static str, usual: &str) -> bool {
+        if self.beats.contains_key(topic) || self.refused.contains_key(topic) {
+            return false;
+        }
+        let (message, publisher) = match self.advertise(topic, Some(usual), false).await {
+            Ok(Some(pair)) => pair,
+            Ok(None) => return false,
+            Err(reason) => {
+                self.refused.insert(topic.to_owned(), reason);
+                return false;
+            }
+        };
+        let frames = self.frames.clone();
+        let beating = tokio::spawn(async move {
+            let mut beats = tokio::time::interval(BEAT);
+            loop {
+                beats.tick().await;
+                let json = if topic == CLOCK {
+                    let now = Time::now();
+                    serde_json::json!({"clock": {"secs": now.secs, "nsecs": now.nsecs}})
+                } else {
+                    frames.lock().tree(Time::from(SystemTime::now() + AHEAD))
+                };
+                let mut bytes = Vec::new();
+                let written = codec::from_json(
+                    &message,
+                    json.to_string().as_bytes(),
+                    &mut bytes,
+                    &FillOptions::default(),
+                );
+                if written.is_ok() {
+                    publisher.publish(bytes.into());
+                }
+            }
+        });
+        self.beats.insert(topic, Beat(beating));
+        true
+    }
+
+    /// One default message for each input that the package itself does not feed; whether there was any.
+    async fn inputs(&mut self, graph: &Graph) -> bool {
+        let mut new = false;
+        for (name, topic) in &graph.topics {
+            let (subscribed, published) = ends(graph, name, &self.options.own_name);
+            let apart =
+                name == CLOCK || TRANSFORMS.contains(&name.as_str()) || is_plumbing(name, topic);
+            let known = self.given.contains_key(name)
+                || self.refused.contains_key(name)
+                || self.goals.contains(name);
+            if !subscribed || published || apart || known || self.given.len() >= MOST_INPUTS {
+                continue;
+            }
+            match self.advertise(name, None, true).await {
+                Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
+                    Ok(bytes) => {
+                        publisher.publish(bytes);
+                        self.given.insert(name.clone(), publisher);
+                        new = true;
+                    }
+                    Err(error) => {
+                        self.refused.insert(name.clone(), error.to_string());
+                    }
+                },
+                Ok(None) => {
+                    self.goals.insert(name.clone());
+                }
+                Err(reason) => {
+                    self.refused.insert(name.clone(), reason);
+                }
+            }
+        }
+        new
+    }
+
+    /// Advertises a topic with the type that its subscribers ask for, or `usual` where they ask for none; nothing
+    /// where that would begin an action.
+    async fn advertise(
+        &mut self,
+        topic: &str,
+        usual: Option<&str>,
+        latch: bool,
+    ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
+        let asked = match timeout(ANSWER, self.bus.topic_type(topic)).await {
+            Ok(Ok(wire)) => wire.name,
+            Ok(Err(error)) => return Err(error.to_string()),
+            Err(_) => return Err(format!("its type was not told within {ANSWER:?}")),
+        };
+        let stated = self.options.types.get(topic).map(String::as_str);
+        let name = match asked.as_str() {
+            "*" => stated.or(usual).unwrap_or_else(|| {
+                self.any.insert(topic.to_owned());
+                ANY
+            }),
+            asked => asked,
+        };
+        if tells_an_action(name) {
+            return Ok(None);
+        }
+        let message = self
+            .registry
+            .message(name)
+            .map_err(|error| error.to_string())?;
+        let options = AdvertiseOptions {
+            wire_type: WireType {
+                name: message.name().to_owned(),
+                md5: message.md5().to_owned(),
+                definition: message.full_text().to_owned(),
+            },
+            latch,
+            queue: 10,
+        };
+        let publisher = self.bus.advertise(topic, options).await;
+        Ok(Some((
+            message,
+            publisher.map_err(|error| error.to_string())?,
+        )))
+    }
+}
+
+/// Whether anybody but the looking node subscribes to a topic, and publishes on it.
+fn ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
+    let others = |nodes: &[String]| nodes.iter().any(|node| node != own);
+    graph.topics.get(topic).map_or((false, false), |topic| {
+        (others(&topic.subscribers), others(&topic.publishers))
+    })
+}
+
+/// Whether a message of this type makes a server of an action begin or stop something.
+fn tells_an_action(type_name: &str) -> bool {
+    type_name.ends_with("ActionGoal") || type_name == "actionlib_msgs/GoalID"
+}
+
+/// Level, node and text of a `rosgraph_msgs/Log`.
+fn read_log(registry: &Registry, bytes: &[u8]) -> Option<(u64, String, String)> {
+    let log = registry.message("rosgraph_msgs/Log").ok()?;
+    let mut json = Vec::new();
+    codec::to_json(&log, bytes, &mut json, &JsonOptions::default()).ok()?;
+    let log: serde_json::Value = serde_json::from_slice(&json).ok()?;
+    let text = |field: &str| log[field].as_str().map(str::to_owned);
+    Some((log["level"].as_u64()?, text("name")?, text("msg")?))
+}

@@ -1,0 +1,93 @@
+//! What can be said of an interface that may not be all there is.
+
+use std::collections::BTreeSet;
+
+use package::interface::{Direction, Interface};
+
+use super::feed::Feed;
+use super::{Found, ProbeOptions};
+
+const STATE: &str = "state what is missing with --interface FILE";
+
+/// Marks what is not in `bare`, the interface before anything was given: a servant has it only once its robot gives
+/// what the nodes wait for.
+pub(super) fn mark_late(interface: &mut Interface, bare: &Interface) {
+    for topic in &mut interface.topics {
+        let same = |other: &&package::interface::Topic| {
+            other.name == topic.name && other.direction == topic.direction
+        };
+        match bare.topics.iter().find(same) {
+            Some(before) => topic.lazy = before.lazy,
+            None => topic.lazy = true,
+        }
+    }
+    let services = interface.services.iter().map(|service| &service.name);
+    let new_services =
+        services.filter(|name| !bare.services.iter().any(|before| before.name == **name));
+    let actions = interface.actions.iter().map(|action| &action.name);
+    let new_actions =
+        actions.filter(|name| !bare.actions.iter().any(|before| before.name == **name));
+    let late: BTreeSet<&String> = new_services.chain(new_actions).collect();
+    let late = late.into_iter().cloned().collect();
+    interface.late = late;
+}
+
+/// What is known of a package one of whose nodes ended of what it was given.
+pub(super) fn ended(mut found: Found, words: &str) -> Found {
+    found.warnings.push(format!(
+        "{words}, while it was given default messages to find the rest of its interface; what was seen until then is \
+         published; where it is not all, {STATE}"
+    ));
+    found
+}
+
+/// Says what may be missing.
+pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_>) {
+    let interface = &found.interface;
+    let outputs = |interface: &Interface| {
+        let topics = interface.topics.iter();
+        topics
+            .filter(|topic| topic.direction == Direction::Output)
+            .count()
+            + interface.services.len()
+            + interface.actions.len()
+    };
+    let nodes = options.nodes.join(", ");
+    let said = feed.said();
+    let words = said
+        .iter()
+        .map(|(node, text)| format!("; {node} says: {text}"));
+    let words: String = words.collect();
+    if interface.topics.is_empty() && interface.services.is_empty() && interface.actions.is_empty()
+    {
+        found.warnings.push(format!(
+            "nothing was seen of {nodes} that a robot could use: it may wait for something that could not be given; \
+             {STATE}{words}"
+        ));
+    } else if outputs(interface) == 0 {
+        found.warnings.push(format!(
+            "{nodes} takes messages and was not seen to give any, nor to serve anything; if it does, {STATE}{words}"
+        ));
+    } else if !words.is_empty() {
+        found.warnings.push(format!(
+            "the interface may not be all there is; {STATE}{words}"
+        ));
+    }
+    let any: Vec<&str> = interface
+        .topics
+        .iter()
+        .filter(|topic| topic.type_name == "*")
+        .map(|topic| topic.name.as_str())
+        .collect();
+    if !any.is_empty() {
+        found.warnings.push(format!(
+            "any type goes for {}: give the type that it is used with in a file for --interface",
+            any.join(", ")
+        ));
+    }
+    for (topic, reason) in feed.refused() {
+        found.warnings.push(format!(
+            "{topic} could not be given a message to see what comes of it: {reason}; {STATE}"
+        ));
+    }
+}

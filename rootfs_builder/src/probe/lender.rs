@@ -1,0 +1,129 @@
+//! Services that nodes look for and nobody serves: lent with default answers, whatever their type.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{Lender, Lent, ServiceHandler, ServiceType};
+use ros::codec::Time;
+use ros::schema::{Registry, ServiceDef};
+use tokio::sync::watch;
+
+use super::plausible;
+
+/// Answers every service that is looked for, and remembers which were.
+pub(super) struct AnyService {
+    by_md5: Arc<BTreeMap<String, Arc<ServiceDef>>>,
+    asked: Mutex<BTreeMap<String, BTreeSet<String>>>,
+    own_name: String,
+    ending: watch::Sender<bool>,
+}
+
+impl AnyService {
+    /// Knows the service types of the image; `own_name` is the looking node, whose questions do not count.
+    pub(super) fn new(registry: &Registry, own_name: &str) -> Arc<Self> {
+        let mut by_md5 = BTreeMap::new();
+        for key in registry.keys() {
+            if let Some((package, name)) = key.split_once("/srv/")
+                && let Ok(service) = registry.service(&format!("{package}/{name}"))
+            {
+                by_md5.entry(service.md5.clone()).or_insert(service);
+            }
+        }
+        Arc::new(Self {
+            by_md5: Arc::new(by_md5),
+            asked: Mutex::default(),
+            own_name: own_name.to_owned(),
+            ending: watch::channel(false).0,
+        })
+    }
+
+    /// Services that were looked for, with the nodes that did.
+    pub(super) fn asked(&self) -> BTreeMap<String, BTreeSet<String>> {
+        self.asked.lock().clone()
+    }
+
+    /// Takes everything back.
+    pub(super) fn end(&self) {
+        self.ending.send_replace(true);
+    }
+}
+
+#[async_trait]
+impl Lender for AnyService {
+    async fn find(&self, service: &str, node: &str) -> Option<Lent> {
+        if node == self.own_name || *self.ending.borrow() {
+            return None;
+        }
+        let mut asked = self.asked.lock();
+        asked
+            .entry(service.to_owned())
+            .or_default()
+            .insert(node.to_owned());
+        Some(Lent {
+            service_type: ServiceType {
+                name: "*".to_owned(),
+                md5: "*".to_owned(),
+            },
+            handler: Arc::new(Answers {
+                by_md5: self.by_md5.clone(),
+                service: None,
+            }),
+            gone: self.ending.subscribe(),
+        })
+    }
+}
+
+/// Answers calls of one type, or of none yet.
+struct Answers {
+    by_md5: Arc<BTreeMap<String, Arc<ServiceDef>>>,
+    service: Option<Arc<ServiceDef>>,
+}
+
+#[async_trait]
+impl ServiceHandler for Answers {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        let unknown = || "the image holds no definition of this service".to_owned();
+        let service = self.service.as_ref().ok_or_else(unknown)?;
+        plausible::message(&service.response, Time::now()).map_err(|error| error.to_string())
+    }
+
+    fn for_md5(&self, md5: &str) -> Option<Arc<dyn ServiceHandler>> {
+        let service = Some(self.by_md5.get(md5)?.clone());
+        Some(Arc::new(Answers {
+            by_md5: self.by_md5.clone(),
+            service,
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_caller_is_answered_as_its_type_asks() {
+        let text = "---\nint64 sum\nstring words\n".to_owned();
+        let definitions = [("lab/srv/Add".to_owned(), text)].into();
+        let registry = Registry::from_definitions(&definitions).expect("valid");
+        let md5 = registry.service("lab/Add").expect("defined").md5.clone();
+        let any = AnyService::new(&registry, "/looker");
+        assert!(
+            any.find("/add", "/looker").await.is_none(),
+            "its own questions"
+        );
+        let lent = any.find("/add", "/node").await.expect("lent");
+        let handler = lent.handler.for_md5(&md5).expect("the type is known");
+        let answer = handler.call(Bytes::new(), "/node").await.expect("answered");
+        assert_eq!(answer.len(), 12);
+        assert!(
+            lent.handler.call(Bytes::new(), "/node").await.is_err(),
+            "of no type"
+        );
+        assert!(any.asked()["/add"].contains("/node"));
+        any.end();
+        assert!(any.find("/add", "/node").await.is_none());
+    }
+}

@@ -1,0 +1,106 @@
+//! Default messages that a node can work with: zeros, except where zeros make no sense (a rotation of length zero, a
+//! map whose cells have no size). Which those are is data: `plausible.json`, by message type.
+
+use std::sync::LazyLock;
+
+use bytes::Bytes;
+use ros::codec::{self, CodecError, FillOptions, Time};
+use ros::schema::{Arity, Base, MessageType};
+use serde_json::{Map, Value};
+
+/// Type → the fields that are not zero. `{"repeat": value, "times": n}` stands for an array.
+static VALUES: LazyLock<Map<String, Value>> =
+    LazyLock::new(|| serde_json::from_str(include_str!("plausible.json")).unwrap_or_default());
+
+/// The default message of a type, serialized; headers are stamped with `now`.
+pub(super) fn message(message: &MessageType, now: Time) -> Result<Bytes, CodecError> {
+    let json = Value::Object(fields(message)).to_string();
+    let mut bytes = Vec::new();
+    let options = FillOptions {
+        now: Some(now),
+        ..FillOptions::default()
+    };
+    codec::from_json(message, json.as_bytes(), &mut bytes, &options)?;
+    Ok(bytes.into())
+}
+
+/// Those that are not zero.
+fn fields(message: &MessageType) -> Map<String, Value> {
+    let mut object = Map::new();
+    for field in message.fields() {
+        if let (Arity::One, Base::Message(inner)) = (field.arity, &field.base) {
+            let inner = fields(inner);
+            if !inner.is_empty() {
+                object.insert(field.name.to_string(), Value::Object(inner));
+            }
+        }
+    }
+    if let Some(Value::Object(values)) = VALUES.get(message.name()) {
+        merge(&mut object, values);
+    }
+    object
+}
+
+fn merge(into: &mut Map<String, Value>, values: &Map<String, Value>) {
+    for (name, value) in values {
+        match (into.get_mut(name), value) {
+            (Some(Value::Object(below)), Value::Object(value)) => merge(below, value),
+            _ => {
+                into.insert(name.clone(), expanded(value));
+            }
+        }
+    }
+}
+
+fn expanded(value: &Value) -> Value {
+    match (
+        value.get("repeat"),
+        value.get("times").and_then(Value::as_u64),
+    ) {
+        (Some(repeated), Some(times)) => {
+            Value::Array(vec![repeated.clone(); usize::try_from(times).unwrap_or(0)])
+        }
+        _ => value.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ros::schema::Registry;
+
+    #[test]
+    fn zeros_that_make_no_sense_are_replaced_at_any_depth() {
+        let registry = Registry::from_definitions(
+            &[
+                ("geometry_msgs/msg/Quaternion", "float64 x\nfloat64 w\n"),
+                (
+                    "lab/msg/Turned",
+                    "int8 times\ngeometry_msgs/Quaternion by\n",
+                ),
+                ("lab/msg/Log", "Header header\nTurned[] all\nTurned last\n"),
+            ]
+            .map(|(key, text)| (key.to_owned(), text.to_owned()))
+            .into(),
+        )
+        .expect("valid");
+        let log = registry.message("lab/Log").expect("defined");
+        let now = Time { secs: 7, nsecs: 8 };
+        let bytes = message(&log, now).expect("a message");
+        let mut json = Vec::new();
+        codec::to_json(&log, &bytes, &mut json, &codec::JsonOptions::default()).expect("valid");
+        let seen: Value = serde_json::from_slice(&json).expect("JSON");
+        let expected = serde_json::json!({
+            "header": {"seq": 0, "stamp": {"secs": 7, "nsecs": 8}, "frame_id": "base_link"},
+            "all": [], "last": {"times": 0, "by": {"x": 0.0, "w": 1.0}}
+        });
+        assert_eq!(seen, expected);
+    }
+
+    #[test]
+    fn arrays_are_written_out() {
+        let three = serde_json::json!({"repeat": 1.5, "times": 3});
+        assert_eq!(expanded(&three), serde_json::json!([1.5, 1.5, 1.5]));
+        assert!(!VALUES.is_empty(), "plausible.json is JSON");
+    }
+}
