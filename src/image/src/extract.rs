@@ -13,8 +13,11 @@ use std::sync::{Arc, PoisonError};
 use crate::digest::Hashing;
 use crate::files::{self, HALF_MADE, Lock};
 use crate::layer_writer::LayerWriter;
+use crate::pipe::pipe;
 use crate::tar_reader::TarReader;
-use crate::{Digest, Error, LayerInfo, Store, gzip};
+use crate::tar_writer::TarWriter;
+use crate::tree::Packer;
+use crate::{Digest, Error, LayerInfo, Store, TreeOptions, gzip};
 
 const VOLATILE: &str = "volatile";
 
@@ -61,12 +64,7 @@ impl Store {
         let half_made = HalfMadeTree::create(self.layers_dir())?;
         self.extract_into(&half_made.path, &layer)
             .map_err(|error| error.needing(layer.unpacked))?;
-        self.mark_volatile(diff_id)?;
-        match std::fs::rename(&half_made.path, &tree) {
-            // Another process may have been faster; what it made is the same.
-            Err(error) if !tree.exists() => return Err(Error::file("create", &tree, error)),
-            _ => self.flush_later(*diff_id),
-        }
+        self.appear(half_made, diff_id)?;
         Ok(tree)
     }
 
@@ -75,30 +73,51 @@ impl Store {
         let label = format!("layer {}", layer.diff_id);
         let blob = File::open(&path).map_err(|error| Error::file("open", &path, error))?;
         let content = gzip::decoder(blob).map_err(|error| Error::file("read", &path, error))?;
-        let found = gzip::reading_ahead(content, |content| {
-            let mut reader = TarReader::new(Hashing::new(content));
-            let mut writer = LayerWriter::new(tree)?;
-            loop {
-                let entry = reader
-                    .next_entry()
-                    .map_err(|stop| Error::stopped(&label, &path, stop))?;
-                let Some(entry) = entry else { break };
-                writer
-                    .entry(&entry, &mut reader)
-                    .map_err(|failed| failed.into_error(&label, tree, &reader))?;
-            }
-            writer.finish()?;
-            let mut rest = reader.into_inner();
-            std::io::copy(&mut rest, &mut std::io::sink())
-                .map_err(|error| Error::file("read", &path, error))?;
-            Ok::<_, Error>(rest.finish().1)
-        })?;
+        let found = gzip::reading_ahead(content, |content| fill(tree, content, &label, &path))?.0;
         if found != layer.diff_id {
             return Err(Error::Damaged {
                 path,
                 expected: layer.diff_id,
                 found,
             });
+        }
+        Ok(())
+    }
+
+    /// Makes the extracted tree of the layer that [`Store::layer_from_tree`] makes of the same tree with the same
+    /// options, without its blob: what is put on top of the layer need not wait until that is compressed. Gives the
+    /// layer's diff-id and the bytes of its tar stream.
+    ///
+    /// Until the blob is there too, no image can have the layer, and [`Store::layer`] does not know it.
+    pub fn stage_tree(&self, tree: &Path, options: &TreeOptions) -> Result<(Digest, u64), Error> {
+        let _hold = self.hold()?;
+        let half_made = HalfMadeTree::create(self.layers_dir())?;
+        let pack = |output: &mut dyn std::io::Write| {
+            let mut packer = Packer::new(TarWriter::new(output), options);
+            packer.pack(tree)?;
+            packer
+                .finish()
+                .map(drop)
+                .map_err(|error| Error::file("pack", tree, error))
+        };
+        let into = &half_made.path;
+        let ((), (diff_id, bytes)) =
+            pipe(pack, |content| fill(into, content, "the new layer", tree))?;
+        self.appear(half_made, &diff_id)?;
+        Ok((diff_id, bytes))
+    }
+
+    /// Gives a tree that is complete its name.
+    fn appear(&self, half_made: HalfMadeTree, diff_id: &Digest) -> Result<(), Error> {
+        let tree = self.tree_path(diff_id);
+        if tree.exists() {
+            return Ok(());
+        }
+        self.mark_volatile(diff_id)?;
+        match std::fs::rename(&half_made.path, &tree) {
+            // Another process may have been faster; what it made is the same.
+            Err(error) if !tree.exists() => return Err(Error::file("create", &tree, error)),
+            _ => self.flush_later(*diff_id),
         }
         Ok(())
     }
@@ -186,6 +205,33 @@ impl Store {
             _ => Ok(()),
         }
     }
+}
+
+/// Writes the entries of a tar stream below `tree`; gives the digest and the bytes of the stream. `label` and `path` are
+/// where it came from, for messages.
+fn fill(
+    tree: &Path,
+    content: &mut dyn std::io::Read,
+    label: &str,
+    path: &Path,
+) -> Result<(Digest, u64), Error> {
+    let mut reader = TarReader::new(Hashing::new(content));
+    let mut writer = LayerWriter::new(tree)?;
+    loop {
+        let entry = reader
+            .next_entry()
+            .map_err(|stop| Error::stopped(label, path, stop))?;
+        let Some(entry) = entry else { break };
+        writer
+            .entry(&entry, &mut reader)
+            .map_err(|failed| failed.into_error(label, tree, &reader))?;
+    }
+    writer.finish()?;
+    let mut rest = reader.into_inner();
+    std::io::copy(&mut rest, &mut std::io::sink())
+        .map_err(|error| Error::file("read", path, error))?;
+    let (_, digest, bytes) = rest.finish();
+    Ok((digest, bytes))
 }
 
 /// Changes with every start of the kernel.

@@ -3,6 +3,7 @@
 //!
 //! ```text
 //!   tree ──layer_from_tree──▶ blobs/sha256/<digest> ──extracted──▶ layers/<diff-id>/  (shared, read-only)
+//!     │  ╰───────────stage_tree──────────────────────────────────▲   (the tree at once, the blob later)
 //!   tar.gz ──import_layer───▶        ▲
 //!                          put_image ┴ tag ──▶ index.json      gc: what no tag and no caller keeps, goes
 //!   upload ──unpack──▶ directory     (refuses whatever could leave it)
@@ -29,6 +30,7 @@ mod layer;
 mod layer_writer;
 mod names;
 pub mod oci;
+mod pipe;
 mod refusal;
 mod store;
 mod tar_reader;

@@ -317,6 +317,76 @@ fn deletions_in_an_overlay_become_whiteouts_and_back() {
 }
 
 #[test]
+fn a_staged_tree_is_the_one_that_is_extracted() {
+    let world = World::new();
+    let tree = world.path("upper");
+    std::fs::create_dir(&tree).unwrap();
+    upper(&tree);
+    write(&tree.join("left/out"), "x");
+    let options = TreeOptions {
+        overlay_upper: true,
+        exclude: vec!["left".into()],
+        ..TreeOptions::default()
+    };
+    let (diff_id, bytes) = world.store.stage_tree(&tree, &options).unwrap();
+    // It can be stood on before there is a blob.
+    let staged = world.store.extracted(&diff_id).unwrap();
+    assert!(staged.join("fresh/inside").exists() && !staged.join("left").exists());
+    assert_eq!(world.store.layer(&diff_id).unwrap(), None);
+    assert!(
+        world
+            .store
+            .put_image(&ImageSpec {
+                layers: vec![LayerInfo {
+                    digest: diff_id,
+                    diff_id,
+                    size: 0,
+                    unpacked: bytes
+                }],
+                ..ImageSpec::default()
+            })
+            .is_err(),
+        "no image has a layer without its blob"
+    );
+    let layer = world.store.layer_from_tree(&tree, &options).unwrap();
+    assert_eq!((layer.diff_id, layer.unpacked), (diff_id, bytes));
+    // What the blob holds is what was staged: extracted from it, it packs to the same.
+    world.store.discard_tree(&diff_id).unwrap();
+    let extracted = world.store.extracted(&diff_id).unwrap();
+    let unchanged = TreeOptions {
+        overlay_upper: true,
+        ..TreeOptions::default()
+    };
+    assert_eq!(
+        world.store.layer_from_tree(&extracted, &unchanged).unwrap(),
+        layer
+    );
+    // Staging what is there already changes nothing.
+    assert_eq!(
+        world.store.stage_tree(&extracted, &unchanged).unwrap(),
+        (diff_id, bytes)
+    );
+    assert_eq!(world.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_tree_that_cannot_be_packed_is_not_staged() {
+    let world = World::new();
+    let tree = world.path("tree");
+    write(&tree.join("usr/.wh.x"), "x");
+    let error = world
+        .store
+        .stage_tree(&tree, &TreeOptions::default())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("tree/usr/.wh.x cannot go into a layer"),
+        "{error}"
+    );
+    assert_eq!(files::list(world.store.layers_dir()).unwrap().len(), 0);
+}
+
+#[test]
 fn a_tree_that_would_be_misread_is_refused() {
     let world = World::new();
     let tree = world.path("tree");
