@@ -64,8 +64,8 @@ impl Bridge {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
-        let waiting = Waiting::new(io, &options.read_ahead, &self.shared.options)
-            .within(&options.budget);
+        let waiting =
+            Waiting::new(io, &options.read_ahead, &self.shared.options).within(&options.budget);
         self.serve_waiting(waiting, options).await
     }
 

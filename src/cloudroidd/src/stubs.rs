@@ -108,7 +108,7 @@ pub fn programs(revision: &RevisionRecord) -> BTreeMap<String, PathBuf> {
     let nodes = revision.plan.nodes.iter();
     nodes
         .filter_map(|node| node.argv.iter().find_map(of_package))
-        .filter(|name| package::names::is_executable(name))
+        .filter(|(name, _)| package::names::is_executable(name))
         .collect()
 }
 

@@ -2,7 +2,7 @@
 //! looked at and mounted: whoever may write beside it cannot put something else in its place in between.
 
 use std::fs::File;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 
 use nix::errno::Errno;
@@ -75,6 +75,7 @@ fn open_beneath(directory: BorrowedFd<'_>, path: &Path) -> std::io::Result<Owned
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::AsRawFd;
     use std::os::unix::fs::symlink;
 
     use super::*;

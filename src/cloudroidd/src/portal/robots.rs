@@ -347,8 +347,7 @@ async fn session<S>(
     }
     let memory = app.choreographer.memory();
     let budget = memory.client(caller.peer, asked.robot.as_deref());
-    let mut waiting =
-        Waiting::new(io, &read_ahead, &bridge_options(&app.config)).within(&budget);
+    let mut waiting = Waiting::new(io, &read_ahead, &bridge_options(&app.config)).within(&budget);
     let taking = servant(&app, &asked, &caller, lease);
     let (lease, works) = match waiting.until(taking).await {
         Ok(Ok(taken)) => taken,
