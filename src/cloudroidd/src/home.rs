@@ -6,10 +6,10 @@
 //!
 //! Nobody else enters it (docs/adr/033).
 
-use std::fs::File;
+use std::fs::{File, Permissions};
 use std::io::{Read, Seek, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::{Flock, FlockArg};
@@ -152,7 +152,8 @@ impl Home {
         // Through a descriptor of its directory, because the path itself may be longer than an address can be.
         let address = format!("/proc/self/fd/{}/daemon.sock", opened.as_raw_fd());
         let listener = UnixListener::bind(address).map_err(io("listen on", &path))?;
-        private::close(&path).map_err(io("protect", &path))?;
+        std::fs::set_permissions(&path, Permissions::from_mode(0o600))
+            .map_err(io("protect", &path))?;
         Ok(listener)
     }
 
@@ -343,13 +344,11 @@ mod tests {
     }
 
     fn mode(path: &Path) -> u32 {
-        use std::os::unix::fs::PermissionsExt;
         path.symlink_metadata().expect("there").permissions().mode() & 0o7777
     }
 
     /// As an earlier version left it, at work for a servant.
     fn lay_out(home: &Path) {
-        use std::os::unix::fs::PermissionsExt;
         let files = [
             "cloudroid.db",
             "cloudroid.db-wal",
@@ -373,7 +372,7 @@ mod tests {
             std::fs::write(&path, "").expect("made");
             for path in path.ancestors().take_while(|path| path.starts_with(home)) {
                 let rights = if path.is_dir() { 0o755 } else { 0o644 };
-                let permissions = std::fs::Permissions::from_mode(rights);
+                let permissions = Permissions::from_mode(rights);
                 std::fs::set_permissions(path, permissions).expect("set");
             }
         }
@@ -412,11 +411,10 @@ mod tests {
 
     #[test]
     fn a_directory_with_other_things_in_it_keeps_its_rights() {
-        use std::os::unix::fs::PermissionsExt;
         let parent = tempfile::tempdir().expect("a directory");
         let theirs = parent.path().join("notes");
         std::fs::create_dir(&theirs).expect("made");
-        let shared = std::fs::Permissions::from_mode(0o755);
+        let shared = Permissions::from_mode(0o755);
         std::fs::set_permissions(parent.path(), shared).expect("set");
         let rights = mode(&theirs);
         drop(Home::open(parent.path()).expect("free"));

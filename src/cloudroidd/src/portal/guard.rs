@@ -224,10 +224,11 @@ fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
 /// one as its first message).
 fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
-    let page = path == "/" || path == "/healthz" || is_asset(path);
+    if is_upgrade(headers) {
+        return *method == Method::GET && (path == "/" || is_service(path));
+    }
     let reads = matches!(*method, Method::GET | Method::HEAD);
-    let handshake = *method == Method::GET && is_upgrade(headers);
-    page && reads || handshake && (path == "/" || is_service(path))
+    reads && (path == "/" || path == "/healthz" || is_asset(path))
 }
 
 fn is_asset(path: &str) -> bool {
@@ -534,7 +535,7 @@ mod tests {
         for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
             let caller = handshake(Method::GET).at(path).expect("may send auth");
             assert!(!caller.trusted, "{path}");
-            for method in [Method::POST, Method::DELETE, Method::PUT, Method::PATCH] {
+            for method in [Method::HEAD, Method::POST, Method::DELETE, Method::PATCH] {
                 let refused = handshake(method.clone()).at(path);
                 assert_eq!(refused, Err(401), "{method} {path}");
             }
