@@ -42,6 +42,8 @@ mod memory;
 mod mishaps;
 #[path = "stories/names.rs"]
 mod names;
+#[path = "stories/patience.rs"]
+mod patience;
 #[path = "stories/portal.rs"]
 mod portal;
 #[path = "stories/push.rs"]
@@ -152,6 +154,7 @@ fn main() -> ExitCode {
             settings_are_changed_through_dynamic_reconfigure,
             pictures_are_made_smaller_where_the_link_is_slow,
         ],
+        stories![patience: a_node_that_waits_is_seen_whole_and_driven_by_its_robot],
         stories![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
@@ -210,6 +213,7 @@ fn main() -> ExitCode {
             a_prebuilt_space_is_served,
             an_unchanged_push_builds_no_layer,
             a_failed_build_leaves_the_earlier_revision_serving,
+            what_package_xml_forgot_is_named_and_added,
             a_revision_is_rolled_back,
             five_packaged_nodes_answer,
         ],

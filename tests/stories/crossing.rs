@@ -17,7 +17,7 @@ const NODE: &str = "/crossing";
 const HOUR: i64 = 3600;
 
 /// The definitions of what is published here.
-fn types() -> anyhow::Result<Registry> {
+pub fn types() -> anyhow::Result<Registry> {
     let registry = Registry::new();
     for (key, text) in [
         ("geometry_msgs/PointStamped", "Header header\nPoint point"),
@@ -54,7 +54,7 @@ fn types() -> anyhow::Result<Registry> {
     Ok(registry)
 }
 
-fn advertises(
+pub fn advertises(
     site: &Site,
     node: &Ros1Bus,
     topic: &str,
@@ -75,28 +75,28 @@ fn advertises(
 
 /// A serialized message, written field by field.
 #[derive(Default)]
-struct Written(Vec<u8>);
+pub struct Written(pub Vec<u8>);
 
 impl Written {
-    fn word(mut self, word: u32) -> Self {
+    pub fn word(mut self, word: u32) -> Self {
         self.0.extend(word.to_le_bytes());
         self
     }
 
-    fn text(self, text: &str) -> Self {
+    pub fn text(self, text: &str) -> Self {
         let mut written = self.word(u32::try_from(text.len()).unwrap_or(0));
         written.0.extend(text.as_bytes());
         written
     }
 
     /// `at`: nanoseconds since 1970.
-    fn time(self, at: i64) -> Self {
+    pub fn time(self, at: i64) -> Self {
         let part = |part: i64| u32::try_from(part).unwrap_or(0);
         self.word(part(at / 1_000_000_000))
             .word(part(at % 1_000_000_000))
     }
 
-    fn zeros(mut self, count: usize) -> Self {
+    pub fn zeros(mut self, count: usize) -> Self {
         self.0.resize(self.0.len() + count, 0);
         self
     }
@@ -146,12 +146,12 @@ fn is_there(site: &Site, app: &Ros1Bus) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn with_log<T>(outcome: anyhow::Result<T>, stub: &Running) -> anyhow::Result<T> {
+pub fn with_log<T>(outcome: anyhow::Result<T>, stub: &Running) -> anyhow::Result<T> {
     outcome.with_context(|| format!("the stub said:\n{}", stub.said()))
 }
 
 /// Publishes until there is an answer: as in every ROS, what is published before all are connected is lost.
-fn answers(
+pub fn answers(
     site: &Site,
     publish: impl Fn(),
     subscription: &mut Subscription,
@@ -170,7 +170,7 @@ fn answers(
 }
 
 /// Subscribes, and waits until the node's stub is connected.
-fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
+pub fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
     let mut subscription = site.hears(app, topic)?;
     let connected = site.runtime.block_on(async {
         let connected = subscription.publishers.wait_for(|count| *count > 0);

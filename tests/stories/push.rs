@@ -240,6 +240,45 @@ pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
     Ok(())
 }
 
+pub fn what_package_xml_forgot_is_named_and_added() -> Told {
+    let daemon = world().shared()?;
+    let deployer = daemon.deployer();
+    let node = ["--node", "recorder", "--param", "file=/tmp/heard.bag"];
+    // CMake's question for roslint, which no package of the distribution has, is answered; this one is not.
+    deployer.pushes("undeclared_cpp", &node)?.failed_saying(&[
+        "the CMake package rosbag_storage is missing",
+        "--with rosbag_storage",
+    ])?;
+    let missed = ["--param", "/recorder/file=/tmp/nobody.bag"];
+    let added = ["--with", "rosbag_storage"];
+    let pushed = deployer
+        .pushes("undeclared_cpp", &[&node[..], &missed, &added].concat())?
+        .succeeded()?;
+    // An anonymous node: its program's name without what makes it unique, and its parameters there.
+    let service = deployer.asks(&["services", "undeclared_cpp"])?;
+    ensure!(
+        service["nodes"][0]["name"] == "/bag_recorder",
+        "{service:#}"
+    );
+    let parameters = service["interface"]["parameters"]
+        .as_array()
+        .context("a list")?;
+    ensure!(
+        parameters
+            .iter()
+            .any(|one| one["name"] == "/bag_recorder/file" && one["value"] == "/tmp/heard.bag"),
+        "{service:#}"
+    );
+    ensure!(
+        pushed
+            .said()
+            .contains("parameter /recorder/file is given for a name that no node has"),
+        "{}",
+        pushed.said()
+    );
+    Ok(())
+}
+
 pub fn a_revision_is_rolled_back() -> Told {
     let daemon = world().with(ADDER)?;
     let deployer = daemon.deployer();

@@ -199,43 +199,54 @@ def describe(node, rospack):
     }
 
 
-def from_executables(ask, rospack, plan, names):
+def find_executable(rospack, packages, asked):
+    """Package, name and path of `EXE`, in one of these packages, or of `PACKAGE/EXE`, in any that the image has."""
     import roslib.packages
 
-    taken = set()
+    package, slash, executable = asked.partition("/")
+    places = [(p, asked[len(p) + 1 :] if asked.startswith(p + "/") else asked) for p in packages]
+    for package, wanted in places + ([(package, executable)] if slash else []):
+        if package_directory(rospack, package) is None:
+            continue
+        matches = roslib.packages.find_node(package, wanted, rospack=rospack)
+        if matches:
+            return package, wanted, matches[0]
+    return None
+
+
+def from_executables(ask, rospack, plan, names):
+    taken, started = set(), set()
     for words in names:
         asked, *arguments = shlex.split(words) or [words]
-        found = None
-        for package in ask["packages"]:
-            wanted = asked[len(package) + 1 :] if asked.startswith(package + "/") else asked
-            if package_directory(rospack, package) is None:
-                continue
-            matches = roslib.packages.find_node(package, wanted, rospack=rospack)
-            if matches:
-                found = (package, wanted, matches[0])
-                break
+        found = find_executable(rospack, ask["packages"], asked)
         if found is None:
             raise Refused("not_found", what="executable", name=asked, known=plan["executables"])
         package, wanted, path = found
+        given = [argument[len("__name:=") :] for argument in arguments if argument.startswith("__name:=")]
         stem = re.sub(r"\W", "_", os.path.splitext(os.path.basename(wanted))[0])
         stem = stem if stem[:1].isalpha() else "node_" + stem
+        stem = given[-1] if given else stem
         name, number = stem, 1
         while name in taken:
             number += 1
             name = "%s_%d" % (stem, number)
         taken.add(name)
+        # As under rosrun the program names itself; the second node of a program would throw out the first.
+        named = bool(given) or path in started
+        started.add(path)
         plan["nodes"].append(
             {
                 "name": "/" + name,
                 "package": package,
                 "executable": wanted,
-                "argv": [path] + arguments + ["__name:=" + name],
+                "argv": [path] + arguments + (["__name:=" + name] if named else []),
                 "remaps": {},
                 "environment": {},
                 "directory": None,
                 "respawn": False,
                 "respawn_delay": 0.0,
                 "required": False,
+                "named": named,
             }
         )
 

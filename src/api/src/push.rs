@@ -26,7 +26,8 @@ pub struct PushOptions {
     /// Launch file, relative to the package, or its bare name.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub launch: Option<String>,
-    /// Executables to run, instead of a launch file.
+    /// Executables to run, instead of a launch file: `EXE` or `PACKAGE/EXE`, with arguments behind it as a shell would
+    /// split them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub nodes: Vec<String>,
     /// Private parameters of the nodes (`~K`), or global ones when they begin with `/`.
@@ -44,7 +45,7 @@ pub struct PushOptions {
     /// Dependencies by hand: rosdep key or ROS package → Debian package.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
-    /// Debian packages to add.
+    /// Debian or ROS packages to add, for compiling and for running.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
     /// Limits of a servant; those given are also reserved for it.

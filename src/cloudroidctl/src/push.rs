@@ -40,8 +40,10 @@ pub struct Push {
     /// Launch file to run, as roslaunch finds it in the package.
     #[arg(long, value_name = "FILE", conflicts_with = "nodes")]
     launch: Option<String>,
-    /// Executable to run (EXE, or PACKAGE/EXE); may be given several times.
-    #[arg(long = "node", value_name = "EXE")]
+    /// Executable to run (EXE, or PACKAGE/EXE), its arguments behind it in one pair of quotes: --node
+    /// 'topic_tools/relay /in /out'; may be given several times. The node has its program's own name, as under rosrun;
+    /// __name:=NAME gives it another.
+    #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
     /// Private parameter of the nodes, or a global one (/K=V); may be given several times.
     #[arg(long = "param", value_name = "K=V", value_parser = parameter)]
@@ -58,8 +60,8 @@ pub struct Push {
     /// Debian package that provides a dependency; may be given several times.
     #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
     map: Vec<(String, String)>,
-    /// Debian package to add; may be given several times.
-    #[arg(long = "with", value_name = "DEB")]
+    /// Debian or ROS package to add, for compiling and for running; may be given several times.
+    #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
     /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
     /// down, and hands back. Without this, both may be asked and the first answer is taken.
@@ -263,6 +265,20 @@ mod tests {
             "limits": {"cpus": 1.5, "memory": 536_870_912}, "source": "--apt opencv_apps"
         });
         assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
+    }
+
+    #[test]
+    fn a_node_takes_arguments() {
+        let line = [
+            "push",
+            "--apt",
+            "topic_tools",
+            "--node",
+            "topic_tools/relay /in /out",
+        ];
+        let push = Line::try_parse_from(line).expect("valid").push;
+        let options = push.options().expect("no file is read");
+        assert_eq!(options.nodes, ["topic_tools/relay /in /out"]);
     }
 
     #[test]

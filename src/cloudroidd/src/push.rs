@@ -10,6 +10,7 @@
 //! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
 
 mod bounds;
+mod naming;
 mod patience;
 mod probe;
 mod publish;
@@ -186,12 +187,12 @@ impl Pusher {
         };
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         tell.step("starting it once to find its interface").await;
-        let plan = plan_of(&built, options);
+        let mut plan = plan_of(&built, options);
         let granted = crate::grants::resolve(&plan.grants, &self.config.allow)?;
         for warning in granted.unfulfilled {
             tell.warning(warning).await;
         }
-        let found = probe::interface(self, id, &built, &plan, options, tell).await?;
+        let found = probe::interface(self, id, &built, &mut plan, options, tell).await?;
         for warning in found.warnings {
             tell.warning(warning).await;
         }

@@ -182,7 +182,7 @@ fn wrong(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::interface::{Direction, Need, Parameter};
+    use crate::interface::{Direction, Need, Parameter, Topic};
 
     fn parse(text: &str) -> Result<Interface, Error> {
         Interface::from_toml(text, Path::new("x.toml"))
@@ -231,6 +231,15 @@ value = 0.5
         let mut interface = parse(SUPPLEMENT).unwrap();
         interface.topics[0].nodes = vec!["/n".into()];
         interface.topics[0].latched = true;
+        interface.late = vec!["/go".into()];
+        // A relay takes any type.
+        let any = Topic {
+            name: "/any".into(),
+            type_name: "*".into(),
+            md5: "*".into(),
+            ..interface.topics[0].clone()
+        };
+        interface.topics.push(any);
         interface
             .definitions
             .insert("a/msg/B".into(), "# \"\"\" ''' \\ \n\tint32 x\r\n".into());

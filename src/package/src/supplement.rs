@@ -170,6 +170,16 @@ mod tests {
     }
 
     #[test]
+    fn a_stated_type_takes_the_place_of_any() {
+        let mut found = Interface::default();
+        let mut any = stated().topics.remove(0);
+        (any.type_name, any.md5) = ("*".into(), "*".into());
+        found.topics.push(any);
+        found.supplement(&stated()).unwrap();
+        assert_eq!(found.topics[0].type_name, "sensor_msgs/Image");
+    }
+
+    #[test]
     fn a_supplement_adds_and_fills_in() {
         let mut found = Interface::default();
         found.topics.push(Topic {

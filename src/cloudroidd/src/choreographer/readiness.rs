@@ -148,6 +148,16 @@ mod tests {
     }
 
     #[test]
+    fn what_comes_only_with_a_robot_is_not_awaited() {
+        let mut promised = interface();
+        promised.late = vec!["/add".into(), "/go".into()];
+        assert_eq!(
+            missing(&promised, &Graph::default()),
+            ["the publisher of /out", "the subscriber of /in"]
+        );
+    }
+
+    #[test]
     fn what_only_a_supplement_promises_is_not_awaited() {
         let mut promised = interface();
         promised.topics = vec![Topic {

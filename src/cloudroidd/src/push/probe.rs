@@ -15,8 +15,8 @@ use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::{Profile, Spec};
 use tokio_util::task::TaskTracker;
 
-use super::Pusher;
 use super::request::Tell;
+use super::{Pusher, naming, supplement};
 use crate::admission::Permit;
 use crate::choreographer;
 use crate::errors::Error;
@@ -26,7 +26,7 @@ use crate::state::Plan;
 use crate::works::MASTER;
 
 /// The name of the looking node.
-const NODE: &str = "/cloudroid_probe";
+pub(super) const NODE: &str = "/cloudroid_probe";
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
 
@@ -35,21 +35,28 @@ pub(super) async fn interface(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
-    plan: &Plan,
+    plan: &mut Plan,
     options: &PushOptions,
     tell: &Tell,
 ) -> Result<Found, Error> {
-    let spec = spec(pusher, id, built, plan, options).await?;
     let _room = room(pusher, options, tell).await?;
+    naming::settle(pusher, id, built, plan, options).await?;
+    let plan = &*plan;
+    let spec = self::spec(pusher, id, built, plan, options).await?;
     let (servant, trial) = start(pusher, spec).await?;
     let endpoint = servant.endpoint();
     let _ways_out = Relays::open(&endpoint, &plan.grants, &pusher.config.allow).await;
     let unmet = servant
         .enforced()
         .unmet(&choreographer::engine_limits(&options.limits));
-    let found = look(pusher, &servant, built, plan).await;
+    let found = look(pusher, &servant, built, plan, options).await;
     trial.end().await?;
-    let mut found = found?;
+    let mut found = match found {
+        Ok(found) => found,
+        Err(error) => return Err(advised(pusher, built, error).await),
+    };
+    let unused = naming::unused(plan, &found.interface, options);
+    found.warnings.extend(unused);
     let warn = |what| format!("servants will run without a limit that was asked for: {what}");
     found.warnings.extend(unmet.into_iter().map(warn));
     Ok(found)
@@ -57,7 +64,10 @@ pub(super) async fn interface(
 
 /// Starts it; it is ended however the trial is dropped: a push can be cancelled at any await. Starting itself is not
 /// interrupted, because what is half-started has no handle to end it by.
-async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servant>, Trial), Error> {
+pub(super) async fn start(
+    pusher: &Pusher,
+    spec: Spec,
+) -> Result<(Arc<dyn Servant>, Trial), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
     let starting = pusher.tasks.spawn(async move {
         let servant = engine.start(spec).await?;
@@ -98,6 +108,7 @@ async fn look(
     servant: &Arc<dyn Servant>,
     built: &BuildOutcome,
     plan: &Plan,
+    push: &PushOptions,
 ) -> Result<Found, Error> {
     let failed = |message: String| Error::Push {
         message,
@@ -109,6 +120,11 @@ async fn look(
     let working = Arc::clone(servant);
     let options = ProbeOptions {
         patience: pusher.config.push.probe.0,
+        types: push
+            .interface
+            .as_deref()
+            .map(supplement::topic_types)
+            .unwrap_or_default(),
         work: Some(Work::new(move || cpu_time(Arc::clone(&working)))),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),
@@ -117,26 +133,44 @@ async fn look(
     };
     let looking = async {
         let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-        let bus: Arc<dyn Bus> = Ros1Bus::connect(sockets, MASTER, NODE)
-            .await
-            .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+        let bus: Arc<dyn Bus> = tokio::select! {
+            // First: of a node that ended, nothing else is worth saying.
+            biased;
+            words = ended(servant, plan) => return Err(failed(words)),
+            bus = Ros1Bus::connect(sockets, MASTER, NODE) => {
+                bus.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
+            }
+        };
         rootfs_builder::probe::probe(
             &*bus,
             &registry,
             &built.definitions,
             &options,
-            std::future::pending(),
+            ended(servant, plan),
         )
         .await
         .map_err(|error| failed(error.to_string()))
     };
-    let outcome = tokio::select! {
-        // First: of a node that ended, nothing else is worth saying.
-        biased;
-        words = ended(servant, plan) => Err(failed(words)),
-        found = looking => found,
-    };
-    outcome.map_err(|error| explained(error, servant))
+    looking.await.map_err(|error| explained(error, servant))
+}
+
+/// With the option that adds what the nodes say is missing.
+async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
+    match error {
+        Error::Push {
+            message,
+            next: None,
+            log,
+        } => {
+            let advice = pusher.builder.advice(&built.base, &log.join("\n")).await;
+            Error::Push {
+                message,
+                next: (!advice.is_empty()).then(|| advice.join("; ")),
+                log,
+            }
+        }
+        other => other,
+    }
 }
 
 async fn cpu_time(servant: Arc<dyn Servant>) -> Option<Duration> {
@@ -145,7 +179,7 @@ async fn cpu_time(servant: Arc<dyn Servant>) -> Option<Duration> {
 }
 
 /// Comes back when a node ends that should not, or the container does, with what is to be said about it.
-async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
+pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
     let mut nodes: FuturesUnordered<_> = plan
         .nodes
         .iter()
@@ -189,7 +223,7 @@ async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
 }
 
 /// With the last lines that the nodes printed.
-fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
+pub(super) fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
     match error {
         Error::Push { message, next, log } if log.is_empty() => {
             let lines = choreographer::read_log(&servant.log_path(), LOG_LINES, None);
@@ -203,7 +237,7 @@ fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
     }
 }
 
-async fn spec(
+pub(super) async fn spec(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
@@ -238,13 +272,13 @@ async fn spec(
 }
 
 /// A servant that ends with this value.
-struct Trial {
+pub(super) struct Trial {
     servant: Option<Arc<dyn Servant>>,
     tasks: TaskTracker,
 }
 
 impl Trial {
-    async fn end(mut self) -> Result<(), Error> {
+    pub(super) async fn end(mut self) -> Result<(), Error> {
         match self.servant.take() {
             Some(servant) => Ok(servant.stop().await?),
             None => Ok(()),

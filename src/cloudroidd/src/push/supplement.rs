@@ -88,6 +88,12 @@ pub(super) fn add(
         .map_err(|error| SupplementError::Contradiction(error.to_string()))
 }
 
+/// Topics and their types, as far as the text can be read: what is wrong with it is said when it is added.
+pub(super) fn topic_types(text: &str) -> BTreeMap<String, String> {
+    let topics = read(text).unwrap_or_default().topics.into_iter();
+    topics.map(|topic| (topic.name, topic.type_name)).collect()
+}
+
 fn read(text: &str) -> Result<Interface, SupplementError> {
     if text.trim_start().starts_with('{') {
         return serde_json::from_str(text)

@@ -9,7 +9,7 @@ import sys
 import rospy
 from std_msgs.msg import Int32, String
 
-rospy.init_node("usual_name")
+rospy.init_node("teller")
 life = rospy.get_param("~lives", 0) + 1
 rospy.set_param("~lives", life)
 

@@ -1,0 +1,314 @@
+//! What nodes are called that were told no name (`--node`): what their programs say, as under rosrun.
+//!
+//! The name is known only when a program runs, and parameters must be there before it does. So it is started once, each
+//! node in a namespace of its own to tell it by, and ended as soon as it has registered. From then on it is told that
+//! name: one with a random end (an anonymous node's) would be another each time.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::PushOptions;
+use package::interface::Interface;
+use rootfs_builder::BuildOutcome;
+use rootfs_builder::probe::ProbeError;
+use ros::bus::{Bus, Graph};
+use ros::ros1::Ros1Bus;
+use servant::engine::Servant;
+use tokio::time::timeout;
+
+use super::Pusher;
+use super::probe::{self, NODE};
+use crate::errors::Error;
+use crate::sockets::ServantSockets;
+use crate::state::Plan;
+use crate::works::MASTER;
+
+/// Where the node of an index is while its name is looked for.
+fn namespace(index: usize) -> String {
+    format!("/cloudroid_name_{index}")
+}
+
+/// Gives the nodes of `plan` that were told no name the one that their program has.
+pub(super) async fn settle(
+    pusher: &Pusher,
+    id: &str,
+    built: &BuildOutcome,
+    plan: &mut Plan,
+    options: &PushOptions,
+) -> Result<(), Error> {
+    let planned = built.plan.nodes.iter().enumerate();
+    let unnamed: Vec<usize> = planned
+        .filter(|(_, node)| !node.named)
+        .map(|(index, _)| index)
+        .collect();
+    if unnamed.is_empty() {
+        return Ok(());
+    }
+    let mut alone = plan.clone();
+    alone.nodes = unnamed
+        .iter()
+        .map(|index| {
+            let mut node = plan.nodes[*index].clone();
+            node.environment
+                .insert("ROS_NAMESPACE".to_owned(), namespace(*index));
+            node
+        })
+        .collect();
+    let mut spec = probe::spec(pusher, id, built, &alone, options).await?;
+    spec.id = format!("{id}-names");
+    let (servant, trial) = probe::start(pusher, spec).await?;
+    let found = look(pusher, &servant, &alone, &unnamed).await;
+    trial.end().await?;
+    apply(plan, &unnamed, &found?, options);
+    Ok(())
+}
+
+/// Names by index, as far as they could be found; those of nodes that end at once stay unknown.
+async fn look(
+    pusher: &Pusher,
+    servant: &Arc<dyn Servant>,
+    alone: &Plan,
+    unnamed: &[usize],
+) -> Result<Vec<(usize, String)>, Error> {
+    let failed = |message: String| Error::Push {
+        message,
+        next: None,
+        log: Vec::new(),
+    };
+    let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
+    let bus = Ros1Bus::connect(sockets, MASTER, NODE)
+        .await
+        .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+    let mut graph = bus.graph();
+    let seen = graph.clone();
+    let patience = pusher.config.push.probe.0;
+    let all_there = |graph: &Arc<Graph>| names(graph, unnamed).len() == unnamed.len();
+    let registered = tokio::select! {
+        biased;
+        // What it says of itself is told when it is started again, with its parameters.
+        _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed)),
+        there = timeout(patience, graph.wait_for(all_there)) => match there {
+            Ok(Ok(graph)) => Ok(names(&graph, unnamed)),
+            Ok(Err(_)) => Err(failed(ProbeError::MasterGone.to_string())),
+            // Here it cannot reach what it was granted; it can when it is looked at.
+            Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed)),
+            Err(_) => Err(never_registered(alone, patience)),
+        },
+    };
+    bus.close().await;
+    registered.map_err(|error| probe::explained(error, servant))
+}
+
+fn never_registered(alone: &Plan, after: Duration) -> Error {
+    let nodes = alone.nodes.iter().map(|node| node.name.clone()).collect();
+    Error::Push {
+        message: ProbeError::NeverRegistered {
+            nodes,
+            after,
+            sought: Vec::new(),
+        }
+        .to_string(),
+        next: None,
+        log: Vec::new(),
+    }
+}
+
+/// Which node of the graph is which.
+fn names(graph: &Graph, unnamed: &[usize]) -> Vec<(usize, String)> {
+    let mut names = Vec::new();
+    for index in unnamed {
+        let below = format!("{}/", namespace(*index));
+        let own = graph
+            .nodes
+            .keys()
+            .find_map(|node| node.strip_prefix(below.as_str()));
+        // A program may choose its namespace itself; alone it is known all the same.
+        let only = (unnamed.len() == 1)
+            .then(|| graph.nodes.keys().find(|node| *node != NODE))
+            .flatten();
+        if let Some(name) = own.or(only.map(|name| name.trim_start_matches('/'))) {
+            names.push((*index, without_random_end(name).to_owned()));
+        }
+    }
+    names
+}
+
+/// The name of an anonymous node without what makes it unique: `_PID_MILLISECONDS` (rospy), `_NANOSECONDS` (roscpp).
+fn without_random_end(name: &str) -> &str {
+    let cut = |name: &str, digits: usize| -> Option<usize> {
+        let (_, end) = name.rsplit_once('_')?;
+        let number = !end.is_empty() && end.bytes().all(|byte| byte.is_ascii_digit());
+        (number && end.len() >= digits).then(|| name.len() - end.len() - 1)
+    };
+    let Some(at) = cut(name, 12).filter(|at| *at > 0) else {
+        return name;
+    };
+    let shorter = &name[..at];
+    let nanoseconds = name.len() - at > 16;
+    match cut(shorter, 1).filter(|at| *at > 0 && !nanoseconds) {
+        Some(at) => &shorter[..at],
+        None => shorter,
+    }
+}
+
+/// Writes names into the plan, and moves private parameters there. A node whose name is not known is told the guess.
+fn apply(plan: &mut Plan, unnamed: &[usize], found: &[(usize, String)], options: &PushOptions) {
+    let mut taken: BTreeSet<String> = plan
+        .nodes
+        .iter()
+        .enumerate()
+        .filter(|(index, _)| !unnamed.contains(index))
+        .map(|(_, node)| node.name.clone())
+        .collect();
+    for index in unnamed {
+        let guess = plan.nodes[*index].name.clone();
+        let known = found.iter().find(|(of, _)| of == index);
+        let wanted = known.map_or(guess.clone(), |(_, name)| format!("/{name}"));
+        let mut name = wanted.clone();
+        let mut number = 1;
+        while !taken.insert(name.clone()) {
+            number += 1;
+            name = format!("{wanted}_{number}");
+        }
+        for key in options.params.keys().filter(|key| !key.starts_with('/')) {
+            let bare = key.trim_start_matches(['~', '_']);
+            if let Some(value) = plan.parameters.remove(&format!("{guess}/{bare}")) {
+                plan.parameters.insert(format!("{name}/{bare}"), value);
+            }
+        }
+        let node = &mut plan.nodes[*index];
+        match name.rsplit_once('/') {
+            Some((namespace, last)) if !namespace.is_empty() => {
+                node.environment
+                    .insert("ROS_NAMESPACE".to_owned(), namespace.to_owned());
+                node.argv.push(format!("__name:={last}"));
+            }
+            _ => node.argv.push(format!("__name:={}", &name[1..])),
+        }
+        node.name = name;
+    }
+}
+
+/// Parameters that were given for a name that no node has, and that none read.
+pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) -> Vec<String> {
+    let below = |key: &str, name: &str| {
+        key.strip_prefix(name)
+            .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+    };
+    let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
+    let mut warnings = Vec::new();
+    for key in options.params.keys() {
+        // `/rate` is everybody's.
+        let of_a_name = key.starts_with('/') && key[1..].contains('/');
+        let known = names.iter().any(|name| below(key, name));
+        let read = interface.parameters.iter().any(|parameter| {
+            !parameter.read_by.is_empty()
+                && (below(key, &parameter.name) || below(&parameter.name, key))
+        });
+        if of_a_name && !known && !read {
+            warnings.push(format!(
+                "parameter {key} is given for a name that no node has, and none read it; there are the nodes {}",
+                names.join(", ")
+            ));
+        }
+    }
+    warnings
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use package::interface::Parameter;
+    use servant::spec::NodeSpec;
+
+    fn plan(names: &[&str]) -> Plan {
+        let node = |name: &&str| NodeSpec {
+            name: (*name).to_owned(),
+            argv: vec!["/x".to_owned()],
+            environment: Default::default(),
+            directory: "/root".to_owned(),
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
+        };
+        Plan {
+            nodes: names.iter().map(node).collect(),
+            ..Plan::default()
+        }
+    }
+
+    fn given(params: &[&str]) -> PushOptions {
+        PushOptions {
+            params: params
+                .iter()
+                .map(|key| ((*key).to_owned(), serde_json::json!(1)))
+                .collect(),
+            ..PushOptions::default()
+        }
+    }
+
+    #[test]
+    fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
+        let mut plan = plan(&["/costmap_2d_node", "/other", "/third"]);
+        let options = given(&["~rate", "/costmap_2d_node/stays"]);
+        for key in ["/costmap_2d_node/rate", "/costmap_2d_node/stays"] {
+            plan.parameters
+                .insert(key.to_owned(), ros::bus::ParamValue::Int(1));
+        }
+        let found = [(0, "costmap_2d".to_owned()), (2, "other".to_owned())];
+        apply(&mut plan, &[0, 2], &found, &options);
+        let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
+        assert_eq!(names, ["/costmap_2d", "/other", "/other_2"]);
+        assert_eq!(plan.nodes[0].argv, ["/x", "__name:=costmap_2d"]);
+        let keys: Vec<&String> = plan.parameters.keys().collect();
+        assert_eq!(keys, ["/costmap_2d/rate", "/costmap_2d_node/stays"]);
+        let words = unused(&plan, &Interface::default(), &options).join("\n");
+        assert!(
+            words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"),
+            "{words}"
+        );
+        // Somebody may read it all the same.
+        let interface = Interface {
+            parameters: vec![Parameter {
+                name: "/costmap_2d_node/stays".to_owned(),
+                value: None,
+                read_by: vec!["/other".to_owned()],
+                written_by: Vec::new(),
+            }],
+            ..Interface::default()
+        };
+        assert!(unused(&plan, &interface, &options).is_empty());
+    }
+
+    #[test]
+    fn nodes_are_told_apart_by_their_namespaces() {
+        let graph = Graph {
+            nodes: [
+                "/cloudroid_name_0/costmap_2d",
+                "/cloudroid_name_3/talker_71_1700000000123",
+                NODE,
+            ]
+            .map(|name| (name.to_owned(), String::new()))
+            .into(),
+            ..Graph::default()
+        };
+        assert_eq!(
+            names(&graph, &[0, 3, 4]),
+            [(0, "costmap_2d".to_owned()), (3, "talker".to_owned())]
+        );
+    }
+
+    #[test]
+    fn random_ends_are_cut_off() {
+        for (name, plain) in [
+            ("talker_4711_1700000000123", "talker"),
+            ("people_detect_1700000000123456789", "people_detect"),
+            ("node_1_1700000000123456789", "node_1"),
+            ("costmap_2d", "costmap_2d"),
+            ("camera_2", "camera_2"),
+        ] {
+            assert_eq!(without_random_end(name), plain);
+        }
+    }
+}
