@@ -230,7 +230,7 @@ mod tests {
         let Error::Refused(text) = error else {
             panic!("trying again changes nothing, but: {error}");
         };
-        assert!(text.contains("does not speak cloudroid-link.v1"), "{text}");
+        assert!(text.contains("does not speak cloudroid-link.v2"), "{text}");
         assert!(text.contains("install the stub from it again"), "{text}");
     }
 

@@ -28,7 +28,7 @@ pub struct Hello {
     /// The session to go on with.
     pub resume: Option<Resume>,
     /// The first number that the robot will use on this connection.
-    pub next: u32,
+    pub next: u64,
     /// The node to run; only its name is looked at in a resumed session.
     pub node: Node,
     /// What the robot's application promises itself.
@@ -51,9 +51,9 @@ pub struct Resume {
     /// As the welcome named it.
     pub session: String,
     /// All numbers up to this one have come …
-    pub received: u32,
+    pub received: u64,
     /// … and these.
-    pub ahead: Vec<u32>,
+    pub ahead: Vec<u64>,
 }
 
 /// A node as roslaunch starts it.
@@ -107,11 +107,11 @@ pub enum Welcome {
         /// It goes on: what the robot has not acknowledged is sent again.
         resumed: bool,
         /// What the cloud has of the robot's numbers.
-        received: u32,
+        received: u64,
         /// And those.
-        ahead: Vec<u32>,
+        ahead: Vec<u64>,
         /// The first number that the cloud will use on this connection.
-        next: u32,
+        next: u64,
         /// Codecs that the cloud decodes.
         #[serde(default)]
         codecs: Vec<String>,
@@ -355,7 +355,7 @@ mod tests {
     /// What stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
     fn what_earlier_stubs_say_is_understood() {
-        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
         let hello = r#"{"version":"0.1.0","run":"r","machine":"m","resume":{"session":"s","received":4,"ahead":[6]},
             "next":5,"node":{"name":"/n","package":"p","executable":"e","argv":["a:=b"],"namespace":"/","share":"/s",
             "directory":"/d","revision":3,"image":"sha256:0","calls":[]},"sla":{"desire":0.1,"max":0.3,

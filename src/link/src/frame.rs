@@ -3,12 +3,12 @@
 //! | first byte | then |
 //! |---|---|
 //! | 0 open | JSON: [`Hello`](crate::control::Hello), [`Welcome`](crate::control::Welcome) |
-//! | 1 whole | number u32 · record |
-//! | 2 begin | stream u32 · number u32 · total u32 · first bytes of a record |
+//! | 1 whole | number u64 · record |
+//! | 2 begin | stream u32 · number u64 · total u32 · first bytes of a record |
 //! | 3 more | stream u32 · more bytes of it |
-//! | 4 ping | sent i64 · received u32 · bytes u64 |
-//! | 5 pong | sent i64 · arrived i64 · left i64 · received u32 · bytes u64 |
-//! | 6 ack | received u32 · bytes u64 |
+//! | 4 ping | sent i64 · received u64 · bytes u64 |
+//! | 5 pong | sent i64 · arrived i64 · left i64 · received u64 · bytes u64 |
+//! | 6 ack | received u64 · bytes u64 |
 //!
 //! A record with a number other than 0 is remembered by its sender until the peer has it, and sent again after a lost
 //! connection or counted as dropped: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
@@ -34,7 +34,7 @@ pub enum Frame {
     /// A record in one piece.
     Whole {
         /// 0: whether it came is of no interest.
-        number: u32,
+        number: u64,
         /// The record.
         record: Bytes,
     },
@@ -43,7 +43,7 @@ pub enum Frame {
         /// Names the record while it is under way.
         stream: u32,
         /// 0: whether it came is of no interest.
-        number: u32,
+        number: u64,
         /// The record's length.
         total: u32,
         /// Its first bytes.
@@ -82,20 +82,20 @@ pub enum Frame {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Received {
     /// All numbers up to and with this one.
-    pub number: u32,
+    pub number: u64,
     /// Bytes of records, over the session.
     pub bytes: u64,
 }
 
 impl Received {
     fn put(self, out: &mut BytesMut) {
-        out.put_u32_le(self.number);
+        out.put_u64_le(self.number);
         out.put_u64_le(self.bytes);
     }
 
     fn get(bytes: &mut Bytes) -> Self {
         Self {
-            number: bytes.get_u32_le(),
+            number: bytes.get_u64_le(),
             bytes: bytes.get_u64_le(),
         }
     }
@@ -109,7 +109,7 @@ impl Frame {
             Frame::Open(_) => out.put_u8(OPEN),
             Frame::Whole { number, .. } => {
                 out.put_u8(WHOLE);
-                out.put_u32_le(*number);
+                out.put_u64_le(*number);
             }
             Frame::Begin {
                 stream,
@@ -119,7 +119,7 @@ impl Frame {
             } => {
                 out.put_u8(BEGIN);
                 out.put_u32_le(*stream);
-                out.put_u32_le(*number);
+                out.put_u64_le(*number);
                 out.put_u32_le(*total);
             }
             Frame::More { stream, .. } => {
@@ -171,11 +171,12 @@ impl Frame {
         };
         let head = match kind {
             OPEN => 1,
-            WHOLE | MORE => 5,
-            BEGIN => 13,
-            PING => 21,
-            PONG => 37,
-            ACK => 13,
+            WHOLE => 9,
+            MORE => 5,
+            BEGIN => 17,
+            PING => 25,
+            PONG => 41,
+            ACK => 17,
             _ => return Err(Error::Protocol("a frame of unknown kind")),
         };
         if bytes.len() < head {
@@ -185,12 +186,12 @@ impl Frame {
         Ok(match kind {
             OPEN => Frame::Open(bytes),
             WHOLE => Frame::Whole {
-                number: bytes.get_u32_le(),
+                number: bytes.get_u64_le(),
                 record: bytes,
             },
             BEGIN => Frame::Begin {
                 stream: bytes.get_u32_le(),
-                number: bytes.get_u32_le(),
+                number: bytes.get_u64_le(),
                 total: bytes.get_u32_le(),
                 bytes,
             },
@@ -253,7 +254,7 @@ mod tests {
     /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
     fn the_bytes_of_frames_are_those_of_this_version() {
-        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
         let received = Received {
             number: 7,
             bytes: 0x0102_0304_0506_0708,
@@ -266,7 +267,7 @@ mod tests {
                     number: 1,
                     record: bytes.clone(),
                 },
-                "01 01000000 616263",
+                "01 0100000000000000 616263",
             ),
             (
                 Frame::Begin {
@@ -275,12 +276,12 @@ mod tests {
                     total: 9,
                     bytes: bytes.clone(),
                 },
-                "02 02000000 03000000 09000000 616263",
+                "02 02000000 0300000000000000 09000000 616263",
             ),
             (Frame::More { stream: 2, bytes }, "03 02000000 616263"),
             (
                 Frame::Ping { sent: -1, received },
-                "04 ffffffffffffffff 07000000 0807060504030201",
+                "04 ffffffffffffffff 0700000000000000 0807060504030201",
             ),
             (
                 Frame::Pong {
@@ -289,9 +290,9 @@ mod tests {
                     left: 3,
                     received,
                 },
-                "05 0100000000000000 0200000000000000 0300000000000000 07000000 0807060504030201",
+                "05 0100000000000000 0200000000000000 0300000000000000 0700000000000000 0807060504030201",
             ),
-            (Frame::Ack(received), "06 07000000 0807060504030201"),
+            (Frame::Ack(received), "06 0700000000000000 0807060504030201"),
         ];
         for (frame, expected) in pinned {
             let encoded = frame.encode();

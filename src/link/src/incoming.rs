@@ -22,10 +22,10 @@ const READ_AHEAD: usize = 1 << 20;
 pub(crate) struct Incoming {
     /// Where records under way count.
     budget: Budget,
-    number: u32,
-    ahead: BTreeSet<u32>,
+    number: u64,
+    ahead: BTreeSet<u64>,
     /// The first number on this connection, until the peer shows by using it that it knows what has come.
-    next: Option<u32>,
+    next: Option<u64>,
     bytes: u64,
     streams: HashMap<u32, Partial>,
     partial: usize,
@@ -33,7 +33,7 @@ pub(crate) struct Incoming {
 
 #[derive(Debug)]
 struct Partial {
-    number: u32,
+    number: u64,
     total: usize,
     bytes: BytesMut,
     permit: Permit,
@@ -60,7 +60,7 @@ impl Incoming {
     }
 
     /// All numbers up to this one have come, and those.
-    pub(crate) fn state(&self) -> (u32, Vec<u32>) {
+    pub(crate) fn state(&self) -> (u64, Vec<u64>) {
         (self.number, self.ahead.iter().copied().collect())
     }
 
@@ -74,14 +74,14 @@ impl Incoming {
     /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again: the peer
     /// sends it under new numbers, once it has heard what came. The connection may be lost before that, so what came is
     /// not forgotten yet.
-    pub(crate) fn reconnect(&mut self, next: u32) {
+    pub(crate) fn reconnect(&mut self, next: u64) {
         self.streams.clear();
         self.partial = 0;
         self.next = Some(next);
     }
 
     /// Takes a record in one piece; `None` if it had come before.
-    pub(crate) fn whole(&mut self, number: u32, record: Bytes) -> Result<Option<Bytes>, Error> {
+    pub(crate) fn whole(&mut self, number: u64, record: Bytes) -> Result<Option<Bytes>, Error> {
         self.bytes += record.len() as u64;
         Ok(self.note(number)?.then_some(record))
     }
@@ -90,7 +90,7 @@ impl Incoming {
     pub(crate) fn begin(
         &mut self,
         stream: u32,
-        number: u32,
+        number: u64,
         total: u32,
         bytes: &[u8],
     ) -> Result<Option<Bytes>, Error> {
@@ -151,7 +151,7 @@ impl Incoming {
     }
 
     /// Whether a number is new.
-    fn note(&mut self, number: u32) -> Result<bool, Error> {
+    fn note(&mut self, number: u64) -> Result<bool, Error> {
         if number == 0 {
             return Ok(true);
         }

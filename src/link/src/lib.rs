@@ -49,7 +49,7 @@ pub use session::{Handler, Lost, Session, SessionOptions};
 /// It stays when a field with a default is added to one of those, or something more is told: readers leave out what
 /// they do not know, and what they do not find has its default, which must mean what it meant before. So it does when
 /// a codec is added, since each end says which it decodes.
-pub const SUBPROTOCOL: &str = "cloudroid-link.v1";
+pub const SUBPROTOCOL: &str = "cloudroid-link.v2";
 /// What all versions begin with.
 pub const SUBPROTOCOLS: &str = "cloudroid-link.";
 /// The longest WebSocket frame: a piece, or a hello with all of a robot's parameters.

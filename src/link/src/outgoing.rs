@@ -92,7 +92,7 @@ impl Out {
 #[derive(Debug)]
 struct Sending {
     stream: u32,
-    number: u32,
+    number: u64,
     /// It is sent again after a lost connection.
     again: bool,
     at: usize,
@@ -102,7 +102,7 @@ struct Sending {
 /// What goes out over the life of a session.
 #[derive(Debug)]
 pub(crate) struct Outgoing {
-    next_number: u32,
+    next_number: u64,
     next_stream: u32,
     urgent: VecDeque<Out>,
     urgent_bytes: usize,
@@ -110,7 +110,7 @@ pub(crate) struct Outgoing {
     /// Topics with something to send that is not under way.
     turns: VecDeque<u32>,
     sending: VecDeque<Sending>,
-    kept: VecDeque<(u32, Kept)>,
+    kept: VecDeque<(u64, Kept)>,
     kept_bytes: usize,
     in_a_row: u32,
     /// Messages of these topics are encoded before they are sent, while `packs`.
@@ -406,7 +406,7 @@ impl Outgoing {
         out.channel.is_none() || (room && (out.len() <= SMALL || out.each))
     }
 
-    fn keep(&mut self, number: u32, again: bool, out: Out) {
+    fn keep(&mut self, number: u64, again: bool, out: Out) {
         if number == 0 {
             return;
         }
@@ -437,7 +437,7 @@ impl Outgoing {
     }
 
     /// The peer has all numbers up to this one.
-    pub(crate) fn acknowledge(&mut self, number: u32) {
+    pub(crate) fn acknowledge(&mut self, number: u64) {
         while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, Kept::Again(out))) = self.kept.pop_front() {
                 self.kept_bytes -= out.len();
@@ -452,18 +452,18 @@ impl Outgoing {
     }
 
     /// Begins with this number, which the peer was told to expect.
-    pub(crate) fn begin_at(&mut self, number: u32) {
+    pub(crate) fn begin_at(&mut self, number: u64) {
         self.next_number = number;
     }
 
     /// The first number on the next connection.
-    pub(crate) fn next_number(&self) -> u32 {
+    pub(crate) fn next_number(&self) -> u64 {
         self.next_number
     }
 
     /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
     /// in order. Big messages that were under way are lost unless each one counts.
-    pub(crate) fn reconnect(&mut self, received: u32, ahead: &[u32]) {
+    pub(crate) fn reconnect(&mut self, received: u64, ahead: &[u64]) {
         let packing = self.packing.take().map(|(out, _)| out);
         for out in packing.into_iter().chain(self.packed.take()) {
             if let Some(channel) = out.channel {

@@ -223,7 +223,7 @@ mod tests {
     /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
     fn the_bytes_of_records_are_those_of_this_version() {
-        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v1");
+        assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
         let data = Data {
             channel: 0x0102_0304,
             encoded: true,

@@ -276,7 +276,7 @@ impl Session {
     }
 
     /// For the opening of a connection: what has come, and the first number that this side will use.
-    pub fn position(&self) -> (u32, Vec<u32>, u32) {
+    pub fn position(&self) -> (u64, Vec<u64>, u64) {
         let state = self.state.lock();
         let (received, ahead) = state.incoming.state();
         (received, ahead, state.out.next_number())
@@ -284,12 +284,12 @@ impl Session {
 
     /// For a new session that takes the place of one the peer has forgotten: the first number that the peer was told
     /// to expect. Before anything is sent.
-    pub fn begin_at(&self, number: u32) {
+    pub fn begin_at(&self, number: u64) {
         self.state.lock().out.begin_at(number);
     }
 
     /// A new connection: what the peer has, and the first number that it will use.
-    pub fn reconnect(&self, received: u32, ahead: &[u32], next: u32) {
+    pub fn reconnect(&self, received: u64, ahead: &[u64], next: u64) {
         let mut state = self.state.lock();
         state.out.reconnect(received, ahead);
         state.incoming.reconnect(next);

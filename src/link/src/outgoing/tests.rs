@@ -62,6 +62,39 @@ fn a_message_shorter_than_a_piece_comes_once_and_whole() {
 }
 
 #[test]
+fn after_four_billion_records_every_one_still_comes_once() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    // 2^32 records: fifty days at 1 kHz.
+    let first = u64::from(u32::MAX) - 3;
+    out.begin_at(first);
+    incoming.reconnect(first);
+    for number in 0..8 {
+        out.push(&control(number), Quality::Each);
+    }
+    let mut came: Vec<Record> = Vec::new();
+    while let Some(frame) = out.next(0) {
+        came.extend(deliver(&mut incoming, frame));
+    }
+    assert_eq!(incoming.received().number, first + 7);
+    out.acknowledge(incoming.received().number);
+    assert!(out.kept.is_empty(), "the peer has them all");
+    // The connection is lost while more is on its way: one came, one did not.
+    for number in 8..10 {
+        out.push(&control(number), Quality::Each);
+    }
+    let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).collect();
+    came.extend(deliver(&mut incoming, frames[0].clone()));
+    let (received, ahead) = incoming.state();
+    out.reconnect(received, &ahead);
+    incoming.reconnect(out.next_number());
+    while let Some(frame) = out.next(0) {
+        came.extend(deliver(&mut incoming, frame));
+    }
+    let all: Vec<Record> = (0..10).map(control).collect();
+    assert_eq!(came, all);
+}
+
+#[test]
 fn a_big_message_does_not_hold_up_small_ones() {
     let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
     out.push(&data(1, 1, 1 << 20), Quality::Newest);
