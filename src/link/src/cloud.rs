@@ -20,12 +20,12 @@ mod mirror;
 mod node_link;
 mod outputs;
 mod parameters;
+mod turns;
 mod twins;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -34,7 +34,7 @@ use parking_lot::Mutex;
 use ros::bus::{Bus, ParamValue};
 use ros::schema::Registry;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
@@ -47,6 +47,7 @@ use crate::{MAX_FRAME, MAX_RECORD};
 
 use attempts::Attempts;
 use node_link::NodeLink;
+use turns::Turns;
 use twins::Machine;
 
 /// For the robot's hello.
@@ -122,11 +123,11 @@ pub struct Hub {
     links: Mutex<BTreeMap<String, Arc<NodeLink>>>,
     /// Grows when links come, go, or change what they listen to.
     changes: watch::Sender<u64>,
-    /// One begins at a time: the second finds what the first left.
-    beginning: tokio::sync::Mutex<()>,
+    /// Of one node, one link begins or ends at a time.
+    turns: Turns,
     parameters: parameters::Known,
     /// Services of the robot are lent already.
-    lends: AtomicBool,
+    lends: OnceCell<()>,
     /// The robot's clock against ours.
     skew: Skew,
     attempts: Attempts,
@@ -187,9 +188,9 @@ impl Hub {
             options,
             links: Mutex::default(),
             changes: watch::Sender::new(0),
-            beginning: tokio::sync::Mutex::default(),
+            turns: Turns::default(),
             parameters: parameters::Known::default(),
-            lends: AtomicBool::new(false),
+            lends: OnceCell::new(),
             skew: Skew::default(),
             attempts: Attempts::default(),
             twins: Mutex::default(),
@@ -295,7 +296,7 @@ impl Hub {
             self.attempts.ended(&hello.run);
         }
         if for_good {
-            self.end(&link).await;
+            self.end(&link, turn).await;
         } else {
             self.expire(&link, turn);
         }
@@ -313,13 +314,8 @@ impl Hub {
                 "{node:?} is not an absolute node name"
             )));
         }
-        let _beginning = self.beginning.lock().await;
-        if let Some(reason) = &*self.closed.borrow() {
-            return Err(Refusal {
-                reason: reason.clone(),
-                again: true,
-            });
-        }
+        let _turn = self.turns.of(node).await;
+        self.check_open()?;
         if !self.attempts.is_newest(&hello.run, hello.attempt) {
             return Err(Refusal {
                 reason: format!("{node} has tried again since, or has ended"),
@@ -371,6 +367,11 @@ impl Hub {
         }
         let link = NodeLink::begin(self, hello, session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
+        // Closed while the node was started: nobody else would end this link.
+        if let Err(refusal) = self.check_open() {
+            self.forget(&link);
+            return Err(refusal);
+        }
         let untold = self.parameters.untold();
         if !untold.is_empty() {
             link.session.tell(&Control::Parameters(untold));
@@ -385,6 +386,16 @@ impl Hub {
         self.changed();
         let turn = *link.kick.borrow();
         Ok((link, false, turn))
+    }
+
+    fn check_open(&self) -> Result<(), Refusal> {
+        match &*self.closed.borrow() {
+            Some(reason) => Err(Refusal {
+                reason: reason.clone(),
+                again: true,
+            }),
+            None => Ok(()),
+        }
     }
 
     fn changed(&self) {
@@ -420,15 +431,12 @@ impl Hub {
         self.changed();
     }
 
-    /// Ends the link and its node.
-    async fn end(&self, link: &Arc<NodeLink>) {
-        let current = self
-            .links
-            .lock()
-            .get(&link.node)
-            .is_some_and(|known| Arc::ptr_eq(known, link));
-        if current {
-            let _beginning = self.beginning.lock().await;
+    /// Ends the link and its node, unless another connection has taken the link up since the one of this turn.
+    async fn end(&self, link: &Arc<NodeLink>, turn: u64) {
+        let _turn = self.turns.of(&link.node).await;
+        let known = self.links.lock().get(&link.node).cloned();
+        let current = known.is_some_and(|known| Arc::ptr_eq(&known, link));
+        if current && *link.kick.borrow() == turn {
             self.forget(link);
             self.stop(&link.node).await;
         }
@@ -441,7 +449,7 @@ impl Hub {
         tokio::spawn(async move {
             let back = kicked.wait_for(|kicks| *kicks != turn);
             if timeout(hub.options.grace, back).await.is_err() {
-                hub.end(&link).await;
+                hub.end(&link, turn).await;
             }
         });
     }

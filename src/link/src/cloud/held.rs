@@ -1,7 +1,7 @@
 //! Messages and calls that come while an output is being subscribed to wait until it is: whoever listens on the robot
 //! is connected to the stub already, and shall hear what the node answers.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
@@ -20,7 +20,9 @@ pub(super) struct Held {
 
 #[derive(Default)]
 struct State {
-    outputs: usize,
+    /// What is waited for, each by its number.
+    holds: BTreeSet<u64>,
+    next: u64,
     bytes: usize,
     records: VecDeque<(Record, i64)>,
     /// Someone passes on what had waited: others queue up behind.
@@ -38,7 +40,7 @@ fn size(record: &Record) -> usize {
 
 impl State {
     fn is_due(&self) -> bool {
-        self.outputs == 0 || self.records.len() >= MOST.0 || self.bytes >= MOST.1
+        self.holds.is_empty() || self.records.len() >= MOST.0 || self.bytes >= MOST.1
     }
 }
 
@@ -46,7 +48,7 @@ impl Held {
     /// Takes a record that must wait; gives back one that need not.
     pub(super) fn take(&self, record: Record, arrived: i64) -> Option<(Record, i64)> {
         let mut state = self.state.lock();
-        if state.outputs == 0 && !state.passing && state.records.is_empty() {
+        if state.holds.is_empty() && !state.passing && state.records.is_empty() {
             return Some((record, arrived));
         }
         state.bytes += size(&record);
@@ -74,39 +76,51 @@ impl Held {
         state.passing = false;
     }
 
-    /// Nothing waits any longer, whatever was waited for.
-    fn give_up(&self) {
-        self.state.lock().outputs = 0;
+    /// One more thing is waited for; its number.
+    fn hold(&self) -> u64 {
+        let mut state = self.state.lock();
+        let number = state.next;
+        state.next += 1;
+        state.holds.insert(number);
+        number
+    }
+
+    /// That is not waited for any longer.
+    fn release(&self, number: u64) {
+        self.state.lock().holds.remove(&number);
     }
 }
 
 /// While this lives, messages and calls of the link wait; not longer than first messages of a topic do.
-pub(super) struct Hold(Arc<NodeLink>);
+pub(super) struct Hold {
+    link: Arc<NodeLink>,
+    number: u64,
+}
 
 impl Hold {
     pub(super) fn new(link: &Arc<NodeLink>) -> Self {
-        link.held.state.lock().outputs += 1;
+        let number = link.held.hold();
         if let Some(hub) = link.hub.upgrade() {
             let weak = Arc::downgrade(link);
             tokio::spawn(async move {
                 tokio::time::sleep(hub.options.warm_up).await;
                 if let Some(link) = weak.upgrade() {
-                    link.held.give_up();
+                    link.held.release(number);
                     link.pass_held();
                 }
             });
         }
-        Self(Arc::clone(link))
+        Self {
+            link: Arc::clone(link),
+            number,
+        }
     }
 }
 
 impl Drop for Hold {
     fn drop(&mut self) {
-        {
-            let mut state = self.0.held.state.lock();
-            state.outputs = state.outputs.saturating_sub(1);
-        }
-        self.0.pass_held();
+        self.link.held.release(self.number);
+        self.link.pass_held();
     }
 }
 
@@ -134,12 +148,12 @@ mod tests {
     fn what_waits_passes_in_order_once_it_may() {
         let held = Held::default();
         assert!(held.take(call(0, 1), 0).is_some(), "nothing to wait for");
-        held.state.lock().outputs = 1;
+        let hold = held.hold();
         for number in 1..4 {
             assert!(held.take(call(0, 1), number).is_none());
         }
         assert!(passed(&held).is_empty());
-        held.give_up();
+        held.release(hold);
         // One that comes while others pass does not overtake them.
         let mut order = Vec::new();
         held.pass(|_, arrived| {
@@ -153,9 +167,24 @@ mod tests {
     }
 
     #[test]
+    fn what_one_output_has_waited_for_long_enough_another_may_still_wait_for() {
+        let held = Held::default();
+        let first = held.hold();
+        let second = held.hold();
+        assert!(held.take(call(0, 1), 1).is_none());
+        // The first one's time is up; then it is subscribed to, which changes nothing for the second.
+        held.release(first);
+        assert!(passed(&held).is_empty());
+        held.release(first);
+        assert!(passed(&held).is_empty());
+        held.release(second);
+        assert_eq!(passed(&held), [1]);
+    }
+
+    #[test]
     fn not_too_much_waits() {
         let held = Held::default();
-        held.state.lock().outputs = 1;
+        held.hold();
         for number in 0..300 {
             assert!(held.take(call(0, 1), number).is_none());
         }

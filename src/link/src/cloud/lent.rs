@@ -11,7 +11,6 @@
 //! ```
 
 use std::collections::HashMap;
-use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
@@ -288,15 +287,10 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
 
 /// Lends the robot's services to the servant, from the first link on.
 pub(super) async fn begin(hub: &Arc<Hub>) {
-    if hub.lends.load(Ordering::Relaxed) {
-        return;
-    }
     let lender = Arc::new(Robot(Arc::downgrade(hub)));
-    match hub.bus.lend(lender).await {
-        Ok(()) => hub.lends.store(true, Ordering::Relaxed),
-        Err(error) => {
-            tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot");
-        }
+    let begun = hub.lends.get_or_try_init(|| hub.bus.lend(lender));
+    if let Err(error) = begun.await {
+        tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot");
     }
 }
 

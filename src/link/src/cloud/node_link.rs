@@ -57,6 +57,8 @@ pub(super) struct NodeLink {
     /// What must wait for an output to be subscribed to.
     pub(super) held: Held,
     orders: mpsc::UnboundedSender<(Control, Option<Hold>)>,
+    /// They wait for no order: a node that answers nobody is the one to be ended.
+    signals: mpsc::UnboundedSender<i32>,
     tasks: Mutex<Vec<AbortHandle>>,
 }
 
@@ -75,6 +77,7 @@ impl NodeLink {
         mut lines: mpsc::Receiver<(bool, String)>,
     ) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
+        let (signals, sent) = mpsc::unbounded_channel();
         let id = format!("{}-{:x}", hello.run, crate::clock::now());
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
@@ -97,10 +100,12 @@ impl NodeLink {
             held: Held::default(),
             dropped: Mutex::default(),
             orders,
+            signals,
             tasks: Mutex::default(),
         });
         let mut tasks = vec![
             tokio::spawn(obey(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
+            tokio::spawn(deliver(Arc::clone(&link), Arc::clone(hub), sent)).abort_handle(),
             tokio::spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
         ];
         let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
@@ -298,6 +303,9 @@ impl NodeLink {
             Record::Control(json) => match serde_json::from_slice(&json) {
                 // A call that waits for it must not wait for other orders.
                 Ok(Control::Lent { service, of }) => this.lends(service, of),
+                Ok(Control::Signal { signal }) => {
+                    let _ = self.signals.send(signal);
+                }
                 Ok(control) => {
                     // Data may follow in the same breath.
                     let hold = match &control {
@@ -365,11 +373,6 @@ async fn obey(
                 outputs.listeners(&link, &hub, (channel, count), hold).await;
             }
             Control::Parameters(changes) => hub.parameters.change(&hub, changes).await,
-            Control::Signal { signal } => {
-                if let Err(reason) = hub.nodes.signal(&link.node, signal).await {
-                    tracing::debug!(node = link.node, signal, reason, "a signal did not arrive");
-                }
-            }
             Control::Requests(requests) => {
                 let mut kept = link.requests.lock();
                 for request in requests {
@@ -397,6 +400,15 @@ async fn obey(
             }
             Control::Dropped(dropped) => *link.dropped.lock() = dropped,
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
+        }
+    }
+}
+
+/// Sends the node what signals the robot sends it, in their order.
+async fn deliver(link: Arc<NodeLink>, hub: Arc<Hub>, mut signals: mpsc::UnboundedReceiver<i32>) {
+    while let Some(signal) = signals.recv().await {
+        if let Err(reason) = hub.nodes.signal(&link.node, signal).await {
+            tracing::debug!(node = link.node, signal, reason, "a signal did not arrive");
         }
     }
 }

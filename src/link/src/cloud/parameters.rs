@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
+use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
 use super::{Hub, RUNS};
@@ -28,12 +29,12 @@ pub(super) struct Known {
     set: Mutex<BTreeMap<String, ParamValue>>,
     /// Set by a node before there was a link to tell it.
     untold: Mutex<BTreeMap<String, Option<ParamValue>>>,
-    watching: Mutex<Option<AbortHandle>>,
+    watching: OnceCell<AbortHandle>,
 }
 
 impl Drop for Known {
     fn drop(&mut self) {
-        if let Some(watching) = self.watching.lock().take() {
+        if let Some(watching) = self.watching.get() {
             watching.abort();
         }
     }
@@ -85,24 +86,20 @@ impl Known {
 
     /// Tells robots what nodes set, from now on.
     pub(super) async fn watch(&self, hub: &Arc<Hub>) {
-        if self.watching.lock().is_some() {
-            return;
-        }
-        let mut changes = match hub.bus.watch_params().await {
-            Ok(changes) => changes,
-            Err(error) => {
-                tracing::warn!(%error, "parameters that nodes set do not reach the robot");
-                return;
-            }
-        };
-        let weak = Arc::downgrade(hub);
-        let task = tokio::spawn(async move {
-            while let Some((key, value)) = changes.recv().await {
-                let Some(hub) = weak.upgrade() else { return };
-                hub.parameters.tell(&hub, key, value);
-            }
+        let begun = self.watching.get_or_try_init(|| async {
+            let mut changes = hub.bus.watch_params().await?;
+            let weak = Arc::downgrade(hub);
+            let task = tokio::spawn(async move {
+                while let Some((key, value)) = changes.recv().await {
+                    let Some(hub) = weak.upgrade() else { return };
+                    hub.parameters.tell(&hub, key, value);
+                }
+            });
+            Ok::<_, ros::bus::BusError>(task.abort_handle())
         });
-        *self.watching.lock() = Some(task.abort_handle());
+        if let Err(error) = begun.await {
+            tracing::warn!(%error, "parameters that nodes set do not reach the robot");
+        }
     }
 
     /// Tells the link whose node the parameter belongs to, or any: they are on one robot.

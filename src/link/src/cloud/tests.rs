@@ -5,22 +5,50 @@ use tokio::io::{DuplexStream, duplex};
 use tokio::net::TcpListener;
 
 use super::*;
-use crate::control::Resume;
+use crate::control::{Input, Resume};
+use crate::record::Record;
 
 /// A servant whose nodes run from when they are started, and say nothing.
-#[derive(Default)]
 struct Quiet {
     running: Mutex<BTreeSet<String>>,
     warnings: Mutex<Vec<String>>,
+    /// Nodes that neither start nor end.
+    stuck: Mutex<BTreeSet<String>>,
+    signals: watch::Sender<Vec<(String, i32)>>,
+}
+
+impl Default for Quiet {
+    fn default() -> Self {
+        Self {
+            running: Mutex::default(),
+            warnings: Mutex::default(),
+            stuck: Mutex::default(),
+            signals: watch::Sender::default(),
+        }
+    }
+}
+
+impl Quiet {
+    fn is_stuck(&self, node: &str) -> bool {
+        self.stuck.lock().contains(node)
+    }
 }
 
 #[async_trait]
 impl Nodes for Quiet {
     async fn start(&self, node: &Node, _: &Sla) -> Result<(), String> {
+        if self.is_stuck(&node.name) {
+            std::future::pending::<()>().await;
+        }
         self.running.lock().insert(node.name.clone());
         Ok(())
     }
-    async fn signal(&self, node: &str, _: i32) -> Result<(), String> {
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+        let sent = (node.to_owned(), signal);
+        self.signals.send_modify(|signals| signals.push(sent));
+        if self.is_stuck(node) {
+            std::future::pending::<()>().await;
+        }
         self.running.lock().remove(node);
         Ok(())
     }
@@ -48,6 +76,10 @@ impl Nodes for Quiet {
 }
 
 async fn hub() -> (Arc<Hub>, Arc<Quiet>) {
+    hub_with(HubOptions::default()).await
+}
+
+async fn hub_with(options: HubOptions) -> (Arc<Hub>, Arc<Quiet>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions::default());
@@ -55,7 +87,6 @@ async fn hub() -> (Arc<Hub>, Arc<Quiet>) {
     let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/bridge");
     let bus: Arc<dyn Bus> = bus.await.unwrap();
     let nodes = Arc::new(Quiet::default());
-    let options = HubOptions::default();
     let registry = Arc::new(Registry::default());
     (Hub::new("s1", bus, registry, nodes.clone(), options), nodes)
 }
@@ -178,5 +209,94 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
     assert!(
         reason.contains("another machine (rover1)") && !again,
         "{reason}"
+    );
+}
+
+/// Not a measure of anything: a test that hangs shall say so.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[tokio::test]
+async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
+    let (hub, nodes) = hub().await;
+    let (_detect, welcome) = says(&hub, &hello("/detect", 1)).await;
+    // One node takes for ever to start …
+    nodes.stuck.lock().insert("/starting".into());
+    let starting = Hello {
+        run: "another life".into(),
+        ..hello("/starting", 1)
+    };
+    let (robot, cloud) = duplex(1 << 16);
+    let serving = Arc::clone(&hub);
+    tokio::spawn(async move { serving.serve(cloud, b"").await });
+    let mut starting_socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
+    send_open(&mut starting_socket, &starting).await.unwrap();
+    // … and one to end, after its robot has left it.
+    let (mut ending, _) = says(
+        &hub,
+        &Hello {
+            run: "a third life".into(),
+            ..hello("/ending", 1)
+        },
+    )
+    .await;
+    nodes.stuck.lock().insert("/ending".into());
+    ending.queue_close(1000, "");
+    let _ = std::future::poll_fn(|cx| ending.poll_flush(cx)).await;
+    let mut signals = nodes.signals.subscribe();
+    let told = signals.wait_for(|signals| signals.contains(&("/ending".into(), 2)));
+    timeout(PATIENCE, told)
+        .await
+        .expect("it is asked to end")
+        .unwrap();
+    let back = resuming(2, &welcome);
+    let resumed = says(&hub, &back);
+    let (_, welcome) = timeout(PATIENCE, resumed).await.expect("others hold it up");
+    assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
+}
+
+#[tokio::test]
+async fn a_link_that_is_taken_up_as_its_grace_ends_goes_on() {
+    let (hub, nodes) = hub().await;
+    let (_first, welcome) = says(&hub, &hello("/detect", 1)).await;
+    let link = hub.links.lock()["/detect"].clone();
+    let turn = *link.kick.borrow();
+    let (_second, welcome) = says(&hub, &resuming(2, &welcome)).await;
+    assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
+    // What was about to end it comes too late.
+    hub.end(&link, turn).await;
+    assert!(hub.links.lock().contains_key("/detect"));
+    assert!(nodes.is_running("/detect").await);
+}
+
+#[tokio::test]
+async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
+    // The node does not connect to what it is sent, as one that was stopped does not.
+    let (hub, nodes) = hub_with(HubOptions {
+        warm_up: PATIENCE * 10,
+        ..HubOptions::default()
+    })
+    .await;
+    let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
+    let link = hub.links.lock()["/detect"].clone();
+    let tell = |control: &Control| {
+        let json = serde_json::to_vec(control).unwrap();
+        crate::Handler::record(&link, Record::Control(json.into()), 0);
+    };
+    tell(&Control::Open(Input {
+        channel: 1,
+        topic: "/image".into(),
+        type_name: "std_msgs/Empty".into(),
+        md5: "d41d8cd98f00b204e9800998ecf8427e".into(),
+        ..Input::default()
+    }));
+    for signal in [2, 15] {
+        tell(&Control::Signal { signal });
+    }
+    let mut signals = nodes.signals.subscribe();
+    let both = signals.wait_for(|signals| signals.len() == 2);
+    let both = timeout(PATIENCE, both).await.expect("they wait").unwrap();
+    assert_eq!(
+        *both,
+        [("/detect".to_owned(), 2), ("/detect".to_owned(), 15)]
     );
 }
