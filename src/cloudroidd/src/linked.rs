@@ -1,5 +1,7 @@
 //! What a servant does for its robot's stubs: nodes are started and ended one by one, as roslaunch does on the robot.
 
+mod planned;
+
 use std::collections::BTreeSet;
 use std::path::{Component, Path, PathBuf};
 use std::sync::{Arc, OnceLock, Weak};
@@ -22,6 +24,8 @@ use crate::journal::Journal;
 use crate::request_times::RequestTimes;
 use crate::state::{NewEvent, RevisionRecord, State};
 use crate::stubs;
+
+use planned::Planned;
 
 /// Lines that wait for a slow link; more are lost, and stand in the servant's log.
 const LINES: usize = 256;
@@ -62,6 +66,7 @@ pub struct LinkedNodes {
     /// A container is made before anybody asks for it.
     handle: OnceLock<Weak<Handle>>,
     container: Arc<dyn Servant>,
+    planned: Planned,
     /// Extracted layers, lowest first.
     layers: Vec<PathBuf>,
 }
@@ -84,6 +89,7 @@ impl LinkedNodes {
             decisions: Mutex::new((Instant::now(), 0)),
             handle: OnceLock::new(),
             container: Arc::clone(container),
+            planned: Planned::default(),
             layers: layers.ok().and_then(Result::ok).unwrap_or_default(),
         }
     }
@@ -165,20 +171,8 @@ impl LinkedNodes {
 
     /// The revision's own nodes end: a stub's take their place.
     async fn end_planned(&self, handle: &Handle) {
-        if handle.is_linked() {
-            return;
-        }
-        handle.set_linked();
-        for node in &self.revision.plan.nodes {
-            if self
-                .container
-                .signal_node(&node.name, libc::SIGINT)
-                .await
-                .is_ok()
-            {
-                let _ = self.container.wait_node(&node.name).await;
-            }
-        }
+        let ending = || planned::end_all(&*self.container, &self.revision.plan.nodes);
+        self.planned.end(|| handle.set_linked(), ending).await;
     }
 }
 

@@ -169,6 +169,11 @@ pub trait Servant: Send + Sync + 'static {
     async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
     /// Sends a signal to a node.
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), crate::Error>;
+    /// Sends a signal to a node that is to end for good: it is not started again, and the servant does not end with
+    /// it, whatever its spec says. So it is from now on even if there is nothing to signal.
+    async fn end_node(&self, node: &str, signal: i32) -> Result<(), crate::Error> {
+        self.signal_node(node, signal).await
+    }
     /// Waits for a node to end and tells how; answers at once when it has ended already.
     async fn wait_node(&self, node: &str) -> Result<NodeExit, crate::Error>;
     /// Every line printed, from the first or from now on, none lost; ends when the container has ended.

@@ -102,6 +102,9 @@ pub enum Command {
         node: String,
         /// Signal number.
         signal: i32,
+        /// It ends for good: is not started again, and the servant does not end with it.
+        #[serde(default)]
+        last: bool,
     },
     /// Change limits.
     SetLimits(Limits),
@@ -152,6 +155,7 @@ mod tests {
             command: Command::SignalNode {
                 node: "/a".into(),
                 signal: 2,
+                last: true,
             },
         };
         assert_eq!(

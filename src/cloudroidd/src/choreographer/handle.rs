@@ -217,9 +217,9 @@ impl Handle {
         self.linked.load(Ordering::Relaxed)
     }
 
-    /// From now on they do.
-    pub fn set_linked(&self) {
-        self.linked.store(true, Ordering::Relaxed);
+    /// From now on they do; whether they did not before.
+    pub fn set_linked(&self) -> bool {
+        !self.linked.swap(true, Ordering::Relaxed)
     }
 
     /// Its container, once made.

@@ -208,8 +208,16 @@ impl<'a> Nodes<'a> {
     }
 
     async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
+        if self.handle.is_linked() {
+            // A stub took its place while it paused.
+            return Ok(());
+        }
         match self.container.start_node(node.clone()).await {
             Ok(()) => {
+                if self.handle.is_linked() {
+                    // Or just now.
+                    let _ = self.container.end_node(&node.name, libc::SIGINT).await;
+                }
                 self.watch(node);
                 Ok(())
             }

@@ -275,6 +275,21 @@ fn last_words(directory: &Path) -> String {
 }
 
 impl LocalServant {
+    async fn send_signal(&self, node: &str, signal: i32, last: bool) -> Result<(), Error> {
+        if !self.known.nodes.borrow().contains_key(node) {
+            return Err(Error::NoNode {
+                id: self.id.clone(),
+                node: node.to_owned(),
+            });
+        }
+        self.ask(Command::SignalNode {
+            node: node.to_owned(),
+            signal,
+            last,
+        })
+        .await
+    }
+
     /// Asks the shim.
     async fn ask(&self, command: Command) -> Result<(), Error> {
         self.requests
@@ -372,17 +387,11 @@ impl Servant for LocalServant {
     }
 
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
-        if !self.known.nodes.borrow().contains_key(node) {
-            return Err(Error::NoNode {
-                id: self.id.clone(),
-                node: node.to_owned(),
-            });
-        }
-        self.ask(Command::SignalNode {
-            node: node.to_owned(),
-            signal,
-        })
-        .await
+        self.send_signal(node, signal, false).await
+    }
+
+    async fn end_node(&self, node: &str, signal: i32) -> Result<(), Error> {
+        self.send_signal(node, signal, true).await
     }
 
     async fn wait_node(&self, node: &str) -> Result<NodeExit, Error> {

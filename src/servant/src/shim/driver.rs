@@ -189,11 +189,16 @@ impl Driver {
                 self.ask_for(number, &spec).await;
                 None
             }
-            Command::SignalNode { node, signal } if self.nodes.is_starting(&node) => {
-                self.early_signals.push((node, signal));
-                Some(Ok(()))
+            Command::SignalNode { node, signal, last } => {
+                if last {
+                    self.nodes.retire(&node);
+                }
+                if self.nodes.is_starting(&node) {
+                    self.early_signals.push((node, signal));
+                    return Some(Ok(()));
+                }
+                Some(self.signal(&node, signal).await)
             }
-            Command::SignalNode { node, signal } => Some(self.signal(&node, signal).await),
             Command::SetLimits(limits) => {
                 let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();

@@ -80,6 +80,19 @@ impl Nodes {
         Ok(())
     }
 
+    /// The node ends for good: nothing follows from its end.
+    pub(super) fn retire(&mut self, name: &str) {
+        if let Some(node) = self.known.get_mut(name) {
+            node.spec.respawn = false;
+            node.spec.required = false;
+        }
+    }
+
+    /// Whether the node is to be started again when it has ended.
+    pub(super) fn respawns(&self, name: &str) -> bool {
+        self.known.get(name).is_some_and(|node| node.spec.respawn)
+    }
+
     /// A number for the start of a node, and what is to be started.
     pub(super) fn start(&mut self, name: &str) -> Option<(u32, NodeSpec)> {
         let node = self.known.get(name).filter(|node| node.inside.is_none())?;
@@ -260,6 +273,27 @@ mod tests {
         assert_eq!(end(4), Some(Consequence::EndServant));
         assert_eq!(end(4), None, "it ended once");
         assert_eq!(end(99), None, "an orphan is no node");
+    }
+
+    #[test]
+    fn nothing_follows_from_the_end_of_a_node_that_ends_for_good() {
+        let mut nodes = Nodes::default();
+        run(&mut nodes, node("/again", false, true), 3);
+        run(&mut nodes, node("/needed", true, true), 4);
+        run(&mut nodes, node("/pausing", false, true), 5);
+        let mut end = |nodes: &mut Nodes, pid| {
+            let ended = nodes.exited(pid, exit_of(0, false));
+            ended.map(|(_, consequence)| consequence)
+        };
+        // One has ended already and waits to be started again.
+        assert_eq!(end(&mut nodes, 5), Some(Consequence::Respawn(0.5)));
+        assert!(nodes.respawns("/pausing"));
+        for name in ["/again", "/needed", "/pausing", "/never"] {
+            nodes.retire(name);
+            assert!(!nodes.respawns(name));
+        }
+        assert_eq!(end(&mut nodes, 3), Some(Consequence::None));
+        assert_eq!(end(&mut nodes, 4), Some(Consequence::None));
     }
 
     #[test]

@@ -150,6 +150,33 @@ async fn a_respawning_node_comes_back_and_can_still_be_stopped() {
 }
 
 #[tokio::test]
+async fn nodes_that_end_for_good_do_not_come_back_and_end_nothing_with_them() {
+    let world = World::new();
+    let mut again = node("/again", &["sleep"]);
+    (again.respawn, again.respawn_delay) = (true, 0.05);
+    let mut needed = node("/needed", &["sleep"]);
+    needed.required = true;
+    let servant = world.start(spec(vec![again, needed])).await;
+    let mut events = servant.events();
+    for name in ["/again", "/needed"] {
+        servant.end_node(name, libc::SIGKILL).await.unwrap();
+        within(servant.wait_node(name)).await.unwrap();
+    }
+    // What comes next is what is started next.
+    servant.start_node(node("/last", &["sleep"])).await.unwrap();
+    loop {
+        match within(events.recv()).await.unwrap() {
+            NodeEvent::Respawning { node } => panic!("{node} comes back"),
+            NodeEvent::Started { node, .. } if node == "/last" => break,
+            _ => {}
+        }
+    }
+    let running = matches!(&*servant.state().borrow(), ContainerState::Running { .. });
+    assert!(running, "it ended with its node");
+    world.stop(servant).await;
+}
+
+#[tokio::test]
 async fn nodes_have_their_environment_and_directory_and_a_name_once() {
     let world = World::new();
     let mut speaker = node("/speaker", &["environment"]);

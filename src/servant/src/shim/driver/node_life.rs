@@ -61,7 +61,7 @@ impl Driver {
     }
 
     pub(super) async fn respawn(&mut self, name: &str) {
-        if self.stopping.is_none() {
+        if self.stopping.is_none() && self.nodes.respawns(name) {
             self.start_node(name).await;
         }
     }
