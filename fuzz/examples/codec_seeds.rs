@@ -2,7 +2,7 @@
 //!
 //!     cargo run -p fuzz --example codec_seeds
 
-use codec::{Codec, Encoder, Schema, VideoOptions};
+use codec::{Codec, Encoder, JpegOptions, Schema, VideoOptions};
 use std::fs;
 use std::path::Path;
 
@@ -206,15 +206,15 @@ fn list(frames: &[Vec<u8>], cut: usize) -> Vec<u8> {
     bytes
 }
 
-/// The frames of messages of one topic, each acknowledged before the next.
+/// The frames of messages of one topic.
 fn frames(schema: Schema, codec: Codec, messages: &[Vec<u8>]) -> Vec<Vec<u8>> {
     let mut encoder = Encoder::new(schema).allow_video(VideoOptions::default());
+    encoder = encoder.allow_jpeg(JpegOptions::default());
     let mut frames = Vec::new();
     for message in messages {
         let mut frame = Vec::new();
         let encoded = encoder.encode(codec, message, &mut frame);
         assert_eq!(encoded.codec.name(), codec.name(), "the message must fit");
-        encoder.acknowledge(encoded.sequence);
         frames.push(frame);
     }
     frames
@@ -282,5 +282,12 @@ fn main() {
     let made = frames(Schema::Image, Codec::Video, &rgb);
     write("codec_video", "moving", &list(&made, 2));
     mixed.extend(made);
+    let grey = image("mono8", 33, 25, 40, &samples(40 * 25));
+    let made = [
+        frames(Schema::Image, Codec::Jpeg, &rgb[..1]),
+        frames(Schema::Image, Codec::Jpeg, &[grey]),
+    ];
+    write("codec_jpeg", "kinds", &list(&made.concat(), 2));
+    mixed.extend(made.concat());
     write("codec_frame", "all", &list(&mixed, 0));
 }

@@ -24,6 +24,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("codec_scan", codec::scan),
     ("codec_cloud", codec::cloud),
     ("codec_video", codec::video),
+    ("codec_jpeg", codec::jpeg),
     ("codec_frame", codec::frame),
     ("codec_message", codec::message),
     ("rosbridge_json", rosbridge::json),

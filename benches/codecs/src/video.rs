@@ -1,6 +1,7 @@
 //! Colour video beside x264, in processor time: one core's, whatever else runs.
 
 use crate::messages::image;
+use crate::psnr::Psnr;
 use crate::samples;
 use anyhow::{Context, Result, ensure};
 use bench_report::{Report, Target, children_time, thread_time};
@@ -10,25 +11,6 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 const FRAMES: usize = 200;
-
-/// Signal to noise of samples of eight bits, in dB.
-#[derive(Default)]
-struct Psnr {
-    squares: f64,
-    samples: f64,
-}
-
-impl Psnr {
-    fn add(&mut self, ours: &[u8], truth: &[u8]) {
-        let square = |(&a, &b): (&u8, &u8)| u64::from(a.abs_diff(b)).pow(2);
-        self.squares += ours.iter().zip(truth).map(square).sum::<u64>() as f64;
-        self.samples += truth.len() as f64;
-    }
-
-    fn decibels(&self) -> f64 {
-        10.0 * (255.0 * 255.0 * self.samples / self.squares.max(1e-9)).log10()
-    }
-}
 
 /// BT.601 luma of blue, green, red.
 fn luma(pixels: &[u8]) -> Vec<u8> {

@@ -24,7 +24,9 @@
 //! # The name that an executable's node has when none is given, where that is not the executable's.
 //! nodes = { "listener.py" = "listener" }
 //! stamps = "rewrite"   # "rewrite" to the cloud's clock and back, or "keep"
-//! codec = "auto"       # "none", "auto" (lossless), or "video" (lossy pictures allowed)
+//! codec = "auto"       # "none", "auto" (lossless), or "jpeg": pictures may lose detail where no lossless codec keeps up
+//!                      # with them or with T_max; "video" is the same as H.264, in programs that are built with it
+//! quality = 80         # of "jpeg", 1 to 100
 //! ```
 //!
 //! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by a ROS
@@ -108,6 +110,9 @@ pub struct Config {
     /// How messages are made smaller on the link.
     #[serde(default)]
     pub codec: Codec,
+    /// How good JPEG pictures are, 1 to 100.
+    #[serde(default)]
+    pub quality: Option<f64>,
     /// Executable → the name its node has when none is given.
     #[serde(default)]
     pub nodes: BTreeMap<String, String>,
@@ -118,6 +123,11 @@ impl Config {
     pub fn longest(&self) -> Option<f64> {
         let interval = self.frames_per_second.map(|rate| 1.0 / rate);
         self.max.or(interval).or(self.age)
+    }
+
+    /// How good pictures are where they lose detail, 1 to 100.
+    pub fn quality(&self) -> Option<u8> {
+        self.quality.map(|quality| quality as u8)
     }
 
     /// This robot's id.
@@ -212,8 +222,44 @@ pub enum Codec {
     /// As it pays, without loss.
     #[default]
     Auto,
-    /// As it pays; pictures may lose detail.
+    /// As it pays; pictures may lose detail, each as a JPEG.
+    Jpeg,
+    /// As it pays; pictures may lose detail, as H.264.
     Video,
+}
+
+impl Codec {
+    /// The codec by which pictures may lose detail.
+    pub fn lossy(self) -> Option<codec::Codec> {
+        match self {
+            Self::None | Self::Auto => None,
+            Self::Jpeg => Some(codec::Codec::Jpeg),
+            Self::Video => Some(codec::Codec::Video),
+        }
+    }
+
+    /// What is wrong with this choice, if `decoded` are the codecs that the server has, and what to do.
+    pub fn unmet(self, decoded: &[String]) -> Option<String> {
+        let lossy = self.lossy()?;
+        let name = lossy.name();
+        let instead = match self {
+            Self::Video => {
+                "set codec = \"jpeg\", or use programs that are built with the feature `video` on both sides"
+            }
+            _ => "update the server",
+        };
+        if !lossy.is_built() {
+            return Some(format!(
+                "codec = \"{name}\" is not built into this stub, so pictures lose no detail and need more of the network; {instead}"
+            ));
+        }
+        if !decoded.iter().any(|has| has == name) {
+            return Some(format!(
+                "codec = \"{name}\" is not known to the server, so pictures lose no detail and need more of the network; {instead}"
+            ));
+        }
+        None
+    }
 }
 
 /// Reads `stub.toml` in `share` with what the environment says instead.
@@ -243,7 +289,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 19] = [
+pub const KEYS: [&str; 20] = [
     "server",
     "service",
     "token",
@@ -263,6 +309,7 @@ pub const KEYS: [&str; 19] = [
     "safe_stop",
     "stamps",
     "codec",
+    "quality",
 ];
 
 /// The file's table with some keys given otherwise, as text.
@@ -311,6 +358,13 @@ impl Config {
                 return wrong(key, reason);
             }
         }
+        if let Some(quality) = self
+            .quality
+            .filter(|quality| !(1.0..=100.0).contains(quality))
+        {
+            let reason = format!("is {quality}; it should be a number from 1 to 100");
+            return wrong("quality", reason);
+        }
         match (self.desire, self.max) {
             (Some(desire), Some(max)) if desire > max => wrong(
                 "desire",
@@ -326,6 +380,9 @@ impl Config {
             let reason = format!("is given without {other}; set {other}, too, or remove {key}");
             Err(Wrong { key, reason })
         };
+        if self.quality.is_some() && self.codec != Codec::Jpeg {
+            return without("quality", "codec = \"jpeg\"");
+        }
         match (self.desire, self.max) {
             (Some(_), None) => without("desire", "max"),
             (None, Some(_)) => without("max", "desire"),
@@ -382,6 +439,45 @@ mod tests {
     }
 
     #[test]
+    fn a_codec_that_one_side_has_not_is_named_with_what_to_do() {
+        let has = |names: &[&str]| {
+            names
+                .iter()
+                .map(|name| (*name).to_owned())
+                .collect::<Vec<_>>()
+        };
+        let with = |codec: &str| config(&[("codec", codec)]).unwrap().codec;
+        assert_eq!(with("auto").unmet(&[]), None);
+        assert_eq!(with("jpeg").unmet(&has(&["raw", "jpeg"])), None);
+        let unmet = with("jpeg").unmet(&has(&["raw"])).unwrap();
+        assert!(
+            unmet.contains("codec = \"jpeg\" is not known to the server"),
+            "{unmet}"
+        );
+        let unmet = with("video").unmet(&has(&["raw"])).unwrap();
+        assert!(unmet.contains("codec = \"video\" is not"), "{unmet}");
+        assert!(unmet.contains("set codec = \"jpeg\""), "{unmet}");
+        let built = with("video").unmet(&has(&["raw", "video"]));
+        assert_eq!(built.is_none(), codec::Codec::Video.is_built(), "{built:?}");
+    }
+
+    #[test]
+    fn quality_is_one_of_jpeg() {
+        let given = config(&[("codec", "jpeg"), ("quality", "90")]).unwrap();
+        assert_eq!(
+            (given.codec.lossy(), given.quality()),
+            (Some(codec::Codec::Jpeg), Some(90))
+        );
+        given.with_parameters(&[]).unwrap();
+        let alone = config(&[("quality", "90")]).unwrap().with_parameters(&[]);
+        let error = format!("{:#}", alone.unwrap_err());
+        assert!(
+            error.contains("quality is given without codec = \"jpeg\""),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn nonsense_is_named() {
         for (key, value, named) in [
             ("server", "cloud:9090", "server"),
@@ -391,6 +487,13 @@ mod tests {
             ("max", "nan", "max is NaN"),
             ("desire", "-1", "desire is -1"),
             ("age", "inf", "age is inf"),
+            ("codec", "mpeg", "mpeg"),
+            (
+                "quality",
+                "0",
+                "quality is 0; it should be a number from 1 to 100",
+            ),
+            ("quality", "best", "quality"),
         ] {
             let error = format!("{:#}", config(&[(key, value)]).unwrap_err());
             assert!(error.contains(named), "{error}");

@@ -54,6 +54,7 @@ pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> S
         hello,
         session: None,
         welcome: WELCOME,
+        unmet: None,
     };
     let mut pace = Pace::default();
     let mut told = String::new();
@@ -135,6 +136,8 @@ struct Link<'a> {
     session: Option<String>,
     /// How long a welcome may take when the link is taken up again.
     welcome: Duration,
+    /// What was said of the codec that the configuration asks for.
+    unmet: Option<String>,
 }
 
 impl Link<'_> {
@@ -211,8 +214,14 @@ impl Link<'_> {
                 tracing::info!(servant, resumed, "linked to {}", self.config.server);
                 let session = self.mirror.session();
                 if self.config.codec != config::Codec::None {
+                    session.set_quality(self.config.quality());
                     session.peer_decodes(&codecs);
                 }
+                let unmet = self.config.codec.unmet(&codecs);
+                if let Some(unmet) = unmet.as_ref().filter(|_| unmet != self.unmet) {
+                    tracing::warn!("{unmet}");
+                }
+                self.unmet = unmet;
                 session.reconnect(received, &ahead, next);
                 Ok(())
             }

@@ -104,9 +104,9 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         sla: sla(&config),
         codecs: match config.codec {
             config::Codec::None => Vec::new(),
-            config::Codec::Auto => link::packing::decoded_here(false),
-            config::Codec::Video => link::packing::decoded_here(true),
+            wanted => link::packing::decoded_here(|codec| wanted.lossy() == Some(codec)),
         },
+        quality: config.quality(),
         lends: true,
         keep_stamps: config.stamps == config::Stamps::Keep,
         parameters,

@@ -297,7 +297,8 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
         say(
             Weight::Hint,
             drop.clone(),
-            "send less (a lower rate, codec = \"video\"), or give the topic's reader a longer queue".to_owned(),
+            "send less (a lower rate, codec = \"jpeg\"), or give the topic's reader a longer queue"
+                .to_owned(),
         );
     }
     if link.requests == 0 {
@@ -360,7 +361,7 @@ fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, S
                 "{} inputs of {node} were not sent in the last minute: the link was busy until newer ones came",
                 link.unsent
             ),
-            "lower their rate, or look at the robot's network; codec = \"video\" in stub.toml sends less".to_owned(),
+            "lower their rate, or look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
         );
     }
     if link.left_out as f64 > LEFT_OUT * link.given as f64 {
@@ -388,7 +389,7 @@ fn blame(served: &Served, link: &Link) -> (String, String) {
         part.name, part.p50
     );
     let next = match part.name.as_str() {
-        "up" | "down" => "look at the robot's network; codec = \"video\" in stub.toml sends less".to_owned(),
+        "up" | "down" => "look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
         "queue" => "requests come faster than they are answered: lower their rate, or give more cores with --cpus".to_owned(),
         "compute" => format!(
             "the node itself is slow: push {} with more --cpus, or raise T_max",

@@ -9,8 +9,8 @@
 //!                        a challenger clearly better PATIENCE times ──▶ switch
 //! ```
 //! The measure is how long a message takes from here to the other side: encoding, then the frame over the link as
-//! measured. A codec that needs more than its share of the time between messages is out. A lossy codec is taken only
-//! when no lossless one keeps up with the topic.
+//! measured. A codec that needs more than its share of the time between messages is out, and so is one that takes
+//! longer than the deadline, where there is one. A lossy codec is taken only when no lossless one keeps up like that.
 
 use crate::codec::Codec;
 use crate::layout::Schema;
@@ -50,7 +50,7 @@ pub enum Reason {
     First,
     /// It brings a message to the other side soonest.
     Fastest,
-    /// No lossless codec keeps up with the topic over this link.
+    /// No lossless codec keeps up with the topic, or with the deadline, over this link.
     OnlyOneThatKeepsUp,
     /// None keeps up; this one comes closest.
     LeastLate,
@@ -85,18 +85,20 @@ pub struct Auto {
     challenger: Option<(usize, u32)>,
     link: Option<f64>,
     period: Option<f64>,
+    /// Seconds from here to the other side.
+    deadline: Option<f64>,
     last: Option<Duration>,
     usual_size: f64,
 }
 
 impl Auto {
-    /// For messages of `schema`; `video` when lossy video is allowed (and built).
-    pub fn new(schema: Schema, video: bool) -> Self {
+    /// For messages of `schema`; with the lossy codec that pictures may have.
+    pub fn new(schema: Schema, lossy: Option<Codec>) -> Self {
         let made = Codec::made_for(schema);
         let mut codecs = vec![made, Codec::Zstd(1), Codec::Raw];
         match schema {
             Schema::Other => codecs.push(Codec::Zstd(9)),
-            Schema::Image if video => codecs.push(Codec::Video),
+            Schema::Image => codecs.extend(lossy),
             _ => {}
         }
         Self::among(&codecs)
@@ -124,9 +126,19 @@ impl Auto {
             challenger: None,
             link: None,
             period: None,
+            deadline: None,
             last: None,
             usual_size: 0.0,
         }
+    }
+
+    /// Messages should be on the other side so soon. Without a lossy codec there is nothing that could be done for it.
+    pub fn within(&mut self, deadline: Option<Duration>) {
+        let lossy = |candidate: &Estimate| !candidate.codec.is_lossless();
+        let has_lossy = self.candidates.iter().any(lossy);
+        self.deadline = deadline
+            .filter(|_| has_lossy)
+            .map(|deadline| deadline.as_secs_f64());
     }
 
     /// The codec for the next message: the current one, or one to be tried.
@@ -253,8 +265,14 @@ impl Auto {
         self.encoding(candidate) + self.sending(candidate)
     }
 
-    /// Whether encoding and sending are each done before the next message.
+    /// Whether encoding and sending are each done before the next message, and both before the deadline.
     fn keeps_up(&self, candidate: &Estimate) -> bool {
+        if self
+            .deadline
+            .is_some_and(|deadline| self.expected(candidate) > deadline)
+        {
+            return false;
+        }
         let Some(period) = self.period else {
             return true;
         };
@@ -349,7 +367,7 @@ mod tests {
 
     #[test]
     fn a_fast_link_gets_the_message_as_it_is_and_a_slow_one_the_smallest_lossless() {
-        let mut auto = Auto::new(Schema::Image, true);
+        let mut auto = Auto::new(Schema::Image, Some(Codec::Video));
         let mut clock = 0;
         run(&mut auto, 60, 1e9, &mut clock);
         assert_eq!(
@@ -367,7 +385,7 @@ mod tests {
     #[test]
     fn what_is_lossy_is_the_last_resort() {
         let mut clock = 0;
-        let mut auto = Auto::new(Schema::Image, true);
+        let mut auto = Auto::new(Schema::Image, Some(Codec::Video));
         run(&mut auto, 60, 2e6, &mut clock);
         assert_eq!(
             (auto.choice().codec, auto.choice().reason),
@@ -375,7 +393,7 @@ mod tests {
         );
         run(&mut auto, 120, 40e6, &mut clock);
         assert_eq!(auto.choice().codec, Codec::Image);
-        let mut lossless = Auto::new(Schema::Image, false);
+        let mut lossless = Auto::new(Schema::Image, None);
         run(&mut lossless, 60, 2e6, &mut clock);
         assert_eq!(
             (lossless.choice().codec, lossless.choice().reason),
@@ -384,8 +402,31 @@ mod tests {
     }
 
     #[test]
+    fn a_deadline_that_no_lossless_codec_keeps_is_a_reason_for_a_lossy_one() {
+        let mut clock = 0;
+        // 250 kB in 25 ms: with the rate it keeps up.
+        let mut auto = Auto::new(Schema::Image, Some(Codec::Jpeg));
+        run(&mut auto, 60, 10.5e6, &mut clock);
+        assert_eq!(auto.choice().codec, Codec::Image);
+        auto.within(Some(Duration::from_millis(15)));
+        run(&mut auto, 60, 10.5e6, &mut clock);
+        assert_eq!(
+            (auto.choice().codec, auto.choice().reason),
+            (Codec::Jpeg, Reason::OnlyOneThatKeepsUp)
+        );
+        // Over a quicker link nothing need be lost.
+        run(&mut auto, 120, 60e6, &mut clock);
+        assert_eq!(auto.choice().codec, Codec::Image);
+        // Where nothing may be, the deadline changes nothing.
+        let mut lossless = Auto::new(Schema::Image, None);
+        lossless.within(Some(Duration::from_millis(15)));
+        run(&mut lossless, 60, 10.5e6, &mut clock);
+        assert_eq!(lossless.choice().reason, Reason::Fastest);
+    }
+
+    #[test]
     fn a_wavering_link_does_not_make_it_waver() {
-        let mut auto = Auto::new(Schema::Image, false);
+        let mut auto = Auto::new(Schema::Image, None);
         let mut clock = 0;
         // Around the point where raw and image take the same time: 1 MB / 150 MB/s = 6.7 ms.
         for round in 0..200 {
@@ -401,7 +442,7 @@ mod tests {
 
     #[test]
     fn every_candidate_is_tried_at_first_and_again_later() {
-        let mut auto = Auto::new(Schema::Other, false);
+        let mut auto = Auto::new(Schema::Other, None);
         let mut clock = 0;
         run(&mut auto, 4, 10e6, &mut clock);
         assert!(
@@ -421,7 +462,7 @@ mod tests {
 
     #[test]
     fn a_message_goes_through() {
-        let mut auto = Auto::new(Schema::Other, false);
+        let mut auto = Auto::new(Schema::Other, None);
         let mut encoder = Encoder::new(Schema::Other);
         let mut decoder = crate::Decoder::new(1000);
         for round in 0..10 {

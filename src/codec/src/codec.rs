@@ -6,7 +6,8 @@ use std::str::FromStr;
 
 /// A way to encode a message.
 ///
-/// Written as `raw`, `zlib`, `zlib:9`, `deflate:1`, `zstd:3`, `image`, `grid`, `scan`, `cloud`, `video`.
+/// Written as `raw`, `zlib`, `zlib:9`, `deflate:1`, `zstd:3`, `image`, `grid`, `scan`, `cloud`, `video`,
+/// `jpeg`.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Codec {
     /// As it is.
@@ -19,7 +20,7 @@ pub enum Codec {
     Zstd(i8),
     /// `sensor_msgs/Image`, lossless: 8-bit colour, grey and Bayer, 16-bit and float depth.
     Image,
-    /// `nav_msgs/OccupancyGrid`, lossless, against the last acknowledged grid.
+    /// `nav_msgs/OccupancyGrid`, lossless.
     Grid,
     /// `sensor_msgs/LaserScan`, lossless.
     Scan,
@@ -27,10 +28,12 @@ pub enum Codec {
     Cloud,
     /// `sensor_msgs/Image` in colour as H.264: the pixels are lossy, all else is exact.
     Video,
+    /// `sensor_msgs/Image`, grey or colour, as JPEG: the pixels are lossy, all else is exact.
+    Jpeg,
 }
 
 /// Tag, name, and the codec with its usual level.
-const CODECS: [(u8, &str, Codec); 9] = [
+const CODECS: [(u8, &str, Codec); 10] = [
     (0x00, "raw", Codec::Raw),
     (0x01, "zlib", Codec::Zlib(6)),
     (0x02, "deflate", Codec::Deflate(6)),
@@ -40,12 +43,10 @@ const CODECS: [(u8, &str, Codec); 9] = [
     (0x12, "scan", Codec::Scan),
     (0x13, "cloud", Codec::Cloud),
     (0x20, "video", Codec::Video),
+    (0x21, "jpeg", Codec::Jpeg),
 ];
 
 impl Codec {
-    /// The version of every codec's body; raised when a body changes.
-    pub(crate) const VERSION: u8 = 1;
-
     fn entry(self) -> (u8, &'static str, Self) {
         CODECS[match self {
             Self::Raw => 0,
@@ -57,6 +58,7 @@ impl Codec {
             Self::Scan => 6,
             Self::Cloud => 7,
             Self::Video => 8,
+            Self::Jpeg => 9,
         }]
     }
 
@@ -68,6 +70,21 @@ impl Codec {
     /// The name without its level.
     pub fn name(self) -> &'static str {
         self.entry().1
+    }
+
+    /// The version of the codec's frames: raised when they change.
+    pub fn version(self) -> u8 {
+        match self {
+            // Since 2 with a checksum; grids are told whole.
+            Self::Image | Self::Grid | Self::Scan | Self::Cloud => 2,
+            _ => 1,
+        }
+    }
+
+    /// Whether frames hold a checksum of the message: those of codecs that predict what they decode from what they
+    /// have decoded before it, where one wrong byte would spoil all that follow.
+    pub(crate) fn has_checksum(self) -> bool {
+        matches!(self, Self::Image | Self::Grid | Self::Scan | Self::Cloud)
     }
 
     /// What a frame's tag means; levels are not on the wire and come back as the usual ones.
@@ -89,9 +106,14 @@ impl Codec {
         }
     }
 
+    /// Whether this build has it: H.264 is an option.
+    pub fn is_built(self) -> bool {
+        self != Self::Video || cfg!(feature = "video")
+    }
+
     /// Whether a message comes back bit by bit.
     pub fn is_lossless(self) -> bool {
-        self != Self::Video
+        !matches!(self, Self::Video | Self::Jpeg)
     }
 }
 
@@ -110,7 +132,7 @@ impl fmt::Display for Codec {
 /// A codec's name that names none.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud or video"
+    "`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud, jpeg or video"
 )]
 pub struct UnknownCodec(pub String);
 
@@ -155,6 +177,7 @@ mod tests {
             "scan",
             "cloud",
             "video",
+            "jpeg",
         ] {
             let codec: Codec = name.parse().unwrap();
             assert_eq!(codec.to_string(), name);

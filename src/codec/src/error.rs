@@ -34,26 +34,36 @@ pub enum Error {
         /// The limit given to the decoder.
         limit: usize,
     },
-    /// A delta against a grid that was never received or is no longer kept.
-    #[error("delta to message {0}, which is not kept here; ask the sender for a keyframe")]
-    MissingReference(u64),
+    /// What was decoded is not what was encoded. It is not given out.
+    #[error(
+        "message decoded by `{codec}` has another checksum than the one sent; send it another way and report this"
+    )]
+    Checksum {
+        /// The codec's name.
+        codec: &'static str,
+    },
     /// A video frame depends on one that was lost.
     #[error("video frame {0} follows a frame that was lost; ask the sender for a keyframe")]
     KeyframeNeeded(u64),
     /// H.264 frames need the cargo feature `video`.
     #[error("frame is H.264 video and this build has no video; build with the feature `video`")]
     VideoNotBuilt,
+    /// The JPEG library refused the frame.
+    #[error("JPEG library refused the frame: {0}; send it another way")]
+    Jpeg(String),
     /// The video library refused the frame.
     #[error("video library refused the frame: {0}; ask the sender for a keyframe")]
     Video(String),
 }
 
 impl Error {
+    /// Whether the message may come through another codec: what is wrong is the frame, not the message.
+    pub fn wants_another_codec(&self) -> bool {
+        !self.wants_keyframe() && !matches!(self, Self::TooLarge { .. })
+    }
+
     /// Whether the sender's next keyframe puts things right.
     pub fn wants_keyframe(&self) -> bool {
-        matches!(
-            self,
-            Self::MissingReference(_) | Self::KeyframeNeeded(_) | Self::Video(_)
-        )
+        matches!(self, Self::KeyframeNeeded(_) | Self::Video(_))
     }
 }

@@ -104,6 +104,8 @@ pub(crate) struct Image {
     pub(crate) pixel: Pixel,
     /// Whether the channels are red first (or unknown) rather than blue first.
     pub(crate) red_first: bool,
+    /// Whether the samples are known to be what a camera saw, rather than labels or other numbers.
+    pub(crate) seen: bool,
 }
 
 impl Image {
@@ -124,6 +126,7 @@ impl Image {
             && step.checked_mul(height)? == data
             && head.checked_add(data)? == total;
         let red_first = !encoding.starts_with(b"bgr");
+        let seen = [&b"mono8"[..], b"rgb8", b"bgr8", b"rgba8", b"bgra8"].contains(&encoding);
         fits.then_some(Self {
             head,
             width,
@@ -132,6 +135,7 @@ impl Image {
             big_endian,
             pixel,
             red_first,
+            seen,
         })
     }
 
@@ -142,29 +146,24 @@ impl Image {
 }
 
 /// `nav_msgs/OccupancyGrid`; the cells are the end of the message.
-#[derive(Clone, Copy, PartialEq, Debug)]
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct Grid {
     /// Where the cells begin.
     pub(crate) head: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// Metres per cell.
-    pub(crate) resolution: f32,
-    /// Where cell (0, 0) lies, in metres.
-    pub(crate) origin: [f64; 2],
 }
 
 impl Grid {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
         let mut input = Cursor::new(head);
         skip_header(&mut input)?;
-        input.take(8).ok()?;
-        let resolution = f32::from_bits(input.u32().ok()?);
+        // When the map was loaded, and metres per cell.
+        input.take(8 + 4).ok()?;
         let width = size(&mut input)?;
         let height = size(&mut input)?;
-        let pose = input.take(56).ok()?;
-        let number = |at: usize| pose[at..at + 8].try_into().map(f64::from_le_bytes).ok();
-        let origin = [number(0)?, number(8)?];
+        // Where cell (0, 0) lies.
+        input.take(56).ok()?;
         let cells = size(&mut input)?;
         let head = head.len() - input.remaining();
         let fits = width > 0
@@ -175,8 +174,6 @@ impl Grid {
             head,
             width,
             height,
-            resolution,
-            origin,
         })
     }
 }

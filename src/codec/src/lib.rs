@@ -1,8 +1,8 @@
 //! Link codecs: ROS messages in, smaller frames out, and back; nothing lost that must not be.
 //!
 //! ```text
-//!   message (serialized, as it is) ──▶ Encoder ──▶ frame ──▶ Decoder ──▶ the same message
-//!                                        ▲   acknowledge(n)     │
+//!   message (serialized, as it is) ──▶ Encoder ──▶ frame ──▶ Decoder ──▶ the same message, by its checksum
+//!                                        ▲  request_keyframe()  │ (of videos all but the pixels, of JPEG too)
 //!                                        └──────────────────────┘
 //! ```
 //! Pure: no I/O, no threads, no clock; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry their
@@ -26,6 +26,7 @@ mod error;
 mod generic;
 mod grid;
 mod image;
+mod jpeg;
 mod layout;
 mod padded;
 mod plane8;
@@ -40,8 +41,9 @@ mod wire;
 
 pub use auto::{Auto, Choice, Estimate, Reason};
 pub use codec::{Codec, UnknownCodec};
-pub use ends::{Answer, Policy, Receiver, Sender};
+pub use ends::{Answer, Lossy, Policy, Receiver, Sender};
 pub use error::Error;
+pub use jpeg::JpegOptions;
 pub use layout::Schema;
 pub use topic::{Decoded, Decoder, Encoded, Encoder, peek};
 pub use video::VideoOptions;

@@ -1,7 +1,9 @@
-//! Rows with padding: the bytes between a row's samples and the next row, kept exactly.
+//! What stands beside the colours of a picture, kept exactly where those are not: the bytes between a row's samples and
+//! the next row, and alpha.
 
 use crate::Error;
 use crate::column::{put_packed, take_packed};
+use crate::layout::Image;
 use crate::wire::Cursor;
 
 /// Appends the last `step - row` bytes of every `step` bytes of `data`.
@@ -50,6 +52,38 @@ pub(crate) fn take_padding(
             }
         }
         _ => return Err(Error::Corrupt("padding of an unknown kind")),
+    }
+    Ok(())
+}
+
+/// Appends the last of every four channels.
+pub(crate) fn put_alpha(data: &[u8], layout: &Image, out: &mut Vec<u8>) {
+    let rows = data.chunks_exact(layout.step);
+    let alpha: Vec<u8> = rows
+        .flat_map(|line| line[..layout.row()].iter().skip(3).step_by(4))
+        .copied()
+        .collect();
+    put_packed(&alpha, out);
+}
+
+/// Reads what [`put_alpha`] wrote into `data`.
+pub(crate) fn take_alpha(
+    input: &mut Cursor<'_>,
+    data: &mut [u8],
+    layout: &Image,
+) -> Result<(), Error> {
+    let count = layout.width * layout.height;
+    let alpha = take_packed(input, count)?;
+    if alpha.len() != count {
+        return Err(Error::Corrupt("alpha of another size"));
+    }
+    for (line, alpha) in data
+        .chunks_exact_mut(layout.step)
+        .zip(alpha.chunks_exact(layout.width))
+    {
+        for (pixel, &alpha) in line[..layout.row()].chunks_exact_mut(4).zip(alpha) {
+            pixel[3] = alpha;
+        }
     }
     Ok(())
 }

@@ -1,21 +1,22 @@
 //! One topic's encoder and decoder: their memory, and the frame around every body.
 //!
-//! Frame: `tag · version · sequence · length of the message · body`, the two numbers in base 128.
+//! Frame: `tag · version · sequence · length of the message · [checksum] · body`, the two numbers in base 128; the
+//! checksum is the message's CRC-32, little endian, where [`Codec::has_checksum`].
 
 use crate::codec::Codec;
 use crate::generic::{self, Zstd};
-use crate::grid::{GridDecoder, GridEncoder};
+use crate::jpeg::{self, JpegOptions};
 use crate::layout::{Cloud, Grid, Image, Scan, Schema};
 use crate::video::{VideoDecoder, VideoEncoder, VideoOptions};
 use crate::wire::{Cursor, put_varint};
-use crate::{Error, cloud, image, scan};
+use crate::{Error, cloud, grid, image, scan};
 
 /// What became of a message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Encoded {
     /// The codec used: the one asked for, or what it fell back to.
     pub codec: Codec,
-    /// The frame's number, to be acknowledged once it was decoded.
+    /// The frame's number.
     pub sequence: u64,
     /// The frame's size in bytes.
     pub bytes: usize,
@@ -30,20 +31,27 @@ pub struct Encoder {
     schema: Schema,
     sequence: u64,
     zstd: Zstd,
-    grid: GridEncoder,
+    jpeg: Option<JpegOptions>,
     video: Option<VideoEncoder>,
 }
 
 impl Encoder {
-    /// An encoder for messages of `schema`. Lossy codecs fall back until [`Encoder::allow_video`].
+    /// An encoder for messages of `schema`. Lossy codecs fall back until they are allowed.
     pub fn new(schema: Schema) -> Self {
         Self {
             schema,
             sequence: 0,
             zstd: Zstd::default(),
-            grid: GridEncoder::default(),
+            jpeg: None,
             video: None,
         }
+    }
+
+    /// Allows JPEG.
+    #[must_use]
+    pub fn allow_jpeg(mut self, options: JpegOptions) -> Self {
+        self.jpeg = Some(options);
+        self
     }
 
     /// Allows H.264. Without the cargo feature `video` it still falls back.
@@ -51,11 +59,6 @@ impl Encoder {
     pub fn allow_video(mut self, options: VideoOptions) -> Self {
         self.video = Some(VideoEncoder::new(options));
         self
-    }
-
-    /// Whether H.264 is allowed and built.
-    pub fn has_video(&self) -> bool {
-        self.video.is_some() && cfg!(feature = "video")
     }
 
     /// What the messages are.
@@ -67,7 +70,6 @@ impl Encoder {
     pub fn encode(&mut self, codec: Codec, message: &[u8], out: &mut Vec<u8>) -> Encoded {
         self.sequence += 1;
         let first = out.len();
-        let header = 2 + varint_size(self.sequence) + varint_size(message.len() as u64);
         let mut used = codec;
         self.put_header(used, message, out);
         if self.put_body(used, message, out).is_none() {
@@ -76,9 +78,10 @@ impl Encoder {
             self.put_header(used, message, out);
             self.zstd.compress(message, 3, out);
         }
-        // A grid's frame may be kept by the decoder, so it must arrive as it is.
+        let header = 2 + varint_size(self.sequence) + varint_size(message.len() as u64);
         let grown = out.len() - first - header >= message.len();
-        if grown && !matches!(used, Codec::Raw | Codec::Grid | Codec::Video) {
+        // A later frame of a video refers to this one, so it must arrive as it is.
+        if grown && !matches!(used, Codec::Raw | Codec::Video) {
             used = Codec::Raw;
             out.truncate(first);
             self.put_header(used, message, out);
@@ -92,9 +95,12 @@ impl Encoder {
     }
 
     fn put_header(&self, codec: Codec, message: &[u8], out: &mut Vec<u8>) {
-        out.extend_from_slice(&[codec.tag(), Codec::VERSION]);
+        out.extend_from_slice(&[codec.tag(), codec.version()]);
         put_varint(out, self.sequence);
         put_varint(out, message.len() as u64);
+        if codec.has_checksum() {
+            out.extend_from_slice(&crc32fast::hash(message).to_le_bytes());
+        }
     }
 
     /// `None` when the message does not fit the codec; `out` may hold anything then.
@@ -109,14 +115,16 @@ impl Encoder {
                 image::encode(message, &Image::read(message, total)?, out)
             }
             (Codec::Grid, Schema::OccupancyGrid) => {
-                self.grid
-                    .encode(message, &Grid::read(message, total)?, self.sequence, out);
+                grid::encode(message, &Grid::read(message, total)?, out);
             }
             (Codec::Scan, Schema::LaserScan) => {
                 scan::encode(message, &Scan::read(message, total)?, out)?
             }
             (Codec::Cloud, Schema::PointCloud2) => {
                 cloud::encode(message, &Cloud::read(message, total)?, out)
+            }
+            (Codec::Jpeg, Schema::Image) => {
+                jpeg::encode(message, &Image::read(message, total)?, self.jpeg?, out)?;
             }
             (Codec::Video, Schema::Image) => {
                 self.video
@@ -128,14 +136,8 @@ impl Encoder {
         Some(())
     }
 
-    /// The peer has decoded the frame `sequence`: later frames may refer to it.
-    pub fn acknowledge(&mut self, sequence: u64) {
-        self.grid.acknowledge(sequence);
-    }
-
     /// The peer lost something: the next frame refers to none before it.
     pub fn request_keyframe(&mut self) {
-        self.grid.forget();
         if let Some(video) = &mut self.video {
             video.request_keyframe();
         }
@@ -151,7 +153,7 @@ fn varint_size(value: u64) -> usize {
 pub struct Decoded {
     /// The codec; levels are not on the wire.
     pub codec: Codec,
-    /// The frame's number: acknowledge it.
+    /// The frame's number.
     pub sequence: u64,
     /// The message's size in bytes.
     pub bytes: usize,
@@ -160,12 +162,12 @@ pub struct Decoded {
 /// Decodes the frames of one topic, in order.
 ///
 /// None may declare a message of more bytes than the limit, and none makes it allocate more than sixteen times what
-/// it declares (two to four, usually) and two MiB of tables; grids keep up to three messages besides. After an error that asks for a keyframe (see
-/// [`Error::wants_keyframe`]) the sender's [`Encoder::request_keyframe`] puts things right.
+/// it declares (two to four, usually) and two MiB of tables. What does not have the checksum that was sent is an error.
+/// After an error that asks for a keyframe (see [`Error::wants_keyframe`]) the sender's [`Encoder::request_keyframe`]
+/// puts things right; after one that wants another codec (see [`Error::wants_another_codec`]) another codec does.
 #[derive(Debug)]
 pub struct Decoder {
     limit: usize,
-    grid: GridDecoder,
     video: VideoDecoder,
 }
 
@@ -174,7 +176,6 @@ impl Decoder {
     pub fn new(limit: usize) -> Self {
         Self {
             limit,
-            grid: GridDecoder::default(),
             video: VideoDecoder::default(),
         }
     }
@@ -192,12 +193,12 @@ impl Decoder {
     fn decode_frame(&mut self, frame: &[u8], out: &mut Vec<u8>) -> Result<Decoded, Error> {
         let mut input = Cursor::new(frame);
         let (decoded, version) = header(&mut input)?;
-        let (codec, sequence, total) = (decoded.codec, decoded.sequence, decoded.bytes);
-        if version != Codec::VERSION {
+        let (codec, total) = (decoded.codec, decoded.bytes);
+        if version != codec.version() {
             return Err(Error::Version {
                 codec: codec.name(),
                 version,
-                known: Codec::VERSION,
+                known: codec.version(),
             });
         }
         if total > self.limit {
@@ -207,22 +208,32 @@ impl Decoder {
             });
         }
         let first = out.len();
+        let checksum = if codec.has_checksum() {
+            Some(input.u32()?)
+        } else {
+            None
+        };
         match codec {
             Codec::Raw => out.extend_from_slice(input.take(total)?),
             Codec::Zlib(_) => generic::inflate(input.take_rest(), total, true, out)?,
             Codec::Deflate(_) => generic::inflate(input.take_rest(), total, false, out)?,
             Codec::Zstd(_) => generic::unzstd(input.take_rest(), total, out)?,
             Codec::Image => image::decode(&mut input, total, out)?,
-            Codec::Grid => self.grid.decode(&mut input, sequence, total, out)?,
+            Codec::Grid => grid::decode(&mut input, total, out)?,
             Codec::Scan => scan::decode(&mut input, total, out)?,
             Codec::Cloud => cloud::decode(&mut input, total, out)?,
+            Codec::Jpeg => jpeg::decode(&mut input, total, out)?,
             Codec::Video => self.video.decode(&mut input, total, out)?,
         }
         input.finish()?;
-        if out.len() - first == total {
-            Ok(decoded)
-        } else {
-            Err(Error::Corrupt("a message of another size than declared"))
+        if out.len() - first != total {
+            return Err(Error::Corrupt("a message of another size than declared"));
+        }
+        match checksum {
+            Some(sent) if crc32fast::hash(&out[first..]) != sent => Err(Error::Checksum {
+                codec: codec.name(),
+            }),
+            _ => Ok(decoded),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! What a decoder may cost: memory in proportion to the message declared, never more, whatever the frame says.
 
-use codec::{Codec, Decoder, Encoder, Error, Schema};
+use codec::{Codec, Decoder, Encoder, Error, JpegOptions, Schema};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
@@ -187,17 +187,43 @@ fn a_frame_that_lies_takes_no_more() {
 }
 
 #[test]
+fn a_jpeg_takes_no_more_than_its_picture_and_one_that_lies_neither() {
+    for (schema, message) in messages() {
+        let mut frame = Vec::new();
+        let mut encoder = Encoder::new(schema).allow_jpeg(JpegOptions { quality: 95 });
+        if encoder.encode(Codec::Jpeg, &message, &mut frame).codec != Codec::Jpeg {
+            continue;
+        }
+        for part in 0..100 {
+            let at = frame.len() * part / 100;
+            let mut damaged = frame.clone();
+            damaged[at] ^= [0, 0x55][usize::from(part > 0)];
+            for frame in [&frame[..at], &damaged] {
+                let (_, taken) =
+                    peak(|| Decoder::new(message.len()).decode(frame, &mut Vec::new()));
+                assert!(
+                    taken <= FACTOR * message.len() + TABLES,
+                    "{} bytes at {at}: {taken}",
+                    message.len()
+                );
+            }
+        }
+    }
+}
+
+#[test]
 fn what_is_too_large_takes_nothing() {
     for codec in [
-        "raw", "zlib", "deflate", "zstd", "image", "grid", "scan", "cloud", "video",
+        "raw", "zlib", "deflate", "zstd", "image", "grid", "scan", "cloud", "video", "jpeg",
     ] {
-        let tag = codec.parse::<Codec>().unwrap().tag();
+        let parsed = codec.parse::<Codec>().unwrap();
+        let (tag, version) = (parsed.tag(), parsed.version());
         // A message of 2^56 bytes, and one of a byte more than allowed.
         for declared in [
             &[0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 1][..],
             &[0x81, 8],
         ] {
-            let frame = [&[tag, 1, 1], declared, &[0; 100]].concat();
+            let frame = [&[tag, version, 1], declared, &[0; 100]].concat();
             let (result, taken) = peak(|| Decoder::new(1024).decode(&frame, &mut Vec::new()));
             assert!(
                 matches!(result, Err(Error::TooLarge { limit: 1024, .. })),

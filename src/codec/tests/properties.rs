@@ -1,6 +1,6 @@
 //! What must hold for every message and every frame.
 
-use codec::{Codec, Decoder, Encoder, Error, Schema, VideoOptions};
+use codec::{Codec, Decoder, Encoder, Error, JpegOptions, Schema, VideoOptions};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -277,27 +277,6 @@ proptest! {
             Err(_) => prop_assert!(back.is_empty()),
         }
     }
-
-    /// Grids in sequence, some lost, some acknowledged, some late, always come back.
-    #[test]
-    fn grids_survive_any_link(steps in vec((grid(), any::<bool>(), 0u64..6), 1..20)) {
-        let mut encoder = Encoder::new(Schema::OccupancyGrid);
-        let mut decoder = Decoder::new(LIMIT);
-        let mut received = Vec::new();
-        for (message, lost, delay) in steps {
-            let mut frame = Vec::new();
-            let encoded = encoder.encode(Codec::Grid, &message, &mut frame);
-            if !lost {
-                let mut back = Vec::new();
-                decoder.decode(&frame, &mut back).unwrap();
-                prop_assert_eq!(back, message);
-                received.push(encoded.sequence);
-            }
-            if let Some(&sequence) = received.iter().rev().nth(delay as usize) {
-                encoder.acknowledge(sequence);
-            }
-        }
-    }
 }
 
 /// A moving scene of 64×48 pixels.
@@ -328,14 +307,113 @@ fn scene(encoding: &str, channels: usize, round: usize) -> Vec<u8> {
 }
 
 #[test]
-fn video_is_never_used_unless_allowed() {
+fn what_is_lossy_is_never_used_unless_allowed() {
+    let message = scene("rgb8", 3, 0);
+    for codec in [Codec::Video, Codec::Jpeg] {
+        let mut frame = Vec::new();
+        let encoded = Encoder::new(Schema::Image).encode(codec, &message, &mut frame);
+        assert_eq!(encoded.codec, Codec::Zstd(3));
+        let mut back = Vec::new();
+        Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+        assert_eq!(back, message);
+    }
+}
+
+/// A scene after it was decoded: all but the colours is as it was, and those differ by less than `most`.
+fn assert_seen(back: &[u8], message: &[u8], channels: usize, most: u8) {
+    let colours = channels.min(3);
+    assert_eq!(back.len(), message.len());
+    let head = message.len() - 48 * (64 * channels + 5);
+    assert_eq!(back[..head], message[..head]);
+    let lines = |bytes: &[u8]| {
+        bytes[head..]
+            .chunks(64 * channels + 5)
+            .map(<[u8]>::to_vec)
+            .collect::<Vec<_>>()
+    };
+    for (new, old) in lines(back).iter().zip(lines(message)) {
+        assert_eq!(new[64 * channels..], old[64 * channels..], "padding");
+        for (new, old) in new[..64 * channels]
+            .chunks(channels)
+            .zip(old.chunks(channels))
+        {
+            assert_eq!(new[colours..], old[colours..], "alpha");
+            let near = |(new, old): (&u8, &u8)| new.abs_diff(*old) < most;
+            assert!(
+                new[..colours].iter().zip(&old[..colours]).all(near),
+                "{new:?} {old:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn jpeg_keeps_all_but_the_colours_and_each_picture_stands_alone() {
+    for (encoding, channels) in [
+        ("mono8", 1),
+        ("rgb8", 3),
+        ("bgr8", 3),
+        ("rgba8", 4),
+        ("bgra8", 4),
+    ] {
+        let mut before = usize::MAX;
+        for (quality, most) in [(95, 30), (80, 60), (30, 120)] {
+            let mut encoder = Encoder::new(Schema::Image).allow_jpeg(JpegOptions { quality });
+            let message = scene(encoding, channels, 3);
+            let mut frame = Vec::new();
+            let encoded = encoder.encode(Codec::Jpeg, &message, &mut frame);
+            assert_eq!(encoded.codec, Codec::Jpeg, "{encoding}");
+            assert!(frame.len() < before, "a lower quality is smaller");
+            before = frame.len();
+            let mut back = Vec::new();
+            Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+            assert_seen(&back, &message, channels, most);
+        }
+    }
+}
+
+#[test]
+fn what_may_not_be_a_picture_is_never_told_as_jpeg() {
+    for (encoding, channels) in [("8UC1", 1), ("8UC3", 3), ("bayer_rggb8", 1)] {
+        let mut encoder = Encoder::new(Schema::Image).allow_jpeg(JpegOptions::default());
+        let message = scene(encoding, channels, 0);
+        let mut frame = Vec::new();
+        let encoded = encoder.encode(Codec::Jpeg, &message, &mut frame);
+        assert_eq!(encoded.codec, Codec::Zstd(3), "{encoding}");
+        let mut back = Vec::new();
+        Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+        assert_eq!(back, message);
+    }
+}
+
+#[test]
+fn a_jpeg_that_is_cut_changed_or_of_another_size_is_refused_or_a_picture() {
+    let mut encoder = Encoder::new(Schema::Image).allow_jpeg(JpegOptions::default());
     let message = scene("rgb8", 3, 0);
     let mut frame = Vec::new();
-    let encoded = Encoder::new(Schema::Image).encode(Codec::Video, &message, &mut frame);
-    assert_eq!(encoded.codec, Codec::Zstd(3));
-    let mut back = Vec::new();
-    Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
-    assert_eq!(back, message);
+    encoder.encode(Codec::Jpeg, &message, &mut frame);
+    for at in 0..frame.len() {
+        let mut out = Vec::new();
+        assert!(Decoder::new(LIMIT).decode(&frame[..at], &mut out).is_err());
+        for flipped in [0x01, 0x80, 0xff] {
+            let mut damaged = frame.clone();
+            damaged[at] ^= flipped;
+            match Decoder::new(LIMIT).decode(&damaged, &mut out) {
+                Ok(decoded) => assert_eq!(out.len(), decoded.bytes),
+                Err(_) => assert!(out.is_empty()),
+            }
+            out.clear();
+        }
+    }
+    // One that tells of a far larger picture: the library never sees it.
+    let at = frame.windows(2).position(|pair| pair == [0xff, 0xc0]);
+    let size = at.unwrap() + 5;
+    frame[size..size + 4].copy_from_slice(&[0xff; 4]);
+    let refused = Decoder::new(LIMIT).decode(&frame, &mut Vec::new());
+    assert_eq!(
+        refused.err(),
+        Some(Error::Corrupt("a JPEG of another size than declared"))
+    );
 }
 
 #[cfg(feature = "video")]
@@ -360,31 +438,7 @@ fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
                 continue;
             }
             decoded.unwrap();
-            assert_eq!(back.len(), message.len());
-            let head = message.len() - 48 * (64 * channels + 5);
-            assert_eq!(back[..head], message[..head]);
-            let lines = |bytes: &[u8]| {
-                bytes[head..]
-                    .chunks(64 * channels + 5)
-                    .map(<[u8]>::to_vec)
-                    .collect::<Vec<_>>()
-            };
-            for (new, old) in lines(&back).iter().zip(lines(&message)) {
-                assert_eq!(new[64 * channels..], old[64 * channels..]);
-                for (new, old) in new[..64 * channels]
-                    .chunks(channels)
-                    .zip(old.chunks(channels))
-                {
-                    assert_eq!(new[3..], old[3..]);
-                    assert!(
-                        new[..3]
-                            .iter()
-                            .zip(&old[..3])
-                            .all(|(new, old)| new.abs_diff(*old) < 40),
-                        "{new:?} {old:?}"
-                    );
-                }
-            }
+            assert_seen(&back, &message, channels, 40);
         }
     }
 }
@@ -394,7 +448,7 @@ fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
 fn a_build_without_video_falls_back() {
     let message = scene("rgb8", 3, 0);
     let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
-    assert!(!encoder.has_video());
+    assert!(!Codec::Video.is_built());
     assert_eq!(
         encoder
             .encode(Codec::Video, &message, &mut Vec::new())

@@ -264,7 +264,7 @@ impl Hub {
             received,
             ahead,
             next,
-            codecs: decoded_here(hello.codecs.iter().any(|codec| codec == "video")),
+            codecs: decoded_here(|codec| hello.codecs.iter().any(|name| name == codec.name())),
             servant: self.servant.clone(),
         };
         let (theirs, theirs_ahead) = hello
@@ -272,6 +272,7 @@ impl Hub {
             .as_ref()
             .filter(|_| resumed)
             .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
+        link.session.set_quality(hello.quality);
         link.session.peer_decodes(&hello.codecs);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
         if let Err(lost) = send_open(&mut socket, &welcome).await {

@@ -35,6 +35,8 @@ pub struct Hello {
     pub sla: Sla,
     /// Codecs that the robot decodes; none: messages come as they are.
     pub codecs: Vec<String>,
+    /// How good pictures are where they lose detail, from 1 to 100; the usual where absent.
+    pub quality: Option<u8>,
     /// Stamps stay as they are, whatever the clocks say.
     pub keep_stamps: bool,
     /// The robot answers a `Lookup`.
@@ -152,17 +154,10 @@ pub enum Control {
         /// Its number.
         signal: i32,
     },
-    /// Robot: the last frame of an output could not be decoded.
+    /// Both: a frame of a channel was lost that later ones refer to.
     Keyframe {
         /// Which.
         channel: u32,
-    },
-    /// Both: a frame of a channel was decoded, later ones may refer to it.
-    Decoded {
-        /// Which channel.
-        channel: u32,
-        /// The codec's number of the frame.
-        sequence: u64,
     },
     /// Cloud: a type that later names refer to.
     Type {
@@ -378,7 +373,6 @@ mod tests {
             r#"{"parameters":[["/a",1],["/b",null]]}"#,
             r#"{"signal":{"signal":2}}"#,
             r#"{"keyframe":{"channel":1}}"#,
-            r#"{"decoded":{"channel":1,"sequence":2}}"#,
             r#"{"type":{"name":"p/T","md5":"0","definition":"d"}}"#,
             r#"{"graph":{"outputs":[{"channel":1,"topic":"/t","type":"p/T","md5":"0"}],
                 "inputs":[{"topic":"/t","type":"*","md5":"*","feed":true}],

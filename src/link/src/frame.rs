@@ -9,6 +9,7 @@
 //! | 4 ping | sent i64 · received u64 · bytes u64 |
 //! | 5 pong | sent i64 · arrived i64 · left i64 · received u64 · bytes u64 |
 //! | 6 ack | received u64 · bytes u64 |
+//! | 7 damaged | channel u32 · born i64 |
 //!
 //! A record with a number other than 0 is remembered by its sender until the peer has it, and sent again after a lost
 //! connection or counted as dropped: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
@@ -25,6 +26,7 @@ const MORE: u8 = 3;
 const PING: u8 = 4;
 const PONG: u8 = 5;
 const ACK: u8 = 6;
+const DAMAGED: u8 = 7;
 
 /// One WebSocket message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -76,6 +78,13 @@ pub enum Frame {
     },
     /// Says what has come.
     Ack(Received),
+    /// The message of this channel that the sender had from ROS then came, and its frame does not make what it was.
+    Damaged {
+        /// The sender's channel.
+        channel: u32,
+        /// The message's `born`.
+        born: i64,
+    },
 }
 
 /// What has come from the peer.
@@ -147,6 +156,11 @@ impl Frame {
                 out.put_u8(ACK);
                 received.put(&mut out);
             }
+            Frame::Damaged { channel, born } => {
+                out.put_u8(DAMAGED);
+                out.put_u32_le(*channel);
+                out.put_i64_le(*born);
+            }
         }
         if let Some(payload) = self.payload() {
             out.put_slice(payload);
@@ -177,6 +191,7 @@ impl Frame {
             PING => 25,
             PONG => 41,
             ACK => 17,
+            DAMAGED => 13,
             _ => return Err(Error::Protocol("a frame of unknown kind")),
         };
         if bytes.len() < head {
@@ -209,7 +224,11 @@ impl Frame {
                 left: bytes.get_i64_le(),
                 received: Received::get(&mut bytes),
             },
-            _ => Frame::Ack(Received::get(&mut bytes)),
+            ACK => Frame::Ack(Received::get(&mut bytes)),
+            _ => Frame::Damaged {
+                channel: bytes.get_u32_le(),
+                born: bytes.get_i64_le(),
+            },
         })
     }
 }
@@ -246,6 +265,10 @@ mod tests {
                 received,
             },
             Frame::Ack(received),
+            Frame::Damaged {
+                channel: 3,
+                born: -4,
+            },
         ] {
             assert_eq!(Frame::decode(frame.encode()).unwrap(), frame);
         }
@@ -293,6 +316,13 @@ mod tests {
                 "05 0100000000000000 0200000000000000 0300000000000000 0700000000000000 0807060504030201",
             ),
             (Frame::Ack(received), "06 0700000000000000 0807060504030201"),
+            (
+                Frame::Damaged {
+                    channel: 3,
+                    born: 4,
+                },
+                "07 03000000 0400000000000000",
+            ),
         ];
         for (frame, expected) in pinned {
             let encoded = frame.encode();

@@ -68,6 +68,8 @@ struct Out {
     each: bool,
     /// The topic's channel; none: urgent.
     channel: Option<u32>,
+    /// The message before it was encoded, where each one counts: it may come damaged.
+    plain: Option<Bytes>,
 }
 
 impl Out {
@@ -167,6 +169,7 @@ impl Outgoing {
             born,
             each: quality == Quality::Each,
             channel,
+            plain: None,
         };
         let Some(channel) = channel else {
             self.urgent_bytes += out.len();
@@ -245,7 +248,8 @@ impl Outgoing {
                 out.head[FLAGS_AT] |= ENCODED;
                 let took = u32::try_from(took.as_micros()).unwrap_or(u32::MAX);
                 out.head[SERIALISE_AT..SERIALISE_AT + 4].copy_from_slice(&took.to_le_bytes());
-                out.payload = frame;
+                let plain = std::mem::replace(&mut out.payload, frame);
+                out.plain = out.each.then_some(plain);
             }
             None => {
                 if let Some(channel) = out.channel {
@@ -443,6 +447,35 @@ impl Outgoing {
                 self.kept_bytes -= out.len();
             }
         }
+    }
+
+    /// A message came and could not be decoded: where each one counts it goes once more, unless a newer one of a
+    /// latched topic has gone. Says whether it does.
+    pub(crate) fn again(&mut self, channel: u32, born: i64) -> bool {
+        let mut kept = self.kept.iter_mut().rev();
+        let damaged = kept.find_map(|(_, kept)| match kept {
+            Kept::Again(out) if out.channel == Some(channel) => Some(out),
+            _ => None,
+        });
+        let Some(out) = damaged.filter(|out| out.born == born) else {
+            return false;
+        };
+        let Some(payload) = out.plain.take() else {
+            return false;
+        };
+        let mut head = out.head.clone();
+        head[FLAGS_AT] &= !ENCODED;
+        let again = Out {
+            head,
+            payload,
+            plain: None,
+            ..*out
+        };
+        self.topics.entry(channel).or_default().push_front(again);
+        if !self.turns.contains(&channel) && !self.is_under_way(channel) {
+            self.turns.push_back(channel);
+        }
+        true
     }
 
     /// The link carries so many bytes per second.

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use codec::{Answer, Codec, Encoder, Policy, Receiver, Schema, Sender, VideoOptions};
+use codec::{Answer, Codec, JpegOptions, Lossy, Policy, Receiver, Schema, Sender, VideoOptions};
 
 use crate::MAX_RECORD;
 
@@ -16,6 +16,8 @@ use crate::MAX_RECORD;
 const FAST: f64 = 60e6;
 /// Topics that may be decoded at once.
 const MAX_TOPICS: usize = 1024;
+/// Part of T_max that the way to the other side may take before pictures lose detail, where they may.
+const SHARE_OF_T_MAX: u32 = 4;
 /// What lossless encoding makes use of.
 const LOSSLESS: [Codec; 6] = [
     Codec::Raw,
@@ -26,12 +28,16 @@ const LOSSLESS: [Codec; 6] = [
     Codec::Cloud,
 ];
 
-/// The names of the codecs that this side decodes, for the opening frames; `lossy`: video is welcome.
-pub fn decoded_here(lossy: bool) -> Vec<String> {
+/// Those that lose detail of pictures.
+const LOSSY: [Codec; 2] = [Codec::Jpeg, Codec::Video];
+
+/// The names of the codecs that this side decodes, for the opening frames; of lossy ones those that are welcome.
+pub fn decoded_here(welcome: impl Fn(Codec) -> bool) -> Vec<String> {
     // Decoding is built with encoding.
-    let encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
-    let video = (lossy && encoder.has_video()).then_some(Codec::Video);
-    let all = LOSSLESS.into_iter().chain(video);
+    let lossy = LOSSY
+        .into_iter()
+        .filter(|codec| codec.is_built() && welcome(*codec));
+    let all = LOSSLESS.into_iter().chain(lossy);
     all.map(|codec| codec.name().to_owned()).collect()
 }
 
@@ -81,17 +87,32 @@ impl Job {
 #[derive(Debug, Default)]
 pub(crate) struct Packing {
     lossless: bool,
-    video: bool,
+    lossy: Option<Codec>,
+    jpeg: JpegOptions,
+    deadline: Option<Duration>,
     lanes: HashMap<u32, Lane>,
     receivers: HashMap<u32, Receiver>,
 }
 
 impl Packing {
+    /// For a link on which messages are answered within `t_max`.
+    pub(crate) fn new(t_max: Option<Duration>) -> Self {
+        Self {
+            deadline: t_max.map(|t_max| t_max / SHARE_OF_T_MAX),
+            ..Self::default()
+        }
+    }
+
+    /// How good pictures are where they lose detail, from 1 to 100.
+    pub(crate) fn set_quality(&mut self, quality: Option<u8>) {
+        self.jpeg = quality.map_or_else(JpegOptions::default, |quality| JpegOptions { quality });
+    }
+
     /// The peer decodes these.
     pub(crate) fn peer_decodes(&mut self, names: &[String]) {
         let has = |codec: &Codec| names.iter().any(|name| name == codec.name());
         self.lossless = LOSSLESS.iter().all(has);
-        self.video = has(&Codec::Video);
+        self.lossy = LOSSY.into_iter().find(has);
     }
 
     /// A topic's messages are of this schema.
@@ -123,16 +144,16 @@ impl Packing {
         throughput: Option<f64>,
     ) -> Option<Job> {
         let lane = self.lanes.get_mut(&channel)?;
-        let policy = if self.video {
-            Policy::Lossy(VideoOptions::default())
-        } else {
-            Policy::Lossless
+        let policy = match self.lossy {
+            Some(Codec::Jpeg) => Policy::Lossy(Lossy::Jpeg(self.jpeg)),
+            Some(Codec::Video) => Policy::Lossy(Lossy::Video(VideoOptions::default())),
+            _ => Policy::Lossless,
         };
-        let schema = lane.schema;
+        let (schema, deadline) = (lane.schema, self.deadline);
         let mut sender = lane
             .sender
             .take()
-            .unwrap_or_else(|| Sender::new(schema, policy));
+            .unwrap_or_else(|| Sender::new(schema, policy).within(deadline));
         if std::mem::take(&mut lane.begin_anew) {
             sender.reconnected();
         }
@@ -166,10 +187,8 @@ impl Packing {
     /// The peer has answered a frame.
     pub(crate) fn answered(&mut self, channel: u32, answer: Answer) {
         if let Some(lane) = self.lanes.get_mut(&channel) {
-            // All that counts are the last of each.
-            lane.answers.retain(|earlier| {
-                std::mem::discriminant(earlier) != std::mem::discriminant(&answer)
-            });
+            // Twice the same tells no more.
+            lane.answers.retain(|earlier| *earlier != answer);
             lane.answers.push(answer);
         }
     }

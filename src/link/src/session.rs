@@ -128,13 +128,14 @@ impl Session {
         let age = options
             .max_age
             .map(|age| i64::try_from(age.as_nanos()).unwrap_or(i64::MAX));
+        let packing = Packing::new(options.max_age);
         Self {
             options,
             state: Mutex::new(State {
                 out: Outgoing::new(age),
                 incoming: Incoming::default(),
                 clock: Clock::default(),
-                packing: Packing::default(),
+                packing,
                 throughput: Throughput::default(),
                 ending: None,
                 topics: BTreeMap::new(),
@@ -247,6 +248,11 @@ impl Session {
         state.topics.insert(channel, topic.to_owned());
         state.packing.add(channel, schema);
         state.out.set_packable(channel);
+    }
+
+    /// How good pictures are where they may lose detail: from 1 to 100; the usual where absent.
+    pub fn set_quality(&self, quality: Option<u8>) {
+        self.state.lock().packing.set_quality(quality);
     }
 
     /// The peer decodes these, as its opening frame says.

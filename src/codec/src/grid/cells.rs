@@ -1,8 +1,8 @@
-//! The cells of a grid that differ from a base, by an adaptive binary coder.
+//! The cells of a grid that differ from its background, by an adaptive binary coder.
 //!
-//! The grid is cut into tiles of 64×64 cells and those into blocks of 8×8. A tile, then a block, is either as the base
-//! says or not; a block that is not may be of one value throughout. Only in the remaining blocks cells are told one by
-//! one, row by row across all blocks of a band, each in the context of its neighbours and of the base around it.
+//! The grid is cut into tiles of 64×64 cells and those into blocks of 8×8. A tile, then a block, is either background
+//! or not; a block that is not may be of one value throughout. Only in the remaining blocks cells are told one by
+//! one, row by row across all blocks of a band, each in the context of its neighbours.
 //!
 //! Maps hold three values (unknown, free, occupied): others are told in full.
 
@@ -18,15 +18,6 @@ const BLOCK: usize = 8;
 const KNOWN: [u8; 3] = [255, 0, 100];
 /// The class of every other value.
 const OTHER: u8 = 3;
-
-/// What the cells are told against.
-#[derive(Clone, Copy)]
-pub(super) enum Base<'a> {
-    /// Every cell has this value.
-    Plain(u8),
-    /// The cells of another grid of the same size.
-    Grid(&'a [u8]),
-}
 
 /// Whether a grid has so many values besides the known three that it is better told as a picture.
 pub(super) fn shaded(cells: &[u8], background: u8) -> bool {
@@ -50,8 +41,8 @@ const CLASSES: [u8; 256] = {
     classes
 };
 
-/// Contexts of a cell: seven neighbours' classes.
-const CONTEXTS: usize = 1 << 14;
+/// Contexts of a cell: six neighbours' classes.
+const CONTEXTS: usize = 1 << 12;
 
 /// The decisions' probabilities.
 struct Model {
@@ -136,41 +127,37 @@ impl Side for Decoding<'_> {
     }
 }
 
-/// Appends `cells` as they differ from `base`.
-pub(super) fn encode(cells: &[u8], layout: &Grid, base: Base<'_>, out: &mut Vec<u8>) {
+/// Appends `cells` as they differ from `background`.
+pub(super) fn encode(cells: &[u8], layout: &Grid, background: u8, out: &mut Vec<u8>) {
     let side = Encoding {
         coder: BinaryEncoder::new(),
         cells,
     };
-    out.extend_from_slice(&walk(side, layout, base).coder.finish());
+    out.extend_from_slice(&walk(side, layout, background).coder.finish());
 }
 
-/// Turns `cells`, which are as `base` says, into what was encoded.
+/// Turns `cells`, which are all `background`, into what was encoded.
 pub(super) fn decode(
     bytes: &[u8],
     layout: &Grid,
-    base: Base<'_>,
+    background: u8,
     cells: &mut [u8],
 ) -> Result<(), Error> {
     let side = Decoding {
         coder: BinaryDecoder::new(bytes),
         cells,
     };
-    walk(side, layout, base).coder.finish()
+    walk(side, layout, background).coder.finish()
 }
 
-fn walk<S: Side>(side: S, layout: &Grid, base: Base<'_>) -> S {
+fn walk<S: Side>(side: S, layout: &Grid, background: u8) -> S {
     let (width, height) = (layout.width, layout.height);
     let mut walk = Walk {
         side,
         model: Model::new(),
-        base,
+        background,
         width,
-        height,
-        plain: match base {
-            Base::Plain(value) => vec![value; width],
-            Base::Grid(_) => Vec::new(),
-        },
+        plain: vec![background; width],
         tiles: vec![false; width.div_ceil(TILE)],
         blocks: vec![State::Same; width.div_ceil(BLOCK)],
     };
@@ -194,7 +181,7 @@ fn walk<S: Side>(side: S, layout: &Grid, base: Base<'_>) -> S {
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum State {
-    /// As the base says.
+    /// Background throughout.
     Same,
     /// Of one value.
     Uniform,
@@ -202,27 +189,19 @@ enum State {
     Mixed,
 }
 
-struct Walk<'a, S> {
+struct Walk<S> {
     side: S,
     model: Model,
-    base: Base<'a>,
+    background: u8,
     width: usize,
-    height: usize,
-    /// A row of a plain base.
+    /// A row of background.
     plain: Vec<u8>,
-    /// Which tiles of the band differ from the base.
+    /// Which tiles of the band are not all background.
     tiles: Vec<bool>,
     blocks: Vec<State>,
 }
 
-impl<S: Side> Walk<'_, S> {
-    fn base_row(&self, y: usize) -> &[u8] {
-        match self.base {
-            Base::Plain(_) => &self.plain,
-            Base::Grid(base) => &base[y * self.width..(y + 1) * self.width],
-        }
-    }
-
+impl<S: Side> Walk<S> {
     fn row_of(&self, y: usize) -> &[u8] {
         &self.side.cells()[y * self.width..(y + 1) * self.width]
     }
@@ -231,7 +210,7 @@ impl<S: Side> Walk<'_, S> {
         let mut changed = vec![false; self.tiles.len()];
         if S::ENCODES {
             for y in rows {
-                let (new, old) = (self.row_of(y), self.base_row(y));
+                let (new, old) = (self.row_of(y), &self.plain[..]);
                 if new != old {
                     for (tile, (new, old)) in changed
                         .iter_mut()
@@ -278,7 +257,7 @@ impl<S: Side> Walk<'_, S> {
             let first = self.side.cells()[at];
             for y in rows.clone() {
                 let new = &self.row_of(y)[columns.clone()];
-                differs |= new != &self.base_row(y)[columns.clone()];
+                differs |= new != &self.plain[columns.clone()];
                 uniform &= new.iter().all(|&cell| cell == first);
             }
         }
@@ -323,69 +302,37 @@ impl<S: Side> Walk<'_, S> {
         for block in 0..self.blocks.len() {
             if self.blocks[block] == State::Mixed {
                 let columns = block * BLOCK..((block + 1) * BLOCK).min(self.width);
-                match self.base {
-                    Base::Plain(value) => columns.for_each(|x| self.plain_cell(x, y, value)),
-                    Base::Grid(base) => columns.for_each(|x| self.changed_cell(x, y, base)),
-                }
+                columns.for_each(|x| self.cell(x, y));
             }
         }
     }
 
-    /// The cell `left` columns left of and `up` rows above (x, y), or `outside`.
+    /// The cell `left` columns left of and `up` rows above (x, y); outside of the grid, background.
     #[inline(always)]
-    fn near(&self, x: usize, y: usize, left: isize, up: usize, outside: u8) -> u8 {
+    fn near(&self, x: usize, y: usize, left: isize, up: usize) -> u8 {
         let column = x.wrapping_add_signed(-left);
         if column < self.width && up <= y {
             self.side.cells()[(y - up) * self.width + column]
         } else {
-            outside
+            self.background
         }
     }
 
     #[inline(always)]
-    fn plain_cell(&mut self, x: usize, y: usize, outside: u8) {
-        let west = self.near(x, y, 1, 0, outside);
-        let neighbours = [
-            west,
-            self.near(x, y, 0, 1, outside),
-            self.near(x, y, 1, 1, outside),
-            self.near(x, y, -1, 1, outside),
-            self.near(x, y, 2, 0, outside),
-            self.near(x, y, 0, 2, outside),
-        ];
-        self.cell(y * self.width + x, west, context(neighbours));
-    }
-
-    #[inline(always)]
-    fn changed_cell(&mut self, x: usize, y: usize, base: &[u8]) {
+    fn cell(&mut self, x: usize, y: usize) {
         let at = y * self.width + x;
-        let old = base[at];
-        let (west, north) = (self.near(x, y, 1, 0, old), self.near(x, y, 0, 1, old));
-        let east = if x + 1 < self.width {
-            base[at + 1]
-        } else {
-            old
-        };
-        let south = if y + 1 < self.height {
-            base[at + self.width]
-        } else {
-            old
-        };
-        let west_changed = x > 0 && west != base[at - 1];
-        let north_changed = y > 0 && north != base[at - self.width];
-        let context = context([old, west, north, east, south]) << 2;
-        self.cell(
-            at,
-            old,
-            context | usize::from(west_changed) | usize::from(north_changed) << 1,
-        );
-    }
-
-    #[inline(always)]
-    fn cell(&mut self, at: usize, guess: u8, context: usize) {
+        let west = self.near(x, y, 1, 0);
+        let context = context([
+            west,
+            self.near(x, y, 0, 1),
+            self.near(x, y, 1, 1),
+            self.near(x, y, -1, 1),
+            self.near(x, y, 2, 0),
+            self.near(x, y, 0, 2),
+        ]);
         let known = self.side.cells()[at];
-        let bits = &mut self.model.cells[context & (CONTEXTS - 1)];
-        let coded = value(&mut self.side, bits, &mut self.model.values, guess, known);
+        let bits = &mut self.model.cells[context];
+        let coded = value(&mut self.side, bits, &mut self.model.values, west, known);
         self.side.set(at..at + 1, coded);
     }
 }

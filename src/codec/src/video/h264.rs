@@ -4,9 +4,8 @@ use super::VideoOptions;
 use super::colour::{self, Order, Planes};
 use super::guard;
 use crate::Error;
-use crate::column::{put_packed, take_packed};
 use crate::layout::{Image, Pixel};
-use crate::rows::{put_padding, take_padding};
+use crate::rows::{put_alpha, put_padding, take_alpha, take_padding};
 use crate::wire::{Cursor, put_block, put_varint};
 use openh264::OpenH264API;
 use openh264::decoder::{Decoder, DecoderConfig};
@@ -108,11 +107,7 @@ impl VideoEncoder {
         put_varint(out, self.number);
         out.push(key.into());
         if order.channels == 4 {
-            let alpha: Vec<u8> = rows()
-                .flat_map(|row| row.iter().skip(3).step_by(4))
-                .copied()
-                .collect();
-            put_packed(&alpha, out);
+            put_alpha(data, layout, out);
         }
         stream.write_vec(out);
         Some(())
@@ -219,23 +214,6 @@ impl VideoDecoder {
         self.last = Some(number);
         Ok(())
     }
-}
-
-fn take_alpha(input: &mut Cursor<'_>, data: &mut [u8], layout: &Image) -> Result<(), Error> {
-    let count = layout.width * layout.height;
-    let alpha = take_packed(input, count)?;
-    if alpha.len() != count {
-        return Err(Error::Corrupt("alpha of another size"));
-    }
-    for (line, alpha) in data
-        .chunks_exact_mut(layout.step)
-        .zip(alpha.chunks_exact(layout.width))
-    {
-        for (pixel, &alpha) in line[..layout.row()].chunks_exact_mut(4).zip(alpha) {
-            pixel[3] = alpha;
-        }
-    }
-    Ok(())
 }
 
 impl fmt::Debug for VideoDecoder {

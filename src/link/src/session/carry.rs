@@ -243,6 +243,10 @@ impl Session {
                 self.acknowledged(received);
                 None
             }
+            Frame::Damaged { channel, born } => {
+                self.came_damaged(channel, born);
+                None
+            }
             Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
         };
         if let Some(record) = record {
@@ -250,8 +254,14 @@ impl Session {
                 Record::Data(data) => {
                     let channel = data.channel;
                     match self.unpacked(data) {
-                        Some(data) => handler.record(Record::Data(data), arrived),
-                        None => handler.undecodable(channel),
+                        Ok(data) => handler.record(Record::Data(data), arrived),
+                        Err(told) => {
+                            handler.undecodable(channel);
+                            // Before an acknowledgement can make the peer forget the message.
+                            if let Some(frame) = told {
+                                socket.queue(opcode::BINARY, frame.encode());
+                            }
+                        }
                     }
                 }
                 Record::Control(json) if self.is_answer(&json) => {}

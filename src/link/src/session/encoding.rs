@@ -5,6 +5,7 @@ use tokio::task::JoinHandle;
 
 use super::{Session, State};
 use crate::control::Control;
+use crate::frame::Frame;
 use crate::packing::Packed;
 use crate::record::Data;
 
@@ -36,44 +37,60 @@ impl Session {
         state.out.packed(frame);
     }
 
-    /// A message as it was before it was encoded; none where that cannot be told.
-    pub(super) fn unpacked(&self, mut data: Data) -> Option<Data> {
+    /// A message as it was before it was encoded; where that cannot be told, what the peer is to be told at once.
+    pub(super) fn unpacked(&self, mut data: Data) -> Result<Data, Option<Frame>> {
         if !data.encoded {
-            return Some(data);
+            return Ok(data);
         }
         let channel = data.channel;
         let (message, answer) = self.state.lock().packing.unpack(channel, &data.message);
-        match answer {
-            Some(Answer::Acknowledge(sequence)) => {
-                self.tell(&Control::Decoded { channel, sequence })
-            }
-            Some(Answer::Keyframe) => self.tell(&Control::Keyframe { channel }),
-            None => {}
-        }
-        match message {
+        let error = match message {
             Ok(message) => {
                 data.message = message;
                 data.encoded = false;
-                Some(data)
+                return Ok(data);
             }
-            Err(error) => {
+            Err(error) => error,
+        };
+        match answer {
+            Some(Answer::Keyframe) => {
                 tracing::debug!(channel, %error, "a message cannot be decoded");
-                None
+                self.tell(&Control::Keyframe { channel });
+                Err(None)
+            }
+            Some(Answer::Damaged) => {
+                tracing::warn!(channel, %error, "a message came damaged");
+                let born = data.born;
+                Err(Some(Frame::Damaged { channel, born }))
+            }
+            None => {
+                tracing::debug!(channel, %error, "a message cannot be decoded");
+                Err(None)
             }
         }
     }
 
+    /// A message came to the peer otherwise than it was: its topic does without that codec from now on.
+    pub(super) fn came_damaged(&self, channel: u32, born: i64) {
+        let mut state = self.state.lock();
+        state.packing.answered(channel, Answer::Damaged);
+        let again = state.out.again(channel, born);
+        let topic = state.topics.get(&channel).cloned().unwrap_or_default();
+        drop(state);
+        let then = if again { "; it is sent again" } else { "" };
+        tracing::warn!(topic, "a message came damaged at the other end{then}");
+    }
+
     /// What the peer says of frames that it was sent; others are the handler's.
     pub(super) fn is_answer(&self, json: &[u8]) -> bool {
-        if !json.starts_with(b"{\"decoded\"") && !json.starts_with(b"{\"keyframe\"") {
+        if !json.starts_with(b"{\"keyframe\"") {
             return false;
         }
-        let (channel, answer) = match serde_json::from_slice(json) {
-            Ok(Control::Decoded { channel, sequence }) => (channel, Answer::Acknowledge(sequence)),
-            Ok(Control::Keyframe { channel }) => (channel, Answer::Keyframe),
-            _ => return false,
+        let Ok(Control::Keyframe { channel }) = serde_json::from_slice(json) else {
+            return false;
         };
-        self.state.lock().packing.answered(channel, answer);
+        let packing = &mut self.state.lock().packing;
+        packing.answered(channel, Answer::Keyframe);
         true
     }
 }

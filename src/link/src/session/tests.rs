@@ -273,7 +273,7 @@ fn picture(number: u8) -> Bytes {
 #[tokio::test]
 async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     let (robot, cloud) = (session(), session());
-    let codecs = crate::packing::decoded_here(false);
+    let codecs = crate::packing::decoded_here(|_| false);
     robot.peer_decodes(&codecs);
     cloud.peer_decodes(&codecs);
     robot.opens(1, "/image", codec::Schema::Image);
@@ -324,4 +324,82 @@ async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
         lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
         () = sending => {}
     }
+}
+
+/// A map of 80×80 cells, as a message.
+fn map() -> Bytes {
+    let mut message = vec![0; 24];
+    message.extend_from_slice(&0.5_f32.to_le_bytes());
+    message.extend_from_slice(&[80, 0, 0, 0, 80, 0, 0, 0]);
+    message.extend_from_slice(&[0; 56]);
+    message.extend_from_slice(&6400_u32.to_le_bytes());
+    let noise = |at: usize| [0, 100][((at * at * 2_654_435_761) >> 40) & 1];
+    message.extend((0..6400).map(|at| if at < 4000 { noise(at) } else { 255 }));
+    message.into()
+}
+
+/// Counts what it is told of, and keeps what comes.
+struct Counting(
+    mpsc::UnboundedSender<Record>,
+    std::sync::atomic::AtomicUsize,
+);
+
+impl Handler for Counting {
+    fn record(&self, record: Record, _arrived: i64) {
+        let _ = self.0.send(record);
+    }
+    fn undecodable(&self, _channel: u32) {
+        self.1.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+#[tokio::test]
+async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_again() {
+    let (robot, cloud) = (session(), session());
+    robot.peer_decodes(&crate::packing::decoded_here(|_| false));
+    robot.opens(1, "/map", codec::Schema::OccupancyGrid);
+    open(&robot, &cloud);
+    // As over a slow link.
+    robot.state.lock().out.set_packs(true);
+    let (near, mut damaging) = duplex(1 << 16);
+    let (mut beyond, far) = duplex(1 << 16);
+    let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);
+    let mut at_cloud = WebSocket::new(far, b"", MAX_FRAME, MAX_RECORD);
+    tokio::spawn(async move {
+        let (mut up, mut down) = tokio::io::split(&mut damaging);
+        let (mut from, mut to) = tokio::io::split(&mut beyond);
+        let upwards = async {
+            let (mut buffer, mut damaged) = (vec![0; 1 << 16], false);
+            loop {
+                let read = tokio::io::AsyncReadExt::read(&mut up, &mut buffer).await?;
+                // One bit of the map, which is longer than all else.
+                if read > 300 && !damaged {
+                    damaged = true;
+                    buffer[read / 2] ^= 4;
+                }
+                tokio::io::AsyncWriteExt::write_all(&mut to, &buffer[..read]).await?;
+            }
+        };
+        let back = tokio::io::copy(&mut from, &mut down);
+        let _: (std::io::Result<()>, _) = tokio::join!(upwards, back);
+    });
+    let (to_robot, _records) = mpsc::unbounded_channel();
+    let (to_cloud, mut records) = mpsc::unbounded_channel();
+    let (to_robot, to_cloud) = (To(to_robot), Counting(to_cloud, Default::default()));
+    let mut latched = data(1, 0);
+    latched.latching = true;
+    latched.message = map();
+    robot.publish(latched, Quality::Each);
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &to_robot) => panic!("{lost}"),
+        lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
+        came = tokio::time::timeout(Duration::from_secs(60), records.recv()) => {
+            let Ok(Some(Record::Data(came))) = came else {
+                panic!("the map does not come: {came:?}");
+            };
+            assert!(came.message == map(), "another map");
+            assert!(came.latching && !came.encoded);
+        }
+    }
+    assert_eq!(to_cloud.1.load(Ordering::Relaxed), 1, "it was told of");
 }

@@ -1,0 +1,3 @@
+//! `sensor_msgs/Image` as JPEG.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(codec, jpeg);
