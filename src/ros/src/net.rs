@@ -3,8 +3,10 @@
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::time::Duration;
 
 use async_trait::async_trait;
+use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 
 /// A place in which TCP sockets can be opened: a servant's network namespace, or the host's own.
@@ -19,6 +21,29 @@ pub trait Sockets: Send + Sync + 'static {
     async fn resolve(&self, host: &str, port: u16) -> io::Result<SocketAddr> {
         let ip = literal(host).unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
         Ok(SocketAddr::new(ip, port))
+    }
+}
+
+/// A peer that has said nothing for so long is asked whether it is there …
+const ASK: Duration = Duration::from_secs(20);
+/// … and again until it answers …
+const ASK_AGAIN: Duration = Duration::from_secs(10);
+/// … and after so long without an answer it is gone. That is also how long it may leave what was sent to it untaken:
+/// a peer that does not read for so long loses its connection.
+const GONE: Duration = Duration::from_secs(60);
+
+/// Has the kernel end the connection when the peer is gone without a word: its machine has lost power or its network.
+/// Otherwise whoever only reads would wait for ever, and whoever writes for a quarter of an hour.
+///
+/// Of a peer that is there and idle nothing is asked: its kernel answers for it, even while its process is stopped.
+pub fn watch(stream: &TcpStream) {
+    let socket = SockRef::from(stream);
+    let asking = TcpKeepalive::new().with_time(ASK).with_interval(ASK_AGAIN);
+    let asked = socket
+        .set_tcp_keepalive(&asking)
+        .and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
+    if let Err(error) = asked {
+        tracing::debug!(%error, "a peer that goes without a word will not be noticed");
     }
 }
 
@@ -78,5 +103,28 @@ impl Sockets for LoopbackSockets {
 
     async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
         HostSockets.listen(address).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_watched_peer_is_gone_after_a_minute() {
+        let listener = HostSockets
+            .listen(SocketAddr::from(([127, 0, 0, 1], 0)))
+            .await
+            .unwrap();
+        let stream = HostSockets
+            .connect(listener.local_addr().unwrap())
+            .await
+            .unwrap();
+        watch(&stream);
+        let socket = SockRef::from(&stream);
+        assert!(socket.keepalive().unwrap());
+        assert_eq!(socket.tcp_keepalive_time().unwrap(), ASK);
+        assert_eq!(socket.tcp_keepalive_interval().unwrap(), ASK_AGAIN);
+        assert_eq!(socket.tcp_user_timeout().unwrap(), Some(GONE));
     }
 }

@@ -16,6 +16,7 @@ use super::master_client::to_bus_error;
 use super::subscriptions::TopicIn;
 use super::{HANDSHAKE, Inner};
 use crate::bus::{BusError, Message, WireType};
+use crate::net;
 use crate::ros1::reply::Reply;
 use crate::ros1::tcpros::{self, FrameReader, Header};
 use crate::ros1::xmlrpc::Value;
@@ -192,6 +193,7 @@ pub(super) async fn connect(
     let shake = async {
         let address = bus.sockets.resolve(&host, port).await?;
         let mut stream = bus.sockets.connect(address).await?;
+        net::watch(&stream);
         let answer = header.exchange(&mut stream, &mut buffer).await?;
         Ok((stream, answer))
     };

@@ -13,6 +13,7 @@ use tokio::time::timeout;
 use super::publications::{Subscriber, TopicOut};
 use super::{FAREWELL, HANDSHAKE, Inner, services};
 use crate::bus::WireType;
+use crate::net;
 use crate::ros1::tcpros::{Error, Header};
 
 /// Connections at a time; further ones wait in the backlog.
@@ -42,6 +43,7 @@ pub(super) async fn serve(bus: Arc<Inner>, listener: TcpListener) {
         connections.spawn(async move {
             let _permit = permit;
             let _ = stream.set_nodelay(true);
+            net::watch(&stream);
             if let Err(error) = connection(&bus, stream).await {
                 tracing::debug!(%error, "a TCPROS connection broke");
             }

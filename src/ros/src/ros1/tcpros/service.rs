@@ -13,7 +13,7 @@ use tokio::sync::watch;
 
 use super::{Error, FrameBounds, FrameReader, Header, write_messages};
 use crate::bus::ServiceHandler;
-use crate::net::Sockets;
+use crate::net::{self, Sockets};
 
 /// A connection to a service's server, ready for calls.
 #[derive(Debug)]
@@ -46,6 +46,7 @@ impl ServiceConnection {
         bounds: impl Into<FrameBounds>,
     ) -> Result<Self, Error> {
         let mut stream = sockets.connect(address).await?;
+        net::watch(&stream);
         let mut buffer = BytesMut::new();
         let header = header.exchange(&mut stream, &mut buffer).await?;
         Ok(Self {

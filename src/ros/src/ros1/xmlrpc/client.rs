@@ -13,7 +13,7 @@ use tokio::time::timeout;
 
 use super::http::{HttpError, Reader};
 use super::{Error, Value, parse_response, print_call};
-use crate::net::Sockets;
+use crate::net::{self, Sockets};
 use crate::ros1::names::PeerUri;
 
 /// Connections kept while nobody calls.
@@ -138,6 +138,7 @@ impl Client {
     async fn connect(&self) -> io::Result<Connection> {
         let address = self.sockets.resolve(&self.uri.host, self.uri.port).await?;
         let stream = self.sockets.connect(address).await?;
+        net::watch(&stream);
         Ok(Connection {
             stream,
             reader: Reader::new(),

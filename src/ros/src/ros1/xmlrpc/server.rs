@@ -18,6 +18,7 @@ use tokio::time::timeout;
 
 use super::http::{Head, HttpError, Reader, SMALL};
 use super::{Call, Fault, Value, parse_call, print_fault, print_response};
+use crate::net;
 
 /// Answers calls.
 #[async_trait]
@@ -90,6 +91,7 @@ pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, limits: Lim
         connections.spawn(async move {
             let _permit = permit;
             let _ = stream.set_nodelay(true);
+            net::watch(&stream);
             if let Err(error) = server.connection(stream).await {
                 tracing::debug!(%error, "an XML-RPC connection broke");
             }
