@@ -24,6 +24,8 @@ pub enum Cause {
     Slow,
     /// More than waits for a node to connect.
     Early,
+    /// More than is kept of what counts one by one.
+    Full,
     /// The publisher has left meanwhile.
     Gone,
     /// A codec's frame that refers to one that did not come.
@@ -47,6 +49,9 @@ impl Cause {
             Self::Busy => "they came faster than this end of the link takes them",
             Self::Slow => "whoever listens takes them too slowly",
             Self::Early => "the node had not connected to the topic yet",
+            Self::Full => {
+                "more latched messages and goals waited for the link than are kept (64 MB)"
+            }
             Self::Gone => "their publisher was gone before they could be sent",
             Self::Undecodable => "they were encoded upon one that did not come",
             Self::Other => "for a reason that this version does not know",

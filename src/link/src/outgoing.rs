@@ -70,11 +70,17 @@ struct Out {
     channel: Option<u32>,
     /// The message before it was encoded, where each one counts: it may come damaged.
     plain: Option<Bytes>,
+    /// No message: the last record of its channel, which tells that there will be no more.
+    closes: bool,
 }
 
 impl Out {
     fn len(&self) -> usize {
         self.head.len() + self.payload.len()
+    }
+
+    fn is_big(&self) -> bool {
+        self.len() > SMALL
     }
 
     /// Bytes from `at` on, at most `length`.
@@ -114,6 +120,8 @@ pub(crate) struct Outgoing {
     sending: VecDeque<Sending>,
     kept: VecDeque<(u64, Kept)>,
     kept_bytes: usize,
+    /// Of big messages that count one by one.
+    kept_big: usize,
     in_a_row: u32,
     /// Messages of these topics are encoded before they are sent, while `packs`.
     packable: BTreeSet<u32>,
@@ -124,6 +132,8 @@ pub(crate) struct Outgoing {
     piece: usize,
     max_age: Option<i64>,
     pub(crate) dropped: Dropped,
+    /// Channels that the peer knows to be closed.
+    pub(crate) closed: Vec<u32>,
     /// Bytes of records given to the socket, over the session.
     pub(crate) sent: u64,
 }
@@ -140,6 +150,7 @@ impl Outgoing {
             sending: VecDeque::new(),
             kept: VecDeque::new(),
             kept_bytes: 0,
+            kept_big: 0,
             in_a_row: 0,
             packable: BTreeSet::new(),
             packs: false,
@@ -148,6 +159,7 @@ impl Outgoing {
             piece: FIRST_PIECE,
             max_age,
             dropped: Dropped::default(),
+            closed: Vec::new(),
             sent: 0,
         }
     }
@@ -170,6 +182,7 @@ impl Outgoing {
             each: quality == Quality::Each,
             channel,
             plain: None,
+            closes: false,
         };
         let Some(channel) = channel else {
             self.urgent_bytes += out.len();
@@ -195,6 +208,26 @@ impl Outgoing {
             bytes -= topic.remove(at).map_or(0, |gone| gone.len());
             count(&mut self.dropped, channel, Cause::Replaced);
         }
+        if topic.len() == 1 && !self.is_under_way(channel) {
+            self.turns.push_back(channel);
+        }
+        if quality == Quality::Each {
+            self.keep_to_budget(channel);
+        }
+    }
+
+    /// Ends a channel by this record, after all that waits on it.
+    pub(crate) fn close(&mut self, channel: u32, record: &Record) {
+        let (head, payload) = record.parts();
+        let topic = self.topics.entry(channel).or_default();
+        topic.push_back(Out {
+            head,
+            payload,
+            born: 0,
+            each: true,
+            channel: Some(channel),
+            closes: true,
+        });
         if topic.len() == 1 && !self.is_under_way(channel) {
             self.turns.push_back(channel);
         }
@@ -366,7 +399,7 @@ impl Outgoing {
     }
 
     fn start(&mut self, mut out: Out, now: i64) -> Frame {
-        if out.channel.is_some() {
+        if out.channel.is_some() && !out.closes {
             out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
         }
         let length = out.len();
@@ -407,7 +440,21 @@ impl Outgoing {
 
     fn is_sent_again(&self, out: &Out) -> bool {
         let room = self.kept.len() < KEPT.0 && self.kept_bytes + out.len() <= KEPT.1;
-        out.channel.is_none() || (room && (out.len() <= SMALL || out.each))
+        let wanted = if out.is_big() {
+            out.each && self.kept.len() < KEPT.0 && budget::has_room(self.kept_big, out)
+        } else {
+            room
+        };
+        out.channel.is_none() || out.closes || wanted
+    }
+
+    /// Where its bytes are counted while it is kept.
+    fn bytes_kept(&mut self, out: &Out) -> &mut usize {
+        if out.channel.is_some() && out.is_big() {
+            &mut self.kept_big
+        } else {
+            &mut self.kept_bytes
+        }
     }
 
     fn keep(&mut self, number: u64, again: bool, out: Out) {
@@ -417,7 +464,7 @@ impl Outgoing {
         let kept = match out.channel {
             Some(channel) if !again => Kept::Not(channel),
             _ => {
-                self.kept_bytes += out.len();
+                *self.bytes_kept(&out) += out.len();
                 Kept::Again(out)
             }
         };
@@ -444,7 +491,13 @@ impl Outgoing {
     pub(crate) fn acknowledge(&mut self, number: u64) {
         while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, Kept::Again(out))) = self.kept.pop_front() {
-                self.kept_bytes -= out.len();
+                *self.bytes_kept(&out) -= out.len();
+                // All that went before it has come, too.
+                if let Some(channel) = out.channel.filter(|_| out.closes) {
+                    self.topics.remove(&channel);
+                    self.packable.remove(&channel);
+                    self.closed.push(channel);
+                }
             }
         }
     }
@@ -531,6 +584,7 @@ impl Outgoing {
             }
         }
         self.kept_bytes = 0;
+        self.kept_big = 0;
         self.turns = self
             .topics
             .iter()
@@ -544,5 +598,6 @@ fn count(dropped: &mut Dropped, channel: u32, cause: Cause) {
     *dropped.entry((channel, cause)).or_default() += 1;
 }
 
+mod budget;
 #[cfg(test)]
 mod tests;

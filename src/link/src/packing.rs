@@ -130,6 +130,10 @@ impl Packing {
         self.lanes.remove(&channel);
     }
 
+    pub(crate) fn peer_closed(&mut self, channel: u32) {
+        self.receivers.remove(&channel);
+    }
+
     /// Whether encoding pays on a link that carries so many bytes per second; none: it never had to hurry.
     pub(crate) fn pays(&self, throughput: Option<f64>) -> bool {
         self.lossless && throughput.is_some_and(|rate| rate < FAST)

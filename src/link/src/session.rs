@@ -118,8 +118,29 @@ struct State {
     packing: Packing,
     throughput: Throughput,
     ending: Option<(u16, String)>,
-    /// What this side's channels stand for; those that are gone, too, for what was dropped of them.
+    /// What this side's channels stand for, until the peer knows that they are gone.
     topics: BTreeMap<u32, String>,
+    /// What was dropped of those that are gone.
+    dropped: BTreeMap<(String, Cause), u64>,
+}
+
+impl State {
+    /// Forgets channels that the peer knows to be closed, but for what was dropped of them.
+    fn let_go(&mut self) {
+        for channel in std::mem::take(&mut self.out.closed) {
+            self.packing.remove(channel);
+            let Some(topic) = self.topics.remove(&channel) else {
+                continue;
+            };
+            self.out.dropped.retain(|(of, cause), count| {
+                if *of == channel {
+                    let all = self.dropped.entry((topic.clone(), *cause)).or_default();
+                    *all += *count;
+                }
+                *of != channel
+            });
+        }
+    }
 }
 
 impl Session {
@@ -139,6 +160,7 @@ impl Session {
                 throughput: Throughput::default(),
                 ending: None,
                 topics: BTreeMap::new(),
+                dropped: BTreeMap::new(),
             }),
             wake: Notify::new(),
             up: watch::Sender::new(false),
@@ -178,7 +200,10 @@ impl Session {
         let of = |cause| {
             let dropped = state.out.dropped.iter();
             let of = dropped.filter(|((_, why), _)| *why == cause);
-            of.map(|(_, count)| count).sum()
+            let gone = state.dropped.iter();
+            let gone = gone.filter(|((_, why), _)| *why == cause);
+            let now: u64 = of.map(|(_, count)| count).sum();
+            now + gone.map(|(_, count)| count).sum::<u64>()
         };
         Dropped {
             replaced: of(Cause::Replaced),
@@ -189,16 +214,19 @@ impl Session {
     /// Messages that did not get to the peer so far.
     pub fn drops(&self) -> Vec<Drop> {
         let state = self.state.lock();
-        let dropped = state.out.dropped.iter();
-        dropped
-            .filter_map(|((channel, cause), count)| {
-                Some(Drop {
-                    topic: state.topics.get(channel)?.clone(),
-                    cause: *cause,
-                    count: *count,
-                })
-            })
-            .collect()
+        let mut all = state.dropped.clone();
+        for ((channel, cause), count) in &state.out.dropped {
+            if let Some(topic) = state.topics.get(channel) {
+                *all.entry((topic.clone(), *cause)).or_default() += count;
+            }
+        }
+        let all = all.into_iter();
+        all.map(|((topic, cause), count)| Drop {
+            topic,
+            cause,
+            count,
+        })
+        .collect()
     }
 
     /// Bytes of records sent so far, and that came.
@@ -268,6 +296,20 @@ impl Session {
         self.wake.notify_one();
     }
 
+    /// Nothing more will be sent as this channel; the peer is told after all that waits on it.
+    pub fn closes(&self, channel: u32) {
+        let json = serde_json::to_vec(&Control::Close { channel }).unwrap_or_default();
+        let mut state = self.state.lock();
+        state.out.close(channel, &Record::Control(json.into()));
+        drop(state);
+        self.wake.notify_one();
+    }
+
+    /// Nothing more will come as this channel of the peer.
+    pub fn peer_closed(&self, channel: u32) {
+        self.state.lock().packing.peer_closed(channel);
+    }
+
     /// Forgets what waits on a channel that is gone.
     pub fn forget(&self, channel: u32) {
         let mut state = self.state.lock();
@@ -307,6 +349,7 @@ impl Session {
     fn acknowledged(&self, received: Received) {
         let mut state = self.state.lock();
         state.out.acknowledge(received.number);
+        state.let_go();
         let told = Told {
             at: Instant::now(),
             bytes: received.bytes,

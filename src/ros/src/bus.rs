@@ -93,6 +93,9 @@ pub struct Subscription {
     pub dropped: Arc<AtomicU64>,
     /// How many publishers are connected now, and later.
     pub publishers: watch::Receiver<usize>,
+    /// Names of the publishers that have not left: who is connected, or was and has not yet been tried again. Who is
+    /// missing here has sent all that it had.
+    pub present: watch::Receiver<BTreeSet<Arc<str>>>,
     /// Keeps the subscription alive.
     pub guard: Box<dyn Send + Sync>,
 }

@@ -306,6 +306,11 @@ impl NodeLink {
                 Ok(Control::Signal { signal }) => {
                     let _ = self.signals.send(signal);
                 }
+                // After the messages before it.
+                Ok(Control::Close { .. }) => match self.held.take(Record::Control(json), arrived) {
+                    Some((record, arrived)) => this.give(record, arrived),
+                    None => this.pass_held(),
+                },
                 Ok(control) => {
                     // Data may follow in the same breath.
                     let hold = match &control {
@@ -348,7 +353,12 @@ impl NodeLink {
                 service,
                 request,
             } => self.call(id, service, request, arrived),
-            _ => {}
+            Record::Control(json) => {
+                if let Ok(control) = serde_json::from_slice(&json) {
+                    let _ = self.orders.send((control, None));
+                }
+            }
+            Record::Answer { .. } => {}
         }
     }
 
@@ -367,7 +377,10 @@ async fn obey(
     while let Some((order, hold)) = orders.recv().await {
         match order {
             Control::Open(input) => link.inputs.open(&hub, &link.drops, input).await,
-            Control::Close { channel } => link.inputs.close(channel),
+            Control::Close { channel } => {
+                link.inputs.close(channel);
+                link.session.peer_closed(channel);
+            }
             Control::Listeners { channel, count } => {
                 let outputs = &link.outputs;
                 outputs.listeners(&link, &hub, (channel, count), hold).await;

@@ -308,3 +308,115 @@ fn small_messages_and_other_topics_are_not_encoded() {
     assert!(out.next(0).is_some() && out.next(0).is_some());
     assert_eq!(out.take_to_pack(), None);
 }
+
+fn latched(channel: u32, born: i64, size: usize) -> Record {
+    let Record::Data(data) = data(channel, born, size) else {
+        unreachable!("data is data")
+    };
+    Record::Data(Data {
+        latching: true,
+        ..data
+    })
+}
+
+/// Bytes of messages that wait.
+fn waiting(out: &Outgoing) -> usize {
+    let all = out.topics.values().flatten();
+    all.map(|out| out.payload.len()).sum()
+}
+
+#[test]
+fn latched_messages_for_a_dead_link_take_so_much_memory_and_no_more() {
+    const MB: usize = 1 << 20;
+    let mut out = Outgoing::new(None);
+    // A map that grows, a second one that was latched once, and the poses that belong to them.
+    out.push(&latched(2, 0, 4 * MB), Quality::Each);
+    for number in 1..=100 {
+        out.push(&latched(1, number, 3 * MB), Quality::Each);
+        out.push(&latched(3, number, 100), Quality::Each);
+        assert!(waiting(&out) <= 68 * MB, "{} MB", waiting(&out) / MB);
+    }
+    assert_eq!(out.topics[&2].len(), 1, "nothing has taken its place");
+    assert_eq!(out.topics[&3].len(), 100, "small ones cost nothing");
+    assert_eq!(out.topics[&1].back().map(|out| out.born), Some(100));
+    let kept = out.topics[&1].len();
+    assert!((19..=21).contains(&kept), "{kept}");
+    let lost = u64::try_from(100 - kept).unwrap();
+    assert_eq!(out.dropped[&(1, Cause::Full)], lost, "{:?}", out.dropped);
+    assert_eq!(out.dropped.len(), 1, "each is told by its cause");
+    // One of many topics gives way when all of them together are too much.
+    for channel in 10..40 {
+        out.push(&latched(channel, 1, 8 * MB), Quality::Each);
+        assert!(waiting(&out) <= 73 * MB, "{} MB", waiting(&out) / MB);
+    }
+    assert_eq!(out.topics[&39].len(), 1);
+    // However big it is, the last one stays.
+    out.push(&latched(50, 1, 100 * MB), Quality::Each);
+    assert_eq!(out.topics[&50].len(), 1);
+    let mut incoming = Incoming::default();
+    let mut came = 0;
+    while let Some(frame) = out.next(0) {
+        came += usize::from(deliver(&mut incoming, frame).is_some());
+    }
+    assert!(came > 100, "what was kept goes out: {came}");
+}
+
+#[test]
+fn a_big_latched_message_that_was_cut_off_comes_again() {
+    const BIG: usize = 6 << 20;
+    let mut out = Outgoing::new(None);
+    out.push(&latched(1, 1, BIG), Quality::Each);
+    out.push(&data(2, 2, 10), Quality::Newest);
+    let mut lost = Incoming::default();
+    while let Some(frame) = out.next(0) {
+        deliver(&mut lost, frame);
+    }
+    // The connection is gone, and nothing is known to have come.
+    out.reconnect(0, &[]);
+    let (mut incoming, mut came) = (Incoming::default(), Vec::new());
+    incoming.reconnect(out.next_number());
+    while let Some(frame) = out.next(0) {
+        came.extend(born(deliver(&mut incoming, frame)));
+    }
+    came.sort_unstable();
+    assert_eq!(came, [1, 2], "{:?}", out.dropped);
+}
+
+#[test]
+fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
+    let mut out = Outgoing::new(None);
+    let close = control(7);
+    out.set_packable(1);
+    for number in 1..=3 {
+        out.push(&data(1, number, 10 * number as usize), Quality::Each);
+    }
+    out.push(&data(1, 4, SMALL * 3), Quality::Each);
+    out.close(1, &close);
+    out.push(&control(1), Quality::Each);
+    let mut lost = Incoming::default();
+    for _ in 0..4 {
+        let frame = out.next(0).unwrap();
+        deliver(&mut lost, frame);
+    }
+    // Cut off in the middle of it.
+    out.reconnect(0, &[]);
+    let (mut incoming, mut came) = (Incoming::default(), Vec::new());
+    incoming.reconnect(out.next_number());
+    while let Some(frame) = out.next(0) {
+        came.extend(deliver(&mut incoming, frame));
+    }
+    let messages: Vec<i64> = came
+        .iter()
+        .cloned()
+        .filter_map(|it| born(Some(it)))
+        .collect();
+    assert_eq!(messages, [1, 2, 3, 4]);
+    assert_eq!(came.last(), Some(&close), "after all of them: {came:?}");
+    assert!(
+        out.closed.is_empty(),
+        "the peer has not said that it has it"
+    );
+    out.acknowledge(incoming.state().0);
+    assert_eq!(out.closed, [1]);
+    assert!(out.topics.is_empty() && out.packable.is_empty() && out.kept.is_empty());
+}

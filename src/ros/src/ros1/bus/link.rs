@@ -34,6 +34,8 @@ pub(super) struct Link {
     listed: watch::Sender<bool>,
     task: Mutex<Option<AbortHandle>>,
     peer: Mutex<Option<Arc<WireType>>>,
+    /// Its name, from the first connection on until it has left.
+    pub(super) publisher: Mutex<Option<Arc<str>>>,
     pub(super) connected: AtomicBool,
     pub(super) messages: AtomicU64,
     pub(super) bytes: AtomicU64,
@@ -73,6 +75,7 @@ pub(super) fn start(bus: &Arc<Inner>, topic: &Arc<TopicIn>, uri: &str) -> Arc<Li
         listed: watch::Sender::new(true),
         task: Mutex::new(None),
         peer: Mutex::new(None),
+        publisher: Mutex::new(None),
         connected: AtomicBool::new(false),
         messages: AtomicU64::new(0),
         bytes: AtomicU64::new(0),
@@ -94,6 +97,9 @@ async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
         if link.connected.swap(false, Ordering::Relaxed) {
             pause = PAUSE;
             topic.connected.send_modify(|count| *count -= 1);
+        } else {
+            // Not even a connection: what there was before has ended for good.
+            topic.left(&link);
         }
         if let Err(error) = result {
             let text = error.to_string();
@@ -142,9 +148,10 @@ async fn connect_and_read(
     } = connection;
     let wire_type = Arc::new(wire_type);
     *link.peer.lock() = Some(wire_type.clone());
+    let publisher: Arc<str> = publisher.into();
+    topic.came(link, &publisher);
     link.connected.store(true, Ordering::Relaxed);
     topic.connected.send_modify(|count| *count += 1);
-    let publisher: Arc<str> = publisher.into();
     loop {
         let next = frames.next(&mut stream).await;
         let Some(bytes) = next.map_err(|error| broken(&link.uri, error))? else {

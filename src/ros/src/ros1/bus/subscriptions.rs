@@ -1,6 +1,6 @@
 //! Topics that this node subscribes to: several local subscriptions share one set of connections.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -22,6 +22,8 @@ pub(super) struct TopicIn {
     links: Mutex<Links>,
     /// Links that are connected.
     pub(super) connected: watch::Sender<usize>,
+    /// Publishers that have not left.
+    present: watch::Sender<BTreeSet<Arc<str>>>,
 }
 
 /// One connection per publisher, by its address.
@@ -77,6 +79,7 @@ pub(super) async fn subscribe(
                 locals: Mutex::default(),
                 links: Mutex::default(),
                 connected: watch::Sender::new(0),
+                present: watch::Sender::default(),
             })
         });
         topic.add(Local {
@@ -102,6 +105,7 @@ pub(super) async fn subscribe(
         dropped: messages.dropped(),
         messages,
         publishers: topic.connected.subscribe(),
+        present: topic.present.subscribe(),
         guard: Box::new(guard),
     })
 }
@@ -189,8 +193,39 @@ impl TopicIn {
             return false;
         }
         links.by_uri.remove(link.uri());
-        self.locals.lock().latched.remove(link.uri());
+        self.forget(&links, link);
         true
+    }
+
+    /// The link's publisher has said its name.
+    pub(super) fn came(&self, link: &Link, publisher: &Arc<str>) {
+        let links = self.links.lock();
+        let before = link.publisher.lock().clone();
+        if before.is_some_and(|before| before != *publisher) {
+            self.forget(&links, link);
+        }
+        *link.publisher.lock() = Some(publisher.clone());
+        self.present
+            .send_if_modified(|present| present.insert(publisher.clone()));
+    }
+
+    /// The link's publisher cannot be reached any more: what it has latched is gone with it.
+    pub(super) fn left(&self, link: &Link) {
+        self.forget(&self.links.lock(), link);
+    }
+
+    fn forget(&self, links: &Links, link: &Link) {
+        self.locals.lock().latched.remove(link.uri());
+        let Some(publisher) = link.publisher.lock().take() else {
+            return;
+        };
+        // It may be back at another address.
+        let mut others = links.by_uri.values();
+        let back = others.any(|other| other.publisher.lock().as_ref() == Some(&publisher));
+        if !back {
+            self.present
+                .send_if_modified(|present| present.remove(&publisher));
+        }
     }
 
     /// Closes all connections and ends all local subscriptions.

@@ -1,0 +1,66 @@
+//! What counts one by one (latched messages, what belongs to actions) is not dropped for a newer one's sake while there
+//! is room, and there is room for so many bytes.
+
+use std::collections::VecDeque;
+
+use super::{Out, Outgoing, count};
+use crate::drops::Cause;
+
+/// Bytes of such messages that wait beside the last one, over all topics, and that are kept in case they are lost.
+pub(super) const EACH: usize = 64 << 20;
+/// A topic with less than this is not where room is to be made while another has more than its last message.
+const LITTLE: usize = 1 << 20;
+
+/// Whether this one may be kept beside so many bytes of others: the only one may be of any size.
+pub(super) fn has_room(kept: usize, out: &Out) -> bool {
+    kept == 0 || kept + out.len() <= EACH
+}
+
+/// How many of them wait on a topic, and their bytes.
+fn load(waiting: &VecDeque<Out>) -> (usize, usize) {
+    let all = waiting.iter().filter(|out| out.counts());
+    all.fold((0, 0), |(count, bytes), out| (count + 1, bytes + out.len()))
+}
+
+impl Out {
+    /// It is a message of which no newer one takes the place.
+    fn counts(&self) -> bool {
+        self.each && !self.closes
+    }
+}
+
+impl Outgoing {
+    /// Makes room after a message of `channel` has come: at first where newer messages follow the oldest one, then
+    /// anywhere, in the biggest topic each time. What has come last stays.
+    pub(super) fn keep_to_budget(&mut self, channel: u32) {
+        loop {
+            let topics = self.topics.iter().map(|(of, waiting)| (*of, load(waiting)));
+            let topics: Vec<(u32, (usize, usize))> = topics.collect();
+            let all: usize = topics.iter().map(|(_, (_, bytes))| bytes).sum();
+            let last = self.topics.get(&channel).and_then(VecDeque::back);
+            if all - last.map_or(0, Out::len).min(all) <= EACH {
+                return;
+            }
+            let size = |&&(_, (_, bytes)): &&(u32, (usize, usize))| bytes;
+            let followed = topics
+                .iter()
+                .filter(|(_, (count, bytes))| *count > 1 && *bytes > LITTLE);
+            let others = topics
+                .iter()
+                .filter(|(of, (count, _))| *of != channel || *count > 1);
+            let biggest = followed.max_by_key(size).or(others.max_by_key(size));
+            let Some(&(of, _)) = biggest else { return };
+            let Some(waiting) = self.topics.get_mut(&of) else {
+                return;
+            };
+            let oldest = waiting.iter().position(Out::counts);
+            if oldest.and_then(|at| waiting.remove(at)).is_none() {
+                return;
+            }
+            if waiting.is_empty() {
+                self.turns.retain(|turn| *turn != of);
+            }
+            count(&mut self.dropped, of, Cause::Full);
+        }
+    }
+}
