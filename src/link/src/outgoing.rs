@@ -226,6 +226,7 @@ impl Outgoing {
             born: 0,
             each: true,
             channel: Some(channel),
+            plain: None,
             closes: true,
         });
         if topic.len() == 1 && !self.is_under_way(channel) {
@@ -522,6 +523,7 @@ impl Outgoing {
             head,
             payload,
             plain: None,
+            closes: false,
             ..*out
         };
         self.topics.entry(channel).or_default().push_front(again);
