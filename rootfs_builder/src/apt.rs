@@ -3,7 +3,7 @@
 //!
 //! In: names of Debian packages and the dpkg status of what is there already. Out: exact versions, and the files.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -36,6 +36,17 @@ pub struct Deb {
     pub version: String,
     /// `amd64`, `all`.
     pub architecture: String,
+}
+
+/// How a package relates to others.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Relations {
+    /// The source package it was made of.
+    pub source: String,
+    /// Every package that its Depends and Pre-Depends name, alternatives too.
+    pub needs: BTreeSet<String>,
+    /// What it can stand for.
+    pub provides: BTreeSet<String>,
 }
 
 impl std::fmt::Display for Deb {
@@ -226,6 +237,26 @@ impl Apt {
         Ok(debs)
     }
 
+    /// What is said of these packages besides their names, by name. `names` are as apt takes them: `NAME` for the
+    /// candidate, or `NAME=VERSION`; those that the lists do not have are left out.
+    pub async fn relations(
+        &self,
+        names: impl IntoIterator<Item = String>,
+    ) -> Result<BTreeMap<String, Relations>, Error> {
+        let mut query = self.command("apt-cache");
+        query.args(["--no-all-versions", "show", "--"]).args(names);
+        let text = process::output(query, "apt").await?;
+        let mut all: BTreeMap<String, Relations> = BTreeMap::new();
+        for (name, about) in text.split("\n\n").filter_map(parse_relations) {
+            // One version from two places may be told twice.
+            let there = all.entry(name).or_default();
+            there.source = about.source;
+            there.needs.extend(about.needs);
+            there.provides.extend(about.provides);
+        }
+        Ok(all)
+    }
+
     /// Files of these packages, in the same order; those not in the cache are fetched and checked by apt.
     pub async fn download(&self, debs: &[Deb], progress: &Progress) -> Result<Vec<PathBuf>, Error> {
         let archives = self.root.join("archives");
@@ -371,15 +402,40 @@ fn parse_inst(line: &str) -> Option<Deb> {
     })
 }
 
+fn field(stanza: &str, name: &str) -> Option<String> {
+    stanza.lines().find_map(|line| {
+        line.strip_prefix(name)?
+            .strip_prefix(": ")
+            .map(str::to_owned)
+    })
+}
+
+/// A stanza's name, and what it says of others.
+fn parse_relations(stanza: &str) -> Option<(String, Relations)> {
+    let names = |name: &str| -> BTreeSet<String> {
+        let text = field(stanza, name).unwrap_or_default();
+        let items = text.split([',', '|']);
+        // `libfoo:any (>= 1.0)`
+        let names =
+            items.filter_map(|item| item.split([' ', ':', '(']).find(|name| !name.is_empty()));
+        names.map(str::to_owned).collect()
+    };
+    let name = field(stanza, "Package")?;
+    let source = field(stanza, "Source").unwrap_or_else(|| name.clone());
+    let about = Relations {
+        source: source.split(' ').next().unwrap_or_default().to_owned(),
+        needs: names("Depends")
+            .into_iter()
+            .chain(names("Pre-Depends"))
+            .collect(),
+        provides: names("Provides"),
+    };
+    Some((name, about))
+}
+
 /// A stanza of `apt-cache show`.
 fn parse_stanza(stanza: &str) -> Option<Deb> {
-    let field = |name: &str| {
-        stanza.lines().find_map(|line| {
-            line.strip_prefix(name)?
-                .strip_prefix(": ")
-                .map(str::to_owned)
-        })
-    };
+    let field = |name: &str| field(stanza, name);
     Some(Deb {
         name: field("Package")?,
         version: field("Version")?,

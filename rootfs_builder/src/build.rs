@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use image::{ImageSpec, LayerInfo};
+use image::{Digest, ImageSpec};
 
 use crate::advice;
 use crate::apt::Deb;
@@ -18,7 +18,7 @@ use crate::key::Key;
 use crate::launch::{self, Ask, LaunchPlan};
 use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
-use crate::workshop::Workshop;
+use crate::workshop::{Layer, Workshop};
 
 /// Where dpkg writes down what is installed.
 const STATUS: &str = "var/lib/dpkg/status";
@@ -40,22 +40,23 @@ pub(crate) struct Parts {
     pub(crate) packages: Vec<String>,
     pub(crate) version: String,
     pub(crate) dependencies: Made,
-    pub(crate) package: Option<Made>,
+    /// Nothing where the dependencies are all.
+    pub(crate) package: Made,
     /// Its install space; none for one below `/usr`.
     pub(crate) prefix: Option<PathBuf>,
 }
 
 impl Build<'_> {
     /// The base layer alone, as what others are put on.
-    pub(crate) fn on_base(&self) -> Vec<LayerInfo> {
-        self.base_layer.layer.into_iter().collect()
+    pub(crate) fn on_base(&self) -> Vec<Digest> {
+        self.base_layer.diff_ids().collect()
     }
 
-    /// A layer with these Debian packages, and what they need, on top of `below`.
+    /// Layers with these Debian packages, and what they need, on top of `below`.
     pub(crate) async fn add(
         &self,
         name: &'static str,
-        below: &[LayerInfo],
+        below: &[Digest],
         packages: &BTreeSet<String>,
         extras: Vec<crate::deb::Member>,
     ) -> Result<Made, Error> {
@@ -66,7 +67,7 @@ impl Build<'_> {
             debs,
             extras,
         };
-        install::layer(
+        install::layers(
             &self.shop,
             &self.archive,
             &self.base,
@@ -79,7 +80,7 @@ impl Build<'_> {
     /// What is to be installed on top of `below`. Remembered: apt takes seconds.
     async fn resolve(
         &self,
-        below: &[LayerInfo],
+        below: &[Digest],
         packages: &BTreeSet<String>,
     ) -> Result<Vec<Deb>, Error> {
         if packages.is_empty() {
@@ -87,7 +88,7 @@ impl Build<'_> {
         }
         let key = Key::new("resolved")
             .with("archive", &self.archive.stamp)
-            .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
+            .with_all("below", below.iter().map(Digest::to_string))
             .with_all("package", packages)
             .finish();
         if let Some(debs) = self.shop.layers.note(&key) {
@@ -142,31 +143,21 @@ impl Build<'_> {
 
     /// Resolves what to run and writes the image.
     pub(crate) async fn finish(
-        self,
+        &self,
         made: Parts,
         hold: image::Hold,
     ) -> Result<BuildOutcome, Error> {
-        let mut layers = Vec::new();
         let parts = [
-            ("base", Some(&self.base_layer)),
-            ("dependencies", Some(&made.dependencies)),
-            ("package", made.package.as_ref()),
+            ("base", &self.base_layer),
+            ("dependencies", &made.dependencies),
+            ("package", &made.package),
         ];
-        for (name, part) in parts {
-            if let Some(Made {
-                layer: Some(info),
-                cached,
-            }) = part
-            {
-                layers.push(BuiltLayer {
-                    name,
-                    info: *info,
-                    cached: *cached,
-                });
-            }
-        }
-        let infos: Vec<LayerInfo> = layers.iter().map(|layer| layer.info).collect();
-        let trees = self.shop.extracted(&infos).await?;
+        let parts = parts
+            .into_iter()
+            .flat_map(|(name, part)| part.layers.iter().map(move |layer| (name, *layer)));
+        let parts: Vec<(&'static str, Layer)> = parts.collect();
+        let diff_ids: Vec<Digest> = parts.iter().map(|(_, layer)| layer.diff_id).collect();
+        let trees = self.shop.extracted(&diff_ids).await?;
         self.progress.step("resolving what to run").await;
         let request = self.request;
         let ask = Ask {
@@ -208,8 +199,9 @@ impl Build<'_> {
         let definitions =
             crate::blocking::spawn(move || package::definitions::read(&trees, &shares)).await??;
         let package = made.packages.first().cloned().unwrap_or_default();
+        let layers = self.packed(parts).await?;
         let spec = ImageSpec {
-            layers: infos,
+            layers: layers.iter().map(|layer| layer.info).collect(),
             env: environment.clone(),
             labels: BTreeMap::from([
                 ("org.cloudroid.package".to_owned(), package.clone()),
@@ -242,5 +234,30 @@ impl Build<'_> {
             definitions,
             hold,
         })
+    }
+
+    /// The layers with their archives.
+    async fn packed(&self, parts: Vec<(&'static str, Layer)>) -> Result<Vec<BuiltLayer>, Error> {
+        if self.shop.is_packing() {
+            self.progress.step("packing the rest of the layers").await;
+        }
+        self.shop.settled().await?;
+        let store = self.shop.layers.store().clone();
+        tokio::task::spawn_blocking(move || {
+            let whole = parts.into_iter().map(|(name, layer)| {
+                let info = store.layer(&layer.diff_id)?;
+                let info = info.ok_or_else(|| image::Error::UnknownLayer {
+                    diff_id: layer.diff_id,
+                    store: store.images_dir().to_owned(),
+                })?;
+                Ok(BuiltLayer {
+                    name,
+                    info,
+                    cached: layer.cached,
+                })
+            });
+            whole.collect()
+        })
+        .await?
     }
 }

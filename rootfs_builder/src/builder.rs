@@ -16,7 +16,7 @@ use crate::archive::Archive;
 use crate::base::{self, Base};
 use crate::bootstrap;
 use crate::build::Build;
-use crate::cache::Layers;
+use crate::cache::{Entry, Layers};
 use crate::error::{Error, IoAt};
 use crate::event::{BuildEvent, Progress};
 use crate::install::Made;
@@ -123,11 +123,7 @@ impl Builder {
             self.config.limits.or(&sandbox::default_limits()),
             self.removals.clone(),
         )?;
-        let shop = Workshop {
-            site,
-            layers: self.layers.clone(),
-            turns: self.turns.clone(),
-        };
+        let shop = Workshop::new(site, self.layers.clone(), self.turns.clone());
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             Source::Tree(path) => {
@@ -162,12 +158,20 @@ impl Builder {
             log,
         };
         sweep_logs(&self.config.logs_dir);
-        let made = match what {
-            What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
-            What::Tree(Pushed::Installed(space)) => prebuilt::build(&build, space).await?,
-            What::Packaged(name) => packaged::build(&build, name).await?,
+        let work = async {
+            let made = match what {
+                What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
+                What::Tree(Pushed::Installed(space)) => prebuilt::build(&build, space).await?,
+                What::Packaged(name) => packaged::build(&build, name).await?,
+            };
+            build.finish(made, hold).await
         };
-        build.finish(made, hold).await
+        let outcome = work.await;
+        // What was installed and compiled before something failed is not lost: the next push begins there.
+        let settled = build.shop.settled().await;
+        let outcome = outcome?;
+        settled?;
+        Ok(outcome)
     }
 
     /// What `words` (of a node of an image on this base) say is missing, and the options of a push that add it. Empty
@@ -220,19 +224,10 @@ impl Builder {
         let key = bootstrap::key(base, &resolved);
         let _turn = shop.turns.take(&key).await;
         if let Some(entry) = shop.cached(&key).await? {
-            return Ok((
-                Made {
-                    layer: entry.layer,
-                    cached: true,
-                },
-                archive,
-            ));
+            return Ok((made_of(&entry, true), archive));
         }
         let entry = bootstrap::make(shop, base, &archive.sources, progress).await?;
-        let made = Made {
-            layer: entry.layer,
-            cached: false,
-        };
+        let (made, layer) = (made_of(&entry, false), entry.layer);
         let present: BTreeSet<&String> = entry.made_from.iter().collect();
         let all_there = resolved
             .iter()
@@ -257,9 +252,9 @@ impl Builder {
             .await
             .insert(base.name.clone(), archive.clone());
         let resolved = bootstrap::resolve(shop, &archive, base).await?;
-        if let Some(layer) = made.layer {
+        if let Some(layer) = layer {
             let made_from = resolved.iter().map(Deb::to_string).collect();
-            let entry = crate::cache::Entry {
+            let entry = Entry {
                 layer: Some(layer),
                 made_from,
             };
@@ -267,6 +262,11 @@ impl Builder {
         }
         Ok((made, archive))
     }
+}
+
+fn made_of(entry: &Entry, cached: bool) -> Made {
+    let layer = entry.layer.map(|layer| Made::one(layer.diff_id, cached));
+    layer.unwrap_or_default()
 }
 
 /// Keeps the newest logs. Best effort: a log too many hurts nobody.

@@ -46,6 +46,26 @@ impl Layers {
         &self.store
     }
 
+    /// The directory of everything cached.
+    pub(crate) fn cache(&self) -> &Path {
+        self.directory.parent().unwrap_or(&self.directory)
+    }
+
+    /// Whether [`Layers::get`] would find a layer, which then need not be in the store yet. Blocking.
+    pub(crate) fn has(&self, key: &str) -> bool {
+        let (about, archive) = self.paths(key);
+        let entry = fs::read(&about)
+            .ok()
+            .and_then(|text| serde_json::from_slice::<Entry>(&text).ok());
+        match entry.map(|entry| entry.layer) {
+            None => false,
+            Some(None) => true,
+            Some(Some(layer)) => {
+                archive.is_file() || matches!(self.store.layer(&layer.diff_id), Ok(Some(_)))
+            }
+        }
+    }
+
     fn paths(&self, key: &str) -> (PathBuf, PathBuf) {
         (
             self.directory.join(format!("{key}.json")),

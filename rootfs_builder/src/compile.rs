@@ -6,8 +6,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use foreign::Visit;
-use image::{LayerInfo, TreeOptions};
-use rustix::fs::{AtFlags, FileType, Gid, Mode, Uid};
+use image::TreeOptions;
+use rustix::fs::{AtFlags, FileType, Mode};
 use serde::Serialize;
 use servant::spec::{Mount, Profile};
 
@@ -35,30 +35,130 @@ pub(crate) struct Unit {
     pub(crate) build_type: String,
 }
 
+/// What is done with packages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Task {
+    /// They are configured, against stand-ins of those among them that they need: most mistakes show in seconds.
+    Check,
+    /// They are compiled and installed.
+    Compile,
+}
+
 #[derive(Serialize)]
 struct Job<'a> {
-    packages: &'a [Unit],
+    check: bool,
+    packages: Vec<Given<'a>>,
+    workspace: Vec<&'a str>,
     prefix: &'a Path,
     cmake: &'a [String],
     jobs: usize,
 }
 
-/// Compiles `units` in this order. `below`: base, toolchain, build dependencies. `log`: where the complete log
-/// goes; it stays there whatever happens. Gives a tree with the prefix in it, owned by root.
-pub(crate) async fn compile(
+#[derive(Serialize)]
+struct Given<'a> {
+    #[serde(flatten)]
+    unit: &'a Unit,
+    /// Those of the job that it needs, in the order of building.
+    needs: Vec<&'a str>,
+}
+
+/// Packages to compile, and what they are compiled in.
+pub(crate) struct Order<'a> {
+    pub(crate) base: &'a Base,
+    /// Base, toolchain, build dependencies, and packages that are compiled already; lowest first.
+    pub(crate) layers: Vec<PathBuf>,
+    /// The sources that can be seen.
+    pub(crate) source: &'a Path,
+    /// What to do, in this order; and which of them each needs, by index.
+    pub(crate) units: Vec<(&'a Unit, Vec<usize>)>,
+    /// All packages of the push.
+    pub(crate) workspace: &'a [Unit],
+}
+
+/// What came of it: a tree with the prefix in it.
+pub(crate) struct Compiled {
+    /// Owned by the compiling user, whiteouts of the overlay included.
+    pub(crate) tree: PathBuf,
+    /// The directory that it is in.
+    pub(crate) room: PathBuf,
+    /// First host uid of the container.
+    pub(crate) uid_offset: u32,
+}
+
+/// The complete log of a build. It stays whatever happens.
+pub(crate) struct Log {
+    path: PathBuf,
+    file: fs::File,
+}
+
+impl Log {
+    pub(crate) fn create(path: &Path) -> Result<Self, Error> {
+        let file = fs::File::options()
+            .read(true)
+            .append(true)
+            .create(true)
+            .open(path)
+            .at("making", path)?;
+        crate::install::set_mode(path, 0o600)?;
+        file.set_len(0).at("emptying", path)?;
+        Ok(Self {
+            path: path.to_owned(),
+            file,
+        })
+    }
+
+    /// Bytes so far.
+    pub(crate) fn len(&self) -> u64 {
+        self.file.metadata().map_or(0, |about| about.len())
+    }
+
+    /// The text from a position on, at most its last mebibyte.
+    pub(crate) fn since(&self, position: u64) -> String {
+        use std::os::unix::fs::FileExt;
+        let end = self.len();
+        let start = position.max(end.saturating_sub(1 << 20));
+        let mut bytes = vec![0; usize::try_from(end.saturating_sub(start)).unwrap_or(0)];
+        match self.file.read_exact_at(&mut bytes, start) {
+            Ok(()) => String::from_utf8_lossy(&bytes).into_owned(),
+            Err(_) => String::new(),
+        }
+    }
+}
+
+/// Runs a task in a container of its own.
+pub(crate) async fn run(
     shop: &Workshop,
-    base: &Base,
-    below: &[LayerInfo],
-    source: &Path,
-    units: &[Unit],
-    log: &Path,
+    task: Task,
+    order: &Order<'_>,
+    log: &mut Log,
     progress: &Progress,
-) -> Result<PathBuf, Error> {
-    let room = shop.site.fresh("compile")?;
+) -> Result<Compiled, Error> {
+    let base = order.base;
+    let name = match task {
+        Task::Check => "configure",
+        Task::Compile => "compile",
+    };
+    let room = shop.site.fresh(name)?;
     let (tools, upper) = (room.join("tools"), room.join("upper"));
     fs::create_dir(&upper).at("making", &upper)?;
     let job = Job {
-        packages: units,
+        check: task == Task::Check,
+        packages: order
+            .units
+            .iter()
+            .map(|(unit, needs)| Given {
+                unit,
+                needs: needs
+                    .iter()
+                    .map(|&index| order.units[index].0.name.as_str())
+                    .collect(),
+            })
+            .collect(),
+        workspace: order
+            .workspace
+            .iter()
+            .map(|unit| unit.name.as_str())
+            .collect(),
         prefix: &base.build.prefix,
         cmake: &base.build.cmake,
         jobs: std::thread::available_parallelism().map_or(1, usize::from),
@@ -81,8 +181,7 @@ pub(crate) async fn compile(
             .map(|(path, text)| (path.clone(), text.clone().into_bytes())),
     );
     lay_out(&tools, &files)?;
-    open_up(source)?;
-    let mut layers = shop.extracted(below).await?;
+    let mut layers = order.layers.clone();
     layers.push(tools);
     let mut environment = base.environment.clone();
     environment.extend(base.build.environment.clone());
@@ -98,17 +197,20 @@ pub(crate) async fn compile(
     // Compiled Python is wanted here: it goes into the layer.
     environment.remove("PYTHONDONTWRITEBYTECODE");
 
-    let mut file = fs::File::create(log).at("making", log)?;
-    crate::install::set_mode(log, 0o600)?;
-    let (mut writing, mut logged) = (Ok(()), 0);
-    let mut package = units
+    // The prefix may be there already, with packages that were compiled before; of each directory a user must be able
+    // to write in the one above all.
+    let owned = vec!["/build".into(), base.build.prefix.clone()];
+    let (mut writing, mut logged) = (Ok(()), log.len());
+    let mut failed: Vec<String> = Vec::new();
+    let mut current = order
+        .units
         .first()
-        .map_or_else(String::new, |unit| unit.name.clone());
+        .map_or_else(String::new, |(unit, _)| unit.name.clone());
     let mut tail = Tail::default();
     let (mut lines, mut told) = crate::lines::channel();
     let forward = async {
         while let Some(line) = told.recv().await {
-            match title(&line, units) {
+            match title(&line, order.workspace) {
                 Some(step) => progress.step(&step).await,
                 None => progress.log(&line).await,
             }
@@ -119,13 +221,13 @@ pub(crate) async fn compile(
             .site
             .run(
                 Run {
-                    name: "compile",
+                    name,
                     profile: Profile::Compile,
                     layers,
                     writable: Some(upper.clone()),
-                    owned: vec!["/build".into(), base.build.prefix.clone()],
+                    owned,
                     mounts: vec![Mount {
-                        source: source.to_owned(),
+                        source: order.source.to_owned(),
                         target: "/cloudroid/source".into(),
                         writable: false,
                         device: false,
@@ -140,10 +242,12 @@ pub(crate) async fn compile(
                     // The beginning says most; a build that prints without end must not fill the disk.
                     if writing.is_ok() && logged < LOG_LIMIT {
                         logged += line.len() as u64 + 1;
-                        writing = writeln!(file, "{line}");
+                        writing = writeln!(log.file, "{line}");
                     }
                     if let Some(name) = line.strip_prefix("::package ") {
-                        package = name.to_owned();
+                        current = name.to_owned();
+                    } else if let Some(name) = line.strip_prefix("::failed ") {
+                        failed.push(name.to_owned());
                     } else if worth_showing(line) {
                         tail.push(line);
                     }
@@ -156,12 +260,25 @@ pub(crate) async fn compile(
     };
     let (finished, ()) = tokio::join!(work, forward);
     let finished = finished?;
-    writing.at("writing", log)?;
+    writing.at("writing", &log.path)?;
+    if task == Task::Check && failed.is_empty() {
+        // However it ended, it found nothing to blame on a package.
+        return Ok(Compiled {
+            tree: upper,
+            room,
+            uid_offset: finished.uid_offset,
+        });
+    }
     if !finished.success() {
         let mut last_lines = tail.text();
         if finished.exit.code != Some(1) {
             last_lines = format!("{last_lines}\n{}", finished.last_words());
         }
+        let package = if failed.is_empty() {
+            current
+        } else {
+            failed.join(", ")
+        };
         if last_lines.contains("No space left on device") {
             return Err(Error::DiskFull {
                 path: upper,
@@ -170,16 +287,19 @@ pub(crate) async fn compile(
         }
         return Err(Error::BuildFailed {
             package,
-            log: log.to_owned(),
+            log: log.path.clone(),
             last_lines,
             advice: Vec::new(),
         });
     }
-    let prefix = base.build.prefix.clone();
-    let tree = room.join("tree");
+    let (prefix, tree) = (base.build.prefix.clone(), room.join("tree"));
     let result = tree.clone();
     blocking::spawn(move || take_out(&upper, &prefix, &tree)).await??;
-    Ok(result)
+    Ok(Compiled {
+        tree: result,
+        room,
+        uid_offset: finished.uid_offset,
+    })
 }
 
 const COMPILE: &str = include_str!("inside/compile.py");
@@ -219,7 +339,7 @@ pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
     })
 }
 
-/// Moves the prefix out of the container's upper directory into a tree of its own that belongs to root.
+/// Moves the prefix out of the container's upper directory into a tree of its own.
 fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
     let inside = prefix.strip_prefix("/").unwrap_or(prefix);
     let target = tree.join(inside);
@@ -232,28 +352,27 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
         set_mode(directory, 0o755)?;
     }
     let from = upper.join(inside);
-    fs::rename(&from, &target).at("moving", &from)?;
-    foreign::walk(&target, |entry| {
-        let (parent, name) = entry.place();
-        let root = (Some(Uid::ROOT), Some(Gid::ROOT));
-        rustix::fs::chownat(parent, name, root.0, root.1, AtFlags::SYMLINK_NOFOLLOW)
-            .map_err(|error| Error::io("changing the owner of", entry.shown(), error.into()))?;
-        Ok::<_, Error>(Visit::Into)
-    })
+    fs::rename(&from, &target).at("moving", &from)
 }
 
-/// Packs an install space.
-pub(crate) async fn pack(shop: &Workshop, base: &Base, tree: &Path) -> Result<LayerInfo, Error> {
-    let store = shop.layers.store().clone();
-    let (tree, options) = (
-        tree.to_owned(),
-        TreeOptions {
-            exclude: Vec::new(),
-            level: 6,
-            ..tree_options(base)
-        },
-    );
-    Ok(blocking::spawn(move || store.layer_from_tree(&tree, &options)).await??)
+/// How what was compiled becomes a layer of the cache, its files the compiling user's as they were.
+pub(crate) fn unit_options(base: &Base, uid_offset: u32) -> TreeOptions {
+    TreeOptions {
+        uid_offset,
+        exclude: Vec::new(),
+        overlay_upper: true,
+        ..tree_options(base)
+    }
+}
+
+/// How an install space becomes a layer of an image, with all files root's. `owner`: whose they are now.
+pub(crate) fn package_options(base: &Base, owner: u32) -> TreeOptions {
+    TreeOptions {
+        uid_offset: owner,
+        exclude: Vec::new(),
+        level: 6,
+        ..tree_options(base)
+    }
 }
 
 #[cfg(test)]

@@ -171,6 +171,14 @@ impl Contents {
             .map_while(move |line| line.strip_prefix(prefix.as_str()))
     }
 
+    /// Debian packages that hold something of any ROS package.
+    pub fn ros_carriers(&self) -> BTreeSet<String> {
+        let fields = self
+            .with_prefix("r")
+            .filter_map(|rest| rest.split('\t').nth(1));
+        fields.map(str::to_owned).collect()
+    }
+
     /// ROS packages of which this Debian package holds something.
     pub fn ros_packages_in(&self, deb: &str) -> Vec<&str> {
         let fields = self

@@ -5,7 +5,7 @@
 //!                       │
 //!    mmdebstrap ──▶  base layer ◀────────────── cache, by key of inputs ──────────────┐
 //!                       │                                                             │
-//!    apt, dpkg  ──▶  dependencies layer ◀── package.xml, Contents index, ELF files ───┤
+//!    apt, dpkg  ──▶  dependency layers ◀── package.xml, Contents index, ELF files ────┤
 //!                       │                                                             │
 //!    catkin     ──▶  package layer ◀────── sources, compiled in a sandbox ────────────┘
 //!                       │
@@ -14,7 +14,9 @@
 //!
 //! In: a [`PushRequest`]. Out: a [`BuildOutcome`] with an untagged image in the store and a [`LaunchPlan`]; [`probe`]
 //! then finds the interface of the running thing. Everything foreign runs in containers without network; what needs
-//! the network is apt on the host. The same inputs give the same layers.
+//! the network is apt on the host. What is in the cache is not made again, part by part: dependency layers stand on each
+//! other, packages of a workspace are compiled one by one. The same inputs give the same layers; where some of their
+//! dependencies are cached, the same files, perhaps cut into other layers.
 
 #![forbid(unsafe_code)]
 
@@ -27,6 +29,7 @@ mod bootstrap;
 mod build;
 mod builder;
 mod cache;
+mod chain;
 mod compile;
 mod complaint;
 mod contents;
@@ -41,6 +44,7 @@ mod keys;
 mod launch;
 mod lines;
 mod manifest;
+mod merge;
 mod packaged;
 mod plan;
 mod prebuilt;
@@ -53,6 +57,8 @@ mod sandbox;
 mod seal;
 mod source;
 mod sources;
+mod split;
+mod units;
 mod workshop;
 
 pub use apt::Sources;

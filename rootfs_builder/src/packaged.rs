@@ -8,6 +8,7 @@ use crate::build::{Build, Parts};
 use crate::deb::Member;
 use crate::error::Error;
 use crate::gather::{self, Wanted};
+use crate::install::Made;
 use crate::key::Key;
 
 /// `name`: a ROS package, or a Debian package that holds some.
@@ -69,7 +70,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
         packages,
         version,
         dependencies,
-        package: None,
+        package: Made::default(),
         prefix: None,
     })
 }

@@ -7,12 +7,12 @@ use std::path::Path;
 use package::workspace::InstallSpace;
 
 use crate::build::{Build, Parts};
-use crate::cache::Entry;
 use crate::compile;
 use crate::error::{Error, IoAt};
 use crate::install::{Made, set_mode};
 use crate::key::{self, Key};
 use crate::keys::{self, Asked};
+use crate::workshop::Packing;
 use crate::{pushed, source};
 
 /// Where a servant has scratch space: what an image holds there cannot be seen.
@@ -51,13 +51,13 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
     )?;
     let python = pushed::has_python(&space.root);
     let package = packed(build, &space, &prefix).await?;
-    let needed = source::needed_by(build, package.layer.as_ref()).await?;
+    let needed = source::needed_by(build, &package).await?;
     let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
     Ok(Parts {
         packages,
         version: pushed::version(&space.packages),
         dependencies,
-        package: Some(package),
+        package,
         prefix: Some(prefix),
     })
 }
@@ -71,15 +71,15 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         .with("prefix", prefix.as_os_str().as_encoded_bytes())
         .finish();
     let shop = &build.shop;
-    let _turn = shop.turns.take(&key).await;
-    if let Some(entry) = shop.cached(&key).await? {
-        return Ok(Made {
-            layer: entry.layer,
-            cached: true,
-        });
+    let turn = shop.turns.take(&key).await;
+    if let Some(entry) = shop.cached(&key).await?
+        && let Some(layer) = entry.layer
+    {
+        return Ok(Made::one(layer.diff_id, true));
     }
     build.progress.step("packing the install space").await;
-    let tree = shop.site.fresh("prebuilt")?;
+    let room = shop.site.fresh("prebuilt")?;
+    let tree = room.join("tree");
     let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
     fs::create_dir_all(&parent).at("making", &parent)?;
@@ -93,18 +93,13 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
     fs::rename(&root, &target).at("moving", &root)?;
     let opened = target.clone();
     crate::blocking::spawn(move || compile::open_up(&opened)).await??;
-    let layer = compile::pack(shop, &build.base, &tree).await?;
-    let made_from = pushed::names(&space.packages).into_iter().collect();
-    shop.keep(
-        &key,
-        Entry {
-            layer: Some(layer),
-            made_from,
-        },
-    )
-    .await?;
-    Ok(Made {
-        layer: Some(layer),
-        cached: false,
-    })
+    let packing = Packing {
+        key,
+        made_from: pushed::names(&space.packages).into_iter().collect(),
+        tree,
+        options: compile::package_options(&build.base, 0),
+        room,
+        turn,
+    };
+    Ok(Made::one(shop.pack(packing, |_| Ok(())).await?, false))
 }

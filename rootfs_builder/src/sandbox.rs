@@ -112,13 +112,17 @@ impl Site {
         Ok(path)
     }
 
-    /// A directory of this build that no build before has used.
+    /// A new directory of this build, whatever else is called `name`.
     pub(crate) fn fresh(&self, name: &str) -> Result<PathBuf, Error> {
-        let path = self.directory.join(name);
-        if path.exists() {
-            foreign::remove(&path)?;
+        let mut number = 1;
+        loop {
+            let path = self.directory.join(format!("{name}-{number}"));
+            match fs::create_dir(&path) {
+                Ok(()) => return Ok(path),
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
+                Err(error) => return Err(Error::io("making", path, error)),
+            }
         }
-        self.directory(name)
     }
 
     /// Runs it to its end; each line it prints goes to `lines` as it comes.

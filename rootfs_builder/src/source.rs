@@ -9,19 +9,17 @@
 //! package.xml (exec dependencies) and of the result itself (the libraries its ELF files need).
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
+use image::Digest;
 use package::workspace::Workspace;
 
 use crate::build::{Build, Parts};
 use crate::builder::kept;
-use crate::cache::Entry;
-use crate::compile::{self, Unit};
 use crate::error::Error;
 use crate::install::Made;
-use crate::key::{self, Key};
 use crate::keys::{self, Resolved};
-use crate::{advice, elf, packaged, pushed};
+use crate::{advice, elf, packaged, pushed, units};
 
 /// Compiles and packs.
 pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Parts, Error> {
@@ -36,51 +34,38 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
         &own,
         &asked,
     )?;
-    let units: Vec<Unit> = workspace
-        .packages
-        .iter()
-        .map(|package| Unit {
-            name: package.manifest.name.clone(),
-            path: package.path.clone(),
-            build_type: package.manifest.build_type.clone(),
-        })
-        .collect();
-    let package = compiled(build, &workspace.root, &units, &resolved).await?;
-    let needed = needed_by(build, package.layer.as_ref()).await?;
-    let dependencies = dependencies(
-        build,
-        &resolved,
-        &needed,
+    let (packages, version, python) = (
+        pushed::by_importance(&workspace.packages),
+        pushed::version(&workspace.packages),
         pushed::has_python(&workspace.root),
-    )
-    .await?;
+    );
+    let below = toolchain(build, &resolved).await?;
+    let package = units::compiled(build, workspace, below)
+        .await
+        .map_err(|error| advice::on(error, &build.archive.contents))?;
+    let needed = needed_by(build, &package).await?;
+    let dependencies = dependencies(build, &resolved, &needed, python).await?;
     Ok(Parts {
-        packages: pushed::by_importance(&workspace.packages),
-        version: pushed::version(&workspace.packages),
+        packages,
+        version,
         dependencies,
-        package: Some(package),
+        package,
         prefix: Some(build.base.build.prefix.clone()),
     })
 }
 
-/// The package layer: from the cache when the same sources were compiled with the same packages before.
-async fn compiled(
-    build: &Build<'_>,
-    root: &Path,
-    units: &[Unit],
-    resolved: &Resolved,
-) -> Result<Made, Error> {
-    let on_base = build.on_base();
+/// What a package is compiled in: base, toolchain, build dependencies.
+async fn toolchain(build: &Build<'_>, resolved: &Resolved) -> Result<Vec<Digest>, Error> {
+    let mut below = build.on_base();
     let toolchain = build.base.build.packages.iter().cloned().collect();
     let toolchain = build
-        .add("toolchain", &on_base, &toolchain, Vec::new())
+        .add("toolchain", &below, &toolchain, Vec::new())
         .await?;
-    let below: Vec<_> = on_base.into_iter().chain(toolchain.layer).collect();
-    let keep: Vec<_> = below.iter().map(|layer| layer.diff_id).collect();
+    below.extend(toolchain.diff_ids());
     build
         .shop
         .layers
-        .keep_note(&kept(&build.base.name), &keep)?;
+        .keep_note(&kept(&build.base.name), &below)?;
     // What the deployer adds may be what package.xml forgot, for compiling as well as for running.
     let (ros, mut wanted) = build.extra_packages()?;
     wanted.extend(ros.iter().flat_map(|name| build.archive.to_build(name)));
@@ -88,65 +73,17 @@ async fn compiled(
     let more = build
         .add("build-dependencies", &below, &wanted, Vec::new())
         .await?;
-    let below: Vec<_> = below.into_iter().chain(more.layer).collect();
-    let hashed = root.to_owned();
-    let sources = crate::blocking::spawn(move || key::sources(&hashed)).await??;
-    let key = Key::new("compiled")
-        .with("build", build.base.build_key())
-        .with("sources", sources)
-        .with_all("below", below.iter().map(|layer| layer.diff_id.to_string()))
-        .with_all(
-            "unit",
-            units
-                .iter()
-                .map(|unit| format!("{} {} {}", unit.name, unit.path.display(), unit.build_type)),
-        )
-        .finish();
-    let shop = &build.shop;
-    let _turn = shop.turns.take(&key).await;
-    if let Some(entry) = shop.cached(&key).await? {
-        return Ok(Made {
-            layer: entry.layer,
-            cached: true,
-        });
-    }
-    let tree = compile::compile(
-        shop,
-        &build.base,
-        &below,
-        root,
-        units,
-        &build.log,
-        build.progress,
-    )
-    .await
-    .map_err(|error| advice::on(error, &build.archive.contents))?;
-    build.progress.step("packing the package").await;
-    let layer = compile::pack(shop, &build.base, &tree).await?;
-    let made_from = units.iter().map(|unit| unit.name.clone()).collect();
-    shop.keep(
-        &key,
-        Entry {
-            layer: Some(layer),
-            made_from,
-        },
-    )
-    .await?;
-    Ok(Made {
-        layer: Some(layer),
-        cached: false,
-    })
+    below.extend(more.diff_ids());
+    Ok(below)
 }
 
 /// Libraries that a package layer needs from elsewhere.
 pub(crate) async fn needed_by(
     build: &Build<'_>,
-    layer: Option<&image::LayerInfo>,
+    package: &Made,
 ) -> Result<BTreeSet<String>, Error> {
-    let trees = build
-        .shop
-        .extracted(layer.map_or(&[], std::slice::from_ref))
-        .await?;
+    let layers: Vec<Digest> = package.diff_ids().collect();
+    let trees = build.shop.extracted(&layers).await?;
     crate::blocking::spawn(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {

@@ -17,6 +17,31 @@ fn apts_simulation_is_understood() {
 }
 
 #[test]
+fn what_a_package_says_of_others_is_understood() {
+    let stanza = "Package: libcv-bridge1d\nSource: ros-vision-opencv (1.16.2+ds-4)\nVersion: 1.16.2+ds-4+b1\n\
+                  Pre-Depends: init-system-helpers\nDepends: libc6 (>= 2.14), python3:any, a | b (= 1), x [amd64]\n\
+                  Provides: cv-plugin (= 1), other\nSuggests: not-this";
+    let (name, about) = parse_relations(stanza).expect("a stanza");
+    assert_eq!(
+        (name.as_str(), about.source.as_str()),
+        ("libcv-bridge1d", "ros-vision-opencv")
+    );
+    let names: Vec<&str> = about.needs.iter().map(String::as_str).collect();
+    assert_eq!(
+        names,
+        ["a", "b", "init-system-helpers", "libc6", "python3", "x"]
+    );
+    assert_eq!(
+        about.provides,
+        ["cv-plugin".to_owned(), "other".to_owned()].into()
+    );
+    // A source package of the same name is not told.
+    let (_, about) = parse_relations("Package: zlib1g\nVersion: 1").expect("a stanza");
+    assert_eq!((about.source.as_str(), about.needs.len()), ("zlib1g", 0));
+    assert_eq!(parse_relations("N: no such package"), None);
+}
+
+#[test]
 fn epochs_are_escaped_in_file_names() {
     let deb = Deb {
         name: "login".into(),

@@ -1,12 +1,15 @@
-"""Compiles ROS packages, one after the other, and installs them into one prefix.
+"""Compiles ROS packages, one after the other, and installs them into one prefix; or, for a `check`, only configures
+them.
 
 Runs as an unprivileged user in a container without network. In: /cloudroid/job.json, sources below
 /cloudroid/source (not written). Out: the prefix; progress and the compilers' output on standard output. A line
-`::package NAME` says which package is next.
+`::package NAME` says which package is next, and `::failed NAME` which failed the check.
 """
 
+import concurrent.futures
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -78,20 +81,141 @@ def add_what_install_forgot(package, source, devel, prefix):
             copy_missing(path, os.path.join(share, os.path.relpath(path, source)))
 
 
+def source_of(package):
+    return os.path.join("/build/src", package["path"])
+
+
+def directory_of(package):
+    return os.path.join("/build/build", package["name"])
+
+
+def devel_of(package):
+    return os.path.join(directory_of(package), "devel")
+
+
+def configuration(package, job):
+    argv = ["cmake", source_of(package), "-DCMAKE_INSTALL_PREFIX=" + job["prefix"]] + job["cmake"]
+    if package["build_type"] == "catkin":
+        argv += ["-DCATKIN_DEVEL_PREFIX=" + devel_of(package), "-DCATKIN_BUILD_BINARY_PACKAGE=OFF"]
+    return argv
+
+
 def build(package, job, given):
-    name, prefix = package["name"], job["prefix"]
-    source = os.path.join("/build/src", package["path"])
-    directory = os.path.join("/build/build", name)
-    devel = os.path.join(directory, "devel")
+    prefix, source = job["prefix"], source_of(package)
+    directory, devel = directory_of(package), devel_of(package)
     os.makedirs(directory)
     environment = environment_of(prefix, given)
-    configure = ["cmake", source, "-DCMAKE_INSTALL_PREFIX=" + prefix] + job["cmake"]
-    if package["build_type"] == "catkin":
-        configure += ["-DCATKIN_DEVEL_PREFIX=" + devel, "-DCATKIN_BUILD_BINARY_PACKAGE=OFF"]
-    run(configure, directory, environment)
+    run(configuration(package, job), directory, environment)
     run(["cmake", "--build", ".", "--parallel", str(job["jobs"])], directory, environment)
     run(["cmake", "--install", "."], directory, environment)
     add_what_install_forgot(package, source, devel, prefix)
+
+
+def stand_in(package):
+    """Makes the devel space of a package that is only configured look as if it were built, as far as others notice
+    when they are configured: the libraries that it exports are there, but empty."""
+    devel, name = devel_of(package), package["name"]
+    os.makedirs(os.path.join(devel, "include"), exist_ok=True)
+    os.makedirs(os.path.join(devel, "lib"), exist_ok=True)
+    path = os.path.join(devel, "share", name, "cmake", name + "Config.cmake")
+    if not os.path.exists(path):
+        return
+    with open(path, encoding="utf-8", errors="replace") as file:
+        text = file.read()
+    for line in re.findall(r'set\(libraries "([^"]*)"\)', text):
+        for library in line.split(";"):
+            if re.fullmatch(r"[\w.+-]+", library):
+                with open(os.path.join(devel, "lib", "lib%s.so" % library), "ab"):
+                    pass
+
+
+def against(spaces, job, given):
+    """The environment in which these devel spaces are found."""
+    environment = environment_of(job["prefix"], given)
+    for name, below in (
+        ("CMAKE_PREFIX_PATH", ""),
+        ("PYTHONPATH", "lib/python3/dist-packages"),
+        ("PKG_CONFIG_PATH", "lib/pkgconfig"),
+    ):
+        paths = [os.path.join(space, below).rstrip("/") for space in spaces]
+        environment[name] = ":".join(paths + [p for p in environment.get(name, "").split(":") if p])
+    sources = [source_of(package) for package in job["packages"]]
+    environment["ROS_PACKAGE_PATH"] = ":".join(sources + [environment.get("ROS_PACKAGE_PATH", "/usr/share")])
+    return environment
+
+
+def may_export(package, name):
+    """Whether a package's build files look as if it installs a CMake configuration of this name."""
+    word = re.escape(name)
+    pattern = re.compile(r"project\s*\(\s*%s\b|\b%sConfig|\b%s-config|EXPORT\s+%s\b" % (word, word, word, word), re.IGNORECASE)
+    for parent, _, files in os.walk(source_of(package)):
+        for entry in files:
+            if pattern.search(entry):
+                return True
+            if entry == "CMakeLists.txt" or entry.endswith((".cmake", ".cmake.in")):
+                with open(os.path.join(parent, entry), encoding="utf-8", errors="replace") as file:
+                    if pattern.search(file.read()):
+                        return True
+    return False
+
+
+def is_certain(package, output, job):
+    """Whether a failed configuration would fail as well once all packages before it are compiled. Wherever that cannot
+    be known it is not certain: then it is tried again at its turn."""
+    others = [other for other in job["packages"] if other["name"] != package["name"]]
+    text = " ".join(output.split())
+    asked = re.findall(r'package configuration file provided by "([^"]+)"', text)
+    if asked:
+        known = set(job["workspace"])
+        return any(name not in known and not any(may_export(other, name) for other in others) for name in asked)
+    if package["needs"]:
+        return False
+    _, _, complaint = text.partition("CMake Error")
+    return not any(re.search(r"(?<!\w)%s(?!\w)" % re.escape(other["name"]), complaint) for other in others)
+
+
+def configure_only(package, spaces, job, given):
+    directory = directory_of(package)
+    os.makedirs(directory)
+    result = subprocess.run(
+        configuration(package, job),
+        cwd=directory,
+        env=against(spaces, job, given),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        check=False,
+    )
+    return result.returncode, result.stdout.decode("utf-8", "replace")
+
+
+def check(job, given):
+    """Configures all packages, each as soon as those that it needs are, before time is spent on compiling any."""
+    waiting = {package["name"]: package for package in job["packages"]}
+    spaces, failures = {}, {}
+    with concurrent.futures.ThreadPoolExecutor(max_workers=job["jobs"]) as pool:
+        running = {}
+        while waiting or running:
+            for name, package in list(waiting.items()):
+                if any(need in waiting or need in (p["name"] for p in running.values()) for need in package["needs"]):
+                    continue
+                del waiting[name]
+                found = [spaces[need] for need in reversed(package["needs"]) if need in spaces]
+                running[pool.submit(configure_only, package, found, job, given)] = package
+            done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in done:
+                package = running.pop(future)
+                status, output = future.result()
+                if status == 0:
+                    stand_in(package)
+                    spaces[package["name"]] = devel_of(package)
+                elif is_certain(package, output, job):
+                    failures[package["name"]] = output
+    for package in job["packages"]:
+        if package["name"] in failures:
+            print("::failed " + package["name"], flush=True)
+            print(failures[package["name"]], flush=True)
+    sys.exit(1 if failures else 0)
 
 
 def main():
@@ -106,9 +230,12 @@ def main():
             path = os.path.join(parent, entry)
             if not os.path.islink(path):
                 os.chmod(path, os.stat(path).st_mode | stat.S_IWUSR)
+    if job["check"]:
+        check(job, given)
     for package in job["packages"]:
         print("::package " + package["name"], flush=True)
         build(package, job, given)
 
 
-main()
+if __name__ == "__main__":
+    main()

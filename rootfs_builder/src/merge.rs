@@ -1,0 +1,164 @@
+//! Puts extracted layers over each other in a directory, as an overlay mount would show them.
+
+use std::fs;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::path::Path;
+
+use crate::error::{Error, IoAt};
+use crate::install::set_mode;
+
+/// Copies `tree` over what is below `target`: files by a link where that can be, so they must not be written to
+/// afterwards. What the tree deletes goes. Blocking.
+pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
+    let mut directories = Vec::new();
+    let entries = walkdir::WalkDir::new(tree).min_depth(1).sort_by_file_name();
+    for entry in entries {
+        let entry = entry.map_err(|error| Error::io("reading", tree, error.into()))?;
+        let from = entry.path();
+        let to = target.join(from.strip_prefix(tree).unwrap_or(from));
+        let about = from.symlink_metadata().at("reading", from)?;
+        let kind = about.file_type();
+        let there = to.symlink_metadata().ok().map(|there| there.is_dir());
+        if kind.is_dir() {
+            let hides = is_opaque(from);
+            if there.is_some_and(|directory| !directory || hides) {
+                remove(&to)?;
+            }
+            if hides || there != Some(true) {
+                fs::create_dir(&to).at("making", &to)?;
+            }
+            std::os::unix::fs::lchown(&to, Some(about.uid()), Some(about.gid()))
+                .at("changing the owner of", &to)?;
+            directories.push((to, about));
+            continue;
+        }
+        if there.is_some() {
+            remove(&to)?;
+        }
+        if kind.is_char_device() && about.rdev() == 0 {
+            continue;
+        }
+        if kind.is_symlink() {
+            let link = fs::read_link(from).at("reading", from)?;
+            std::os::unix::fs::symlink(link, &to).at("linking", &to)?;
+            std::os::unix::fs::lchown(&to, Some(about.uid()), Some(about.gid()))
+                .at("changing the owner of", &to)?;
+        } else if kind.is_file() {
+            link(from, &to)?;
+        }
+    }
+    // Last, as writing into a directory changes its time and may need its rights.
+    for (path, about) in directories.iter().rev() {
+        set_mode(path, about.mode() & 0o7777)?;
+        let time = about.modified().at("reading", path)?;
+        let opened = fs::File::open(path).at("opening", path)?;
+        opened.set_modified(time).at("changing the time of", path)?;
+    }
+    Ok(())
+}
+
+fn link(from: &Path, to: &Path) -> Result<(), Error> {
+    if fs::hard_link(from, to).is_ok() {
+        return Ok(());
+    }
+    let about = from.metadata().at("reading", from)?;
+    fs::copy(from, to).at("copying", from)?;
+    std::os::unix::fs::lchown(to, Some(about.uid()), Some(about.gid()))
+        .at("changing the owner of", to)?;
+    set_mode(to, about.mode() & 0o7777)?;
+    let time = about.modified().at("reading", from)?;
+    let opened = fs::File::options().write(true).open(to).at("opening", to)?;
+    opened.set_modified(time).at("changing the time of", to)
+}
+
+fn remove(path: &Path) -> Result<(), Error> {
+    let directory = path.symlink_metadata().is_ok_and(|about| about.is_dir());
+    if directory {
+        Ok(foreign::remove(path)?)
+    } else {
+        fs::remove_file(path).at("removing", path)
+    }
+}
+
+/// Whether a directory hides what is below it in lower layers.
+fn is_opaque(path: &Path) -> bool {
+    ["trusted.overlay.opaque", "user.overlay.opaque"]
+        .iter()
+        .any(|name| {
+            let mut value = [0; 1];
+            matches!(rustix::fs::getxattr(path, *name, &mut value[..]), Ok(1)) && value == *b"y"
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::symlink;
+
+    fn write(root: &Path, path: &str, text: &str) {
+        let path = root.join(path);
+        fs::create_dir_all(path.parent().expect("below")).expect("made");
+        fs::write(path, text).expect("written");
+    }
+
+    fn opaque(path: &Path) {
+        let set =
+            |name: &str| rustix::fs::setxattr(path, name, b"y", rustix::fs::XattrFlags::empty());
+        set("trusted.overlay.opaque")
+            .or_else(|_| set("user.overlay.opaque"))
+            .expect("marked");
+    }
+
+    #[test]
+    fn the_last_one_counts_and_deletions_delete() {
+        let place = tempfile::tempdir().expect("a directory");
+        let (one, two, all) = (
+            place.path().join("1"),
+            place.path().join("2"),
+            place.path().join("all"),
+        );
+        for (path, text) in [
+            ("a/same", "1"),
+            ("a/gone", "1"),
+            ("a/was_directory/x", "1"),
+            ("a/was_file", "1"),
+            ("new_again/old", "1"),
+        ] {
+            write(&one, path, text);
+        }
+        write(&two, "a/same", "2");
+        write(&two, "a/was_file/inner", "2");
+        write(&two, "a/was_directory", "2");
+        write(&two, "new_again/new", "2");
+        symlink("same", two.join("a/link")).expect("linked");
+        opaque(&two.join("new_again"));
+        set_mode(&two.join("a/same"), 0o755).expect("set");
+        set_mode(&two.join("new_again"), 0o500).expect("set");
+        // Only root can make an overlay's mark for a deletion.
+        let mark = rustix::fs::mknodat(
+            rustix::fs::CWD,
+            two.join("a/gone"),
+            rustix::fs::FileType::CharacterDevice,
+            rustix::fs::Mode::empty(),
+            0,
+        );
+        fs::create_dir(&all).expect("made");
+        for tree in [&one, &two] {
+            lay_over(tree, &all).expect("laid over");
+        }
+        let read = |path: &str| fs::read_to_string(all.join(path)).ok();
+        assert_eq!(read("a/same").as_deref(), Some("2"));
+        assert_eq!(read("a/link").as_deref(), Some("2"));
+        assert_eq!(read("a/was_file/inner").as_deref(), Some("2"));
+        assert_eq!(read("a/was_directory").as_deref(), Some("2"));
+        assert_eq!(
+            (read("new_again/old"), read("new_again/new").as_deref()),
+            (None, Some("2"))
+        );
+        assert_eq!(read("a/gone").is_some(), mark.is_err());
+        let mode = |path: &str| all.join(path).metadata().expect("there").mode() & 0o777;
+        assert_eq!((mode("a/same"), mode("new_again")), (0o755, 0o500));
+        // What was laid over is as it was.
+        assert_eq!(fs::read_to_string(one.join("a/same")).expect("there"), "1");
+    }
+}
