@@ -51,7 +51,11 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
     // What is written from here on, the log above all, is for this user alone.
     umask(Mode::from_bits_truncate(0o077));
     let control = take_control()?;
-    let (network, uid_lock, opened) = receive_descriptors(&control)?;
+    let Received {
+        network,
+        uid_lock,
+        opened,
+    } = receive_descriptors(&control)?;
     let path = directory.join(launch::SPEC);
     let mut launch: Launch = launch::read(&path)?.ok_or_else(|| Error::Malformed {
         path: path.clone(),
@@ -128,21 +132,28 @@ fn take_control() -> Result<UnixStream, Error> {
     Ok(UnixStream::from(control))
 }
 
-/// The network namespace and the lock on our uids come first, then what was opened to be mounted, by the number of its
-/// mount (see [`crate::local::start`]).
-fn receive_descriptors(control: &UnixStream) -> Result<(NetNs, OwnedFd, Vec<(u8, Opened)>), Error> {
+/// What the daemon hands over.
+struct Received {
+    network: NetNs,
+    uid_lock: OwnedFd,
+    /// What was opened to be mounted, by the number of its mount.
+    opened: Vec<(u8, Opened)>,
+}
+
+/// The network namespace and the lock on our uids come first, then what is to be mounted, one by one (`local/start.rs`).
+fn receive_descriptors(control: &UnixStream) -> Result<Received, Error> {
     let (count, fds) = receive(control)?;
-    let [network, lock] = <[OwnedFd; 2]>::try_from(fds).map_err(|_| gone())?;
+    let [network, uid_lock] = <[OwnedFd; 2]>::try_from(fds).map_err(|_| gone())?;
     let opened = (0..count).map(|_| {
         let (index, fds) = receive(control)?;
         let [descriptor] = <[OwnedFd; 1]>::try_from(fds).map_err(|_| gone())?;
         Ok((index, Opened::new(descriptor)))
     });
-    Ok((
-        NetNs::from_fd(network)?,
-        lock,
-        opened.collect::<Result<_, Error>>()?,
-    ))
+    Ok(Received {
+        opened: opened.collect::<Result<_, Error>>()?,
+        network: NetNs::from_fd(network)?,
+        uid_lock,
+    })
 }
 
 /// One byte, and the descriptors beside it.
