@@ -177,8 +177,10 @@ impl Outlet {
         if generation == *settled {
             return false;
         }
-        let given_up = self.given_up.lock();
         let missing = self.missing(&publisher.subscriber_names());
+        let mut given_up = self.given_up.lock();
+        // Who has gone meanwhile may come back with the right type.
+        given_up.retain(|node| missing.contains(node));
         let incomplete = !missing.is_subset(&given_up);
         if !incomplete {
             *settled = generation;

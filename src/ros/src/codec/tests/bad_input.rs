@@ -150,8 +150,8 @@ fn a_publish_that_does_not_fit_names_the_field_and_the_reason() {
         ),
         (
             "std_msgs/Time",
-            r#"{"data":{"sec":1}}"#,
-            "field data.sec of std_msgs/Time: there is no such field",
+            r#"{"data":{"seconds":1}}"#,
+            "field data.seconds of std_msgs/Time: there is no such field",
         ),
         (
             "std_msgs/Time",

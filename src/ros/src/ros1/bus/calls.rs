@@ -232,3 +232,68 @@ async fn open(
         }),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use async_trait::async_trait;
+
+    use super::*;
+    use crate::bus::{Bus, ServiceHandler};
+    use crate::net::HostSockets;
+    use crate::ros1::Ros1Bus;
+    use crate::ros1::testing::TestMaster;
+
+    struct Echo;
+
+    #[async_trait]
+    impl ServiceHandler for Echo {
+        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+            Ok(request)
+        }
+    }
+
+    /// A graph in which this node serves.
+    fn served_by(node: &str, address: &str) -> Arc<Graph> {
+        Arc::new(Graph {
+            services: [("/who".to_owned(), node.to_owned())].into(),
+            nodes: [(node.to_owned(), address.to_owned())].into(),
+            ..Graph::default()
+        })
+    }
+
+    #[tokio::test]
+    async fn only_a_connection_to_whom_serves_now_is_used_again() {
+        let master = TestMaster::start().await;
+        let join = |name| Ros1Bus::connect(Arc::new(HostSockets), master.address, name);
+        let (server, caller) = (join("/old").await.unwrap(), join("/caller").await.unwrap());
+        let service_type = ServiceType {
+            name: "pkg/Who".to_owned(),
+            md5: "abcd".to_owned(),
+        };
+        let _served = server.serve("/who", service_type, Arc::new(Echo)).await;
+        let connection = || async {
+            let opened = open(&caller.inner, "/who", ("persistent", "1")).await;
+            Kept {
+                connection: opened.unwrap(),
+                address: Some("http://a/".to_owned()),
+            }
+        };
+        let pool = CallPool::default();
+        let graph = watch::Sender::new(served_by("/old", "http://a/"));
+        pool.put("/who", connection().await, &graph);
+        assert!(pool.take("/who", &graph).is_some());
+
+        // Another node takes the service over while the connection is idle, or in use.
+        pool.put("/who", connection().await, &graph);
+        graph.send_replace(served_by("/new", "http://b/"));
+        assert!(pool.take("/who", &graph).is_none());
+        pool.put("/who", connection().await, &graph);
+        graph.send_replace(served_by("/old", "http://a/"));
+        assert!(pool.take("/who", &graph).is_none(), "it was kept");
+
+        // A node of the same name comes back at another place.
+        pool.put("/who", connection().await, &graph);
+        graph.send_replace(served_by("/old", "http://c/"));
+        assert!(pool.take("/who", &graph).is_none());
+    }
+}

@@ -2,7 +2,7 @@ use std::sync::atomic::AtomicUsize;
 
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpListener;
-use tokio::sync::{Barrier, Notify};
+use tokio::sync::Barrier;
 
 use super::*;
 use crate::ros1::tcpros::Header;
@@ -253,53 +253,4 @@ async fn callers_that_misbehave_are_refused_and_harm_nobody() {
         two.call("/echo", "fine".into(), LONG).await.unwrap(),
         "fine"
     );
-}
-
-/// Answers with its name, when it may.
-struct Named {
-    name: &'static str,
-    asked: Notify,
-    may: Notify,
-}
-
-#[async_trait]
-impl ServiceHandler for Named {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        self.asked.notify_one();
-        self.may.notified().await;
-        Ok(self.name.into())
-    }
-}
-
-#[tokio::test]
-async fn a_call_that_outlasts_its_server_leaves_no_connection_to_it() {
-    let master = TestMaster::start().await;
-    let caller = join(&master, "/caller").await;
-    let (old, new) = (join(&master, "/old").await, join(&master, "/new").await);
-    let [first, second] = ["first", "second"].map(|name| {
-        let (asked, may) = (Notify::new(), Notify::new());
-        Arc::new(Named { name, asked, may })
-    });
-    let _old = old.serve("/who", add_type(), first.clone()).await.unwrap();
-    until(&caller, |graph| graph.services.contains_key("/who")).await;
-    let under_way = tokio::spawn({
-        let caller = caller.clone();
-        async move { caller.call("/who", Bytes::new(), LONG).await }
-    });
-    first.asked.notified().await;
-    // Another node takes the service over meanwhile. The old one would go on answering.
-    let _new = new.serve("/who", add_type(), second.clone()).await.unwrap();
-    until(&caller, |graph| {
-        graph
-            .services
-            .get("/who")
-            .is_some_and(|node| node == "/new")
-    })
-    .await;
-    first.may.notify_one();
-    assert_eq!(under_way.await.unwrap().unwrap(), "first");
-    first.may.notify_one();
-    second.may.notify_one();
-    let answer = caller.call("/who", Bytes::new(), LONG).await;
-    assert_eq!(answer.unwrap(), "second");
 }
