@@ -85,6 +85,10 @@ pub struct Link {
     /// The greatest age of an output, where that is promised instead.
     #[serde(default)]
     pub age: Option<f64>,
+    /// Nothing is promised: the local original stands in so long after the link was lost. Such links have no Q, and no
+    /// request of theirs is late.
+    #[serde(default)]
+    pub fallback_after: Option<f64>,
     /// Q after the last request.
     pub satisfaction: Option<f64>,
     /// So many requests are known.

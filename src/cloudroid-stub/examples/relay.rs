@@ -1,6 +1,6 @@
 //! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting from a sibling's parameter before it;
 //! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` comes, what
-//! that service answers leaves.
+//! that service answers leaves. `patient`: it listens once it is heard.
 //!
 //! The tests of the local original start it in place of one.
 
@@ -82,6 +82,9 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         queue: 8,
     };
     let out = bus.advertise(&topic("out"), out).await?;
+    if arguments.iter().any(|argument| argument == "patient") {
+        out.subscribers().wait_for(|count| *count > 0).await?;
+    }
     let input = SubscribeOptions {
         wire_type: Some(wire_type),
         queue: 8,

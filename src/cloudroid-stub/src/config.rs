@@ -9,12 +9,16 @@
 //!
 //! desire = 0.10        # T_desire, seconds: the response time that is wished for
 //! max = 0.30           # T_max, seconds: the longest that is acceptable
-//! threshold = 10       # Q_t: below it the local original is started
-//! initial = 10         # Q at the beginning; Q_t where absent
+//! threshold = 4.0      # Q_t: below it the local original is started
+//! initial = 8.0        # Q at the beginning; 2·Q_t where absent
 //! frames_per_second = 5.0   # instead of desire and max: least rate of an output
 //! age = 0.5            # instead of desire and max, seconds: greatest age that an output reaches
 //! output = "/people"   # which output those two are about; the one that answers the node's requests where absent
 //! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
+//!
+//! fallback_after = 3.0 # where no time, rate or age is promised: seconds without a link after which the local original
+//!                      # stands in, until the link is back
+//! call_limit = 600.0   # seconds that a service of the robot may take when the node in the cloud calls it
 //!
 //! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed,
 //!                      # "first-sign" started by the first late request and fed when needed, "none"
@@ -36,6 +40,7 @@ mod parameters;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
@@ -95,6 +100,12 @@ pub struct Config {
     /// `auto`, or `INPUT -> OUTPUT`.
     #[serde(default)]
     pub request: Option<String>,
+    /// Seconds without a link after which the local original stands in, where no time, rate or age is promised.
+    #[serde(default = "fallback_after")]
+    pub fallback_after: f64,
+    /// Seconds that a service of the robot may take when it is called for the node in the cloud.
+    #[serde(default = "call_limit")]
+    pub call_limit: f64,
     /// When the local original runs.
     #[serde(default)]
     pub local: Local,
@@ -118,6 +129,17 @@ pub struct Config {
     pub nodes: BTreeMap<String, String>,
 }
 
+/// [`Config::fallback_after`] where nothing else is said.
+pub const FALLBACK_AFTER: f64 = 3.0;
+
+fn fallback_after() -> f64 {
+    FALLBACK_AFTER
+}
+
+fn call_limit() -> f64 {
+    600.0
+}
+
 impl Config {
     /// After so many seconds without an answer, or a frame, the promise is broken.
     pub fn longest(&self) -> Option<f64> {
@@ -128,6 +150,17 @@ impl Config {
     /// How good pictures are where they lose detail, 1 to 100.
     pub fn quality(&self) -> Option<u8> {
         self.quality.map(|quality| quality as u8)
+    }
+
+    /// [`call_limit`](Self::call_limit) as a time.
+    pub fn call_limit(&self) -> Duration {
+        Duration::from_secs_f64(self.call_limit)
+    }
+
+    /// Whether a time, a rate or an age is promised.
+    pub fn promises(&self) -> bool {
+        let all = [self.desire, self.max, self.frames_per_second, self.age];
+        all.iter().any(Option::is_some)
     }
 
     /// This robot's id.
@@ -289,7 +322,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 20] = [
+pub const KEYS: [&str; 22] = [
     "server",
     "service",
     "token",
@@ -304,6 +337,8 @@ pub const KEYS: [&str; 20] = [
     "age",
     "output",
     "request",
+    "fallback_after",
+    "call_limit",
     "local",
     "stateful",
     "safe_stop",
@@ -350,6 +385,8 @@ impl Config {
             ("frames_per_second", self.frames_per_second),
             ("threshold", self.threshold),
             ("initial", self.initial),
+            ("fallback_after", Some(self.fallback_after)),
+            ("call_limit", Some(self.call_limit)),
         ] {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
                 let reason = format!(
@@ -404,99 +441,4 @@ fn value_of(text: &str) -> Value {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const FILE: &str =
-        "server = 'ws://cloud:9090/'\nservice = 'opencv_apps'\ndesire = 0.1\nmax = 1\n";
-
-    fn config(instead: &[(&str, &str)]) -> anyhow::Result<Config> {
-        let instead = instead
-            .iter()
-            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
-        with(toml::from_str(FILE)?, instead)
-    }
-
-    #[test]
-    fn the_file_is_enough() {
-        let config = config(&[]).unwrap();
-        assert_eq!(config.server, "ws://cloud:9090");
-        assert_eq!((config.desire, config.max), (Some(0.1), Some(1.0)));
-        assert_eq!((config.local, config.codec), (Local::Cold, Codec::Auto));
-        let local = toml::from_str::<Config>(&format!("{FILE}local = 'first-sign'"));
-        assert_eq!(local.unwrap().local, Local::FirstSign);
-    }
-
-    #[test]
-    fn the_environment_says_otherwise() {
-        assert_eq!(key_of("CLOUDROID_LOCAL").as_deref(), Some("local"));
-        assert_eq!(key_of("CLOUDROID_HOME"), None);
-        let config = config(&[("local", "warm"), ("max", "0.5"), ("stateful", "true")]).unwrap();
-        assert_eq!(
-            (config.local, config.max, config.stateful),
-            (Local::Warm, Some(0.5), true)
-        );
-    }
-
-    #[test]
-    fn a_codec_that_one_side_has_not_is_named_with_what_to_do() {
-        let has = |names: &[&str]| {
-            names
-                .iter()
-                .map(|name| (*name).to_owned())
-                .collect::<Vec<_>>()
-        };
-        let with = |codec: &str| config(&[("codec", codec)]).unwrap().codec;
-        assert_eq!(with("auto").unmet(&[]), None);
-        assert_eq!(with("jpeg").unmet(&has(&["raw", "jpeg"])), None);
-        let unmet = with("jpeg").unmet(&has(&["raw"])).unwrap();
-        assert!(
-            unmet.contains("codec = \"jpeg\" is not known to the server"),
-            "{unmet}"
-        );
-        let unmet = with("video").unmet(&has(&["raw"])).unwrap();
-        assert!(unmet.contains("codec = \"video\" is not"), "{unmet}");
-        assert!(unmet.contains("set codec = \"jpeg\""), "{unmet}");
-        let built = with("video").unmet(&has(&["raw", "video"]));
-        assert_eq!(built.is_none(), codec::Codec::Video.is_built(), "{built:?}");
-    }
-
-    #[test]
-    fn quality_is_one_of_jpeg() {
-        let given = config(&[("codec", "jpeg"), ("quality", "90")]).unwrap();
-        assert_eq!(
-            (given.codec.lossy(), given.quality()),
-            (Some(codec::Codec::Jpeg), Some(90))
-        );
-        given.with_parameters(&[]).unwrap();
-        let alone = config(&[("quality", "90")]).unwrap().with_parameters(&[]);
-        let error = format!("{:#}", alone.unwrap_err());
-        assert!(
-            error.contains("quality is given without codec = \"jpeg\""),
-            "{error}"
-        );
-    }
-
-    #[test]
-    fn nonsense_is_named() {
-        for (key, value, named) in [
-            ("server", "cloud:9090", "server"),
-            ("desire", "2", "desire"),
-            ("local", "hot", "hot"),
-            ("max", "soon", "max"),
-            ("max", "nan", "max is NaN"),
-            ("desire", "-1", "desire is -1"),
-            ("age", "inf", "age is inf"),
-            ("codec", "mpeg", "mpeg"),
-            (
-                "quality",
-                "0",
-                "quality is 0; it should be a number from 1 to 100",
-            ),
-            ("quality", "best", "quality"),
-        ] {
-            let error = format!("{:#}", config(&[(key, value)]).unwrap_err());
-            assert!(error.contains(named), "{error}");
-        }
-    }
-}
+mod tests;

@@ -10,15 +10,18 @@
 //! graph except through the [`Keeper`], and it is given no backlog. See docs/adr/015-a-master-for-the-local-original.md.
 
 mod keeper;
+mod latched;
 mod lender;
 mod original;
 mod place;
 mod process;
 mod stamp;
 #[cfg(test)]
-mod tests;
+pub mod tests;
 
 pub use keeper::{Application, Cloud, Keeper};
-pub use original::{Original, Setting};
+pub use lender::took_too_long;
+pub use original::{Interface, Original, Setting};
+pub use place::Registered;
 pub use process::Program;
 pub use stamp::{is_of_action, is_stamped};

@@ -19,9 +19,13 @@ mod parameters;
 pub mod promise;
 mod reports;
 mod safe_stop;
+mod stand_in;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock, Weak};
+use std::time::Duration;
 
 use link::control::{Control, Exit, Graph};
 use link::drops::{Cause, Drops};
@@ -37,6 +41,9 @@ use lent::Lent;
 use outputs::Outputs;
 use parameters::Parameters;
 use promise::Promise;
+
+/// For a node of a new session to register what it had before.
+const SETTLE: Duration = Duration::from_secs(3);
 
 /// The node on the robot.
 pub struct Mirror {
@@ -54,6 +61,10 @@ pub struct Mirror {
     /// Messages dropped on this side, but for the session's own.
     drops: Drops,
     promise: OnceLock<Promise>,
+    /// How long a service of the robot may take.
+    call_limit: Duration,
+    /// What is registered here; locked while it is changed.
+    applied: tokio::sync::Mutex<Applied>,
     /// Definitions by name and md5.
     types: Mutex<HashMap<(String, String), WireType>>,
     siblings: RwLock<BTreeSet<String>>,
@@ -62,8 +73,14 @@ pub struct Mirror {
 }
 
 impl Mirror {
-    /// A mirror on `bus`, which is labelled so; its tasks end with it.
-    pub fn start(bus: Arc<dyn Bus>, label: String, session: Arc<Session>) -> Arc<Self> {
+    /// A mirror on `bus`, which is labelled so; its tasks end with it. A service of the robot may take `call_limit` when
+    /// the node calls it.
+    pub fn start(
+        bus: Arc<dyn Bus>,
+        label: String,
+        session: Arc<Session>,
+        call_limit: Duration,
+    ) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
         let mirror = Arc::new_cyclic(|this| Self {
             this: this.clone(),
@@ -77,6 +94,8 @@ impl Mirror {
             parameters: Parameters::default(),
             drops: Drops::default(),
             promise: OnceLock::new(),
+            call_limit,
+            applied: tokio::sync::Mutex::default(),
             types: Mutex::default(),
             siblings: RwLock::default(),
             exit: watch::Sender::new(None),
@@ -120,11 +139,28 @@ impl Mirror {
     }
 
     async fn apply(self: &Arc<Self>, graph: Graph) {
+        let mut applied = self.applied.lock().await;
+        let session = Arc::downgrade(&self.session());
+        if !Weak::ptr_eq(&applied.session, &session) {
+            applied.session = session;
+            // Before the first one nothing was registered, unless the original stood in.
+            applied.settled = applied.graph.is_none() && !applied.stood_in;
+            if !applied.settled {
+                tokio::spawn(settle(self.this.clone(), applied.session.clone()));
+            }
+        }
         *self.siblings.write() = graph.siblings.iter().cloned().collect();
-        self.outputs.apply(self, &graph.outputs).await;
-        self.inputs.apply(self, &graph.inputs);
-        self.calls.apply(self, &graph.services).await;
-        self.learn(&graph).await;
+        applied.graph = Some(graph);
+        self.register(&applied).await;
+    }
+
+    async fn register(self: &Arc<Self>, applied: &Applied) {
+        let Some(graph) = &applied.graph else { return };
+        let keeps = !applied.settled;
+        self.outputs.apply(self, &graph.outputs, keeps).await;
+        self.inputs.apply(self, &graph.inputs, keeps);
+        self.calls.apply(self, &graph.services, (true, keeps)).await;
+        self.learn(graph).await;
     }
 }
 
@@ -160,6 +196,33 @@ impl Handler for Mirror {
                 Err(error) => tracing::debug!(%error, "the cloud tells something unknown"),
             },
         }
+    }
+}
+
+/// What the cloud has told to register.
+#[derive(Default)]
+struct Applied {
+    /// By which session.
+    session: Weak<Session>,
+    /// That has had time to tell all: what it does not list is taken back.
+    settled: bool,
+    /// Told last; none: never.
+    graph: Option<Graph>,
+    /// Something was registered without being told.
+    stood_in: bool,
+}
+
+/// A session's node may have just been started, and registers one thing after the other: for so long what was
+/// registered on the robot before stays, and whoever uses it waits.
+async fn settle(mirror: Weak<Mirror>, session: Weak<Session>) {
+    tokio::time::sleep(SETTLE).await;
+    let Some(mirror) = mirror.upgrade() else {
+        return;
+    };
+    let mut applied = mirror.applied.lock().await;
+    if Weak::ptr_eq(&applied.session, &session) {
+        applied.settled = true;
+        mirror.register(&applied).await;
     }
 }
 

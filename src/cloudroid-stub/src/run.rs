@@ -80,11 +80,16 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         () = stopped(&mut stopping) => return Ok(End::Asked),
     };
     let config = with_parameters(config, &*bus, &robot.node).await?;
+    if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
+        tracing::warn!(
+            "fallback_after is not looked at where desire and max, a rate or an age are given: those decide when the local original answers"
+        );
+    }
     let mut shutdown = bus.shutdown_requested();
     let session = Arc::new(Session::new(session_options(&config)));
     let label = format!("{} for {}", config.service, config.robot());
     bus.set_label(&label);
-    let mirror = Mirror::start(bus.clone(), label, session);
+    let mirror = Mirror::start(bus.clone(), label, session, config.call_limit());
     let mut watcher: Option<Arc<dyn Bus>> = None;
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
         let bus: Arc<dyn Bus> = join(robot, &format!("{}_cloudroid", robot.node)).await?;
@@ -238,6 +243,8 @@ fn sla(config: &Config) -> Sla {
         frames_per_second: config.frames_per_second,
         age: config.age,
         threshold: config.threshold,
+        fallback_after: (!config.promises() && config.local != Local::None)
+            .then_some(config.fallback_after),
     }
 }
 

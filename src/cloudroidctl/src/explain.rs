@@ -74,6 +74,10 @@ fn promise(link: &Link) -> String {
     let threshold = link
         .threshold
         .map_or_else(String::new, |threshold| format!(", Q_t {threshold:.1}"));
+    if let Some(after) = link.fallback_after {
+        let after = after / 1000.0;
+        return format!("no time promised, fallback {after:.1} s after the link is lost");
+    }
     match (link.frames_per_second, link.age) {
         (Some(rate), _) => format!("at least {rate} frames a second{threshold}"),
         (None, Some(_)) => format!("at most {} old{threshold}", millis(link.age)),

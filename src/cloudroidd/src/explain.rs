@@ -85,7 +85,9 @@ fn links(handle: &Handle) -> Vec<Link> {
 fn link(status: LinkStatus) -> Link {
     let millis = |seconds: f64| seconds * 1000.0;
     let max = status.sla.max.map(millis);
+    let unpromised = status.sla.fallback_after.is_some();
     let is_late = |request: &&Request| match (request.total, max) {
+        _ if unpromised => false,
         (Some(total), Some(max)) => total > max,
         (answered, _) => answered.is_none(),
     };
@@ -112,7 +114,11 @@ fn link(status: LinkStatus) -> Link {
         threshold: status.sla.threshold,
         frames_per_second: status.sla.frames_per_second,
         age: status.sla.age.map(millis),
-        satisfaction: requests.last().map(|request| request.satisfaction),
+        fallback_after: status.sla.fallback_after.map(millis),
+        satisfaction: requests
+            .last()
+            .filter(|_| !unpromised)
+            .map(|request| request.satisfaction),
         requests: requests.len(),
         late: late.len(),
         local: requests.iter().filter(|request| request.local).count(),
@@ -253,7 +259,13 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
     if !link.up {
         say(
             Weight::Blocks,
-            format!("the link of {node} is down"),
+            match link.fallback_after {
+                Some(after) => format!(
+                    "the link of {node} is down; where the original is installed on the robot, it stands in after {:.1} s",
+                    after / 1000.0
+                ),
+                None => format!("the link of {node} is down"),
+            },
             "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
         );
     }
@@ -329,7 +341,12 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
                 "the local original answered {} of the last {} requests of {node}{q}",
                 link.local, link.requests
             ),
-            "it stops by itself when the cloud keeps T_max again".to_owned(),
+            match link.fallback_after {
+                Some(_) => {
+                    "it stands in while the link is away, and hands back by itself".to_owned()
+                }
+                None => "it stops by itself when the cloud keeps T_max again".to_owned(),
+            },
         );
     }
 }
@@ -630,6 +647,48 @@ mod tests {
         assert_eq!(name(seen.dominant()).as_deref(), Some("compute"));
         let late_in = name(seen.late_in.as_ref());
         assert_eq!(late_in.as_deref(), Some("up"), "of those that were late");
+    }
+
+    #[test]
+    fn what_was_never_promised_is_not_late() {
+        let request = |total: Option<f64>| Request {
+            total,
+            local: total.is_none(),
+            satisfaction: 8.0,
+            ..Request::default()
+        };
+        let seen = super::link(LinkStatus {
+            node: "/detect".into(),
+            up: false,
+            round_trip: None,
+            clock: None,
+            throughput: None,
+            drops: vec![],
+            dropped: vec![],
+            sla: link::control::Sla {
+                fallback_after: Some(3.0),
+                ..Default::default()
+            },
+            requests: vec![request(Some(9000.0)), request(None)],
+            unsent: 0,
+            given: 0,
+            left_out: 0,
+            unfed: vec![],
+            unserved: vec![],
+            twins: vec![],
+        });
+        assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
+        let causes = texts(served(seen));
+        for words in [
+            "the link of /detect is down; where the original is installed on the robot, it stands in after 3.0 s",
+            "answered 1 of the last 2 requests of /detect; it stands in while the link is away",
+        ] {
+            assert!(
+                causes.iter().any(|(_, text)| text.contains(words)),
+                "{words}: {causes:?}"
+            );
+        }
+        assert_eq!(causes.len(), 2, "{causes:?}");
     }
 
     #[test]

@@ -96,6 +96,8 @@ pub struct Sla {
     pub age: Option<f64>,
     /// Q_t, which has no unit.
     pub threshold: Option<f64>,
+    /// Nothing is promised: the local original stands in so long after the link was lost.
+    pub fallback_after: Option<f64>,
 }
 
 /// The cloud's first frame on every connection.

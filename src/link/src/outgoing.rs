@@ -523,7 +523,6 @@ impl Outgoing {
             head,
             payload,
             plain: None,
-            closes: false,
             ..*out
         };
         self.topics.entry(channel).or_default().push_front(again);

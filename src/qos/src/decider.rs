@@ -28,9 +28,9 @@ pub enum Why {
         /// Q.
         q: f64,
     },
-    /// Stateful: the link is down, the local original takes over.
+    /// Stateful, or no time promised: the link is down, the local original takes over.
     LinkDown,
-    /// Stateful: the cloud is there again, the local original hands back.
+    /// The same: the cloud is there again, the local original hands back.
     LinkUp,
     /// It is kept warm.
     Warm,
@@ -63,7 +63,8 @@ pub enum Event {
 /// Runs the local original as the SLA says. Its answers are the commands; it asks nobody.
 #[derive(Debug, Clone)]
 pub struct Decider {
-    mode: Mode,
+    /// The link's state decides, not Q.
+    by_link: bool,
     local: Local,
     warm: Warm,
     state: LocalState,
@@ -78,7 +79,7 @@ impl Decider {
     /// The process does not run yet.
     pub fn new(sla: &Sla) -> Self {
         Self {
-            mode: sla.mode,
+            by_link: sla.mode == Mode::Stateful || sla.is_of_link(),
             local: sla.local,
             warm: sla.warm,
             state: LocalState::Stopped,
@@ -109,6 +110,11 @@ impl Decider {
         self.sign = true;
     }
 
+    /// Nothing points to trouble any more.
+    pub fn calm(&mut self) {
+        self.sign = false;
+    }
+
     /// The process changed.
     pub fn reported(&mut self, state: LocalState) -> Vec<Event> {
         let before = std::mem::replace(&mut self.state, state);
@@ -123,7 +129,7 @@ impl Decider {
         events
     }
 
-    /// What follows from Q and the link.
+    /// What follows from Q and the link; `link`: it has not been away for too long.
     pub fn decide(&mut self, satisfaction: &Satisfaction, link: bool) -> Vec<Event> {
         let mut events = Vec::new();
         if self.local == Local::None || self.state == LocalState::Missing {
@@ -132,20 +138,17 @@ impl Decider {
         if satisfaction.is_full() {
             self.sign = false;
         }
-        let why = match self.mode {
-            Mode::Stateless => {
-                if satisfaction.wants_local() {
-                    self.wanted = true;
-                } else if satisfaction.wants_cloud_alone() {
-                    self.wanted = false;
-                }
-                Why::Satisfaction {
-                    q: satisfaction.q(),
-                }
+        let why = if self.by_link {
+            self.wanted = !link;
+            if link { Why::LinkUp } else { Why::LinkDown }
+        } else {
+            if satisfaction.wants_local() {
+                self.wanted = true;
+            } else if satisfaction.wants_cloud_alone() {
+                self.wanted = false;
             }
-            Mode::Stateful => {
-                self.wanted = !link;
-                if link { Why::LinkUp } else { Why::LinkDown }
+            Why::Satisfaction {
+                q: satisfaction.q(),
             }
         };
         let kept = match (self.local, self.warm) {

@@ -46,6 +46,10 @@ pub struct Governor<P> {
     meter: Option<Metered>,
     pairs: Vec<Stream>,
     link: bool,
+    /// The link is down, and where no time was promised it has been for long enough.
+    away: bool,
+    /// When it will have been.
+    away_at: Option<Instant>,
     counts: Counts,
     phases: PhaseBook,
     /// How long the local original took for its last answer.
@@ -71,6 +75,8 @@ impl<P: Clone> Governor<P> {
             meter: Meter::new(&sla).map(metered),
             pairs: pairs.into_iter().map(Stream::new).collect(),
             link: false,
+            away: !sla.is_of_link(),
+            away_at: None,
             counts: Counts::default(),
             phases: PhaseBook::default(),
             local_time: None,
@@ -90,8 +96,8 @@ impl<P: Clone> Governor<P> {
     pub fn deadline(&self) -> Option<Instant> {
         let meters = self.meter.as_ref();
         let meters = meters.map(|meter| [meter.cloud.deadline(), meter.delivered.deadline()]);
-        let meters = meters.into_iter().flatten().flatten();
-        self.arbiter.deadline().into_iter().chain(meters).min()
+        let others = meters.into_iter().flatten().flatten().chain(self.away_at);
+        self.arbiter.deadline().into_iter().chain(others).min()
     }
 
     /// Who is given messages at the moment.
@@ -109,6 +115,9 @@ impl<P: Clone> Governor<P> {
 
     /// The node is up; a warm local original is started now.
     pub fn begin(&mut self, now: Instant) {
+        if !self.link {
+            self.left_alone(now);
+        }
         self.decide(now);
     }
 
@@ -155,7 +164,7 @@ impl<P: Clone> Governor<P> {
             .iter()
             .position(|stream| *stream.input == **topic)
         else {
-            for side in self.asked_sides() {
+            for side in self.told_sides() {
                 self.give(side, None, Channel::Topic(topic.clone()), payload.clone());
             }
             return;
@@ -171,7 +180,7 @@ impl<P: Clone> Governor<P> {
         };
         if busy {
             // Not a request of its own: the same stamp again, or, by arrival, one is outstanding already.
-            for side in self.asked_sides() {
+            for side in self.told_sides() {
                 self.give(side, None, Channel::Topic(topic.clone()), payload.clone());
             }
             return;
@@ -187,6 +196,14 @@ impl<P: Clone> Governor<P> {
             self.pairs[index].keys.insert(key, id);
         }
         self.asked(now, id);
+    }
+
+    /// An input that the cloud has by another way: it is for the local original, if that is fed.
+    pub fn overheard(&mut self, now: Instant, topic: &Arc<str>, payload: P) {
+        self.tick(now);
+        if self.decider.is_fed() {
+            self.give(Side::Local, None, Channel::Topic(topic.clone()), payload);
+        }
     }
 
     /// A side gave the result of a call.
@@ -234,7 +251,9 @@ impl<P: Clone> Governor<P> {
             // Nobody asked for it: only who speaks for the node at the moment is heard.
             None => {
                 self.decide(now);
-                let speaker = if self.decider.is_fed() {
+                // It may say something before it is known to listen: without a link nobody else speaks.
+                let alone = !self.link && self.decider.is_coming();
+                let speaker = if self.decider.is_fed() || alone {
                     Side::Local
                 } else {
                     Side::Cloud
@@ -260,6 +279,11 @@ impl<P: Clone> Governor<P> {
         if std::mem::replace(&mut self.link, true) {
             return;
         }
+        self.away = false;
+        self.away_at = None;
+        if self.sla.is_of_link() {
+            self.decider.calm();
+        }
         let next = if resumed { Leg::Asked } else { Leg::NotAsked };
         // A stateful service that is new has forgotten what it was asked; asking again could do it twice.
         let anew = resumed || self.sla.mode == Mode::Stateless;
@@ -281,6 +305,7 @@ impl<P: Clone> Governor<P> {
         if !std::mem::replace(&mut self.link, false) {
             return;
         }
+        self.left_alone(now);
         let lost = self.arbiter.turn(Side::Cloud, &Leg::Asked, &Leg::Lost);
         for id in &lost {
             self.judge(*id, None);
@@ -318,6 +343,10 @@ impl<P: Clone> Governor<P> {
     pub fn tick(&mut self, now: Instant) {
         if !self.arbiter.is_crowded() && self.deadline().is_none_or(|deadline| deadline > now) {
             return;
+        }
+        if self.away_at.is_some_and(|at| at <= now) {
+            self.away_at = None;
+            self.away = true;
         }
         let mut stop = false;
         let (overdue, forgotten) = self.arbiter.expire(now);

@@ -37,7 +37,7 @@ impl Meter {
     /// For an SLA's measure, with the topic it looks at; none where that is the response time.
     pub fn new(sla: &Sla) -> Option<(&str, Self)> {
         let (output, kind) = match &sla.measure {
-            Measure::Rrt => return None,
+            Measure::Rrt | Measure::Link { .. } => return None,
             Measure::FramesPerSecond { output, over } => {
                 let arrivals = VecDeque::new();
                 (

@@ -27,6 +27,10 @@ pub struct Report {
     pub fed: bool,
     /// The link to the cloud is up.
     pub link: bool,
+    /// No time is promised: seconds without a link after which the local original stands in. T_desire, T_max, Q and Q_t
+    /// mean nothing then.
+    #[serde(default)]
+    pub fallback_after: Option<f64>,
     /// Which input triggers which outputs, as `/in -> /out by stamp`.
     pub pairs: Vec<String>,
     /// Since the node began.

@@ -50,7 +50,8 @@ pub enum Side {
 }
 
 impl Side {
-    pub(crate) fn index(self) -> usize {
+    /// For tables of both sides: the cloud first.
+    pub fn index(self) -> usize {
         match self {
             Self::Cloud => 0,
             Self::Local => 1,

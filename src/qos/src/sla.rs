@@ -122,6 +122,12 @@ pub enum Measure {
         /// The output topic; empty: the one that answers the first request that is found.
         output: String,
     },
+    /// Nothing, no time was promised: the local original stands in while the link is away.
+    Link {
+        /// For so long the link must have been away.
+        #[serde(serialize_with = "seconds")]
+        after: Duration,
+    },
 }
 
 /// The message that brings the robot to rest.
@@ -153,6 +159,11 @@ impl Sla {
             }
         })?;
         written.check()
+    }
+
+    /// No time is promised: the link alone decides about the local original.
+    pub fn is_of_link(&self) -> bool {
+        matches!(self.measure, Measure::Link { .. })
     }
 
     /// The times of one service, action or input.

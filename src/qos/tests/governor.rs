@@ -500,3 +500,96 @@ fn what_is_no_request_goes_where_requests_go() {
     assert_eq!(status(&mut robot, Side::Cloud), Verdict::Drop);
     assert_eq!(Channel::Topic(info.clone()), Channel::Topic(info));
 }
+
+#[test]
+fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
+    let mut robot = Robot::new(json(r#"{"measure": {"link": {"after": 3}}}"#));
+    let map: Arc<str> = "/map".into();
+    // However slow the cloud is, it answers alone.
+    let slow = robot.call("slow");
+    assert_eq!(robot.effects(), ["slow to Cloud"]);
+    assert!(robot.after(60_000).is_empty());
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Cloud, slow),
+        Verdict::Deliver
+    );
+    // A link that comes back soon changes nothing, and what is told meanwhile waits for it.
+    robot.governor.link_down(robot.now);
+    robot.governor.input(robot.now, &map, None, "map");
+    assert_eq!(robot.after(2999), ["map to Cloud"]);
+    let early = robot.call("early");
+    assert!(robot.effects().is_empty());
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(robot.after(10_000), ["early to Cloud"]);
+    // One that stays away does.
+    robot.governor.link_down(robot.now);
+    assert!(robot.after(2999).is_empty());
+    assert_eq!(robot.after(1), ["start"]);
+    let said = |robot: &mut Robot, side| {
+        let now = robot.now;
+        let governor = &mut robot.governor;
+        governor.output(now, side, "/status", None, Duration::ZERO)
+    };
+    assert_eq!(said(&mut robot, Side::Local), Verdict::Deliver);
+    robot.governor.local(robot.now, LocalState::Ready);
+    assert_eq!(robot.effects(), ["feed", "early to Local"]);
+    robot.governor.input(robot.now, &map, None, "map");
+    assert_eq!(robot.effects(), ["map to Local"]);
+    assert_eq!(
+        robot.governor.answered(robot.now, Side::Local, early),
+        Verdict::Deliver
+    );
+    let report = robot.governor.report(robot.now);
+    assert_eq!(report.fallback_after, Some(3.0));
+    assert!(
+        report.summary.contains("the local original answers")
+            && report
+                .summary
+                .contains("stands in 3 s after the link is lost"),
+        "{}",
+        report.summary
+    );
+    robot.governor.link_up(robot.now, false);
+    assert_eq!(robot.effects(), ["stop feeding", "stop"]);
+    assert!(robot.after(86_400_000).is_empty());
+}
+
+#[test]
+fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
+    let sla = json(r#"{"measure": {"link": {"after": "500ms"}}}"#);
+    let mut governor =
+        Governor::<&str>::new(Sla::parse(sla).unwrap(), Vec::new(), Limits::default());
+    let now = Instant::now();
+    governor.begin(now);
+    assert!(governor.next_effect().is_none());
+    assert_eq!(governor.deadline(), Some(now + 500 * MS));
+    governor.tick(now + 500 * MS);
+    let started = governor.next_effect();
+    assert!(
+        matches!(started, Some(Effect::Event(Event::Start(Why::LinkDown)))),
+        "{started:?}"
+    );
+    assert_eq!(governor.deadline(), None, "said once");
+}
+
+#[test]
+fn without_a_promise_warm_and_first_sign_are_ready_before_they_are_needed() {
+    for (local, begun) in [
+        (r#""warm""#, true),
+        (r#""warm", "warm": "first-sign""#, false),
+    ] {
+        let mut robot = Robot::new(json(&format!(
+            r#"{{"measure": {{"link": {{"after": 3}}}}, "local": {local}}}"#
+        )));
+        assert_eq!(robot.effects() == ["start"], begun, "{local}");
+        robot.governor.link_down(robot.now);
+        assert_eq!(robot.effects() == ["start"], !begun, "{local}");
+        robot.governor.local(robot.now, LocalState::Ready);
+        assert!(robot.after(2999).is_empty(), "{local}");
+        assert_eq!(robot.after(1), ["feed"], "{local}");
+        robot.governor.link_up(robot.now, true);
+        let given_up = robot.effects();
+        assert_eq!(given_up[0], "stop feeding", "{local}");
+        assert_eq!(given_up.len() == 1, begun, "{local}: {given_up:?}");
+    }
+}

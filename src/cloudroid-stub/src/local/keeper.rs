@@ -1,7 +1,7 @@
 //! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
 //! the application.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
@@ -12,11 +12,11 @@ use qos::{
     Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Pair, Phases,
     RequestId, SafeStop, Side, Sla, Verdict,
 };
-use ros::bus::{BusError, Message, WireType};
+use ros::bus::{BusError, Message};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
-use super::original::{News, Original};
+use super::original::{Interface, News, Original};
 use super::stamp::{Stamps, age};
 
 /// Longer than any call of a local service is waited for.
@@ -34,6 +34,8 @@ pub trait Cloud: Send + Sync + 'static {
 pub trait Application: Send + Sync + 'static {
     /// Publishes an output of the local original.
     fn deliver(&self, topic: &str, message: Message);
+    /// The local original has latched this while it does not speak for the node: its last word, once it does.
+    fn latched(&self, topic: &str, message: Message);
     /// Publishes the safe-stop message: nobody has answered in time.
     fn safe_stop(&self, stop: &SafeStop);
     /// A decision about the local original.
@@ -71,7 +73,8 @@ struct State {
 }
 
 impl Keeper {
-    /// Begins, with the link down. Without an `original` the cloud is alone.
+    /// Begins, with the link down. Without an `original` the cloud is alone; where no time is promised that is said when
+    /// it would be needed, else at once.
     pub fn start(
         sla: Sla,
         pairs: Vec<Pair>,
@@ -80,6 +83,7 @@ impl Keeper {
         robot: Arc<dyn Application>,
     ) -> Arc<Self> {
         let (original, news) = original.unzip();
+        let promised = !sla.is_of_link();
         let safe_stop = sla.safe_stop.clone();
         let state = State {
             governor: Governor::new(sla, pairs, Limits::default()),
@@ -99,24 +103,29 @@ impl Keeper {
         tokio::spawn(keep_time(Arc::downgrade(&keeper), keeper.wake.clone()));
         match news {
             Some(news) => drop(tokio::spawn(listen(Arc::downgrade(&keeper), news))),
-            None => keeper.with(|state, now| state.governor.local(now, LocalState::Missing)),
+            None if promised => keeper.missing(),
+            None => {}
         }
         keeper.with(|state, now| state.governor.begin(now));
         keeper
     }
 
     /// More of the interface has become known.
-    pub async fn learn(
-        &self,
-        pairs: Vec<Pair>,
-        inputs: BTreeMap<String, WireType>,
-        outputs: Vec<String>,
-    ) -> anyhow::Result<()> {
+    pub async fn learn(&self, pairs: Vec<Pair>, interface: Interface) -> anyhow::Result<()> {
         self.with(|state, now| state.governor.learn(now, pairs));
         match &self.original {
-            Some(original) => original.adapt(inputs, outputs).await,
+            Some(original) => original.adapt(interface).await,
             None => Ok(()),
         }
+    }
+
+    /// The local original, where there is one.
+    pub fn original(&self) -> Option<&Arc<Original>> {
+        self.original.as_ref()
+    }
+
+    fn missing(&self) {
+        self.with(|state, now| state.governor.local(now, LocalState::Missing));
     }
 
     /// The local original is given messages, too.
@@ -129,14 +138,41 @@ impl Keeper {
         self.with(|state, now| state.governor.wanted(now, output, wanted));
     }
 
-    /// The application published an input.
+    /// The application published an input. What is latched is for both sides, whoever answers now: one that begins later
+    /// needs it, too.
     pub fn input(&self, topic: &Arc<str>, message: Message) {
+        if message.latching {
+            self.cloud.publish(topic, &message);
+            if let Some(original) = &self.original {
+                original.latch(topic, &message);
+            }
+        }
         self.with(|state, now| {
             let key = state.stamps.key(&message);
             state
                 .governor
                 .input(now, topic, key, Payload::Input(message));
         });
+    }
+
+    /// The application published an input that the cloud has by another way: nodes of one servant hear each other inside,
+    /// and one of them takes up what several listen to.
+    pub fn overheard(&self, topic: &Arc<str>, message: Message) {
+        if let Some(original) = self.original.as_ref().filter(|_| message.latching) {
+            return original.latch(topic, &message);
+        }
+        self.with(|state, now| {
+            state
+                .governor
+                .overheard(now, topic, Payload::Input(message));
+        });
+    }
+
+    /// A publisher of the robot has gone, and with it what it has latched on this topic.
+    pub fn left(&self, topic: &Arc<str>, publisher: &Arc<str>) {
+        if let Some(original) = &self.original {
+            original.unlatch(topic, publisher);
+        }
     }
 
     /// The application calls a service. When the caller goes, so does the request.
@@ -274,6 +310,8 @@ impl Keeper {
                 channel,
                 payload,
             } => match (side, channel, payload, request) {
+                // Both have it since it came.
+                (_, _, Payload::Input(message), _) if message.latching => {}
                 (Side::Cloud, Channel::Topic(topic), Payload::Input(message), _) => {
                     self.cloud.publish(&topic, &message);
                 }
@@ -298,6 +336,7 @@ impl Keeper {
             Effect::Event(event) => {
                 match (&event, &self.original) {
                     (Event::Start(_), Some(original)) => original.start(),
+                    (Event::Start(_), None) => return self.missing(),
                     (Event::Stop(_), Some(original)) => original.stop(),
                     _ => {}
                 }
@@ -387,6 +426,8 @@ async fn listen(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<News>) {
             News::Output(topic, message) => {
                 if keeper.output(Side::Local, &topic, &message, None) {
                     keeper.robot.deliver(&topic, message);
+                } else if message.latching {
+                    keeper.robot.latched(&topic, message);
                 }
             }
         }

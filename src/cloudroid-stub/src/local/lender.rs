@@ -13,15 +13,18 @@ use tokio::sync::watch;
 pub struct Robot {
     bus: Arc<dyn Bus>,
     node: String,
+    limit: Duration,
     /// Connections are never ended from here: a call that finds nobody fails with the reason.
     open: watch::Sender<bool>,
 }
 
 impl Robot {
-    pub fn new(node: &str, bus: &Arc<dyn Bus>) -> Self {
+    /// A service may take `limit`.
+    pub fn new(node: &str, bus: &Arc<dyn Bus>, limit: Duration) -> Self {
         Self {
             bus: Arc::clone(bus),
             node: node.to_owned(),
+            limit,
             open: watch::Sender::new(false),
         }
     }
@@ -39,6 +42,7 @@ impl Lender for Robot {
             handler: Arc::new(Passing {
                 bus: Arc::clone(&self.bus),
                 service: service.to_owned(),
+                limit: self.limit,
                 md5: provider.service_type.md5.clone(),
             }),
             service_type: provider.service_type,
@@ -51,6 +55,7 @@ impl Lender for Robot {
 struct Passing {
     bus: Arc<dyn Bus>,
     service: String,
+    limit: Duration,
     md5: String,
 }
 
@@ -58,11 +63,18 @@ struct Passing {
 impl ServiceHandler for Passing {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let (service, md5) = (&self.service, &self.md5);
-        // As long as it takes, as it would without a stub.
-        let called = self.bus.call_typed(service, md5, request, Duration::MAX);
+        let called = self.bus.call_typed(service, md5, request, self.limit);
         called.await.map_err(|error| match error {
             BusError::CallFailed { reason, .. } => reason,
+            error @ BusError::Timeout { .. } => took_too_long(&error),
             other => other.to_string(),
         })
     }
+}
+
+/// What is said of a service of the robot that has not answered within its limit, to who called it and in the log.
+pub fn took_too_long(error: &BusError) -> String {
+    let reason = format!("{error}; where it needs longer, raise call_limit in stub.toml");
+    tracing::warn!("{reason}");
+    reason
 }

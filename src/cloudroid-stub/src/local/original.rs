@@ -8,7 +8,7 @@
 //!     └──────────────────────────── stop ◀────────────────────────────┘
 //! ```
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -19,13 +19,16 @@ use ros::bus::{AdvertiseOptions, Bus, BusError, Message, Publisher, SubscribeOpt
 use tokio::process::Child;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
-use tokio::time::sleep;
+use tokio::time::{sleep, timeout};
 
-use super::place::Place;
+use super::latched::Latched;
+use super::place::{Place, Registered};
 use super::process::{self, Program};
 
 /// Messages kept per topic: what waits longer is old.
 const QUEUE: usize = 16;
+/// For all of the interface to be registered, once the node is: what a version of its own lacks is not waited for.
+const SETTLE: Duration = Duration::from_secs(3);
 /// Pauses after crashes, at first and at last; and how long a life forgives them.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
 const FORGIVEN: Duration = Duration::from_secs(30);
@@ -37,6 +40,20 @@ pub struct Setting {
     pub program: Option<Program>,
     /// Its absolute node name.
     pub node: String,
+}
+
+/// What is known of the node's interface. It is ready when it listens to what it is waited for, and has registered the
+/// rest or has had time to.
+#[derive(Debug, Clone, Default)]
+pub struct Interface {
+    /// What it listens to.
+    pub inputs: BTreeMap<String, WireType>,
+    /// Of these, those that it must listen to before it is given anything.
+    pub awaited: BTreeSet<String>,
+    /// What it publishes.
+    pub outputs: Vec<String>,
+    /// What it serves.
+    pub services: Vec<String>,
 }
 
 /// What comes back.
@@ -52,10 +69,14 @@ pub enum News {
 
 /// A handle; dropping it ends the process.
 pub struct Original {
+    /// The node's name.
+    node: String,
     orders: mpsc::UnboundedSender<Order>,
     place: Arc<Place>,
     publishers: Publishers,
     sources: Sources,
+    latched: Latched,
+    expected: Expected,
     news: mpsc::UnboundedSender<News>,
     tasks: Mutex<Tasks>,
 }
@@ -64,6 +85,8 @@ pub struct Original {
 type Publishers = Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>;
 /// How many publish each output.
 type Sources = Arc<Mutex<HashMap<String, watch::Receiver<usize>>>>;
+/// What the node is expected to register.
+type Expected = Arc<Mutex<Interface>>;
 
 enum Order {
     Start,
@@ -81,49 +104,53 @@ impl Drop for Tasks {
 }
 
 impl Original {
-    /// Prepares everything but the process: the private ROS system, inputs advertised, outputs subscribed to. It is
-    /// ready when it listens to all `inputs`; those fed without being named here may lose their first message.
-    /// Parameters are those of `robot`.
+    /// Prepares everything but the process: the private ROS system, inputs advertised, outputs subscribed to. Inputs
+    /// fed without being named in `interface` may lose their first message. Parameters are those of `robot`, and so are
+    /// services, which may take `limit`.
     pub async fn new(
         setting: Setting,
-        inputs: BTreeMap<String, WireType>,
-        outputs: Vec<String>,
+        interface: Interface,
         robot: Arc<dyn Bus>,
+        limit: Duration,
     ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
         let place = Arc::new(Place::new().await?);
-        place.lend(&setting.node, &robot).await?;
+        place.lend(&setting.node, &robot, limit).await?;
         let (news, received) = mpsc::unbounded_channel();
         let publishers = Arc::default();
         let sources = Arc::default();
+        let expected = Expected::default();
+        let latched = Latched::begin(&place);
         let (orders, taken) = mpsc::unbounded_channel();
+        let node = setting.node.clone();
         let runner = Runner {
             setting,
             place: place.clone(),
             robot,
             publishers: Arc::clone(&publishers),
             sources: Arc::clone(&sources),
+            expected: Arc::clone(&expected),
             news: news.clone(),
         };
         let task = tokio::spawn(runner.run(taken)).abort_handle();
         let original = Self {
+            node,
             orders,
             place,
             publishers,
             sources,
+            latched,
+            expected,
             news,
             tasks: Mutex::new(Tasks(vec![task])),
         };
-        original.adapt(inputs, outputs).await?;
+        original.adapt(interface).await?;
         Ok((original, received))
     }
 
     /// Advertises and subscribes to what is new in the interface.
-    pub async fn adapt(
-        &self,
-        inputs: BTreeMap<String, WireType>,
-        outputs: Vec<String>,
-    ) -> anyhow::Result<()> {
-        for output in outputs {
+    pub async fn adapt(&self, interface: Interface) -> anyhow::Result<()> {
+        *self.expected.lock() = interface.clone();
+        for output in interface.outputs {
             if self.sources.lock().contains_key(&output) {
                 continue;
             }
@@ -147,13 +174,47 @@ impl Original {
             });
             self.tasks.lock().0.push(task.abort_handle());
         }
-        for (topic, wire_type) in inputs {
+        for (topic, wire_type) in interface.inputs {
             if !self.publishers.lock().contains_key(&topic) {
                 let publisher = advertise(&self.place, &topic, &wire_type).await?;
                 self.publishers.lock().insert(topic, publisher);
             }
         }
         Ok(())
+    }
+
+    /// What it has registered, types included.
+    pub async fn registered(&self) -> Registered {
+        self.place.registered_by(&self.node).await
+    }
+
+    /// Changes with whatever is registered.
+    pub fn registrations(&self) -> watch::Receiver<u64> {
+        self.place.changes()
+    }
+
+    /// Returns once the process is connected to all inputs, or has had time to be.
+    pub async fn connected(&self) {
+        let counts: Vec<_> = {
+            let inputs = self.publishers.lock();
+            inputs.values().map(|input| input.subscribers()).collect()
+        };
+        let all = async {
+            for mut count in counts {
+                let _ = count.wait_for(|count| *count > 0).await;
+            }
+        };
+        let _ = timeout(SETTLE, all).await;
+    }
+
+    /// A publisher has latched this: the process is given it when it starts, too, and at once if it runs.
+    pub fn latch(&self, topic: &Arc<str>, message: &Message) {
+        self.latched.keep(topic, message);
+    }
+
+    /// This publisher of a topic has gone, and what it has latched with it.
+    pub fn unlatch(&self, topic: &Arc<str>, publisher: &Arc<str>) {
+        self.latched.forget(topic, publisher);
     }
 
     /// Starts the process, if it does not run.
@@ -216,6 +277,7 @@ struct Runner {
     robot: Arc<dyn Bus>,
     publishers: Publishers,
     sources: Sources,
+    expected: Expected,
     news: mpsc::UnboundedSender<News>,
 }
 
@@ -278,17 +340,27 @@ impl Runner {
         process::ended(child.wait().await)
     }
 
-    /// Its node is registered, listens to all inputs that are announced, and what it publishes is heard.
+    /// Its node is registered, listens to its inputs, and what it publishes is heard.
     async fn ready(&self) {
-        self.place.registered(&self.setting.node).await;
+        let node = &self.setting.node;
+        self.place.registered(node).await;
+        let expected = self.expected.lock().clone();
+        let _ = timeout(SETTLE, self.place.registers(node, &expected)).await;
+        let published = self.place.graph();
+        let listens = |topic: &String| {
+            let nodes = published.topics.get(topic).map(|topic| &topic.subscribers);
+            nodes.is_some_and(|nodes| nodes.contains(node))
+        };
         let counts: Vec<_> = {
             let inputs = self.publishers.lock();
-            inputs.values().map(|input| input.subscribers()).collect()
+            let due = inputs
+                .iter()
+                .filter(|(topic, _)| expected.awaited.contains(*topic) || listens(topic));
+            due.map(|(_, input)| input.subscribers()).collect()
         };
         for mut count in counts {
             let _ = count.wait_for(|count| *count > 0).await;
         }
-        let published = self.place.graph();
         let sources = self.sources.lock().clone();
         for (topic, mut source) in sources {
             let nodes = published.topics.get(&topic).map(|topic| &topic.publishers);

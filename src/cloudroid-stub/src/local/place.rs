@@ -2,19 +2,33 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
-use ros::bus::{Bus, Graph};
+use ros::bus::{Bus, Graph, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
+use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use super::lender::Robot;
+use super::original::Interface;
 use crate::parameters;
 
 /// The stub's name in it.
 const NODE: &str = "/cloudroid_stub";
+
+/// What a node has registered.
+#[derive(Debug, Clone, Default)]
+pub struct Registered {
+    /// What it publishes.
+    pub outputs: Vec<(String, WireType)>,
+    /// What it subscribes to.
+    pub inputs: Vec<(String, WireType)>,
+    /// What it serves.
+    pub services: Vec<(String, ServiceType)>,
+}
 
 /// A Master and a bus; both end with it.
 pub struct Place {
@@ -63,8 +77,13 @@ impl Place {
     }
 
     /// What `node` calls that is served elsewhere on the robot.
-    pub async fn lend(&self, node: &str, robot: &Arc<dyn Bus>) -> anyhow::Result<()> {
-        let lender = Arc::new(Robot::new(node, robot));
+    pub async fn lend(
+        &self,
+        node: &str,
+        robot: &Arc<dyn Bus>,
+        limit: Duration,
+    ) -> anyhow::Result<()> {
+        let lender = Arc::new(Robot::new(node, robot, limit));
         let lent = self.bus.lend(lender).await;
         lent.context("lending services to the local original")
     }
@@ -94,6 +113,66 @@ impl Place {
                 std::future::pending::<()>().await;
             }
         }
+    }
+
+    /// Returns once `node` has registered all of this.
+    pub async fn registers(&self, node: &str, all: &Interface) {
+        let node = node.to_owned();
+        let mut generation = self.master.generation();
+        loop {
+            let graph = self.graph();
+            let listens = |topic: &String| {
+                let ends = graph.topics.get(topic);
+                ends.is_some_and(|ends| ends.subscribers.contains(&node))
+            };
+            let says = |topic: &String| {
+                let ends = graph.topics.get(topic);
+                ends.is_some_and(|ends| ends.publishers.contains(&node))
+            };
+            let serves = |service: &String| graph.services.get(service) == Some(&node);
+            if all.inputs.keys().all(listens)
+                && all.outputs.iter().all(says)
+                && all.services.iter().all(serves)
+            {
+                return;
+            }
+            if generation.changed().await.is_err() {
+                std::future::pending::<()>().await;
+            }
+        }
+    }
+
+    /// Changes with whatever is registered.
+    pub fn changes(&self) -> watch::Receiver<u64> {
+        self.master.generation()
+    }
+
+    /// What `node` has registered, as far as its types can be told.
+    pub async fn registered_by(&self, node: &str) -> Registered {
+        let graph = self.graph();
+        let mut registered = Registered::default();
+        for (topic, ends) in &graph.topics {
+            let says = ends.publishers.iter().any(|name| name == node);
+            let listens = ends.subscribers.iter().any(|name| name == node);
+            if !says && !listens {
+                continue;
+            }
+            let Ok(wire_type) = self.bus.topic_type(topic).await else {
+                continue;
+            };
+            if says && wire_type.md5 != "*" {
+                registered.outputs.push((topic.clone(), wire_type.clone()));
+            }
+            if listens {
+                registered.inputs.push((topic.clone(), wire_type));
+            }
+        }
+        for service in graph.services.iter().filter(|(_, server)| *server == node) {
+            if let Ok(service_type) = self.bus.service_type(service.0).await {
+                registered.services.push((service.0.clone(), service_type));
+            }
+        }
+        registered
     }
 
     /// A process ended: its registrations are dropped.

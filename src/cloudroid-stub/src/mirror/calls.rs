@@ -82,7 +82,11 @@ impl Calls {
     pub fn kept(&self, mirror: &Mirror, request: RequestId, service: &str, bytes: Bytes) {
         let services = self.services.lock();
         let Some(known) = services.get(service) else {
-            // It was taken back meanwhile.
+            drop(services);
+            if let Some(keeper) = mirror.keeper() {
+                let gone = format!("the node does not serve {service} any more");
+                keeper.cloud_answered(request, Err(Failure::Unreachable(gone)), None);
+            }
             return;
         };
         let Some(channel) = *known.channel.borrow() else {
@@ -95,18 +99,24 @@ impl Calls {
         kept.insert(id, (request, now()));
     }
 
-    /// Serves what is new and takes back what is gone.
-    pub async fn apply(&self, mirror: &Arc<Mirror>, services: &[Served]) {
+    /// Serves what is new and takes back what is gone, unless it `keeps` that for the time being. `told`: the channels
+    /// are the cloud's, else it knows of none yet.
+    pub async fn apply(
+        &self,
+        mirror: &Arc<Mirror>,
+        services: &[Served],
+        (told, keeps): (bool, bool),
+    ) {
         self.services.lock().retain(|name, service| {
-            let same = |served: &&Served| served.name == *name && served.md5 == service.md5;
-            services.iter().any(|served| same(&served))
+            let listed = services.iter().find(|served| served.name == *name);
+            listed.map_or(keeps, |served| served.md5 == service.md5)
         });
         for served in services {
             if let Some(known) = self.services.lock().get(&served.name) {
-                known.channel.send_replace(Some(served.channel));
+                known.channel.send_replace(told.then_some(served.channel));
                 continue;
             }
-            let channel = Arc::new(watch::Sender::new(Some(served.channel)));
+            let channel = Arc::new(watch::Sender::new(told.then_some(served.channel)));
             let handler = Arc::new(Forward {
                 mirror: Arc::downgrade(mirror),
                 name: served.name.as_str().into(),

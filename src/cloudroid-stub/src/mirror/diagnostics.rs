@@ -84,7 +84,8 @@ fn wire_type() -> WireType {
 
 /// How bad it is: nobody answers; somebody does, but not as wished for; the cloud keeps its promise.
 fn level(report: &Report) -> u8 {
-    let wished_for = report.link && report.q >= report.threshold;
+    let unpromised = report.fallback_after.is_some();
+    let wished_for = report.link && (unpromised || report.q >= report.threshold);
     let in_its_place = report.local != Local::None && report.local_state != LocalState::Missing;
     if wished_for {
         OK
@@ -98,12 +99,16 @@ fn level(report: &Report) -> u8 {
 fn values(report: &Report) -> Vec<(String, String)> {
     let counts = &report.counts;
     let yes = |it: bool| if it { "yes" } else { "no" }.to_owned();
-    let mut values: Vec<(String, String)> = [
-        ("link is up", yes(report.link)),
-        ("Q", format!("{:.2}", report.q)),
-        ("Q_t", format!("{:.2}", report.threshold)),
-        ("T_desire [s]", report.t_desire.to_string()),
-        ("T_max [s]", report.t_max.to_string()),
+    let promise = match report.fallback_after {
+        Some(after) => vec![("local original stands in after [s]", after.to_string())],
+        None => vec![
+            ("Q", format!("{:.2}", report.q)),
+            ("Q_t", format!("{:.2}", report.threshold)),
+            ("T_desire [s]", report.t_desire.to_string()),
+            ("T_max [s]", report.t_max.to_string()),
+        ],
+    };
+    let standing = [
         (
             "local original",
             format!("{:?}", report.local_state).to_lowercase(),
@@ -115,16 +120,21 @@ fn values(report: &Report) -> Vec<(String, String)> {
             "answered by the local original",
             counts.from_local.to_string(),
         ),
+        ("failed", counts.failed.to_string()),
+    ];
+    let late = [
         ("later than T_max by the cloud", counts.late.to_string()),
         (
             "later than T_max by both",
             counts.unanswered_in_time.to_string(),
         ),
-        ("failed", counts.failed.to_string()),
         ("safe stops", counts.safe_stops.to_string()),
-    ]
-    .map(|(key, value)| (key.to_owned(), value))
-    .into();
+    ];
+    let late = late.into_iter().filter(|_| report.fallback_after.is_none());
+    let all = std::iter::once(("link is up", yes(report.link)));
+    let all = all.chain(promise).chain(standing).chain(late);
+    let mut values: Vec<(String, String)> =
+        all.map(|(key, value)| (key.to_owned(), value)).collect();
     for pair in &report.pairs {
         values.push(("request".to_owned(), pair.clone()));
     }
@@ -197,5 +207,18 @@ mod tests {
         assert_eq!(q["value"], "8.00");
         governor.link_up(now, false);
         assert_eq!(level(&governor.report(now)), OK);
+        let sla = serde_json::json!({"measure": {"link": {"after": 3}}, "initial": 1});
+        let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        governor.begin(now);
+        let down = governor.report(now);
+        let after = (
+            "local original stands in after [s]".to_owned(),
+            "3".to_owned(),
+        );
+        assert!(super::values(&down).contains(&after));
+        assert!(super::values(&down).iter().all(|(key, _)| key != "Q"));
+        assert_eq!(level(&down), WARN);
+        governor.link_up(now, false);
+        assert_eq!(level(&governor.report(now)), OK, "nothing was promised");
     }
 }

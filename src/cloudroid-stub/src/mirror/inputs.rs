@@ -1,6 +1,6 @@
 //! What the real node listens to: subscribed to on the robot under this node's name, and sent up.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
@@ -40,19 +40,23 @@ impl Drop for Topic {
 }
 
 impl Inputs {
-    /// Subscribes to what is new and takes back what is gone.
-    pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[Wanted]) {
-        // A new servant's node registers its inputs one by one; meanwhile the local original must not become deaf.
-        let others_need = mirror.keeper().is_some_and(|keeper| keeper.is_local_fed());
+    /// Subscribes to what is new and takes back what is gone, unless it `keeps` that for the time being.
+    pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[Wanted], keeps: bool) {
+        // The local original must not become deaf, whatever the servant's node listens to.
+        let others_need = keeps || mirror.keeper().is_some_and(|keeper| keeper.is_local_fed());
         let mut topics = self.topics.lock();
         topics.retain(|name, topic| {
             let listed = inputs.iter().find(|wanted| wanted.topic == *name);
             listed.map_or(others_need, |wanted| wanted.md5 == topic.wanted.md5)
         });
         // Subscribed to anew, a topic gets new channels.
-        self.channels
-            .lock()
-            .retain(|name, _| topics.contains_key(name));
+        self.channels.lock().retain(|name, channels| {
+            let stays = topics.contains_key(name);
+            if !stays {
+                channels.close(mirror);
+            }
+            stays
+        });
         for wanted in inputs {
             let feed = match topics.get(&wanted.topic) {
                 Some(topic) => {
@@ -122,6 +126,21 @@ impl Inputs {
         mirror.session().publish(data, quality);
     }
 
+    /// Only these publishers of a topic are left: what the cloud was given of others is taken back.
+    fn left(&self, mirror: &Mirror, topic: &str, present: &BTreeSet<Arc<str>>) {
+        if let Some(channels) = self.channels.lock().get_mut(topic) {
+            channels.left(mirror, present);
+        }
+    }
+
+    /// How many channels are open, and how many messages are kept since they are latched.
+    #[cfg(test)]
+    pub fn known(&self) -> (usize, usize) {
+        let channels = self.channels.lock();
+        let open = channels.values().map(|of| of.by_publisher.len()).sum();
+        (open, channels.values().map(|of| of.latched.len()).sum())
+    }
+
     /// Another session begins: the cloud knows no channel any more. What is subscribed to on the robot stays so, or
     /// the local original would miss messages.
     pub fn renew(&self) {
@@ -157,17 +176,42 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         mirror.drops.watch(&wanted.topic, Cause::Busy, dropped);
     }
     let topic: Arc<str> = wanted.topic.as_str().into();
-    while let Some(message) = subscription.messages.recv().await {
-        let Some(mirror) = mirror.upgrade() else {
+    let mut present = subscription.present.clone();
+    let mut latching: BTreeSet<Arc<str>> = BTreeSet::new();
+    loop {
+        let message = tokio::select! {
+            // Who has left has sent all that it had before.
+            biased;
+            message = subscription.messages.recv() => message,
+            changed = present.changed() => {
+                let Some(mirror) = mirror.upgrade().filter(|_| changed.is_ok()) else {
+                    return;
+                };
+                let present = present.borrow_and_update().clone();
+                mirror.inputs.left(&mirror, &topic, &present);
+                latching.retain(|publisher| {
+                    let stays = present.contains(publisher);
+                    if let Some(keeper) = mirror.keeper().filter(|_| !stays) {
+                        keeper.left(&topic, publisher);
+                    }
+                    stays
+                });
+                continue;
+            }
+        };
+        let (Some(message), Some(mirror)) = (message, mirror.upgrade()) else {
             return;
         };
-        // Other nodes of the servant hear each other inside.
-        if mirror.siblings.read().contains(&*message.publisher) || !feed.load(Ordering::Relaxed) {
-            continue;
+        if message.latching && !latching.contains(&message.publisher) {
+            latching.insert(message.publisher.clone());
         }
-        match mirror.keeper() {
-            Some(keeper) => keeper.input(&topic, message),
-            None => mirror.inputs.send(&mirror, &topic, &message),
+        // Other nodes of the servant hear each other inside. Their originals on the robot do not.
+        let inside = mirror.siblings.read().contains(&*message.publisher);
+        match (mirror.keeper(), !inside && feed.load(Ordering::Relaxed)) {
+            (Some(keeper), true) => keeper.input(&topic, message),
+            (Some(keeper), false) => keeper.overheard(&topic, message),
+            (None, true) => mirror.inputs.send(&mirror, &topic, &message),
+            (None, false) => {}
         }
     }
 }
@@ -175,18 +219,44 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
 /// A channel for all publishers that do not latch, and one for each that does: what each has latched is kept.
 #[derive(Default)]
 struct Channels {
-    by_publisher: HashMap<(Option<Arc<str>>, String), u32>,
+    by_publisher: HashMap<(Option<Arc<str>>, String), Channel>,
     /// What each publisher has latched last.
     latched: HashMap<Arc<str>, Message>,
     /// Of that, what a new servant was not given yet.
     to_send_again: HashMap<Arc<str>, Message>,
 }
 
+struct Channel {
+    number: u32,
+    /// Who has sent by it.
+    publishers: BTreeSet<Arc<str>>,
+}
+
 impl Channels {
+    /// The cloud is told that nothing more comes by any of them.
+    fn close(&mut self, mirror: &Mirror) {
+        for (_, channel) in self.by_publisher.drain() {
+            mirror.session().closes(channel.number);
+        }
+    }
+
+    /// Forgets publishers that are not among these.
+    fn left(&mut self, mirror: &Mirror, present: &BTreeSet<Arc<str>>) {
+        self.by_publisher.retain(|_, channel| {
+            channel.publishers.retain(|name| present.contains(name));
+            if channel.publishers.is_empty() {
+                mirror.session().closes(channel.number);
+            }
+            !channel.publishers.is_empty()
+        });
+        self.to_send_again.retain(|name, _| present.contains(name));
+        self.latched.retain(|name, _| present.contains(name));
+    }
+
     fn of(&mut self, mirror: &Mirror, topic: &str, message: &Message) -> u32 {
         let publisher = message.latching.then(|| message.publisher.clone());
         let key = (publisher, message.wire_type.md5.clone());
-        *self.by_publisher.entry(key).or_insert_with(|| {
+        let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
             mirror.session().tell(&Control::Open(Input {
                 channel,
@@ -199,7 +269,14 @@ impl Channels {
             let of = &message.wire_type;
             let schema = codec::Schema::of(&of.name, &of.md5);
             mirror.session().opens(channel, topic, schema);
-            channel
-        })
+            Channel {
+                number: channel,
+                publishers: BTreeSet::new(),
+            }
+        });
+        if !known.publishers.contains(&message.publisher) {
+            known.publishers.insert(message.publisher.clone());
+        }
+        known.number
     }
 }

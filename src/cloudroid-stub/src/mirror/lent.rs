@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Weak};
-use std::time::Duration;
 
 use bytes::Bytes;
 use link::Session;
@@ -13,9 +12,7 @@ use parking_lot::Mutex;
 use ros::bus::{BusError, Graph, ServiceProvider};
 
 use super::Mirror;
-
-/// A service of the robot may take as long as it likes, as it may for any of its callers.
-const NO_LIMIT: Duration = Duration::MAX;
+use crate::local;
 
 /// What the cloud was told of.
 #[derive(Default)]
@@ -110,7 +107,8 @@ impl Lent {
         let this = mirror.this.clone();
         tokio::spawn(async move {
             let Some(mirror) = this.upgrade() else { return };
-            let called = mirror.bus.call_typed(&name, &md5, request, NO_LIMIT).await;
+            let limit = mirror.call_limit;
+            let called = mirror.bus.call_typed(&name, &md5, request, limit).await;
             if called.as_ref().is_err_and(is_of_the_provider) {
                 mirror
                     .lent
@@ -118,6 +116,7 @@ impl Lent {
             }
             let called = called.map_err(|error| match error {
                 BusError::CallFailed { reason, .. } => reason,
+                error @ BusError::Timeout { .. } => local::took_too_long(&error),
                 other => other.to_string(),
             });
             // By the session that it came by: the ids of another mean other calls.
@@ -199,6 +198,8 @@ pub async fn follow(mirror: Weak<Mirror>) {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use async_trait::async_trait;
     use link::SessionOptions;
     use ros::bus::{Bus, ServiceHandler, ServiceType};
@@ -239,7 +240,8 @@ mod tests {
             max_age: None,
         };
         let session = Arc::new(Session::new(options));
-        let mirror = Mirror::start(own.clone(), "maps for rover".to_owned(), session);
+        let label = "maps for rover".to_owned();
+        let mirror = Mirror::start(own.clone(), label, session, Duration::from_secs(60));
         mirror.siblings.write().insert("/unlabelled".to_owned());
         for (node, label, lent) in [
             ("/sibling", Some("maps for rover"), false),

@@ -2,11 +2,14 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
+use bytes::Bytes;
 use link::control::{Control, Output};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
+use qos::Side;
 use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
@@ -15,6 +18,8 @@ use super::{Mirror, reports};
 
 /// Messages kept for a slow subscriber.
 const QUEUE: usize = 256;
+/// The channel of outputs that the cloud has not told of.
+pub const NOWHERE: u32 = u32::MAX;
 
 /// Outputs, by topic and by channel.
 #[derive(Default)]
@@ -32,19 +37,77 @@ struct Topic {
     channel: Mutex<u32>,
     publisher: Arc<dyn Publisher>,
     latched: Mutex<Latched>,
+    /// Who listens on the robot, other nodes of the servant not counted.
+    listeners: AtomicUsize,
     /// A first latched message has come.
     news: Notify,
     counting: Mutex<Option<AbortHandle>>,
 }
 
-/// A latching topic has a second advertisement, which keeps the last message while somebody listens: without
-/// listeners the cloud sends nothing, and what is kept would grow old.
+/// What newcomers are given: the last word of who speaks for the node.
 #[derive(Default)]
-enum Latched {
+struct Latched {
+    /// What each side has latched last. Of the cloud only while somebody listens: else it sends nothing, and what is
+    /// kept would grow old.
+    last: [Option<Bytes>; 2],
+    advertised: Advertised,
+}
+
+/// A latching topic has a second advertisement.
+#[derive(Default)]
+enum Advertised {
     #[default]
     Not,
-    Asked(Vec<bytes::Bytes>),
+    Asked(Vec<Bytes>),
     Kept(Box<dyn Publisher>),
+}
+
+impl Topic {
+    /// A side has published; `heard`: it speaks for the node.
+    fn take(&self, side: Side, message: Bytes, latching: bool, heard: bool) {
+        let mut latched = self.latched.lock();
+        if latching {
+            latched.last[side.index()] = Some(message.clone());
+        }
+        if heard {
+            self.publish(&mut latched, message, latching);
+        }
+    }
+
+    fn publish(&self, latched: &mut Latched, message: Bytes, latching: bool) {
+        match &mut latched.advertised {
+            Advertised::Kept(publisher) => publisher.publish(message),
+            Advertised::Asked(waiting) => waiting.push(message),
+            Advertised::Not if latching => {
+                latched.advertised = Advertised::Asked(vec![message]);
+                self.news.notify_one();
+            }
+            Advertised::Not => self.publisher.publish(message),
+        }
+    }
+
+    /// This side speaks for the node from now on.
+    fn speaks(&self, side: Side) {
+        let mut latched = self.latched.lock();
+        match latched.last[side.index()].clone() {
+            Some(message) => self.publish(&mut latched, message, true),
+            // The cloud will be asked when somebody listens; until it has latched something, what was heard last stays.
+            None if side == Side::Cloud && self.listeners.load(Ordering::Relaxed) == 0 => {
+                latched.advertised = Advertised::Not;
+            }
+            None => {}
+        }
+    }
+
+    /// Nobody listens any more.
+    fn is_left(&self, local_speaks: bool) {
+        let mut latched = self.latched.lock();
+        latched.last[Side::Cloud.index()] = None;
+        let kept = local_speaks && latched.last[Side::Local.index()].is_some();
+        if !kept {
+            latched.advertised = Advertised::Not;
+        }
+    }
 }
 
 impl Drop for Topic {
@@ -61,6 +124,7 @@ impl Outputs {
         let Some(topic) = self.channels.lock().get(&data.channel).cloned() else {
             return;
         };
+        let mut heard = true;
         if let Some(keeper) = mirror.keeper() {
             let message = Message {
                 bytes: data.message.clone(),
@@ -72,20 +136,35 @@ impl Outputs {
                 .session()
                 .clock()
                 .and_then(|clock| reports::of_output(&data, arrived, clock.offset));
-            if !keeper.cloud_output(&topic.name, &message, phases) {
-                return;
-            }
+            heard = keeper.cloud_output(&topic.name, &message, phases);
         }
-        let mut latched = topic.latched.lock();
-        match &mut *latched {
-            Latched::Kept(publisher) => publisher.publish(data.message),
-            Latched::Asked(waiting) => waiting.push(data.message),
-            Latched::Not if data.latching => {
-                *latched = Latched::Asked(vec![data.message]);
-                topic.news.notify_one();
-            }
-            Latched::Not => topic.publisher.publish(data.message),
+        topic.take(Side::Cloud, data.message, data.latching, heard);
+    }
+
+    /// The local original has published; `heard`: it speaks for the node.
+    pub fn take_local(&self, topic: &str, message: Message, heard: bool) {
+        let topic = self.topics.lock().get(topic).cloned();
+        if let Some(topic) = topic {
+            topic.take(Side::Local, message.bytes, message.latching, heard);
         }
+    }
+
+    /// This side speaks for the node from now on.
+    pub fn speaks(&self, side: Side) {
+        for topic in self.all() {
+            topic.speaks(side);
+        }
+    }
+
+    /// The local original has ended, and what it has latched with it.
+    pub fn local_ended(&self) {
+        for topic in self.all() {
+            topic.latched.lock().last[Side::Local.index()] = None;
+        }
+    }
+
+    fn all(&self) -> Vec<Arc<Topic>> {
+        self.topics.lock().values().cloned().collect()
     }
 
     /// The topic of a channel.
@@ -95,7 +174,7 @@ impl Outputs {
     }
 
     /// Publishes a message of this side, on a topic that is advertised.
-    pub fn publish(&self, topic: &str, message: bytes::Bytes) {
+    pub fn publish(&self, topic: &str, message: Bytes) {
         if let Some(topic) = self.topics.lock().get(topic) {
             topic.publisher.publish(message);
         }
@@ -107,11 +186,11 @@ impl Outputs {
         topics.get(topic).map(|topic| topic.wire_type.clone())
     }
 
-    /// Advertises what is new and takes back what is gone.
-    pub async fn apply(&self, mirror: &Arc<Mirror>, outputs: &[Output]) {
+    /// Advertises what is new and takes back what is gone, unless it `keeps` that for the time being.
+    pub async fn apply(&self, mirror: &Arc<Mirror>, outputs: &[Output], keeps: bool) {
         self.topics.lock().retain(|name, topic| {
-            let same = |output: &&Output| output.topic == *name && output.md5 == topic.md5;
-            outputs.iter().any(|output| same(&output))
+            let listed = outputs.iter().find(|output| output.topic == *name);
+            listed.map_or(keeps, |output| output.md5 == topic.md5)
         });
         let mut channels = HashMap::new();
         for output in outputs {
@@ -124,13 +203,12 @@ impl Outputs {
                 },
             };
             *topic.channel.lock() = output.channel;
+            // Siblings may have changed, so who counts as a listener; a new session knows of none.
+            count(mirror, &topic);
             channels.insert(output.channel, topic);
         }
-        *self.channels.lock() = channels.clone();
-        // Siblings may have changed, so who counts as a listener; a new session knows of none.
-        for topic in channels.values() {
-            count(mirror, topic);
-        }
+        channels.remove(&NOWHERE);
+        *self.channels.lock() = channels;
     }
 
     async fn advertise(&self, mirror: &Arc<Mirror>, output: &Output) -> Option<Arc<Topic>> {
@@ -155,6 +233,7 @@ impl Outputs {
                     channel: Mutex::new(output.channel),
                     publisher: publisher.into(),
                     latched: Mutex::default(),
+                    listeners: AtomicUsize::new(0),
                     news: Notify::new(),
                     counting: Mutex::default(),
                 });
@@ -197,16 +276,19 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
                     .count();
                 if told != Some(count) {
                     told = Some(count);
+                    topic.listeners.store(count, Ordering::Relaxed);
                     if let Some(keeper) = mirror.keeper() {
                         keeper.wanted(&topic.name, count > 0);
                     }
                     if count == 0 {
-                        *topic.latched.lock() = Latched::Not;
+                        topic.is_left(mirror.keeper().is_some_and(|keeper| keeper.is_local_fed()));
                     }
                     let channel = *topic.channel.lock();
-                    mirror
-                        .session()
-                        .tell(&Control::Listeners { channel, count });
+                    if channel != NOWHERE {
+                        mirror
+                            .session()
+                            .tell(&Control::Listeners { channel, count });
+                    }
                 }
                 keep_latched(&mirror, &topic).await;
             }
@@ -224,7 +306,7 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
 
 /// Adds the latching advertisement once a latched message has come, before the next newcomer.
 async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
-    if !matches!(&*topic.latched.lock(), Latched::Asked(_)) {
+    if !matches!(topic.latched.lock().advertised, Advertised::Asked(_)) {
         return;
     }
     let name = mirror
@@ -248,11 +330,11 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     };
     if let Ok(publisher) = mirror.bus.advertise(&name, options).await {
         let mut latched = topic.latched.lock();
-        if let Latched::Asked(waiting) = &mut *latched {
+        if let Advertised::Asked(waiting) = &mut latched.advertised {
             for message in waiting.drain(..) {
                 publisher.publish(message);
             }
-            *latched = Latched::Kept(publisher);
+            latched.advertised = Advertised::Kept(publisher);
         }
     }
 }

@@ -8,7 +8,9 @@ use bytes::Bytes;
 use link::Session;
 use link::control::Graph;
 use parking_lot::Mutex;
-use qos::{Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Sla, Topic, Warm};
+use qos::{
+    Correlation, Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side, Sla, Topic, Warm,
+};
 use ros::bus::{Bus, Message, WireType};
 use serde_json::json;
 
@@ -17,7 +19,7 @@ use super::diagnostics::Diagnostics;
 use super::reports::{self, Reports};
 use super::safe_stop::{self, Stop};
 use crate::config::{self, Config};
-use crate::local::{self, Application, Cloud, Keeper, Original, Setting};
+use crate::local::{self, Application, Cloud, Interface, Keeper, Original, Setting};
 
 /// What is known of the interface so far: lazy inputs become known later, and do not go again.
 #[derive(Default)]
@@ -27,18 +29,23 @@ pub struct Known {
     told: BTreeSet<String>,
 }
 
-/// The SLA that a configuration states; none where it states no times.
+/// The SLA that a configuration states. Where it promises nothing the local original stands in while the link is away;
+/// none where there is to be no local original either.
 pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
     let mut sla = serde_json::Map::new();
     let output = config.output.clone().unwrap_or_default();
     match (config.frames_per_second, config.age) {
-        (None, None) => {
-            let (Some(desire), Some(max)) = (config.desire, config.max) else {
-                return Ok(None);
-            };
-            sla.insert("t_desire".into(), desire.into());
-            sla.insert("t_max".into(), max.into());
-        }
+        (None, None) => match (config.desire, config.max) {
+            (Some(desire), Some(max)) => {
+                sla.insert("t_desire".into(), desire.into());
+                sla.insert("t_max".into(), max.into());
+            }
+            _ if config.local == config::Local::None => return Ok(None),
+            _ => {
+                let measure = json!({"link": {"after": config.fallback_after}});
+                sla.insert("measure".into(), measure);
+            }
+        },
         (Some(_), Some(_)) => bail!("frames_per_second and age are both given; remove one"),
         _ if config.desire.or(config.max).is_some() => {
             bail!(
@@ -96,7 +103,7 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
 }
 
 impl Mirror {
-    /// Keeps the promise of `sla` from now on, with the local original that `setting` tells of; how it stands is
+    /// Keeps the promise of `sla` from now on, or stands by for a lost link where it promises nothing, with the local original that `setting` tells of; how it stands is
     /// shown by `diagnostics`. A safe stop of a declared type is published by `watcher`.
     pub async fn promise(
         self: &Arc<Self>,
@@ -105,14 +112,17 @@ impl Mirror {
         diagnostics: Diagnostics,
         watcher: &Arc<dyn Bus>,
     ) -> anyhow::Result<()> {
-        let original = match sla.local {
-            Local::None => None,
-            _ => {
-                let original =
-                    Original::new(setting, BTreeMap::new(), Vec::new(), self.bus.clone());
-                Some(original.await.context("the local original")?)
-            }
+        // Where nothing is promised, what is not installed is not missed before it is needed.
+        let useless = sla.local == Local::None || (sla.is_of_link() && setting.program.is_none());
+        let original = if useless {
+            None
+        } else {
+            let interface = Interface::default();
+            let robot = self.bus.clone();
+            let original = Original::new(setting, interface, robot, self.call_limit);
+            Some(original.await.context("the local original")?)
         };
+        let of_link = sla.is_of_link();
         let way = Arc::new(Way(Arc::downgrade(self)));
         let answers = sla.answers.clone();
         let sla_stop = sla.safe_stop.clone();
@@ -123,12 +133,17 @@ impl Mirror {
         };
         let _ = self.promise.set(Promise {
             keeper: keeper.clone(),
+            of_link,
             answers,
             known: Mutex::default(),
             reports: Reports::default(),
             stop,
         });
         let mirror = Arc::downgrade(self);
+        tokio::spawn(super::stand_in::follow(
+            mirror.clone(),
+            Arc::downgrade(&keeper),
+        ));
         tokio::spawn(follow(mirror.clone(), keeper));
         tokio::spawn(reports::tell(mirror, diagnostics));
         Ok(())
@@ -144,7 +159,7 @@ impl Mirror {
         let Some(promise) = self.promise.get() else {
             return;
         };
-        let (pairs, inputs, outputs) = {
+        let (pairs, interface) = {
             let mut known = promise.known.lock();
             let types = self.types.lock();
             let wire_type = |name: &str, md5: &str| {
@@ -167,7 +182,7 @@ impl Mirror {
                 let found = wire_type(&output.type_name, &output.md5);
                 known.outputs.insert(output.topic.clone(), found);
             }
-            let found = match qos::find(
+            let mut found = match qos::find(
                 &topics(&known.inputs),
                 &topics(&known.outputs),
                 promise.answers.as_deref(),
@@ -179,20 +194,30 @@ impl Mirror {
                     qos::Found::default()
                 }
             };
+            if promise.of_link {
+                // A goal is done by one side or the other; of all else only who speaks counts.
+                let of_action = |pair: &Pair| pair.by == Some(Correlation::Goal);
+                found.pairs.retain(of_action);
+            }
             for pair in &found.pairs {
                 if known.told.insert(pair.to_string()) {
                     tracing::info!("requests and answers: {pair}");
                 }
             }
-            let inputs = known.inputs.iter();
-            let inputs: BTreeMap<_, _> = inputs
-                .filter(|(name, _)| found.pairs.iter().any(|pair: &Pair| pair.input == **name))
-                .map(|(name, wire_type)| (name.clone(), wire_type.clone()))
-                .collect();
-            let outputs: Vec<String> = known.outputs.keys().cloned().collect();
-            (found.pairs, inputs, outputs)
+            let answered = |name: &&String| found.pairs.iter().any(|pair| pair.input == **name);
+            let interface = Interface {
+                inputs: known.inputs.clone(),
+                awaited: known.inputs.keys().filter(answered).cloned().collect(),
+                outputs: known.outputs.keys().cloned().collect(),
+                services: graph
+                    .services
+                    .iter()
+                    .map(|service| service.name.clone())
+                    .collect(),
+            };
+            (found.pairs, interface)
         };
-        if let Err(error) = promise.keeper.learn(pairs, inputs, outputs).await {
+        if let Err(error) = promise.keeper.learn(pairs, interface).await {
             tracing::warn!("the local original cannot be fed: {error:#}");
         }
     }
@@ -201,6 +226,8 @@ impl Mirror {
 /// What a mirror holds of it.
 pub struct Promise {
     keeper: Arc<Keeper>,
+    /// No time is promised: the link alone decides.
+    of_link: bool,
     answers: Option<Vec<Pair>>,
     known: Mutex<Known>,
     pub(super) reports: Reports,
@@ -266,7 +293,13 @@ impl Cloud for Way {
 impl Application for Way {
     fn deliver(&self, topic: &str, message: Message) {
         if let Some(mirror) = self.0.upgrade() {
-            mirror.outputs.publish(topic, message.bytes);
+            mirror.outputs.take_local(topic, message, true);
+        }
+    }
+
+    fn latched(&self, topic: &str, message: Message) {
+        if let Some(mirror) = self.0.upgrade() {
+            mirror.outputs.take_local(topic, message, false);
         }
     }
 
@@ -312,6 +345,14 @@ impl Application for Way {
         if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
             promise.reports.decided(event);
         }
+        if let Some(mirror) = &mirror {
+            match event {
+                Event::Feed(_) => mirror.outputs.speaks(Side::Local),
+                Event::StopFeeding(_) => mirror.outputs.speaks(Side::Cloud),
+                Event::Stop(_) | Event::Crashed(_) => mirror.outputs.local_ended(),
+                _ => {}
+            }
+        }
         match event {
             Event::Start(why) => tracing::info!(?why, "the local original is started"),
             Event::Feed(why) => tracing::warn!(?why, "the local original answers, too"),
@@ -342,7 +383,18 @@ mod tests {
 
     #[test]
     fn a_promise_is_about_times_or_frames_or_age() {
-        assert_eq!(promised("local = 'warm'").unwrap(), None);
+        assert_eq!(promised("local = 'none'").unwrap(), None);
+        let nothing = promised("").unwrap().unwrap();
+        let after = std::time::Duration::from_secs(3);
+        assert_eq!(nothing.measure, Measure::Link { after });
+        let own = promised("fallback_after = 0.5\nlocal = 'warm'")
+            .unwrap()
+            .unwrap();
+        let after = std::time::Duration::from_millis(500);
+        assert_eq!(
+            (own.measure, own.local),
+            (Measure::Link { after }, Local::Warm)
+        );
         let sign = promised("desire = 0.1\nmax = 0.3\nlocal = 'first-sign'").unwrap();
         let sign = sign.map(|sla| (sla.local, sla.warm));
         assert_eq!(sign, Some((Local::Warm, Warm::FirstSign)));

@@ -28,15 +28,8 @@ pub(super) fn stub(about: &About<'_>) -> String {
     )
 }
 
-const SETTINGS: &str = r#"
-# robot = "rover1"         # this robot's id; by default its host name
-# ca_file = "/path.pem"    # for a server of wss://: whom to trust, where that is not the system's to say
-# token_file = "/path"     # holds the token, where the server asks for one
-# desire = 0.1             # T_desire: the response time that is wished for, seconds
-# max = 0.3                # T_max: the longest that is acceptable, seconds
-# local = "cold"           # the local original: "cold", "first-sign", "warm" or "none"
-# nodes = { "talk.py" = "talker" }   # what an executable's node is called by default, where that is not its own name
-"#;
+/// What may be set; the stub's own tests compare what it says of defaults with the stub's.
+const SETTINGS: &str = include_str!("inside/settings.toml");
 
 /// What the archive was made of.
 pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> String {

@@ -30,6 +30,16 @@ impl<P: Clone> Governor<P> {
             .collect()
     }
 
+    /// Who is given what awaits no answer. Where no time was promised the way to the cloud takes it while the link is
+    /// down, as long as nobody stands in.
+    pub(super) fn told_sides(&self) -> Vec<Side> {
+        let sides = self.asked_sides();
+        if sides.is_empty() && self.sla.is_of_link() {
+            return vec![Side::Cloud];
+        }
+        sides
+    }
+
     pub(super) fn ask(&mut self, now: Instant, id: RequestId, side: Side) {
         let Some(payload) = self.arbiter.ask(now, id, side) else {
             return;

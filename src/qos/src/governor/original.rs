@@ -6,10 +6,22 @@ use super::{EVENTS, Effect, Governor, UNMATCHED};
 use crate::decider::Event;
 use crate::pair::Correlation;
 use crate::request::{Leg, Side};
+use crate::sla::Measure;
 
 impl<P: Clone> Governor<P> {
+    /// The link is down from now on. Where no time was promised it may come back before that means anything.
+    pub(super) fn left_alone(&mut self, now: Instant) {
+        match self.sla.measure {
+            Measure::Link { after } => {
+                self.away_at = Some(now + after);
+                self.decider.late();
+            }
+            _ => self.away = true,
+        }
+    }
+
     pub(super) fn decide(&mut self, now: Instant) {
-        for event in self.decider.decide(&self.satisfaction, self.link) {
+        for event in self.decider.decide(&self.satisfaction, !self.away) {
             let (feed, stop) = (
                 matches!(event, Event::Feed(_)),
                 matches!(event, Event::Stop(_)),

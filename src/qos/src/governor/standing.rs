@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::Governor;
 use crate::decider::{Event, LocalState};
 use crate::report::{Report, TimedEvent};
-use crate::sla::{Local, Mode};
+use crate::sla::{Local, Measure, Mode};
 
 impl<P: Clone> Governor<P> {
     /// A snapshot for diagnostics.
@@ -24,6 +24,10 @@ impl<P: Clone> Governor<P> {
             local_state: self.decider.state(),
             fed: self.decider.is_fed(),
             link: self.link,
+            fallback_after: match self.sla.measure {
+                Measure::Link { after } => Some(after.as_secs_f64()),
+                _ => None,
+            },
             pairs: self.pairs.iter().map(|stream| stream.shown()).collect(),
             counts: self.counts,
             phases: self.phases.quantiles(),
@@ -33,13 +37,21 @@ impl<P: Clone> Governor<P> {
     }
 
     fn summary(&self) -> String {
-        let q = format!(
-            "Q {:.1} of threshold {:.1}",
-            self.satisfaction.q(),
-            self.satisfaction.threshold()
-        );
+        let q = match self.sla.measure {
+            Measure::Link { after } => format!(
+                "no response time is promised; the local original stands in {} s after the link is lost",
+                after.as_secs_f64()
+            ),
+            _ => format!(
+                "Q {:.1} of threshold {:.1}",
+                self.satisfaction.q(),
+                self.satisfaction.threshold()
+            ),
+        };
         let who = match (self.link, self.decider.is_fed(), self.decider.state()) {
-            (true, false, _) if !self.satisfaction.wants_local() => "the cloud answers",
+            (true, false, _) if self.sla.is_of_link() || !self.satisfaction.wants_local() => {
+                "the cloud answers"
+            }
             (true, false, LocalState::Missing) => {
                 "the cloud is slow, and there is no local original"
             }
@@ -50,6 +62,7 @@ impl<P: Clone> Governor<P> {
                 "the cloud is slow; stateful, so it answers alone"
             }
             (true, false, _) => "the cloud is slow, and the local original is starting",
+            (true, true, _) if self.sla.is_of_link() => "the cloud takes over again",
             (true, true, _) => "the cloud is slow, so both are asked and the first answer is taken",
             (false, true, _) => "the link is down, the local original answers",
             (false, false, LocalState::Missing) => {

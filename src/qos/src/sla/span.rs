@@ -6,6 +6,9 @@ use serde::Deserialize;
 
 use crate::sla_error::SlaError;
 
+/// Beyond a day it is a mistake of units, and far below it sums of deadlines cannot overflow.
+pub(super) const LONGEST: Duration = Duration::from_secs(86_400);
+
 /// A time as written: seconds, or text with a unit.
 #[derive(Deserialize, Clone)]
 #[serde(
@@ -38,8 +41,7 @@ impl Span {
                 }
             };
         positive(field, seconds)?;
-        // Beyond a day it is a mistake of units, and far below it sums of deadlines cannot overflow.
-        if seconds > 86_400.0 {
+        if seconds > LONGEST.as_secs_f64() {
             return Err(SlaError::new(
                 field,
                 format!("{seconds} s is more than a day; times are in seconds"),

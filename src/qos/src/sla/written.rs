@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
-use super::span::{Span, interval, positive};
+use super::span::{LONGEST, Span, interval, positive};
 use super::{Local, Measure, Mode, SafeStop, Sla, Times, Warm};
 use crate::pair::Pair;
 use crate::sla_error::SlaError;
@@ -37,6 +37,7 @@ enum WrittenMeasure {
     Rrt,
     FramesPerSecond(WrittenRate),
     Age(WrittenAge),
+    Link(WrittenLink),
 }
 
 #[derive(Deserialize)]
@@ -57,6 +58,12 @@ struct WrittenAge {
     output: String,
     desire: Span,
     max: Span,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct WrittenLink {
+    after: Span,
 }
 
 #[derive(Deserialize)]
@@ -185,6 +192,15 @@ impl WrittenMeasure {
                     t_max: max,
                 };
                 Ok((Measure::Age { output: age.output }, times))
+            }
+            Self::Link(link) => {
+                let after = link.after.check("measure.link.after")?;
+                // Requests wait as long as whoever asks does.
+                let times = Times {
+                    t_desire: LONGEST,
+                    t_max: LONGEST,
+                };
+                Ok((Measure::Link { after }, times))
             }
         }
     }

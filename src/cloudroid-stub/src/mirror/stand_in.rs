@@ -1,0 +1,78 @@
+//! A cloud that was never reached has not told what the node registers. While the local original stands in, that is what
+//! it has registered itself, in the ROS system of its own.
+
+use std::sync::{Arc, Weak};
+
+use link::control::{Graph, Output, Served, Wanted};
+use ros::bus::{ServiceType, WireType};
+
+use super::Mirror;
+use super::outputs::NOWHERE;
+use crate::local::{Keeper, Original, Registered};
+
+/// Registers on the robot what the local original does, until the cloud tells.
+pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
+    // Not held while nothing changes: the original ends with its keeper.
+    let original = || keeper.upgrade()?.original().cloned();
+    let Some(mut changes) = original().map(|original| original.registrations()) else {
+        return;
+    };
+    while changes.changed().await.is_ok() {
+        let Some(original) = original() else { return };
+        let registered = original.registered().await;
+        let Some(mirror) = mirror.upgrade() else {
+            return;
+        };
+        if !mirror.stand_in(&original, registered).await {
+            return;
+        }
+    }
+}
+
+impl Mirror {
+    /// Registers this in place of what the cloud would tell; false once it has. Nothing is taken back: the original may
+    /// have ended since the cloud is there, and that will tell.
+    async fn stand_in(self: &Arc<Self>, original: &Original, registered: Registered) -> bool {
+        let mut applied = self.applied.lock().await;
+        if applied.graph.is_some() {
+            return false;
+        }
+        applied.stood_in = true;
+        let types = registered.outputs.iter().chain(&registered.inputs);
+        for (_, wire_type) in types {
+            let key = (wire_type.name.clone(), wire_type.md5.clone());
+            self.types.lock().insert(key, wire_type.clone());
+        }
+        let output = |(topic, of): (String, WireType)| Output {
+            channel: NOWHERE,
+            topic,
+            type_name: of.name,
+            md5: of.md5,
+        };
+        let input = |(topic, of): (String, WireType)| Wanted {
+            topic,
+            type_name: of.name,
+            md5: of.md5,
+            feed: true,
+        };
+        let serves = |(name, of): (String, ServiceType)| Served {
+            channel: NOWHERE,
+            name,
+            type_name: of.name,
+            md5: of.md5,
+        };
+        let graph = Graph {
+            outputs: registered.outputs.into_iter().map(output).collect(),
+            inputs: registered.inputs.into_iter().map(input).collect(),
+            services: registered.services.into_iter().map(serves).collect(),
+            siblings: Vec::new(),
+        };
+        // What it says has somewhere to go before it is heard, and what it is given comes once it listens.
+        self.outputs.apply(self, &graph.outputs, true).await;
+        self.learn(&graph).await;
+        original.connected().await;
+        self.inputs.apply(self, &graph.inputs, true);
+        self.calls.apply(self, &graph.services, (false, true)).await;
+        true
+    }
+}
