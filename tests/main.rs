@@ -24,6 +24,8 @@ mod crossing;
 mod cuts;
 #[path = "stories/failover.rs"]
 mod failover;
+#[path = "stories/fallback.rs"]
+mod fallback;
 #[path = "stories/grants.rs"]
 mod grants;
 #[path = "stories/house.rs"]
@@ -109,6 +111,11 @@ fn main() -> ExitCode {
             outputs_that_become_too_old_wake_the_original,
             a_first_sign_has_the_original_ready_before_it_is_needed,
             explain_says_why,
+        ],
+        stories![fallback:
+            an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back,
+            a_server_that_was_never_reached_is_stood_in_for,
+            an_untouched_stub_can_be_told_to_leave_the_original_alone,
         ],
         stories![grants:
             a_service_is_given_what_its_operator_allows,

@@ -75,6 +75,13 @@ pub const CROSSING: Service = Service {
     arguments: &["--node", "crossing.py"],
 };
 
+/// Our Python package that needs a map.
+pub const LOCALISER: Service = Service {
+    name: "localiser_py",
+    package: Some("localiser_py"),
+    arguments: &["--node", "localiser.py"],
+};
+
 /// Our C++ package that calls services of others.
 pub const CALLER: Service = Service {
     name: "caller_cpp",

@@ -1,0 +1,358 @@
+//! A stub as it comes, nothing promised: while the server is away the original stands in, and finds what it needs.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use bytes::{BufMut, Bytes, BytesMut};
+use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::ros1::Ros1Bus;
+use support::Told;
+use support::cable::{Badness, Cable};
+use support::daemon::Daemon;
+use support::robot::PATIENCE;
+use support::site::{Running, Site};
+use support::world::{LOCALISER, world};
+
+const SILENT: Badness = Badness {
+    rate: 100_000,
+    delay: 1,
+    loss: 1.0,
+    limit: 1000,
+};
+const PROGRAM: &str = "/opt/cloudroid/install/lib/localiser_py/localiser.py";
+const HEADER: &str = "\
+    ================================================================================\n\
+    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
+
+/// A hall with one wall in it, as a map server has read it: `#` is a wall.
+const HALL: [&str; 8] = [
+    "##########",
+    "#........#",
+    "#........#",
+    "#....#####",
+    "#........#",
+    "#........#",
+    "#........#",
+    "##########",
+];
+const RESOLUTION: f32 = 0.5;
+
+/// A map server and a laser of one robot, and who asks where it is.
+struct Robot {
+    // In the order in which they end.
+    poses: Subscription,
+    scan: Box<dyn Publisher>,
+    _map: Box<dyn Publisher>,
+    _server: Arc<Ros1Bus>,
+    node: Arc<Ros1Bus>,
+    site: Site,
+    sent: u32,
+}
+
+fn text(out: &mut BytesMut, text: &str) {
+    out.put_u32_le(u32::try_from(text.len()).unwrap_or(0));
+    out.put_slice(text.as_bytes());
+}
+
+fn header(out: &mut BytesMut, number: u32, frame: &str) {
+    for word in [number, number, 0] {
+        out.put_u32_le(word);
+    }
+    text(out, frame);
+}
+
+/// A nav_msgs/OccupancyGrid.
+fn map() -> Bytes {
+    let mut out = BytesMut::new();
+    header(&mut out, 1, "map");
+    out.put_u64_le(0);
+    out.put_f32_le(RESOLUTION);
+    out.put_u32_le(10);
+    out.put_u32_le(8);
+    for number in [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] {
+        out.put_f64_le(number);
+    }
+    out.put_u32_le(80);
+    for cell in HALL.concat().bytes() {
+        out.put_u8(if cell == b'#' { 100 } else { 0 });
+    }
+    out.freeze()
+}
+
+/// How far the next wall is in four directions, seen from a cell; metres.
+fn ranges((x, y): (usize, usize)) -> [f32; 4] {
+    let steps: [(isize, isize); 4] = [(1, 0), (0, 1), (-1, 0), (0, -1)];
+    steps.map(|(dx, dy)| {
+        let mut count = 0_u8;
+        let (mut x, mut y) = (x, y);
+        while HALL[y].as_bytes()[x] != b'#' {
+            x = x.saturating_add_signed(dx);
+            y = y.saturating_add_signed(dy);
+            count += 1;
+        }
+        f32::from(count) * RESOLUTION
+    })
+}
+
+/// A sensor_msgs/LaserScan, stamped with its number.
+fn scan(number: u32, cell: (usize, usize)) -> Bytes {
+    let mut out = BytesMut::new();
+    header(&mut out, number, "laser");
+    for number in [0.0, 4.71, 1.57, 0.0, 0.1, 0.0, 10.0] {
+        out.put_f32_le(number);
+    }
+    out.put_u32_le(4);
+    for range in ranges(cell) {
+        out.put_f32_le(range);
+    }
+    out.put_u32_le(0);
+    out.freeze()
+}
+
+impl Robot {
+    fn new() -> anyhow::Result<Self> {
+        let site = Site::new()?;
+        let (server, node) = (site.node("/map_server")?, site.node("/laser")?);
+        let advertise = |node: &Ros1Bus, topic: &str, latch: bool, wire_type: WireType| {
+            let options = AdvertiseOptions {
+                wire_type,
+                latch,
+                queue: 10,
+            };
+            site.runtime.block_on(node.advertise(topic, options))
+        };
+        let grid = WireType {
+            name: "nav_msgs/OccupancyGrid".into(),
+            md5: "3381f2d731d4076ec5c71b0759edbe4e".into(),
+            definition: format!("{GRID}{HEADER}"),
+        };
+        let map_publisher = advertise(&server, "/map", true, grid)?;
+        // Once, long before anybody asks.
+        map_publisher.publish(map());
+        let laser = WireType {
+            name: "sensor_msgs/LaserScan".into(),
+            md5: "90c7ef2dc6895d81024acba2ac42f369".into(),
+            definition: format!("{SCAN}{HEADER}"),
+        };
+        let scan = advertise(&node, "/scan", false, laser)?;
+        let poses = site.hears(&node, "/localiser/pose")?;
+        Ok(Self {
+            poses,
+            scan,
+            _map: map_publisher,
+            _server: server,
+            node,
+            site,
+            sent: 0,
+        })
+    }
+
+    /// Stub and original as they are installed on a robot.
+    fn starts(&self, daemon: &Daemon, robot: &str, server: &str) -> anyhow::Result<Running> {
+        let (service, package, node) = (LOCALISER.name, "localiser_py", "localiser.py");
+        let overlay = self.site.installs(daemon, service, "")?;
+        let original = (package, node);
+        let workspace: PathBuf = self
+            .site
+            .installs_original(daemon, service, original, PROGRAM)?;
+        let prefixes = format!("{}:{}", overlay.display(), workspace.display());
+        let server = format!("ws://{server}");
+        let variables = [
+            ("CMAKE_PREFIX_PATH", prefixes.as_str()),
+            ("CLOUDROID_SERVER", server.as_str()),
+            ("CLOUDROID_ROBOT", robot),
+            ("NO_COLOR", "1"),
+        ];
+        self.site
+            .runs_among(&variables, &overlay, package, node, &["__name:=localiser"])
+    }
+
+    /// Shows scans of a cell until one is answered; the answer is right.
+    fn is_found(&mut self, cell: (usize, usize), stub: &Running) -> Told {
+        let wanted = [cell.0, cell.1].map(|at| (at as f64 + 0.5) * f64::from(RESOLUTION));
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            self.sent += 1;
+            self.scan.publish(scan(self.sent, cell));
+            let heard = self.site.runtime.block_on(async {
+                let pause = Duration::from_millis(100);
+                tokio::time::timeout(pause, self.poses.messages.recv()).await
+            });
+            if let Ok(Some(pose)) = heard {
+                let place = pose.bytes.len() - 56;
+                let number = |at: usize| {
+                    let bytes = pose.bytes[place + at..place + at + 8].try_into();
+                    bytes.map(f64::from_le_bytes)
+                };
+                // Of an earlier cell's scans some may still be answered.
+                if [number(0)?, number(8)?] == wanted {
+                    return Ok(());
+                }
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "{cell:?} should be found:\n{}",
+                stub.said()
+            );
+        }
+    }
+}
+
+/// Waits until the stub has said this so many times.
+fn says(stub: &Running, words: &str, times: usize) -> Told {
+    let deadline = Instant::now() + PATIENCE;
+    while stub.said().matches(words).count() < times {
+        ensure!(
+            Instant::now() < deadline,
+            "it should say {words:?}:\n{}",
+            stub.said()
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Ok(())
+}
+
+/// Waits until a topic's message has these words.
+fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Told {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let message = site.next(subscription)?;
+        let said = String::from_utf8_lossy(&message.bytes).into_owned();
+        if said.contains(words) {
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "{words:?}: {said}");
+    }
+}
+
+/// Waits until `explain` says this.
+fn explains(daemon: &Daemon, robot: &str, words: &str) -> Told {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let said = daemon.deployer().types(&["explain", robot])?.succeeded()?;
+        if said.stdout.contains(words) {
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "{words:?}: {}", said.stdout);
+    }
+}
+
+pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() -> Told {
+    let daemon = world().with(LOCALISER)?;
+    let cable = Cable::new(&daemon.address)?;
+    let mut robot = Robot::new()?;
+    let stub = robot.starts(&daemon, "fallback-cut", &cable.server.to_string())?;
+    says(&stub, "linked to", 1)?;
+    robot.is_found((2, 4), &stub)?;
+    let mut diagnostics = robot.site.hears(&robot.node, "/diagnostics")?;
+    let (over, back) = (
+        "the local original answers, too why=LinkDown",
+        "the cloud answers alone why=LinkUp",
+    );
+    // Slow machines reach the cloud late: it may have stood in already.
+    tells(
+        &robot.site,
+        &mut diagnostics,
+        "the cloud answers (no response time is promised",
+    )?;
+    let before = stub.said().matches(over).count();
+    for round in 1..=2 {
+        cable.degrade(SILENT)?;
+        says(&stub, over, before + round)?;
+        // A process that has just been started: only the latched map tells it where these walls are.
+        robot.is_found((6, 2), &stub)?;
+        tells(
+            &robot.site,
+            &mut diagnostics,
+            "the link is down, the local original answers",
+        )?;
+        explains(
+            &daemon,
+            "fallback-cut",
+            "where the original is installed on the robot, it stands in after 3.0 s",
+        )?;
+        explains(
+            &daemon,
+            "fallback-cut",
+            "no time promised, fallback 3.0 s after the link is lost",
+        )?;
+        // Who comes now is given what the original has latched, not the cloud's last pose.
+        let newcomer = robot.site.node(&format!("/newcomer{round}"))?;
+        let mut late = robot.site.hears(&newcomer, "/localiser/pose")?;
+        let pose = robot.site.next(&mut late)?;
+        let x = pose.bytes.len() - 56;
+        ensure!(pose.bytes[x..x + 8] == 3.25_f64.to_le_bytes(), "{pose:?}");
+        cable.restore()?;
+        says(&stub, back, before + round)?;
+        robot.is_found((1, 1), &stub)?;
+    }
+    let events = daemon.deployer().asks(&["events", "-n", "500"])?;
+    let mine = events.as_array().context("a list")?.iter();
+    let mine = mine.filter(|event| event["robot"] == "fallback-cut");
+    let kinds: Vec<&str> = mine
+        .filter_map(|event| event["kind"].as_str())
+        .filter(|kind| kind.starts_with("local-"))
+        .collect();
+    ensure!(kinds.contains(&"local-takes-over"), "{kinds:?}");
+    Ok(())
+}
+
+pub fn a_server_that_was_never_reached_is_stood_in_for() -> Told {
+    let daemon = world().with(LOCALISER)?;
+    let mut robot = Robot::new()?;
+    // Nobody listens there.
+    let stub = robot.starts(&daemon, "fallback-never", "127.0.0.1:1")?;
+    says(&stub, "no link: ", 1)?;
+    robot.is_found((6, 6), &stub)?;
+    ensure!(stub.said().contains("why=LinkDown"), "{}", stub.said());
+    Ok(())
+}
+
+pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone() -> Told {
+    let daemon = world().with(LOCALISER)?;
+    let robot = Robot::new()?;
+    let overlay = robot
+        .site
+        .installs(&daemon, LOCALISER.name, "local = \"none\"\n")?;
+    let workspace = robot.site.installs_original(
+        &daemon,
+        LOCALISER.name,
+        ("localiser_py", "localiser.py"),
+        PROGRAM,
+    )?;
+    let prefixes = format!("{}:{}", overlay.display(), workspace.display());
+    let variables = [
+        ("CMAKE_PREFIX_PATH", prefixes.as_str()),
+        ("CLOUDROID_ROBOT", "fallback-none"),
+        ("NO_COLOR", "1"),
+    ];
+    let stub = robot
+        .site
+        .runs_among(&variables, &overlay, "localiser_py", "localiser.py", &[])?;
+    says(&stub, "linked to", 1)?;
+    let explained = daemon.deployer().asks(&["explain", "fallback-none"])?;
+    let link = &explained["servants"][0]["links"][0];
+    ensure!(link["fallback_after"].is_null(), "{explained:#}");
+    let graph = robot.node.graph().borrow().clone();
+    ensure!(
+        !graph.nodes.contains_key("/localiser_cloudroid"),
+        "{graph:#?}"
+    );
+    Ok(())
+}
+
+const GRID: &str = "std_msgs/Header header\nnav_msgs/MapMetaData info\nint8[] data\n\
+    ================================================================================\n\
+    MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\n\
+    geometry_msgs/Pose origin\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n";
+const SCAN: &str = "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n\
+    float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\nfloat32[] ranges\n\
+    float32[] intensities\n";
