@@ -4,6 +4,8 @@ use std::fs;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::Path;
 
+use foreign::Visit;
+
 use crate::error::{Error, IoAt};
 use crate::install::set_mode;
 
@@ -11,11 +13,12 @@ use crate::install::set_mode;
 /// afterwards. What the tree deletes goes. Blocking.
 pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
     let mut directories = Vec::new();
-    let entries = walkdir::WalkDir::new(tree).min_depth(1).sort_by_file_name();
-    for entry in entries {
-        let entry = entry.map_err(|error| Error::io("reading", tree, error.into()))?;
-        let from = entry.path();
-        let to = target.join(from.strip_prefix(tree).unwrap_or(from));
+    foreign::walk(tree, |entry| {
+        if entry.path.as_os_str().is_empty() {
+            return Ok(Visit::Into);
+        }
+        let (from, to) = (entry.shown(), target.join(entry.path));
+        let from = from.as_path();
         let about = from.symlink_metadata().at("reading", from)?;
         let kind = about.file_type();
         let there = to.symlink_metadata().ok().map(|there| there.is_dir());
@@ -30,13 +33,13 @@ pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
             std::os::unix::fs::lchown(&to, Some(about.uid()), Some(about.gid()))
                 .at("changing the owner of", &to)?;
             directories.push((to, about));
-            continue;
+            return Ok(Visit::Into);
         }
         if there.is_some() {
             remove(&to)?;
         }
         if kind.is_char_device() && about.rdev() == 0 {
-            continue;
+            return Ok(Visit::Into);
         }
         if kind.is_symlink() {
             let link = fs::read_link(from).at("reading", from)?;
@@ -46,7 +49,8 @@ pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
         } else if kind.is_file() {
             link(from, &to)?;
         }
-    }
+        Ok::<_, Error>(Visit::Into)
+    })?;
     // Last, as writing into a directory changes its time and may need its rights.
     for (path, about) in directories.iter().rev() {
         set_mode(path, about.mode() & 0o7777)?;

@@ -9,13 +9,17 @@
 //! something it was not shown, it is compiled again with everything in sight, and its key says so.
 
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::fs;
+use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use foreign::Visit;
 use image::Digest;
 use package::manifest::Kind;
 use package::workspace::{Package, Workspace};
+use rustix::fs::FileType;
 
 use crate::build::Build;
 use crate::compile::{self, Compiled, Log, Order, Task, Unit};
@@ -202,28 +206,28 @@ fn needs(packages: &[Package]) -> Vec<Vec<usize>> {
 /// Links all files below `from` into `to`, without the directories in `skip` and what version control keeps at the
 /// top of a workspace; what is in `to` already stays. Blocking.
 fn link_tree(from: &Path, to: &Path, skip: &BTreeSet<PathBuf>) -> Result<(), Error> {
-    let mut entries = walkdir::WalkDir::new(from).min_depth(1).into_iter();
-    while let Some(entry) = entries.next() {
-        let entry = entry.map_err(|error| Error::io("reading", from, error.into()))?;
-        let path = entry.path();
-        let target = to.join(path.strip_prefix(from).unwrap_or(path));
-        let kind = entry.file_type();
-        if kind.is_dir() {
-            if skip.contains(path) {
-                entries.skip_current_dir();
-            } else if !target.is_dir() {
-                fs::create_dir(&target).at("making", &target)?;
-            }
-        } else if target.symlink_metadata().is_ok() {
-            continue;
-        } else if kind.is_symlink() {
-            let link = fs::read_link(path).at("reading", path)?;
-            std::os::unix::fs::symlink(link, &target).at("linking", &target)?;
-        } else if fs::hard_link(path, &target).is_err() {
-            fs::copy(path, &target).at("copying", path)?;
+    foreign::walk(from, |entry| {
+        if entry.path.as_os_str().is_empty() {
+            return Ok(Visit::Into);
         }
-    }
-    Ok(())
+        let (path, target) = (entry.shown(), to.join(entry.path));
+        match entry.kind() {
+            FileType::Directory if skip.contains(&path) => return Ok(Visit::Skip),
+            FileType::Directory if target.is_dir() => {}
+            FileType::Directory => fs::create_dir(&target).at("making", &target)?,
+            _ if target.symlink_metadata().is_ok() => {}
+            FileType::Symlink => {
+                let link = OsString::from_vec(entry.link()?);
+                std::os::unix::fs::symlink(link, &target).at("linking", &target)?;
+            }
+            _ => {
+                if fs::hard_link(&path, &target).is_err() {
+                    fs::copy(&path, &target).at("copying", &path)?;
+                }
+            }
+        }
+        Ok::<_, Error>(Visit::Into)
+    })
 }
 
 /// The package layer: of packages from the cache as far as they are there, and compiled now. `below`: base, toolchain
@@ -461,10 +465,8 @@ impl Making<'_> {
         fs::create_dir(&tree).at("making", &tree)?;
         let diff_ids: Vec<Digest> = self.diff_ids.iter().copied().flatten().collect();
         let (trees, into) = (shop.extracted(&diff_ids).await?, tree.clone());
-        crate::blocking::spawn(move || {
-            trees.iter().try_for_each(|tree| lay_over(tree, &into))
-        })
-        .await??;
+        crate::blocking::spawn(move || trees.iter().try_for_each(|tree| lay_over(tree, &into)))
+            .await??;
         let made_from = self.units.units.iter().map(|unit| unit.name.clone());
         let packing = Packing {
             key,

@@ -4,7 +4,6 @@
 //! that runs, the compressed archive for the image and the cache.
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -12,7 +11,7 @@ use image::{Digest, TreeOptions};
 use tokio::task::JoinHandle;
 
 use crate::cache::{Entry, Layers};
-use crate::error::{Error, IoAt};
+use crate::error::Error;
 use crate::sandbox::Site;
 
 /// Lives as long as one build.

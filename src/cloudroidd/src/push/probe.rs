@@ -64,10 +64,7 @@ pub(super) async fn interface(
 
 /// Starts it; it is ended however the trial is dropped: a push can be cancelled at any await. Starting itself is not
 /// interrupted, because what is half-started has no handle to end it by.
-pub(super) async fn start(
-    pusher: &Pusher,
-    spec: Spec,
-) -> Result<(Arc<dyn Servant>, Trial), Error> {
+pub(super) async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servant>, Trial), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
     let starting = pusher.tasks.spawn(async move {
         let servant = engine.start(spec).await?;
