@@ -231,7 +231,9 @@ async fn look(
             continue;
         }
         look.listen().await?;
+        let before = std::mem::take(&mut found.interface);
         found = look.describe(&feed).await?;
+        incomplete::keep_inputs(&mut found.interface, before);
         incomplete::mark_late(&mut found.interface, &bare.interface);
         *unfed.lock() = Some(found.clone());
     }

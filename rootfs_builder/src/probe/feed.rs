@@ -4,7 +4,7 @@
 //!   surroundings:  transforms (an identity tree), /clock, services that are looked for
 //!        │ nothing new of these is asked for any more
 //!        ▼
-//!   inputs:        one default message each, kept for late connections (latched)
+//!   inputs:        one default message each
 //! ```
 //!
 //! Whatever appears after that is looked at again, and may ask for more. A goal of an action is no such input: a
@@ -113,12 +113,12 @@ impl<'a> Feed<'a> {
             // Whoever waits for these asks again now and then.
             self.options.settle * 3
         } else if self.inputs(graph).await {
-            self.options.settle
+            self.options.settle * 2
         } else {
             return None;
         };
         // On a busy machine everything takes longer.
-        Some(patience.max(began.elapsed() * 3).min(self.options.restless))
+        Some(patience.max(began.elapsed() * 6).min(self.options.restless))
     }
 
     /// Services that were looked for since, with the nodes that did.
@@ -215,7 +215,7 @@ impl<'a> Feed<'a> {
         if self.beats.contains_key(topic) || self.refused.contains_key(topic) {
             return false;
         }
-        let (message, publisher) = match self.advertise(topic, Some(usual), false).await {
+        let (message, publisher) = match self.advertise(topic, Some(usual)).await {
             Ok(Some(pair)) => pair,
             Ok(None) => return false,
             Err(reason) => {
@@ -263,9 +263,12 @@ impl<'a> Feed<'a> {
             if !subscribed || published || apart || known || self.given.len() >= MOST_INPUTS {
                 continue;
             }
-            match self.advertise(name, None, true).await {
+            match self.advertise(name, None).await {
                 Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
                     Ok(bytes) => {
+                        // Not latched, which would reach whoever is late, too: relays latch what was latched.
+                        let mut connected = publisher.subscribers();
+                        let _ = timeout(ANSWER, connected.wait_for(|count| *count > 0)).await;
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
                         new = true;
@@ -291,7 +294,6 @@ impl<'a> Feed<'a> {
         &mut self,
         topic: &str,
         usual: Option<&str>,
-        latch: bool,
     ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
         let asked = match timeout(ANSWER, self.bus.topic_type(topic)).await {
             Ok(Ok(wire)) => wire.name,
@@ -319,7 +321,7 @@ impl<'a> Feed<'a> {
                 md5: message.md5().to_owned(),
                 definition: message.full_text().to_owned(),
             },
-            latch,
+            latch: false,
             queue: 10,
         };
         let publisher = self.bus.advertise(topic, options).await;

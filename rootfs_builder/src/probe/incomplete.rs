@@ -7,6 +7,7 @@ use package::interface::{Direction, Interface};
 use super::feed::Feed;
 use super::{Found, ProbeOptions};
 
+const ACTION_ENDS: [&str; 5] = ["/goal", "/cancel", "/status", "/feedback", "/result"];
 const STATE: &str = "state what is missing with --interface FILE";
 
 /// Marks what is not in `bare`, the interface before anything was given: a servant has it only once its robot gives
@@ -17,7 +18,7 @@ pub(super) fn mark_late(interface: &mut Interface, bare: &Interface) {
             other.name == topic.name && other.direction == topic.direction
         };
         match bare.topics.iter().find(same) {
-            Some(before) => topic.lazy = before.lazy,
+            Some(before) => topic.lazy |= before.lazy,
             None => topic.lazy = true,
         }
     }
@@ -30,6 +31,32 @@ pub(super) fn mark_late(interface: &mut Interface, bare: &Interface) {
     let late: BTreeSet<&String> = new_services.chain(new_actions).collect();
     let late = late.into_iter().cloned().collect();
     interface.late = late;
+}
+
+/// Keeps inputs that were there before and are no more: a node that waits for one message listens no longer once it
+/// has come, and waits for it anew in every servant.
+pub(super) fn keep_inputs(interface: &mut Interface, before: Interface) {
+    let gone = before.topics.into_iter().filter(|topic| {
+        let same = |other: &package::interface::Topic| {
+            other.name == topic.name && other.direction == topic.direction
+        };
+        let of_an_action = interface.actions.iter().any(|action| {
+            let end = topic.name.strip_prefix(action.name.as_str());
+            end.is_some_and(|end| ACTION_ENDS.contains(&end))
+        });
+        topic.direction == Direction::Input && !of_an_action && !interface.topics.iter().any(same)
+    });
+    let gone: Vec<_> = gone
+        .map(|topic| package::interface::Topic {
+            lazy: true,
+            ..topic
+        })
+        .collect();
+    interface.topics.extend(gone);
+    for (key, text) in before.definitions {
+        interface.definitions.entry(key).or_insert(text);
+    }
+    interface.sort();
 }
 
 /// What is known of a package one of whose nodes ended of what it was given.

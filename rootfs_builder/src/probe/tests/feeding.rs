@@ -126,6 +126,8 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
         }
         let mut map = node.hears("/map", "std_msgs/String").await;
         map.messages.recv().await.expect("told");
+        // One was enough, as after wait_for_message.
+        drop(map);
         let turn = node.registry.action("lab/Turn").expect("defined");
         // As move_base does: it sends itself goals.
         let own_goals = node
@@ -143,7 +145,7 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
             .tells("/turn/result", node.wire(turn.action_result.name()))
             .await;
         (
-            transforms, map, own_goals, goals, cancel, status, feedback, result,
+            transforms, own_goals, goals, cancel, status, feedback, result,
         )
     });
 
