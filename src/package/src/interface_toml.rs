@@ -13,7 +13,6 @@ const MAX_BYTES: u64 = 16 << 20;
 
 /// Keys that may stand in each table of a file.
 const KEYS: [(&str, &[&str]); 6] = [
-    ("late", &[]),
     (
         "topics",
         &[
@@ -30,6 +29,7 @@ const KEYS: [(&str, &[&str]); 6] = [
     ("actions", &["name", "type", "node"]),
     ("parameters", &["name", "value", "read_by", "written_by"]),
     ("needs", &["name", "nodes"]),
+    ("late", &[]),
 ];
 
 impl Interface {
