@@ -38,7 +38,7 @@ fn begins_a_trial(daemon: &Daemon) -> anyhow::Result<TcpStream> {
 pub fn what_is_begun_and_never_ended_costs_its_owner() -> Told {
     let daemon = world()
         .own("memory")
-        .config("[memory]\nclient = \"8M\"\nunfinished = \"3s\"\n")
+        .config("[memory]\nclient = \"8M\"\nunfinished = \"8s\"\n")
         .start()?;
     daemon
         .deployer()

@@ -17,6 +17,10 @@ use ws::frame::{BINARY, TEXT};
 /// What becomes of a message counts in no budget up to this size: the lengths of queues bound it.
 const UNCOUNTED: usize = 64 * 1024;
 
+/// A message becomes at most about so many times longer (an array of booleans does), and what it always has besides.
+const LONGEST: usize = 8;
+const SHORT: usize = 4 * 1024;
+
 /// A whole WebSocket message, ready to be sent to anyone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Frame {
@@ -197,10 +201,10 @@ impl Sample {
             Compression::Cbor => 1,
             Compression::CborRaw => 2,
         };
-        let hint = self.types.sizes[slot]
-            .load(Ordering::Relaxed)
-            .max(self.bytes.len())
-            + 128;
+        let length = self.bytes.len();
+        let last = self.types.sizes[slot].load(Ordering::Relaxed);
+        // The last one may have been of quite another size.
+        let hint = last.min(LONGEST * length + SHORT).max(length) + 128;
         let full = |full: budget::Exceeded| {
             Arc::<str>::from(format!(
                 "a message from {} is left out: {full}",

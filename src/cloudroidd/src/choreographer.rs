@@ -48,7 +48,7 @@ use crate::state::{self, State};
 pub use handle::{Asked, Handle, Lease};
 pub use limits::engine_limits;
 pub(crate) use nodes::how_it_ended;
-pub use tail::{last as last_log_lines, read as read_log, record as log_record};
+pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
 use driver::Beginning;
 use spares::Spares;

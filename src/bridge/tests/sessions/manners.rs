@@ -241,6 +241,89 @@ async fn a_connection_without_servant_is_refused_with_a_status() {
 }
 
 #[tokio::test]
+async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
+    let budget = budget::Budget::new("servant x", 4 << 20);
+    let options = BridgeOptions {
+        budget: budget.clone(),
+        max_encoded: 3 << 20,
+        ..BridgeOptions::default()
+    };
+    let world = World::with(options).await;
+    let publisher = world
+        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
+        .await;
+    let mut client = world.client().await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/big"}))
+        .await;
+    client.settled().await;
+    connected(publisher.as_ref(), 1).await;
+    let bytes = |length: usize| {
+        let mut message = (length as u32).to_le_bytes().to_vec();
+        message.resize(4 + length, 7);
+        bytes::Bytes::from(message)
+    };
+    publisher.publish(bytes(1 << 20));
+    let heard = client.json().await;
+    assert!(
+        heard["msg"]["data"]
+            .as_str()
+            .is_some_and(|data| data.len() > 1 << 20)
+    );
+    // As base64 it is more than may be.
+    publisher.publish(bytes(5 << 19));
+    let told = client.json().await;
+    assert!(
+        told["op"] == "status" && told["msg"].as_str().unwrap().contains("/big"),
+        "{told}"
+    );
+    // Others hold what there is for the servant.
+    let others = budget.take(budget.left()).unwrap();
+    publisher.publish(bytes(1 << 20));
+    publisher.publish(bytes(10));
+    let small = client.json().await;
+    assert_eq!(
+        small["msg"]["data"], "BwcHBwcHBwcHBw==",
+        "small ones do not count"
+    );
+    drop(others);
+    publisher.publish(bytes(1 << 20));
+    let heard = client.json().await;
+    assert!(
+        heard["msg"]["data"]
+            .as_str()
+            .is_some_and(|data| data.len() > 1 << 20)
+    );
+    drop(client);
+    patiently(async {
+        while budget.used() > 0 {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn fragments_that_do_not_fit_close_the_connection() {
+    let world = World::new().await;
+    let budget = budget::Budget::new("client x", 100_000);
+    let options = bridge::SessionOptions {
+        budget: budget.clone(),
+        ..bridge::SessionOptions::default()
+    };
+    let mut client = world.client_with(options).await;
+    for number in 0..3 {
+        let part = json!({"op": "fragment", "id": "a", "num": number, "total": 10, "data": "x".repeat(40_000)});
+        client.send(part).await;
+    }
+    let reason = client.refusal().await;
+    assert!(reason.contains("the memory for client x"), "{reason}");
+    assert_eq!(client.closed().await.0, 1013);
+    patiently(client.session).await.unwrap();
+    assert_eq!(budget.used(), 0);
+}
+
+#[tokio::test]
 async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
     let options = BridgeOptions {
         topic_bytes: 1 << 20,

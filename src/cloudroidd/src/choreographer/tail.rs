@@ -71,6 +71,11 @@ fn backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<
     Ok(())
 }
 
+/// Whether a line comes after the one with the number `last`. Its time says nothing: clocks are set back.
+pub fn is_after(line: &LogLine, last: Option<u64>) -> bool {
+    line.number.is_none() || line.number > last
+}
+
 /// A line as the API shows it.
 pub fn record(line: LogLine) -> api::LogLine {
     api::LogLine {
@@ -120,6 +125,33 @@ mod tests {
         assert_eq!(texts(2, None), ["2", "3"]);
         assert_eq!(texts(9, Some("/a")), ["1", "3"]);
         assert!(texts(0, None).is_empty());
+    }
+
+    #[test]
+    fn what_follows_is_known_by_its_place_and_not_by_its_time() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("log.jsonl");
+        let mut writer = servant::logs::Writer::create(&path, 1 << 20).expect("a log");
+        for number in 0..3 {
+            writer.append("/a", "stdout", &number.to_string());
+        }
+        let past = read(&path, 2, None);
+        let last = past.last().and_then(|line| line.number);
+        assert_eq!(last, Some(2));
+        // The clock was set back before the next line.
+        let next = LogLine {
+            number: Some(3),
+            time: SystemTime::UNIX_EPOCH,
+            ..past[1].clone()
+        };
+        assert!(is_after(&next, last));
+        assert!(!is_after(&past[1], last), "it was given already");
+        assert!(is_after(&past[0], None), "nothing was given");
+        let said = LogLine {
+            number: None,
+            ..next
+        };
+        assert!(is_after(&said, last), "of the log itself");
     }
 
     #[test]

@@ -48,7 +48,8 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
 fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let home = tempfile::tempdir().expect("a directory");
     let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
-    let store = image::Store::open(home.path()).expect("a store");
+    let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
+        .expect("a store");
     let choreographer = Choreographer::new(
         Arc::new(Config::default()),
         Arc::new(state),

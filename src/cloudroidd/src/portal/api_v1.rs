@@ -275,10 +275,10 @@ pub async fn logs(
     let past = futures_util::stream::iter(past).map(choreographer::log_record);
     match following {
         Some(future) => {
-            let new =
-                move |line: &servant::engine::LogLine| line.number.is_none() || line.number > last;
-            let future =
-                ReceiverStream::new(future).filter(move |line| std::future::ready(new(line)));
+            let new = move |line: &servant::engine::LogLine| {
+                std::future::ready(choreographer::is_after(line, last))
+            };
+            let future = ReceiverStream::new(future).filter(new);
             // A follower must not keep the daemon from ending.
             let ending = app.ending.clone().cancelled_owned();
             Ok(lines(
