@@ -191,7 +191,7 @@ mod tests {
 
     #[test]
     fn records_under_way_take_no_more_than_their_budget() {
-        let budget = Budget::new("servant x", 3 << 20);
+        let budget = Budget::new("servant x", 4 << 20);
         let mut incoming = Incoming::within(&budget);
         // Promises cost little.
         for stream in 0..2 {
@@ -199,7 +199,7 @@ mod tests {
             assert!(begun.expect("there is room").is_none());
         }
         assert_eq!(budget.used(), 2 * READ_AHEAD);
-        let more = vec![7; READ_AHEAD];
+        let more = vec![7; 2 * READ_AHEAD];
         let refused = incoming
             .more(0, &more)
             .and_then(|_| incoming.more(1, &more));
