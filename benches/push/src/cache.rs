@@ -18,10 +18,29 @@ pub(crate) fn copy(place: &Path) -> Result<PathBuf> {
         .context("neither XDG_CACHE_HOME nor HOME is set")?
         .join("cloudroid");
     let cache = place.join("cache");
-    for part in ["layers", "notes", "apt"] {
+    for part in ["layers", "chains", "notes", "apt"] {
         fill(&users.join(part), &cache.join("cloudroid").join(part))?;
     }
     Ok(cache)
+}
+
+/// Fills `to` with what `from` has of the base layer (by its digest) and of downloads, and nothing else.
+pub(crate) fn base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<()> {
+    let (from, to) = (from.join("cloudroid"), to.join("cloudroid"));
+    fill(&from.join("apt"), &to.join("apt"))?;
+    let (layers, kept) = (from.join("layers"), to.join("layers"));
+    fs::create_dir_all(&kept)?;
+    for entry in fs::read_dir(&layers)? {
+        let record = entry?.path();
+        let archive = record.with_extension("tar.gz");
+        if crate::packages::is_of(&record, base) && archive.exists() {
+            for path in [&record, &archive] {
+                let name = path.file_name().unwrap_or_default();
+                fs::copy(path, kept.join(name))?;
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Copies what is below `from`, where there is anything; layers and packages, which are replaced and never written to, by

@@ -1,8 +1,12 @@
-//! `make bench ONLY=push`: pushing a prebuilt install space again that has not changed, beside its first push. Needs root.
+//! `make bench ONLY=push`: what a push costs beside one that it shares something with: a package that needs nearly the
+//! same, a workspace of which one package changed, an install space that has not changed. Needs root.
 
 #![forbid(unsafe_code)]
 
 mod cache;
+mod packages;
+mod steps;
+mod workspace;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -34,6 +38,7 @@ fn main() -> Result<()> {
     push(&daemon, &first)?;
     let relay = relay_of(&daemon)?;
     let mut report = Report::new("push");
+    workspace::measure(&mut report, &daemon)?;
     for (package, size, data) in [
         ("small_space", "one node", 0),
         ("big_space", "one node and 64 MiB of data", MODEL),
@@ -46,6 +51,8 @@ fn main() -> Result<()> {
         }
         measure(&mut report, &daemon, &space, size)?;
     }
+    drop(daemon);
+    packages::measure(&mut report)?;
     report.finish()?;
     Ok(())
 }

@@ -75,6 +75,15 @@ impl Pushed {
             .collect())
     }
 
+    /// How long it took until the first step began: the daemon opens the archive's index and the base, once.
+    pub fn opening(&self) -> Duration {
+        let first = self
+            .events
+            .iter()
+            .find(|(_, event)| event["type"] == "step");
+        first.map_or(Duration::ZERO, |(time, _)| *time)
+    }
+
     /// How long the steps took whose titles begin like this: each lasts until the next, or to the end.
     pub fn step(&self, title: &str) -> Option<Duration> {
         let ends = |event: &Value| event["type"] == "step" || event["type"] == "done";
