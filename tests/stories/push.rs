@@ -1,8 +1,9 @@
 //! What a deployer pushes, and what comes of it.
 
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{path_str, run};
@@ -115,6 +116,205 @@ pub fn a_workspace_is_built_in_order() -> Told {
     let mut robot = daemon.robot("lab?robot=both")?;
     ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     ensure!(robot.calls("/greeter/count", json!({}))?["result"] == true);
+    Ok(())
+}
+
+/// A workspace of `aa_lib`, a library, and `bb_app`, a node that uses it, below `place`. `names` is what `bb_app`'s
+/// package.xml says of it.
+fn workspace_of_two(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
+    let workspace = place.join("two_ws");
+    let manifest = |name: &str, needs: &str| {
+        format!(
+            "<package format=\"2\"><name>{name}</name><version>1.0.0</version><description>A part.</description>\
+             <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>\
+             <buildtool_depend>catkin</buildtool_depend><depend>roscpp</depend><depend>std_msgs</depend>{needs}\
+             </package>\n"
+        )
+    };
+    let list = |name: &str, needs: &str, rest: &str| {
+        format!(
+            "cmake_minimum_required(VERSION 3.0.2)\nproject({name})\n\
+             find_package(catkin REQUIRED COMPONENTS roscpp std_msgs {needs})\n{rest}"
+        )
+    };
+    let library = "catkin_package(INCLUDE_DIRS include LIBRARIES aa_lib)\n\
+                   include_directories(include ${catkin_INCLUDE_DIRS})\nadd_library(aa_lib src/aa.cpp)\n\
+                   target_link_libraries(aa_lib ${catkin_LIBRARIES})\n\
+                   install(TARGETS aa_lib LIBRARY DESTINATION ${CATKIN_PACKAGE_LIB_DESTINATION})\n\
+                   install(DIRECTORY include/aa_lib/ DESTINATION ${CATKIN_PACKAGE_INCLUDE_DESTINATION})\n";
+    let node = "catkin_package()\ninclude_directories(${catkin_INCLUDE_DIRS})\nadd_executable(app src/app.cpp)\n\
+                target_link_libraries(app ${catkin_LIBRARIES})\n\
+                install(TARGETS app RUNTIME DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
+    // New to every cache: what this story says of compiling is true each time it is told.
+    let unique = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)?
+        .as_nanos();
+    for (path, text) in [
+        ("aa_lib/package.xml", manifest("aa_lib", "")),
+        ("aa_lib/CMakeLists.txt", list("aa_lib", "", library)),
+        (
+            "aa_lib/include/aa_lib/aa.h",
+            "#pragma once\n#include <string>\nstd::string aa();\n".into(),
+        ),
+        (
+            "aa_lib/src/aa.cpp",
+            format!("// {unique}\n#include <aa_lib/aa.h>\nstd::string aa() {{ return \"aa\"; }}\n"),
+        ),
+        ("bb_app/package.xml", manifest("bb_app", names)),
+        ("bb_app/CMakeLists.txt", list("bb_app", "aa_lib", node)),
+        (
+            "bb_app/src/app.cpp",
+            "#include <aa_lib/aa.h>\n#include <ros/ros.h>\n#include <std_msgs/String.h>\n\
+             int main(int argc, char** argv) {\n  ros::init(argc, argv, \"app\");\n  ros::NodeHandle node;\n\
+             \x20 auto said = node.advertise<std_msgs::String>(\"said\", 1, true);\n\
+             \x20 std_msgs::String text;\n  text.data = aa();\n  said.publish(text);\n  ros::spin();\n}\n"
+                .into(),
+        ),
+    ] {
+        let path = workspace.join("src").join(path);
+        std::fs::create_dir_all(path.parent().context("below")?)?;
+        std::fs::write(path, text)?;
+    }
+    Ok(workspace)
+}
+
+/// Pushes a workspace of two; its outcome, and the titles of its steps.
+fn push_of_two(
+    daemon: &Daemon,
+    workspace: &Path,
+    name: &str,
+) -> anyhow::Result<(support::deployer::Outcome, Vec<String>)> {
+    let outcome = daemon.deployer().types(&[
+        "--format",
+        "json",
+        "push",
+        path_str(workspace),
+        "--name",
+        name,
+        "--node",
+        "bb_app/app",
+    ])?;
+    let events = outcome.stdout.lines();
+    let events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let steps = events.filter(|event| event["type"] == "step");
+    let titles = steps.filter_map(|event| Some(event["title"].as_str()?.to_owned()));
+    let titles = titles.collect();
+    Ok((outcome, titles))
+}
+
+fn compiled(steps: &[String]) -> Vec<&str> {
+    let titles = steps
+        .iter()
+        .filter_map(|step| step.strip_prefix("compiling "));
+    titles.filter_map(|rest| rest.split(' ').next()).collect()
+}
+
+pub fn what_was_compiled_before_a_failure_stays_compiled() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
+    let source = workspace.join("src/bb_app/src/app.cpp");
+    let good = std::fs::read_to_string(&source)?;
+    std::fs::write(
+        &source,
+        good.replace("ros::spin()", "ros::no_such_function()"),
+    )?;
+    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
+    outcome.failed_saying(&["no_such_function"])?;
+    ensure!(compiled(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
+    std::fs::write(&source, &good)?;
+    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
+    outcome.succeeded()?;
+    ensure!(compiled(&steps) == ["bb_app"], "{steps:?}");
+    let mut robot = daemon.robot("of_two")?;
+    robot.subscribes("/said")?;
+    ensure!(robot.hears_on("/said")?["data"] == "aa");
+    // A change of what is at the bottom reaches what stands on it.
+    let library = workspace.join("src/aa_lib/src/aa.cpp");
+    let text = std::fs::read_to_string(&library)?;
+    std::fs::write(&library, text.replace("\"aa\"", "\"bb\""))?;
+    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
+    outcome.succeeded()?;
+    ensure!(compiled(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
+    let mut robot = daemon.robot("of_two?robot=later")?;
+    robot.subscribes("/said")?;
+    ensure!(robot.hears_on("/said")?["data"] == "bb");
+    Ok(())
+}
+
+pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
+    let list = workspace.join("src/bb_app/CMakeLists.txt");
+    let good = std::fs::read_to_string(&list)?;
+    std::fs::write(
+        &list,
+        good.replace("std_msgs aa_lib", "std_msgs aa_lib no_such_package"),
+    )?;
+    let (outcome, steps) = push_of_two(&daemon, &workspace, "unconfigured")?;
+    outcome.failed_saying(&["the build of bb_app failed", "no_such_package"])?;
+    ensure!(compiled(&steps).is_empty(), "{steps:?}");
+    Ok(())
+}
+
+pub fn a_package_may_use_others_that_it_does_not_name() -> Told {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let workspace = workspace_of_two(place.path(), "")?;
+    let (outcome, _) = push_of_two(&daemon, &workspace, "unnamed")?;
+    let outcome = outcome.succeeded()?;
+    ensure!(
+        outcome
+            .stdout
+            .contains("bb_app uses other packages of the workspace"),
+        "{}",
+        outcome.said()
+    );
+    let mut robot = daemon.robot("unnamed")?;
+    robot.subscribes("/said")?;
+    ensure!(robot.hears_on("/said")?["data"] == "aa");
+    let (outcome, steps) = push_of_two(&daemon, &workspace, "unnamed")?;
+    outcome.succeeded()?;
+    ensure!(compiled(&steps).is_empty(), "{steps:?}");
+    Ok(())
+}
+
+pub fn packages_with_the_same_libraries_share_their_layers() -> Told {
+    let daemon = world().shared()?;
+    let mut images = Vec::new();
+    for package in ["image_proc", "stereo_image_proc"] {
+        let outcome = daemon.deployer().types(&[
+            "--format", "json", "push", "--apt", package, "--node", package,
+        ])?;
+        let outcome = outcome.succeeded()?;
+        let events = outcome.stdout.lines();
+        let mut events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let done = events.find(|event| event["type"] == "done");
+        let done = done.with_context(|| format!("a done event in {}", outcome.stdout))?;
+        let layers = done["layers"].as_array().context("layers")?.clone();
+        ensure!(layers.len() < 20, "an image has few layers: {layers:#?}");
+        images.push(layers);
+    }
+    let [first, second] = &images[..] else {
+        bail!("two images");
+    };
+    let bytes = |layers: &[&Value]| -> u64 {
+        layers
+            .iter()
+            .filter_map(|layer| layer["size"].as_u64())
+            .sum()
+    };
+    let above_base = second.iter().filter(|layer| layer["name"] != "base");
+    let above_base: Vec<&Value> = above_base.collect();
+    let shared = above_base.iter().copied();
+    let shared: Vec<&Value> = shared
+        .filter(|layer| first.iter().any(|other| other["digest"] == layer["digest"]))
+        .collect();
+    ensure!(
+        bytes(&shared) * 10 > bytes(&above_base) * 9,
+        "nine tenths of what stands on the base are the same layers: {images:#?}"
+    );
     Ok(())
 }
 
