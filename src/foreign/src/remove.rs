@@ -64,12 +64,12 @@ impl Remover<'_> {
         let mut at = parent;
         let mut next = Some(name);
         loop {
-            if let Some(name) = next.take() {
-                if let Some((directory, left)) = self.enter(&at, &name, &stack)? {
-                    let above = identity(&self.stat(&at, &stack)?);
-                    at = directory;
-                    stack.push(Level { name, above, left });
-                }
+            if let Some(name) = next.take()
+                && let Some((directory, left)) = self.enter(&at, &name, &stack)?
+            {
+                let above = identity(&self.stat(&at, &stack)?);
+                at = directory;
+                stack.push(Level { name, above, left });
             }
             let Some(level) = stack.last_mut() else {
                 return Ok(());
@@ -142,13 +142,9 @@ impl Remover<'_> {
                 Err(error) => return Err(self.failed("remove", stack, &entry, error)),
             }
         }
-        if !left.is_empty() {
-            // Removing a directory needs the right to write the one it is in.
-            let _ = self.stat(&directory, stack).map(|stat| {
-                if stat.st_mode & 0o700 != 0o700 {
-                    let _ = rustix::fs::fchmod(&directory, Mode::RWXU);
-                }
-            });
+        // Removing a directory needs the right to write the one it is in.
+        if !left.is_empty() && self.stat(&directory, stack)?.st_mode & 0o700 != 0o700 {
+            let _ = rustix::fs::fchmod(&directory, Mode::RWXU);
         }
         Ok(Some((directory, left)))
     }
@@ -218,7 +214,7 @@ mod tests {
         symlink(&outside, root.join("a/link")).expect("linked");
         symlink("nowhere", root.join("dangling")).expect("linked");
         std::fs::set_permissions(root.join("a/b"), PermissionsExt::from_mode(0o500)).expect("set");
-        std::fs::set_permissions(root.join("a/c"), PermissionsExt::from_mode(0)).expect("set");
+        std::fs::set_permissions(root.join("a/c"), PermissionsExt::from_mode(0o000)).expect("set");
         remove(&root).expect("removed");
         assert!(!root.exists() && outside.join("f").exists());
         remove(&root).expect("gone already");
