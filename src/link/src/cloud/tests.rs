@@ -231,14 +231,12 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let mut starting_socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut starting_socket, &starting).await.unwrap();
     // … and one to end, after its robot has left it.
-    let (mut ending, _) = says(
-        &hub,
-        &Hello {
-            run: "a third life".into(),
-            ..hello("/ending", 1)
-        },
-    )
-    .await;
+    let another = Hello {
+        run: "a third life".into(),
+        ..hello("/ending", 1)
+    };
+    let begun = timeout(PATIENCE, says(&hub, &another)).await;
+    let (mut ending, _) = begun.expect("others hold it up");
     nodes.stuck.lock().insert("/ending".into());
     ending.queue_close(1000, "");
     let _ = std::future::poll_fn(|cx| ending.poll_flush(cx)).await;
