@@ -1,12 +1,14 @@
 //! Nodes that wait for their robot before they show all of themselves.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{Bus, ServiceHandler, ServiceType};
 use support::Told;
+use support::robot::PATIENCE;
 use support::site::Site;
 use support::world::world;
 
@@ -74,8 +76,6 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Told {
     let transforms = types.message("tf2_msgs/TFMessage")?;
     let transforms = advertises(&site, &app, "/tf", &transforms, false)?;
     let goals = advertises(&site, &app, "/move_base/goal", &action.action_goal, false)?;
-    with_log(site.connected(&*goals, 1), &stub)?;
-    let mut results = listens(&site, &app, "/move_base/result")?;
     let now = link::clock::now();
     let transform = Written::default()
         .word(1)
@@ -98,9 +98,31 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Told {
         .text("there")
         .word(7);
     let goal: Bytes = goal.0.into();
-    let drives = || {
+    // The action is there once the node has what it waits for.
+    let gives = || {
         transforms.publish(transform.clone());
         scans.publish(scan.clone());
+    };
+    let mut connected = goals.subscribers();
+    let deadline = Instant::now() + PATIENCE;
+    let there = |connected: &mut tokio::sync::watch::Receiver<usize>| {
+        let wait = async {
+            tokio::time::timeout(
+                Duration::from_millis(200),
+                connected.wait_for(|count| *count > 0),
+            )
+            .await
+            .is_ok()
+        };
+        site.runtime.block_on(wait)
+    };
+    while !there(&mut connected) {
+        ensure!(Instant::now() < deadline, "no action came: {}", stub.said());
+        gives();
+    }
+    let mut results = listens(&site, &app, "/move_base/result")?;
+    let drives = || {
+        gives();
         goals.publish(goal.clone());
     };
     let result = with_log(answers(&site, drives, &mut results), &stub)?;
