@@ -134,6 +134,7 @@ mod tests {
     fn node() -> LaunchNode {
         LaunchNode {
             name: "/a".into(),
+            named: true,
             package: "p".into(),
             executable: "x".into(),
             argv: vec!["/usr/lib/p/x".into(), "__name:=a".into()],

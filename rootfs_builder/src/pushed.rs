@@ -121,7 +121,7 @@ pub(crate) fn has_python(root: &Path) -> bool {
         let mut start = [0; 64];
         let read = entry
             .open()
-            .and_then(|mut file| Ok(file.read(&mut start).unwrap_or(0)))
+            .map(|mut file| file.read(&mut start).unwrap_or(0))
             .unwrap_or(0);
         let first = start[..read]
             .split(|byte| *byte == b'\n')

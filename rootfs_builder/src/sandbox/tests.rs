@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use async_trait::async_trait;
 use servant::endpoint::Endpoint;
-use servant::engine::{ContainerState, Enforced, LogLine, NodeEvent, Servant, Usage};
+use servant::engine::{Adopted, ContainerState, Enforced, LogLine, NodeEvent, Servant, Usage};
 use tokio::sync::{Notify, broadcast, watch};
 
 use super::*;
@@ -40,8 +40,8 @@ impl Engine for Pretended {
         }))
     }
 
-    async fn adopt(&self) -> Result<Vec<Arc<dyn Servant>>, servant::Error> {
-        Ok(Vec::new())
+    async fn adopt(&self) -> Result<Adopted, servant::Error> {
+        Ok(Adopted::default())
     }
 }
 

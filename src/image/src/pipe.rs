@@ -31,11 +31,11 @@ pub(crate) fn pipe<T, U: Send, E: Send>(
             chunk: Vec::with_capacity(CHUNK),
             broken: false,
         };
-        let filled = fill(&mut input).map(|value| {
+        let filled = fill(&mut input);
+        if filled.is_ok() {
             // A reader that has gone says itself why.
             let _ = input.flush();
-            value
-        });
+        }
         let broken = input.broken;
         drop(input);
         let consumed = consuming

@@ -50,9 +50,12 @@ impl Latched {
     }
 }
 
+/// By topic and publisher: the MD5 of its type, and who repeats it here.
+type Repeated = HashMap<(Arc<str>, Arc<str>), (String, Box<dyn Publisher>)>;
+
 /// One order after the other: only the first message of a publisher takes longer than a moment.
 async fn serve(place: Arc<Place>, mut orders: mpsc::UnboundedReceiver<Order>) {
-    let mut all: HashMap<(Arc<str>, Arc<str>), (String, Box<dyn Publisher>)> = HashMap::new();
+    let mut all = Repeated::new();
     while let Some(order) = orders.recv().await {
         let (topic, message) = match order {
             Order::Keep(topic, message) => (topic, message),
