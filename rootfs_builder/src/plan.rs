@@ -166,7 +166,8 @@ mod tests {
 
     #[test]
     fn what_no_launch_file_says_is_refused_as_a_whole() {
-        let changes: [(&str, fn(&mut LaunchNode)); 8] = [
+        type Change = fn(&mut LaunchNode);
+        let changes: [(&str, Change); 8] = [
             ("name", |node| node.name = "/a'$(cmd)'".into()),
             ("package", |node| node.package = "../p".into()),
             ("x'$(cmd)'y", |node| node.executable = "x'$(cmd)'y".into()),

@@ -166,11 +166,7 @@ mod tests {
             for frame in frames {
                 assert!(known.0.contains(*frame), "{frame} in {line:?}: {known:?}");
             }
-            assert_eq!(
-                known.0.len() - USUAL.len() >= frames.len(),
-                true,
-                "{known:?}"
-            );
+            assert!(known.0.len() - USUAL.len() >= frames.len(), "{known:?}");
             assert!(
                 !known.0.contains("the") && !known.0.contains("become"),
                 "{known:?}"

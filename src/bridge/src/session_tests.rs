@@ -38,7 +38,13 @@ async fn session(options: SessionOptions) -> (Session<DuplexStream>, DuplexStrea
     let socket = WebSocket::new(ours, b"", 1 << 20, 1 << 20);
     let number = client.outbox.attach();
     (
-        Session::new(socket, VecDeque::new(), client, number),
+        Session::new(
+            socket,
+            VecDeque::new(),
+            client,
+            number,
+            &budget::Budget::unlimited(),
+        ),
         theirs,
     )
 }

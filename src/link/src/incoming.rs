@@ -195,7 +195,7 @@ mod tests {
         let mut incoming = Incoming::within(&budget);
         // Promises cost little.
         for stream in 0..2 {
-            let begun = incoming.begin(stream, stream + 1, 100 << 20, b"x");
+            let begun = incoming.begin(stream, u64::from(stream) + 1, 100 << 20, b"x");
             assert!(begun.expect("there is room").is_none());
         }
         assert_eq!(budget.used(), 2 * READ_AHEAD);

@@ -9,23 +9,13 @@ use crate::control::{Input, Resume};
 use crate::record::Record;
 
 /// A servant whose nodes run from when they are started, and say nothing.
+#[derive(Default)]
 struct Quiet {
     running: Mutex<BTreeSet<String>>,
     warnings: Mutex<Vec<String>>,
     /// Nodes that neither start nor end.
     stuck: Mutex<BTreeSet<String>>,
     signals: watch::Sender<Vec<(String, i32)>>,
-}
-
-impl Default for Quiet {
-    fn default() -> Self {
-        Self {
-            running: Mutex::default(),
-            warnings: Mutex::default(),
-            stuck: Mutex::default(),
-            signals: watch::Sender::default(),
-        }
-    }
 }
 
 impl Quiet {

@@ -281,7 +281,7 @@ mod tests {
         run(&mut nodes, node("/again", false, true), 3);
         run(&mut nodes, node("/needed", true, true), 4);
         run(&mut nodes, node("/pausing", false, true), 5);
-        let mut end = |nodes: &mut Nodes, pid| {
+        let end = |nodes: &mut Nodes, pid| {
             let ended = nodes.exited(pid, exit_of(0, false));
             ended.map(|(_, consequence)| consequence)
         };
