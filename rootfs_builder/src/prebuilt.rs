@@ -63,7 +63,8 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
 }
 
 async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<Made, Error> {
-    let root = space.root.clone();
+    let root = &space.root;
+    let root = root.canonicalize().at("opening", root)?;
     let hashed = root.clone();
     let content = crate::blocking::spawn(move || key::tree(&hashed)).await??;
     let key = Key::new("prebuilt")

@@ -90,9 +90,11 @@ impl Units {
         let mut own = BTreeSet::new();
         let mut sources = Vec::new();
         for package in packages {
+            // It may stand behind a link that stays inside, as the workspace was searched.
             let directory = root.join(&package.path);
+            let directory = directory.canonicalize().at("opening", &directory)?;
             sources.push(key::sources(&directory)?);
-            own.insert(directory.canonicalize().at("opening", &directory)?);
+            own.insert(directory);
         }
         let rest = place.join("rest");
         fs::create_dir(&rest).at("making", &rest)?;

@@ -290,7 +290,7 @@ pub fn what_a_stub_cannot_do_is_said() -> Told {
         (
             format!("{server}service = \"greeter_cpp\""),
             "no_such",
-            "no executable no_such",
+            "not pushed with the executable no_such",
         ),
         (
             format!("{server}service = \"greeter_cpp\"\ntoken_file = \"/nowhere/token\""),

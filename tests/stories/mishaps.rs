@@ -355,14 +355,14 @@ export ROS_MASTER_URI=http://localhost:{port}
 rosmaster --core -p {port} > /dev/null 2>&1 & master=$!
 until rosparam list > /dev/null 2>&1; do kill -0 $master; sleep 0.1; done
 rosrun teller_py teller.py > said 2>&1 &
-timeout 60 rostopic echo -n 1 -p /usual_name/told; cat said"#,
+timeout 60 rostopic echo -n 1 -p /teller/told; cat said"#,
         port = free_port()?
     );
     let outcome = machine.runs("bash", &script)?.succeeded()?;
     for words in [
         "nobody",
         "running the local original instead",
-        "life 1 of /usual_name",
+        "life 1 of /teller",
     ] {
         ensure!(
             outcome.stdout.contains(words),

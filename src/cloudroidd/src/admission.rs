@@ -92,6 +92,8 @@ pub enum Refused {
 
 struct Waiter {
     wanted: Amount,
+    /// Those behind it that fit go before it.
+    yields: bool,
     admit: oneshot::Sender<Permit>,
 }
 
@@ -192,21 +194,21 @@ impl Book {
         })
     }
 
-    /// Admits from the queue's head as far as there is room; the head is never overtaken, or big servants
-    /// would wait for ever.
+    /// Admits from the queue's head as far as there is room. A robot is never overtaken, or big servants would wait
+    /// for ever; a push is, or a big one would keep robots waiting.
     fn admit_waiting(&mut self, book: &Arc<Mutex<Book>>) -> Vec<(oneshot::Sender<Permit>, Permit)> {
         let mut admitted = Vec::new();
-        while let Some(head) = self.waiting.pop_front() {
-            if head.admit.is_closed() {
+        let mut blocked = false;
+        for waiter in std::mem::take(&mut self.waiting) {
+            if waiter.admit.is_closed() {
                 continue;
             }
-            match self.take(head.wanted, book) {
-                Some(permit) => admitted.push((head.admit, permit)),
-                None => {
-                    self.waiting.push_front(head);
-                    break;
-                }
+            if !blocked && let Some(permit) = self.take(waiter.wanted, book) {
+                admitted.push((waiter.admit, permit));
+                continue;
             }
+            blocked |= !waiter.yields;
+            self.waiting.push_back(waiter);
         }
         admitted
     }
@@ -271,22 +273,49 @@ impl Admission {
         deadline: Duration,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Refused> {
+        self.wait(wanted, false, deadline, on_wait).await
+    }
+
+    /// The same for what is nobody's robot: whoever waits and fits goes before it, and it takes no robot's place in the
+    /// queue.
+    pub async fn admit_yielding(
+        &self,
+        wanted: Amount,
+        deadline: Duration,
+        on_wait: impl FnOnce(),
+    ) -> Result<Permit, Refused> {
+        self.wait(wanted, true, deadline, on_wait).await
+    }
+
+    async fn wait(
+        &self,
+        wanted: Amount,
+        yields: bool,
+        deadline: Duration,
+        on_wait: impl FnOnce(),
+    ) -> Result<Permit, Refused> {
         self.check(wanted)?;
         let admitted = {
             let mut book = self.book.lock();
             book.waiting.retain(|waiter| !waiter.admit.is_closed());
-            if book.waiting.is_empty()
-                && let Some(permit) = book.take(wanted, &self.book)
-            {
+            let robots = book.waiting.iter().filter(|waiter| !waiter.yields).count();
+            let first = if yields {
+                book.waiting.is_empty()
+            } else {
+                robots == 0
+            };
+            if first && let Some(permit) = book.take(wanted, &self.book) {
                 return Ok(permit);
             }
-            if book.waiting.len() >= book.queue {
-                return Err(Refused::QueueFull {
-                    waiting: book.waiting.len(),
-                });
+            if !yields && robots >= book.queue {
+                return Err(Refused::QueueFull { waiting: robots });
             }
             let (admit, admitted) = oneshot::channel();
-            book.waiting.push_back(Waiter { wanted, admit });
+            book.waiting.push_back(Waiter {
+                wanted,
+                yields,
+                admit,
+            });
             admitted
         };
         let given_up = GivenUp { book: &self.book };
@@ -387,6 +416,31 @@ mod tests {
             .await
             .expect_err("too big");
         assert!(matches!(refused, Refused::TooBig { .. }), "{refused}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn robots_that_fit_go_before_a_push_that_does_not() {
+        let room = machine(1);
+        let half = room
+            .admit(Amount::new(1.0, 0), SECOND, || {})
+            .await
+            .expect("room");
+        let push = room.admit_yielding(Amount::new(2.0, 0), SECOND * 9, || {});
+        tokio::pin!(push);
+        tokio::select! {
+            biased;
+            _ = &mut push => panic!("no room for the push"),
+            () = tokio::task::yield_now() => {}
+        }
+        let small = room
+            .admit(Amount::new(0.5, 0), SECOND, || panic!("it fits"))
+            .await
+            .expect("room beside the push that waits");
+        // It takes no robot's place in the queue of one, and a robot behind it is admitted when there is room.
+        let other = room.admit(Amount::new(1.0, 0), SECOND, || drop(half));
+        let other = other.await.expect("room came free");
+        drop((small, other));
+        push.await.expect("all robots have left");
     }
 
     #[tokio::test(start_paused = true)]

@@ -302,7 +302,7 @@ impl Choreographer {
         };
         self.inner
             .admission
-            .admit(wanted, deadline, make_room)
+            .admit_yielding(wanted, deadline, make_room)
             .await
     }
 

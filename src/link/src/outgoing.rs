@@ -79,8 +79,13 @@ impl Out {
         self.head.len() + self.payload.len()
     }
 
+    /// Bytes of memory, with the message before it was encoded.
+    fn held(&self) -> usize {
+        self.len() + self.plain.as_ref().map_or(0, Bytes::len)
+    }
+
     fn is_big(&self) -> bool {
-        self.len() > SMALL
+        self.held() > SMALL
     }
 
     /// Bytes from `at` on, at most `length`.
@@ -440,7 +445,7 @@ impl Outgoing {
     }
 
     fn is_sent_again(&self, out: &Out) -> bool {
-        let room = self.kept.len() < KEPT.0 && self.kept_bytes + out.len() <= KEPT.1;
+        let room = self.kept.len() < KEPT.0 && self.kept_bytes + out.held() <= KEPT.1;
         let wanted = if out.is_big() {
             out.each && self.kept.len() < KEPT.0 && budget::has_room(self.kept_big, out)
         } else {
@@ -465,7 +470,7 @@ impl Outgoing {
         let kept = match out.channel {
             Some(channel) if !again => Kept::Not(channel),
             _ => {
-                *self.bytes_kept(&out) += out.len();
+                *self.bytes_kept(&out) += out.held();
                 Kept::Again(out)
             }
         };
@@ -492,7 +497,7 @@ impl Outgoing {
     pub(crate) fn acknowledge(&mut self, number: u64) {
         while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, Kept::Again(out))) = self.kept.pop_front() {
-                *self.bytes_kept(&out) -= out.len();
+                *self.bytes_kept(&out) -= out.held();
                 // All that went before it has come, too.
                 if let Some(channel) = out.channel.filter(|_| out.closes) {
                     self.topics.remove(&channel);

@@ -77,7 +77,12 @@ impl Topic {
     fn publish(&self, latched: &mut Latched, message: Bytes, latching: bool) {
         match &mut latched.advertised {
             Advertised::Kept(publisher) => publisher.publish(message),
-            Advertised::Asked(waiting) => waiting.push(message),
+            Advertised::Asked(waiting) => {
+                if waiting.len() >= QUEUE {
+                    waiting.remove(0);
+                }
+                waiting.push(message);
+            }
             Advertised::Not if latching => {
                 latched.advertised = Advertised::Asked(vec![message]);
                 self.news.notify_one();
@@ -315,26 +320,35 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
         .lock()
         .iter()
         .find_map(|(name, known)| Arc::ptr_eq(known, topic).then(|| name.clone()));
-    let Some(name) = name else { return };
     let wire_type = mirror
         .types
         .lock()
         .values()
         .find(|known| known.md5 == topic.md5)
         .cloned();
-    let Some(wire_type) = wire_type else { return };
-    let options = AdvertiseOptions {
-        wire_type,
-        latch: true,
-        queue: QUEUE,
-    };
-    if let Ok(publisher) = mirror.bus.advertise(&name, options).await {
-        let mut latched = topic.latched.lock();
-        if let Advertised::Asked(waiting) = &mut latched.advertised {
-            for message in waiting.drain(..) {
-                publisher.publish(message);
-            }
-            latched.advertised = Advertised::Kept(publisher);
+    let advertised = match (name, wire_type) {
+        (Some(name), Some(wire_type)) => {
+            let options = AdvertiseOptions {
+                wire_type,
+                latch: true,
+                queue: QUEUE,
+            };
+            mirror.bus.advertise(&name, options).await.ok()
         }
+        _ => None,
+    };
+    let mut latched = topic.latched.lock();
+    let Advertised::Asked(waiting) = &mut latched.advertised else {
+        return;
+    };
+    let waiting = std::mem::take(waiting);
+    // Without one they are heard all the same; the next latched message asks again.
+    let publisher = advertised.as_ref().unwrap_or(&topic.publisher);
+    for message in waiting {
+        publisher.publish(message);
     }
+    latched.advertised = match advertised {
+        Some(publisher) => Advertised::Kept(publisher),
+        None => Advertised::Not,
+    };
 }

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use api::PushOptions;
 use package::interface::Interface;
+use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
 use ros::bus::{Bus, Graph};
@@ -127,8 +128,13 @@ fn names(graph: &Graph, unnamed: &[usize]) -> Vec<(usize, String)> {
         let only = (unnamed.len() == 1)
             .then(|| graph.nodes.keys().find(|node| *node != NODE))
             .flatten();
-        if let Some(name) = own.or(only.map(|name| name.trim_start_matches('/'))) {
-            names.push((*index, without_random_end(name).to_owned()));
+        let said = own.or(only.map(|name| name.trim_start_matches('/')));
+        // Whatever a program registers is what a stranger says.
+        let said = said
+            .map(without_random_end)
+            .filter(|name| is_graph_name(&format!("/{name}")));
+        if let Some(name) = said {
+            names.push((*index, name.to_owned()));
         }
     }
     names
@@ -287,6 +293,7 @@ mod tests {
             nodes: [
                 "/cloudroid_name_0/costmap_2d",
                 "/cloudroid_name_3/talker_71_1700000000123",
+                "/cloudroid_name_4/x'$(cmd)'",
                 NODE,
             ]
             .map(|name| (name.to_owned(), String::new()))

@@ -13,13 +13,15 @@ const LITTLE: usize = 1 << 20;
 
 /// Whether this one may be kept beside so many bytes of others: the only one may be of any size.
 pub(super) fn has_room(kept: usize, out: &Out) -> bool {
-    kept == 0 || kept + out.len() <= EACH
+    kept == 0 || kept + out.held() <= EACH
 }
 
 /// How many of them wait on a topic, and their bytes.
 fn load(waiting: &VecDeque<Out>) -> (usize, usize) {
     let all = waiting.iter().filter(|out| out.counts());
-    all.fold((0, 0), |(count, bytes), out| (count + 1, bytes + out.len()))
+    all.fold((0, 0), |(count, bytes), out| {
+        (count + 1, bytes + out.held())
+    })
 }
 
 impl Out {
@@ -38,7 +40,7 @@ impl Outgoing {
             let topics: Vec<(u32, (usize, usize))> = topics.collect();
             let all: usize = topics.iter().map(|(_, (_, bytes))| bytes).sum();
             let last = self.topics.get(&channel).and_then(VecDeque::back);
-            if all - last.map_or(0, Out::len).min(all) <= EACH {
+            if all - last.map_or(0, Out::held).min(all) <= EACH {
                 return;
             }
             let size = |&&(_, (_, bytes)): &&(u32, (usize, usize))| bytes;
