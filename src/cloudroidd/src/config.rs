@@ -40,9 +40,9 @@ pub struct Config {
     pub servant: Servant,
     /// What clients may do.
     pub portal: Portal,
-    /// What may be held for clients and servants.
+    /// Limits of memory outside of servants' containers.
     pub memory: Memory,
-    /// How big pushes may be.
+    /// Limits of pushes.
     pub push: Push,
     /// What pushes may ask for beyond a container.
     pub allow: Allow,
@@ -90,7 +90,7 @@ pub struct Servant {
     pub reserve_cpus: f64,
     /// Memory promised to a servant whose push asked for none.
     pub reserve_memory: Size,
-    /// From asked for to Ready.
+    /// How long a servant may take from its request to ready.
     pub start: Time,
     /// How long a robot's servant is kept after its last connection.
     pub grace: Time,
@@ -120,35 +120,35 @@ pub struct Portal {
     pub max_message: Size,
     /// Biggest WebSocket frame.
     pub max_frame: Size,
-    /// Between pings; 0: none are sent.
+    /// Time between pings; 0: none are sent.
     pub ping: Time,
     /// A connection from which nothing came for so long, not even a pong, is closed; 0: never.
     pub idle: Time,
-    /// Most JSON or CBOR that one message of a servant may become.
+    /// Bytes of JSON or CBOR that one message of a servant may become; a bigger one is not sent.
     pub max_encoded: Size,
     /// How NaN and infinities are written in JSON.
     pub non_finite: NonFinite,
-    /// For a request's header, and for the `auth` message where that is awaited.
+    /// How long a request's header may take, and the `auth` message where one is awaited.
     pub handshake: Time,
-    /// For connections to end when the daemon does.
+    /// How long connections may take to end when the daemon ends.
     pub drain: Time,
 }
 
-/// What may be held outside of servants' containers: in the daemon for clients and servants, and in shims.
+/// Limits of memory outside of servants' containers: in the daemon, and in shims.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Memory {
-    /// By the daemon for all together; by default a quarter of the machine's memory, at most 1G.
+    /// All clients and servants together, in the daemon; by default a quarter of the machine's memory, at most 1G.
     pub daemon: Option<Size>,
-    /// For one client: messages that it has begun to send, and bodies of its requests.
+    /// One client: its unfinished messages, and bodies of its requests.
     pub client: Size,
-    /// For one servant: messages that its nodes and links have begun to send, and JSON made of its messages.
+    /// One servant: unfinished messages of its nodes and links, and JSON or CBOR made of its messages.
     pub servant: Size,
-    /// A message, frame or body that was begun must be complete within this time.
+    /// Time from the first byte of a message, frame or body to its last.
     pub unfinished: Time,
-    /// By one servant's shim, in a cgroup of its own.
+    /// Memory of one servant's shim, in a cgroup of its own.
     pub shim: Size,
-    /// Cores for one servant's shim; it never has more than its servant, and a tenth at least.
+    /// Cores of one servant's shim; limited to its servant's, but never to less than 0.1.
     pub shim_cpus: f64,
 }
 
@@ -168,23 +168,23 @@ pub struct Allow {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Push {
-    /// The archive as sent.
+    /// Bytes of the archive as sent.
     pub archive: Size,
-    /// The files in it, unpacked.
+    /// Bytes of the files in it, unpacked.
     pub unpacked: Size,
-    /// How many files.
+    /// How many files the archive may have.
     pub entries: u64,
     /// How long the nodes may take to show their interface.
     pub probe: Time,
-    /// How long nothing of the archive may come before the push is ended.
+    /// How long the archive may pause while it is sent.
     pub stall: Time,
     /// Pushes that are built at once; others wait.
     pub at_once: usize,
     /// Pushes that may wait.
     pub queue: usize,
-    /// From a push's turn to its end.
+    /// Time from the start of a push's build (after waiting) to its end.
     pub time: Time,
-    /// The files of a push while it is built.
+    /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
     pub disk: Size,
     /// Cores of each container of a build; as many as servants leave when not set.
     pub cpus: Option<f64>,
@@ -298,7 +298,7 @@ impl Default for Push {
 }
 
 impl Push {
-    /// Of each container of a build.
+    /// Limits of each container of a build.
     pub fn limits(&self) -> servant::spec::Limits {
         servant::spec::Limits {
             cpus: self.cpus,
@@ -429,7 +429,7 @@ impl Config {
 }
 
 impl Memory {
-    /// What nothing could work with.
+    /// Bytes below which nothing works.
     const LEAST: u64 = 1 << 20;
     const LEAST_FOR_A_SHIM: u64 = 32 << 20;
 
