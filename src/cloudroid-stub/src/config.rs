@@ -16,8 +16,8 @@
 //! output = "/people"   # which output those two are about; the one that answers the node's requests where absent
 //! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
 //!
-//! fallback_after = 3.0 # where no time, rate or age is promised: seconds without a link after which the local original
-//!                      # stands in, until the link is back
+//! fallback_after = 3.0 # where no time, rate or age is promised: seconds for which the link is down before the local
+//!                      # original takes over, until the link is up again
 //! call_limit = 600.0   # seconds that a service of the robot may take when the node in the cloud calls it
 //!
 //! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed,
@@ -53,7 +53,7 @@ pub use parameters::{Group, groups};
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
 
-/// No time, rate or count of a configuration is as much.
+/// Times, rates and counts of a configuration must be less than this.
 const MOST: f64 = 1e6;
 
 /// How the stub is to behave.
@@ -64,7 +64,7 @@ pub struct Config {
     pub server: String,
     /// The service's name.
     pub service: String,
-    /// The bearer token itself. Better in a file, which fewer can read.
+    /// The bearer token itself; prefer `token_file`, which only its owner can read.
     #[serde(default)]
     pub token: Option<String>,
     /// A file that holds it.
@@ -100,10 +100,10 @@ pub struct Config {
     /// `auto`, or `INPUT -> OUTPUT`.
     #[serde(default)]
     pub request: Option<String>,
-    /// Seconds without a link after which the local original stands in, where no time, rate or age is promised.
+    /// Seconds for which the link is down before the local original takes over, where no time, rate or age is promised.
     #[serde(default = "fallback_after")]
     pub fallback_after: f64,
-    /// Seconds that a service of the robot may take when it is called for the node in the cloud.
+    /// Seconds that a service of the robot may take when the node in the cloud calls it.
     #[serde(default = "call_limit")]
     pub call_limit: f64,
     /// When the local original runs.
@@ -121,7 +121,7 @@ pub struct Config {
     /// How messages are made smaller on the link.
     #[serde(default)]
     pub codec: Codec,
-    /// How good JPEG pictures are, 1 to 100.
+    /// Quality of JPEG pictures, 1 to 100.
     #[serde(default)]
     pub quality: Option<f64>,
     /// Executable → the name its node has when none is given.
@@ -129,7 +129,7 @@ pub struct Config {
     pub nodes: BTreeMap<String, String>,
 }
 
-/// [`Config::fallback_after`] where nothing else is said.
+/// Default of [`Config::fallback_after`], seconds.
 pub const FALLBACK_AFTER: f64 = 3.0;
 
 fn fallback_after() -> f64 {
@@ -141,18 +141,18 @@ fn call_limit() -> f64 {
 }
 
 impl Config {
-    /// After so many seconds without an answer, or a frame, the promise is broken.
+    /// Seconds without an answer, or without a frame, after which the promise is broken.
     pub fn longest(&self) -> Option<f64> {
         let interval = self.frames_per_second.map(|rate| 1.0 / rate);
         self.max.or(interval).or(self.age)
     }
 
-    /// How good pictures are where they lose detail, 1 to 100.
+    /// Quality of JPEG pictures, 1 to 100; none: the codec's own, 80.
     pub fn quality(&self) -> Option<u8> {
         self.quality.map(|quality| quality as u8)
     }
 
-    /// [`call_limit`](Self::call_limit) as a time.
+    /// [`call_limit`](Self::call_limit) as a duration.
     pub fn call_limit(&self) -> Duration {
         Duration::from_secs_f64(self.call_limit)
     }
@@ -235,7 +235,7 @@ pub enum Local {
     None,
 }
 
-/// What becomes of stamps while the clocks of robot and cloud differ.
+/// How stamps are treated while the clocks of robot and cloud differ.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Stamps {
@@ -252,12 +252,12 @@ pub enum Stamps {
 pub enum Codec {
     /// Not at all.
     None,
-    /// As it pays, without loss.
+    /// Where it saves time, without loss.
     #[default]
     Auto,
-    /// As it pays; pictures may lose detail, each as a JPEG.
+    /// Where it saves time; pictures may lose detail, each as a JPEG.
     Jpeg,
-    /// As it pays; pictures may lose detail, as H.264.
+    /// Where it saves time; pictures may lose detail, as H.264.
     Video,
 }
 
@@ -271,7 +271,7 @@ impl Codec {
         }
     }
 
-    /// What is wrong with this choice, if `decoded` are the codecs that the server has, and what to do.
+    /// Why this choice has no effect with a server that decodes the codecs `decoded`, and what to do; none if it has.
     pub fn unmet(self, decoded: &[String]) -> Option<String> {
         let lossy = self.lossy()?;
         let name = lossy.name();
