@@ -115,10 +115,8 @@ pub enum Error {
         /// The last lines it printed.
         last_lines: String,
     },
-    /// The package's code put something else in the place of the plan of what to run.
-    #[error(
-        "the plan of what to run is refused, because its container's answer cannot be one: {problem}"
-    )]
+    /// The launch plan is not one that the launch script writes; the package's code may have replaced it.
+    #[error("the launch plan that the container wrote is not valid: {problem}")]
     BadPlan {
         /// What is wrong with it.
         problem: String,

@@ -1,8 +1,8 @@
 //! The plan of what to run, as it comes out of the package's own container.
 //!
-//! The script that resolves launch files runs beside the package's code, which can put anything in its answer's place.
-//! So the answer is read beneath a descriptor and up to a limit, and believed in nothing: what is no plan that the
-//! script could have made is refused as a whole.
+//! The script that resolves launch files runs beside the package's code, which can replace the script's answer. So the
+//! answer is read beneath a directory descriptor and up to a size, every value is checked, and an answer that the
+//! script could not have written is refused as a whole.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -19,9 +19,9 @@ const MAX_BYTES: u64 = 32 << 20;
 const MAX_NODES: usize = 256;
 const MAX_PARAMETERS: usize = 20_000;
 const MAX_WARNINGS: usize = 1000;
-/// What an `execve` takes at most is 2 MiB, arguments and environment together.
+/// Bytes of arguments, or of environment; `execve` takes 2 MiB of both together.
 const MAX_WORDS: usize = 1 << 20;
-/// The longest that a node may wait before it comes again: a day, in seconds.
+/// Longest respawn_delay of a node: a day, in seconds.
 const MAX_DELAY: f64 = 86_400.0;
 
 /// The bytes of the answer in `out`; none when there is none.
@@ -30,7 +30,7 @@ pub(crate) fn read(out: &Path) -> Result<Option<Vec<u8>>, Error> {
     Ok(file.map(|file| file.bytes))
 }
 
-/// Refuses what cannot be a plan.
+/// Refuses an answer that the script could not have written.
 pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
     let refused = |problem: String| Err(Error::BadPlan { problem });
     for (what, count, limit) in [
@@ -39,7 +39,9 @@ pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
         ("warnings", answer.warnings.len(), MAX_WARNINGS),
     ] {
         if count > limit {
-            return refused(format!("it has {count} {what}, and {limit} are possible"));
+            return refused(format!(
+                "it has {count} {what}, and {limit} are allowed at most"
+            ));
         }
     }
     let mut seen = BTreeSet::new();
@@ -56,7 +58,7 @@ pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
     }
     let bad = |name: &&String| !names::is_graph_name(name) && !is_parameter(name);
     if let Some(name) = answer.parameters.keys().find(bad) {
-        return refused(format!("{name:?} is no absolute name of a parameter"));
+        return refused(format!("{name:?} is not an absolute name of a parameter"));
     }
     Ok(())
 }
@@ -68,14 +70,17 @@ fn is_parameter(name: &str) -> bool {
 
 fn wrong_with(node: &LaunchNode) -> Option<String> {
     if !names::is_graph_name(&node.name) {
-        return Some("has no name that a ROS node can have".into());
+        return Some("has a name that is not valid for a ROS node".into());
     }
     if !names::is_package(&node.package) {
-        return Some(format!("is of {:?}, which is no package", node.package));
+        return Some(format!(
+            "names the package {:?}, which is not a valid name of a package",
+            node.package
+        ));
     }
     if !node.executable.split('/').all(names::is_executable) {
         return Some(format!(
-            "runs {:?}, and a program of such a name cannot be run; rename it, without quotes, $, \\ and control characters",
+            "runs {:?}, a name that is not allowed; rename the program, without quotes, $, \\ and control characters",
             node.executable
         ));
     }
@@ -85,7 +90,7 @@ fn wrong_with(node: &LaunchNode) -> Option<String> {
     let words = node.argv.iter().map(String::len).sum::<usize>();
     if words > MAX_WORDS {
         return Some(format!(
-            "has {words} bytes of arguments, and {MAX_WORDS} are possible"
+            "has {words} bytes of arguments, and {MAX_WORDS} are allowed at most"
         ));
     }
     if node.argv.iter().any(|word| word.contains('\0')) {
@@ -94,11 +99,13 @@ fn wrong_with(node: &LaunchNode) -> Option<String> {
     if let Some(directory) = &node.directory
         && (!directory.starts_with('/') || directory.contains('\0') || directory.len() > 4095)
     {
-        return Some(format!("runs in {directory:?}, which is no absolute path"));
+        return Some(format!(
+            "runs in {directory:?}, which is not an absolute path"
+        ));
     }
     if !(0.0..=MAX_DELAY).contains(&node.respawn_delay) {
         return Some(format!(
-            "waits {} s before it comes again",
+            "has a respawn_delay of {} s, and 0 to {MAX_DELAY} are allowed",
             node.respawn_delay
         ));
     }
@@ -113,12 +120,12 @@ fn wrong_with_environment(environment: &BTreeMap<String, String>) -> Option<Stri
         .sum();
     if size > MAX_WORDS {
         return Some(format!(
-            "the environment has {size} bytes, and {MAX_WORDS} are possible"
+            "the environment has {size} bytes, and {MAX_WORDS} are allowed at most"
         ));
     }
     environment.iter().find_map(|(name, value)| {
         if name.is_empty() || name.contains(['=', '\0']) {
-            Some(format!("{name:?} is no name of a variable"))
+            Some(format!("{name:?} is not a name of a variable"))
         } else if value.contains('\0') {
             Some(format!("{name} holds a NUL byte"))
         } else {
@@ -175,7 +182,7 @@ mod tests {
             ("NUL", |node| node.argv.push("a\0b".into())),
             ("arguments", |node| node.argv.push("a".repeat(MAX_WORDS))),
             ("absolute", |node| node.directory = Some("../../etc".into())),
-            ("before it comes", |node| node.respawn_delay = f64::NAN),
+            ("respawn_delay", |node| node.respawn_delay = f64::NAN),
         ];
         for (words, change) in changes {
             let mut bad = node();

@@ -1,4 +1,4 @@
-//! What can be said of an interface that may not be all there is.
+//! Marks and warnings for an interface that may be incomplete.
 
 use std::collections::BTreeSet;
 
@@ -59,16 +59,16 @@ pub(super) fn keep_inputs(interface: &mut Interface, before: Interface) {
     interface.sort();
 }
 
-/// What is known of a package one of whose nodes ended of what it was given.
+/// The interface of a package of which a node ended because of the messages that it was given.
 pub(super) fn ended(mut found: Found, words: &str) -> Found {
     found.warnings.push(format!(
-        "{words}, while it was given default messages to find the rest of its interface; what was seen until then is \
-         published; where it is not all, {STATE}"
+        "{words}, while it was given default messages to find the rest of its interface; the interface found until \
+         then is published; if it is incomplete, {STATE}"
     ));
     found
 }
 
-/// Says what may be missing.
+/// Adds warnings about what may be missing.
 pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_>) {
     let interface = &found.interface;
     let outputs = |interface: &Interface| {
@@ -88,17 +88,17 @@ pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_
     if interface.topics.is_empty() && interface.services.is_empty() && interface.actions.is_empty()
     {
         found.warnings.push(format!(
-            "nothing was seen of {nodes} that a robot could use: it may wait for something that could not be given; \
+            "no topic, service or action of {nodes} was found: it may wait for input that the push cannot give; \
              {STATE}{words}"
         ));
     } else if outputs(interface) == 0 {
         found.warnings.push(format!(
-            "{nodes} takes messages and was not seen to give any, nor to serve anything; if it does, {STATE}{words}"
+            "no output, service or action of {nodes} was found, only inputs; if there are others, {STATE}{words}"
         ));
     } else if !words.is_empty() {
-        found.warnings.push(format!(
-            "the interface may not be all there is; {STATE}{words}"
-        ));
+        found
+            .warnings
+            .push(format!("the interface may be incomplete; {STATE}{words}"));
     }
     let any: Vec<&str> = interface
         .topics
@@ -108,13 +108,13 @@ pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_
         .collect();
     if !any.is_empty() {
         found.warnings.push(format!(
-            "any type goes for {}: give the type that it is used with in a file for --interface",
+            "inputs and outputs of any type: {}; give the type that is used in a file for --interface",
             any.join(", ")
         ));
     }
     for (topic, reason) in feed.refused() {
         found.warnings.push(format!(
-            "{topic} could not be given a message to see what comes of it: {reason}; {STATE}"
+            "no test message could be sent to {topic}: {reason}; {STATE}"
         ));
     }
 }

@@ -73,7 +73,7 @@ impl Inbox {
         }
     }
 
-    /// Has what is not yet complete count.
+    /// Counts unfinished messages of the client in its budget.
     pub(crate) fn count(&mut self) -> Result<(), Exceeded> {
         let held = self.fragments.bytes() + self.pictures.bytes();
         self.permit.resize(held)
@@ -301,7 +301,7 @@ impl Client {
         self.send_frame(Frame { format, bytes }, None, true);
     }
 
-    /// Ends the call or goal that the client has answered with something that is of no use: no other answer will come.
+    /// Fails the call or goal to which the client has sent an answer that cannot be used: no other answer will come.
     fn answer_is_lost(&self, op: &str, id: Option<&Id<'_>>, reason: &str) {
         let Some(id) = id.map(Id::to_string) else {
             return;

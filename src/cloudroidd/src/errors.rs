@@ -146,19 +146,19 @@ pub enum Error {
         /// What is allowed.
         limit: api::Size,
     },
-    /// Another body than an archive is too big.
+    /// A body other than an archive is too big.
     #[error("the body is bigger than {limit}")]
     BodyTooLarge {
         /// What is allowed.
         limit: api::Size,
     },
-    /// What is sent does not fit into the memory for its sender.
-    #[error("the body cannot be held: {0}")]
+    /// A body does not fit into its sender's memory budget.
+    #[error("there is no memory for the body: {0}")]
     Memory(#[from] budget::Exceeded),
-    /// What is sent does not come to its end.
+    /// A body is not complete in time.
     #[error("the body is not complete after {} s", after.as_secs())]
     Unfinished {
-        /// How long was waited.
+        /// The time that it may take.
         after: std::time::Duration,
     },
     /// The state database.

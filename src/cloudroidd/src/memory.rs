@@ -1,7 +1,7 @@
-//! How many bytes robots and servants may have the daemon hold for them. What is refused becomes an event.
+//! Limits of the memory that the daemon uses for each client and each servant. A refusal becomes an event.
 //!
 //! ```text
-//!  the daemon ─┬─ client 10.0.0.7    messages that it has begun to send, bodies of its requests
+//!  the daemon ─┬─ client 10.0.0.7    unfinished messages, bodies of requests
 //!              └─ servant cam-1      frames of its nodes, records of its links, JSON made of its messages
 //! ```
 
@@ -19,12 +19,13 @@ use crate::portal::Peer;
 use crate::state::NewEvent;
 use crate::supervision;
 
-/// Of the machine's memory the daemon takes no more than this part, and no more than so much, unless told otherwise.
+/// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
+/// `MOST` bytes.
 const PART: u64 = 4;
 const MOST: u64 = 1 << 30;
-/// Whoever is refused again and again becomes an event no more often than this.
+/// Shortest time between two events about the same client or servant.
 const TOLD_AGAIN: Duration = Duration::from_secs(60);
-/// Names that are remembered for that.
+/// How many clients and servants are remembered for that.
 const REMEMBERED: usize = 1000;
 
 /// The daemon's budgets.
@@ -34,12 +35,12 @@ pub struct Memory {
     clients: Shares,
     servants: Shares,
     refused: Arc<AtomicU64>,
-    /// What was begun must be complete within this time.
+    /// Time from the first byte of a message, frame or body to its last.
     pub unfinished: Duration,
 }
 
 impl Memory {
-    /// As configured; refusals are written to the journal.
+    /// Budgets as configured; refusals are written to the journal.
     pub fn new(config: &config::Memory, journal: Journal) -> Memory {
         let bytes = |size: api::Size| usize::try_from(size.0).unwrap_or(usize::MAX);
         let whole = config
@@ -73,7 +74,7 @@ impl Memory {
         }
     }
 
-    /// That of a robot or another client. Behind a proxy on this machine all have the same address, and robots their names.
+    /// The budget of a client: of its IP address or, for connections from this machine (a proxy's), of its robot's name.
     pub fn client(&self, peer: Peer, robot: Option<&str>) -> Budget {
         match (peer, robot) {
             (Peer::Tcp(address), _) if !address.ip().is_loopback() => {
@@ -85,17 +86,17 @@ impl Memory {
         }
     }
 
-    /// That of a servant.
+    /// The budget of a servant.
     pub fn servant(&self, id: &str) -> Budget {
         self.servants.of(id)
     }
 
-    /// How often somebody was refused.
+    /// How often a request for memory was refused.
     pub fn refused(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }
 
-    /// All of it.
+    /// The budget above all others.
     pub fn whole(&self) -> &Budget {
         &self.whole
     }
@@ -105,7 +106,7 @@ fn tell(journal: &Journal, who: &str, full: &Exceeded) {
     let journal = journal.clone();
     let servant = who.strip_prefix("servant ").map(str::to_owned);
     let message = format!(
-        "{who} was refused memory: {full}; what it was for is lost ([memory] of the configuration)"
+        "{who} was refused memory: {full}; the data was dropped (the limits are in [memory] of the configuration)"
     );
     // The database may make whoever writes wait; who asks for memory must not.
     let write = move || {
@@ -121,5 +122,5 @@ fn tell(journal: &Journal, who: &str, full: &Exceeded) {
     }
 }
 
-/// Shared by all that hold bytes for somebody.
+/// The daemon's budgets, shared by its parts.
 pub type SharedMemory = Arc<Memory>;

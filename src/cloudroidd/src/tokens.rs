@@ -25,9 +25,9 @@ pub struct Tokens {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum AuthRefusal {
     /// It holds no token, and no token signed it for now.
-    #[error("the auth message proves no token that is known")]
+    #[error("the auth message neither contains a known token nor is signed by one")]
     Unknown,
-    /// Somebody has come in by it already.
+    /// It was accepted before.
     #[error(
         "this auth message was used before, and each counts once; sign a new one (t, rand) for each connection"
     )]
@@ -139,8 +139,8 @@ impl Tokens {
     }
 }
 
-/// What a client's resume token is known by: bound to who shows it, so that nobody takes over what belongs to another token,
-/// or to none.
+/// The key of a client's resume token: a hash of it and of the bearer token that it came with, so that a client with another
+/// bearer token, or none, cannot resume by it.
 pub fn bound_to(principal: Option<&TokenHash>, resume: &str) -> String {
     let principal = principal.map_or("", String::as_str);
     hash(&format!("{principal} {resume}"))

@@ -309,7 +309,8 @@ async fn an_interface_without_anything_in_it_is_told() {
         .await
         .expect("found");
     let told = |warning: &String| {
-        warning.starts_with("nothing was seen of /package") && warning.contains("--interface")
+        warning.starts_with("no topic, service or action of /package")
+            && warning.contains("--interface")
     };
     assert!(found.warnings.iter().any(told), "{:?}", found.warnings);
     lab.ends().await;

@@ -290,12 +290,12 @@ impl Client {
         Ok(())
     }
 
-    /// The client's answer to that call is of no use: its caller waits no longer.
+    /// The client's answer to that call cannot be used: the call fails, so that its caller does not wait for ever.
     pub(super) fn response_is_lost(&self, id: &str, reason: &str) {
         let request = self.services.lock().requests.remove(id);
         if let Some(Request { answer, .. }) = request {
             // The caller may have given up.
-            let _ = answer.send(Err(format!("the client's answer is of no use: {reason}")));
+            let _ = answer.send(Err(format!("the client's answer cannot be used: {reason}")));
         }
     }
 

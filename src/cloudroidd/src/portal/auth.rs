@@ -141,7 +141,7 @@ mod tests {
         let cases: [(Vec<u8>, &str); 6] = [
             (
                 frame(r#"{"op":"auth","mac":"guess"}"#),
-                "no token that is known",
+                "neither contains a known token",
             ),
             (
                 frame(r#"{"op":"subscribe","topic":"/x"}"#),

@@ -1,4 +1,4 @@
-//! What one push may use: a place among those that go on at once, time, and disk.
+//! Limits of one push: how many run at a time, how long it takes, and the bytes of its files.
 //!
 //! Memory, processes and cores of its containers are limits of their cgroups. Files have no such thing where file
 //! systems are mounted without quotas, so the directory of the build is measured, often enough that a build which
@@ -25,7 +25,7 @@ use crate::errors::Error;
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// How often a build is measured although the file system does not fill: somebody else may be making room in it.
 const MEASURE_EVERY: Duration = Duration::from_secs(10);
-/// What a file costs at least, whatever is in it: its inode, its name, its block.
+/// Bytes that each file counts at least, for its inode, name and block.
 const LEAST: u64 = 4 << 10;
 
 /// Bytes of a topic's, service's, action's or parameter's name.
@@ -33,7 +33,7 @@ const LONGEST_NAME: usize = 1024;
 /// Of those together.
 const MOST_NAMES: usize = 20_000;
 
-/// Places for pushes.
+/// Limits the number of pushes that are built at a time and that wait.
 pub(super) struct Places {
     free: Arc<Semaphore>,
     waiting: AtomicUsize,
@@ -99,16 +99,16 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// Comes back when a push that works in `directory` has used more than it may, with what is to be said about it.
+/// Returns when the push that works in `directory` has exceeded a limit, with the error for its client.
 pub(super) async fn exceeded(config: &Push, directory: &Path) -> Error {
     let (what, next) = tokio::select! {
         () = tokio::time::sleep(config.time.0) => (
             format!("it took longer than {} s", config.time.0.as_secs()),
-            "push what is needed alone, or raise time in [push] of the configuration",
+            "push only what is needed, or raise time in [push] of the configuration",
         ),
         what = overfull(config.disk, directory) => (
             what,
-            "push what is needed alone, or raise disk in [push] of the configuration",
+            "push only what is needed, or raise disk in [push] of the configuration",
         ),
     };
     Error::Push {
@@ -118,7 +118,7 @@ pub(super) async fn exceeded(config: &Push, directory: &Path) -> Error {
     }
 }
 
-/// Comes back when the files of a build are too many or too large.
+/// Returns when the files of a build exceed their limit, with the reason.
 async fn overfull(most: Size, directory: &Path) -> String {
     let mut ticks = tokio::time::interval(LOOK_EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -167,14 +167,14 @@ pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
         count += 1;
         if name.len() > LONGEST_NAME || name.chars().any(char::is_control) {
             return refused(format!(
-                "a name in the interface cannot be one: {:?}",
+                "the interface has a name that is not valid: {:?}",
                 name.chars().take(100).collect::<String>()
             ));
         }
     }
     if count > MOST_NAMES {
         return refused(format!(
-            "the interface has {count} topics, services, actions and parameters, and {MOST_NAMES} are possible"
+            "the interface has {count} topics, services, actions and parameters, and {MOST_NAMES} are allowed at most"
         ));
     }
     Ok(())
@@ -314,7 +314,7 @@ mod tests {
         check_interface(&interface(vec![topic("/a"), topic("/b/c")])).expect("possible");
         for bad in ["/a\x1b[2J", &"/a".repeat(1000)] {
             let refused = words(check_interface(&interface(vec![topic(bad)])).expect_err(bad));
-            assert!(refused.contains("cannot be one"), "{refused}");
+            assert!(refused.contains("not valid"), "{refused}");
         }
         let many = (0..=MOST_NAMES).map(|number| topic(&format!("/t{number}")));
         let refused = check_interface(&interface(many.collect())).expect_err("too many");

@@ -60,10 +60,10 @@ impl Client {
         Ok(())
     }
 
-    /// The client's result of that goal is of no use: whoever has sent the goal waits no longer.
+    /// The client's result of that goal cannot be used: the goal is ended as failed, so that its sender does not wait for ever.
     pub(in crate::client) fn result_is_lost(&self, request: &str, reason: &str) {
         let servers: Vec<_> = self.actions.lock().served.values().cloned().collect();
-        let text = format!("the result is of no use: {reason}");
+        let text = format!("the result cannot be used: {reason}");
         for server in servers {
             let body = vec![0; server.def.result.min_size()];
             // Most of them have no such goal.
