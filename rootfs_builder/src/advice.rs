@@ -1,11 +1,11 @@
-//! What a build or a node misses, read from its own words, and the option of `push` that adds it.
+//! Finds in the output of a build or a node what is missing, and the option of `push` that adds it.
 
 use std::collections::BTreeSet;
 
 use crate::contents::Contents;
 use crate::error::Error;
 
-/// What is missed, as those say who miss it.
+/// Something missing, under the name that the output gives it.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Missed<'a> {
     /// CMake's `find_package(NAME)`.
@@ -16,7 +16,7 @@ enum Missed<'a> {
     Library(String),
 }
 
-/// One line for each thing that `words` say is missing. Empty where they say nothing of the kind.
+/// One line of advice for each missing thing that `words` names; empty if it names none.
 pub(crate) fn for_words(words: &str, contents: &Contents) -> Vec<String> {
     let missed: BTreeSet<Missed<'_>> = words.lines().filter_map(missed).collect();
     missed

@@ -1,4 +1,4 @@
-//! Blocking work of a build, which ends when the build does.
+//! Starts a build's blocking work, and cancels it when the build ends.
 //!
 //! Dropping a build's future ends its containers, but not the threads that pack, hash and extract for it: those would
 //! go on for minutes, and keep the daemon from ending. So such work is started here, under the build's
@@ -13,14 +13,14 @@ tokio::task_local! {
     static CANCEL: Cancel;
 }
 
-/// Awaits `future`; blocking work that it has started is cancelled when it ends or is dropped.
+/// Awaits `future`. When it ends or is dropped, blocking work that it started is cancelled.
 pub async fn cancellable<F: Future>(future: F) -> F::Output {
     let cancel = Cancel::default();
     let _ended = cancel.on_drop();
     CANCEL.scope(cancel.clone(), future).await
 }
 
-/// `work` on a thread where it may block, cancelled with the [`cancellable`] future that this is called in.
+/// Runs `work` on a thread where it may block; it is cancelled with the [`cancellable`] future that calls this.
 pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
     let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();
     tokio::task::spawn_blocking(move || cancel.during(work))

@@ -49,8 +49,8 @@ pub struct Config {
     pub store: Arc<Store>,
     /// What runs sandboxes.
     pub engine: Arc<dyn Engine>,
-    /// Of each sandbox. Where it says nothing: half of the machine's memory, 4096 processes, and cores as far as
-    /// servants leave some.
+    /// Limits of each sandbox. By default half of the machine's memory, 4096 processes and threads, and the cores that
+    /// servants leave.
     pub limits: Limits,
 }
 
@@ -99,7 +99,7 @@ impl Builder {
         blocking::cancellable(self.make(request, events)).await
     }
 
-    /// Comes back when the containers of a build have ended and its directory is gone.
+    /// Returns when the containers of a build have ended and its directory is removed.
     pub async fn removed(&self, id: &str) {
         self.removals.done(id).await;
     }
@@ -174,8 +174,8 @@ impl Builder {
         Ok(outcome)
     }
 
-    /// What `words` (of a node of an image on this base) say is missing, and the options of a push that add it. Empty
-    /// where they say nothing of the kind.
+    /// Finds in `words`, output of a node of an image on this base, what is missing, and the options of `push` that add it.
+    /// Empty if the output names nothing missing.
     pub async fn advice(&self, base: &str, words: &str) -> Vec<String> {
         let archives = self.archives.lock().await;
         archives.get(base).map_or_else(Vec::new, |archive| {

@@ -1,4 +1,4 @@
-//! Makes of what was pushed what a build sees: nothing but what its key is made of.
+//! Changes a pushed tree so that a build sees only what its cache key covers.
 //!
 //! A compiled layer is found again by a hash of the sources, by whoever pushes the same ones next. So whatever a build
 //! could see and the hash does not cover would let one deployer choose what another one gets. The hash covers names, contents,
@@ -14,7 +14,7 @@ use rustix::fs::{AtFlags, FileType, Mode, Timespec, Timestamps};
 use crate::bootstrap::EPOCH;
 use crate::error::Error;
 
-/// What version control keeps beside the sources: directories, or files that say where those are.
+/// Names of version control's directories, and of files that point to them.
 const LEFT_OUT: [&str; 4] = [".git", ".hg", ".svn", ".bzr"];
 
 /// Seals a pushed tree of sources. Blocking.
@@ -85,7 +85,7 @@ mod tests {
         root
     }
 
-    /// Everything in a tree that a program in it could tell from another: names, kinds, rights, times, contents.
+    /// All properties of a tree that a program can see: names, kinds, modes, times, contents.
     fn visible(root: &Path) -> Vec<String> {
         let mut all = Vec::new();
         foreign::walk(root, |entry| {

@@ -1,4 +1,4 @@
-//! Gives nodes what they may be waiting for before they show all of themselves.
+//! Gives nodes the input that they may be waiting for before they register all of their interface.
 //!
 //! ```text
 //!   surroundings:  transforms (an identity tree), /clock, services that are looked for
@@ -7,8 +7,8 @@
 //!   inputs:        one default message each
 //! ```
 //!
-//! Whatever appears after that is looked at again, and may ask for more. A goal of an action is no such input: a
-//! server is not told to begin anything.
+//! What nodes register after that may need input in turn, in the next round. Goals of actions are not sent, so that no
+//! server begins anything.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -27,22 +27,22 @@ use super::frames::{self, Frames};
 use super::lender::AnyService;
 use super::{ProbeOptions, is_plumbing, plausible};
 
-/// For a node to say the type of an input.
+/// How long a node may take to tell the type of an input.
 const ANSWER: Duration = Duration::from_secs(5);
-/// Between two messages of transforms and time.
+/// Time between two messages of transforms, and of `/clock`.
 const BEAT: Duration = Duration::from_millis(50);
-/// Transforms are stamped so far ahead: a node that asks for those of this moment has them.
+/// How far in the future transforms are stamped, so that a lookup for the present finds them.
 const AHEAD: Duration = Duration::from_millis(100);
-/// More inputs than this are not fed: nobody waits for all of them.
+/// Most inputs that get a message.
 const MOST_INPUTS: usize = 200;
-/// What an input of any type is given where nobody says its type.
+/// The type of message for an input that takes any type, unless `--interface` gives one.
 pub(super) const ANY: &str = "std_msgs/Empty";
 
 const TRANSFORMS: [&str; 2] = ["/tf", "/tf_static"];
 const CLOCK: &str = "/clock";
 const LOG: &str = "/rosout";
 
-/// What was given so far, and goes on being given until this is dropped.
+/// What has been published and lent so far; it is taken back when this is dropped.
 pub(super) struct Feed<'a> {
     bus: &'a dyn Bus,
     registry: &'a Registry,

@@ -54,10 +54,10 @@ pub struct BridgeOptions {
     pub max_png: usize,
     /// How NaN and infinities are written in JSON.
     pub non_finite: NonFinite,
-    /// Most bytes of JSON or CBOR that one message from ROS may become; a longer one is not sent.
+    /// Bytes of JSON or CBOR that one message from ROS may become; a longer one is not sent.
     pub max_encoded: usize,
-    /// Where what big messages from ROS become counts, for as long as they wait for their clients. What does not fit is not
-    /// sent, and its clients are told.
+    /// Budget for JSON and CBOR made of messages from ROS (above 64 KiB), for as long as they wait for their clients. A message
+    /// that does not fit is not sent, and its clients get a status.
     pub budget: Budget,
     /// A WebSocket message that was begun and is not complete after this time closes its connection (1008).
     pub unfinished: Duration,
@@ -113,7 +113,7 @@ pub struct SessionOptions {
     /// Whether it receives what this bridge's own clients publish, as rosbridge's clients do. A robot's link does
     /// not: its ROS has those messages already.
     pub hears_clients: bool,
-    /// Where what the client has begun to send counts; what does not fit closes its connection (1013).
+    /// Budget for unfinished messages of the client; one that does not fit closes its connection (1013).
     pub budget: Budget,
 }
 

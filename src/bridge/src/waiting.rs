@@ -1,5 +1,5 @@
-//! A connection whose servant is not there yet: it is read all the same. Pings are answered, a close frame at once,
-//! and what else the client sends is kept, to be carried out in order when the servant is there.
+//! Reads a connection while its servant starts. Pings and close frames are answered at once; other messages are kept and
+//! handled in order when the servant is ready.
 
 use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
@@ -16,11 +16,11 @@ use ws::{Message, WebSocket, WsError, frame};
 
 use crate::{BridgeOptions, SessionEnd};
 
-/// Messages kept, and bytes of those. While there are so many nothing more is read: the client has to wait, as it does
-/// for a servant that is busy.
+/// Most messages that are kept, and most bytes of them. At either limit the socket is not read, so the client has to wait
+/// as it does for a busy servant.
 const KEPT_MESSAGES: usize = 1000;
 const KEPT_BYTES: usize = 1 << 20;
-/// Answers to pings wait in no more memory than this (bytes).
+/// Bytes of answers to pings that may wait to be sent.
 const ANSWERS: usize = 64 * 1024;
 
 /// A connection behind its WebSocket upgrade, before a bridge serves it.
@@ -39,7 +39,7 @@ pub struct Waiting<S> {
     ping_at: Option<Instant>,
 }
 
-/// Why there is no more need to wait.
+/// Why waiting has ended.
 enum Left {
     Client { code: u16, reason: String },
     Refused { code: u16, reason: String },
@@ -67,16 +67,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         }
     }
 
-    /// Has what the client sends count in `budget`, now and in the session.
+    /// Counts the client's messages in `budget`, now and in the session.
     pub fn within(mut self, budget: &Budget) -> Self {
         self.socket = self.socket.within(budget, self.unfinished);
         self
     }
 
-    /// Waits for `ready`, and gives what that gives.
+    /// Serves the connection until `ready` completes, and returns its output.
     ///
     /// # Errors
-    /// How the connection ended, where its client left before. `ready` has been dropped by then.
+    /// The client left before; says how. `ready` has been dropped by then.
     pub async fn until<T>(&mut self, ready: impl Future<Output = T>) -> Result<T, SessionEnd> {
         let left = {
             let mut ready = pin!(ready);
@@ -169,7 +169,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         self.kept.len() >= KEPT_MESSAGES || self.kept_bytes >= KEPT_BYTES
     }
 
-    /// When silence has become too long; never while it is this side that does not read.
+    /// When the connection counts as silent; never while this side does not read.
     fn silent_at(&self) -> Option<Instant> {
         let counts = !self.idle_timeout.is_zero() && !self.is_full();
         counts.then(|| self.heard + self.idle_timeout)

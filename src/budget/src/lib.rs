@@ -1,13 +1,13 @@
-//! Bytes that may be held at a time, in a hierarchy: in go requests for bytes, out come permits, which give them back
-//! when they are dropped.
+//! Limits of memory, in a hierarchy of budgets. In: requests for a number of bytes. Out: permits, which count these bytes
+//! until they are dropped.
 //!
 //! ```text
 //!   daemon 1 GiB ─┬─ client 10.0.0.7, 256 MiB ─┬─ a permit: a WebSocket message being assembled
 //!                 │                            └─ a permit: a body being read
 //!                 └─ servant cam-1, 256 MiB ───── a permit: a TCPROS frame being read
 //! ```
-//! A permit counts in its budget and in all those above it. One that does not fit in any of them is refused, and the
-//! refusal names the budget that is full: whoever asked loses what it was about, and nobody else anything.
+//! A permit counts in its budget and in all budgets above it. If it does not fit in one of them it is refused, and the error
+//! names the budget that is full. What a refusal costs is the caller's decision; other permits are not affected.
 
 #![forbid(unsafe_code)]
 
@@ -22,7 +22,7 @@ use tokio::sync::Notify;
 
 pub use shares::Shares;
 
-/// A number of bytes that may be held at a time. Clones are handles to the same one.
+/// A limit in bytes, and how many of them are in use. Clones are handles to the same budget.
 #[derive(Clone)]
 pub struct Budget(Arc<Node>);
 
@@ -38,7 +38,7 @@ struct Node {
     observer: Option<Observer>,
 }
 
-/// Is told who asked (the name of the budget that was asked) and why that was refused. Must not block.
+/// Called for each refusal, with the name of the budget that was asked and the error. Must not block.
 pub type Observer = Box<dyn Fn(&str, &Exceeded) + Send + Sync>;
 
 /// Bytes that were asked for and do not fit.
@@ -58,22 +58,22 @@ pub struct Exceeded {
 }
 
 impl Budget {
-    /// One that nothing stands above. `name` is what it is for, as refusals are to say it.
+    /// A topmost budget of `limit` bytes. `name` is what errors call it.
     pub fn new(name: impl Into<String>, limit: usize) -> Self {
         Self::node(name.into(), limit, None, None)
     }
 
-    /// The same, whose `observer` is told of all refusals in it and in those below it.
+    /// The same; `observer` is called for each refusal in it and in budgets below it.
     pub fn observed(name: impl Into<String>, limit: usize, observer: Observer) -> Self {
         Self::node(name.into(), limit, None, Some(observer))
     }
 
-    /// One whose permits count in this one, too.
+    /// A budget of `limit` bytes below this one: its permits count in both.
     pub fn within(&self, name: impl Into<String>, limit: usize) -> Self {
         Self::node(name.into(), limit, Some(self.clone()), None)
     }
 
-    /// One that refuses nothing.
+    /// A budget that refuses nothing.
     pub fn unlimited() -> Self {
         Self::new("everything", usize::MAX)
     }
@@ -90,22 +90,22 @@ impl Budget {
         }))
     }
 
-    /// What it is for.
+    /// Its name, as errors call it.
     pub fn name(&self) -> &str {
         &self.0.name
     }
 
-    /// Bytes that may be held in it.
+    /// Its limit in bytes.
     pub fn limit(&self) -> usize {
         self.0.limit
     }
 
-    /// Bytes held in it now.
+    /// Bytes of its permits now.
     pub fn used(&self) -> usize {
         self.0.used.load(Ordering::Relaxed)
     }
 
-    /// How often it was too full.
+    /// How many refusals it has caused.
     pub fn refused(&self) -> u64 {
         self.0.refused.load(Ordering::Relaxed)
     }
@@ -129,15 +129,20 @@ impl Budget {
         }
     }
 
-    /// A permit for so many bytes.
+    /// A permit for `bytes` bytes.
+    ///
+    /// # Errors
+    /// They do not fit in this budget or in one above.
     pub fn take(&self, bytes: usize) -> Result<Permit, Exceeded> {
         let mut permit = self.permit();
         permit.resize(bytes)?;
         Ok(permit)
     }
 
-    /// A permit for so many bytes, as soon as they are there; refused after `patience`, and at once where they never can
-    /// be.
+    /// A permit for `bytes` bytes, waiting at most for `patience` until they fit.
+    ///
+    /// # Errors
+    /// They did not fit in time; at once if they exceed the limit itself.
     pub async fn wait(&self, bytes: usize, patience: Duration) -> Result<Permit, Exceeded> {
         let mut permit = self.permit();
         permit.wait(bytes, patience).await?;
@@ -203,7 +208,7 @@ impl fmt::Debug for Budget {
     }
 }
 
-/// Bytes that are held, until this is dropped.
+/// Bytes that count as in use until this is dropped.
 #[derive(Debug)]
 pub struct Permit {
     budget: Budget,
@@ -211,12 +216,15 @@ pub struct Permit {
 }
 
 impl Permit {
-    /// How many bytes it is for.
+    /// Its size in bytes.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Makes it one for `bytes` in all. Refused, it stays as it was; for fewer bytes it never is.
+    /// Sets its size to `bytes`.
+    ///
+    /// # Errors
+    /// More bytes do not fit; it keeps its size. Fewer bytes always succeed.
     pub fn resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.try_resize(bytes)
             .inspect_err(|full| self.budget.tell(full))
@@ -232,7 +240,7 @@ impl Permit {
         Ok(())
     }
 
-    /// The same for what only ever grows: fewer bytes change nothing.
+    /// Grows it to `bytes`; fewer bytes than it has change nothing.
     pub fn grow_to(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.resize(bytes.max(self.bytes))
     }

@@ -1,4 +1,4 @@
-//! A budget of its own for everybody who has a name.
+//! Budgets by name, such as one for each client.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -7,8 +7,8 @@ use parking_lot::Mutex;
 
 use crate::{Budget, Node};
 
-/// One budget for each name, all of the same size, within a common one. A name's budget lives for as long as somebody
-/// has a handle or a permit of it.
+/// One budget for each name, all of the same size, below a common budget. A name's budget exists for as long as there is
+/// a handle or a permit of it.
 #[derive(Debug)]
 pub struct Shares {
     whole: Budget,
@@ -18,7 +18,7 @@ pub struct Shares {
 }
 
 impl Shares {
-    /// Shares of `each` bytes at most, for `what` (such as "client").
+    /// Budgets of `each` bytes below `whole`; their names begin with `what` (such as "client").
     pub fn new(whole: &Budget, what: &'static str, each: usize) -> Self {
         Self {
             whole: whole.clone(),
@@ -28,7 +28,7 @@ impl Shares {
         }
     }
 
-    /// The share of this name.
+    /// The budget of this name.
     pub fn of(&self, name: &str) -> Budget {
         let mut known = self.known.lock();
         if let Some(node) = known.get(name).and_then(Weak::upgrade) {
@@ -42,7 +42,7 @@ impl Shares {
         budget
     }
 
-    /// How many names have one now.
+    /// How many names have a budget now.
     pub fn len(&self) -> usize {
         let known = self.known.lock();
         known
@@ -51,7 +51,7 @@ impl Shares {
             .count()
     }
 
-    /// Whether nobody has one now.
+    /// Whether no name has a budget now.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

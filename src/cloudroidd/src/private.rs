@@ -1,5 +1,5 @@
-//! What is nobody else's business: environments of servants, hashes of tokens, other people's sources and what their builds
-//! print. Directories that only this user enters, files that only this user reads (docs/adr/033).
+//! Files and directories that only this user can read: environments of servants, hashes of tokens, pushed sources, logs of
+//! builds (docs/adr/033).
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions};
 use std::io;
@@ -27,7 +27,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Takes from others what rights they have on a file or directory. A link, and what is gone, is left alone.
+/// Removes the rights of group and others on a file or directory. Links, and paths that do not exist, are skipped.
 pub fn close(path: &Path) -> io::Result<()> {
     let about = match path.symlink_metadata() {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
@@ -43,8 +43,8 @@ pub fn close(path: &Path) -> io::Result<()> {
     }
 }
 
-/// The same for a directory and for all in it, so many levels deep; deeper things are behind it anyway. Whatever `leave`
-/// names stays as it is.
+/// The same for a directory and its entries, down to a number of levels; deeper entries cannot be reached through it
+/// anyway. Entries that `leave` names are skipped.
 pub fn close_below(path: &Path, levels: usize, leave: &dyn Fn(&Path) -> bool) -> io::Result<()> {
     close(path)?;
     if levels == 0 || !path.symlink_metadata().is_ok_and(|about| about.is_dir()) {

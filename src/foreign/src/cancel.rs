@@ -1,7 +1,7 @@
-//! Ending blocking work early.
+//! Cancels blocking work.
 //!
 //! Packing, hashing and extracting run for minutes on threads of their own, several calls deep. Whoever starts such a
-//! thread runs the work under a [`Cancel`]; the loops in between ask [`check`], which knows the thread's own.
+//! thread runs the work under a [`Cancel`]; the loops in it call [`check`], which reads the `Cancel` of the current thread.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ thread_local! {
     static CURRENT: RefCell<Option<Cancel>> = const { RefCell::new(None) };
 }
 
-/// Says that some work is not wanted any more. Clones are the same.
+/// A flag that cancels work. Clones share the flag.
 #[derive(Debug, Clone, Default)]
 pub struct Cancel(Arc<AtomicBool>);
 
@@ -20,7 +20,7 @@ pub struct Cancel(Arc<AtomicBool>);
 #[must_use = "dropping it cancels"]
 pub struct CancelOnDrop(Cancel);
 
-/// The work is not wanted any more.
+/// The error of cancelled work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("it was cancelled")]
 pub struct Cancelled;
@@ -43,12 +43,12 @@ impl Cancel {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// Cancels when what this gives is dropped.
+    /// A guard that cancels when it is dropped.
     pub fn on_drop(&self) -> CancelOnDrop {
         CancelOnDrop(self.clone())
     }
 
-    /// Does `work` on this thread, under this. What the thread worked under before comes back afterwards.
+    /// Does `work` on this thread, under this flag. Afterwards the thread has the flag that it had before.
     pub fn during<T>(&self, work: impl FnOnce() -> T) -> T {
         struct Restore(Option<Cancel>);
         impl Drop for Restore {
@@ -67,7 +67,7 @@ impl Drop for CancelOnDrop {
     }
 }
 
-/// Fails when the work that this thread does was cancelled.
+/// Fails if the work of the current thread was cancelled.
 pub fn check() -> Result<(), Cancelled> {
     let cancelled =
         CURRENT.with_borrow(|current| current.as_ref().is_some_and(Cancel::is_cancelled));

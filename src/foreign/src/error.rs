@@ -8,30 +8,30 @@ use crate::cancel::Cancelled;
 /// Why a foreign tree is not read, walked or removed any further.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The system's own words.
+    /// A system call failed.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     File {
         /// What was being done: "open", "read", "list".
         action: &'static str,
-        /// With what.
+        /// The file or directory.
         path: PathBuf,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
-    /// More bytes than are read.
+    /// A file is larger than the caller allows.
     #[error("{path} is larger than the {limit} bytes that are read of it", path = path.display())]
     TooLarge {
         /// The file.
         path: PathBuf,
-        /// In bytes.
+        /// The caller's limit in bytes.
         limit: u64,
     },
-    /// Directories in directories in directories.
+    /// Directories are nested too deep.
     #[error("{path} is more than {limit} directories deep; nest them less", path = path.display())]
     TooDeep {
-        /// The first that is too deep.
+        /// The first directory that is too deep.
         path: PathBuf,
-        /// So many may be.
+        /// The most levels.
         limit: usize,
     },
     /// A link, a directory, a pipe or a device stands where a file should.
@@ -48,7 +48,7 @@ pub enum Error {
         /// The tree.
         root: PathBuf,
     },
-    /// Nobody wants the result any more.
+    /// The work was cancelled.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
 }

@@ -1,4 +1,5 @@
-//! File trees whose content strangers decide: what a push sent, what a container left behind, layers of images.
+//! File trees whose content is not ours: what a push sent, what a container left, layers of images. In: a path of ours to
+//! the tree. Out: bytes of files, and entries, of this tree only.
 //!
 //! ```text
 //!   path of ours ──Tree::open──▶ descriptor ──read──▶ bytes: beneath it, through no link, at most so many

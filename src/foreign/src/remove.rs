@@ -1,8 +1,8 @@
 //! Removing a tree of any depth.
 //!
 //! The standard library's `remove_dir_all` calls itself for each level and keeps a file open for each: fifteen thousand
-//! directories in each other overflow a thread's stack, which ends the process. Here the way back up is `..`, checked
-//! against the directory that was left, so depth costs some bytes of the heap.
+//! nested directories overflow a thread's stack, which ends the process. Here the way back to the parent is `..`, checked
+//! against the directory from which it was entered, so each level costs some bytes of the heap.
 
 use std::ffi::CString;
 use std::os::fd::OwnedFd;
@@ -21,10 +21,11 @@ const HERE: ResolveFlags = ResolveFlags::BENEATH
     .union(ResolveFlags::NO_MAGICLINKS)
     .union(ResolveFlags::NO_XDEV);
 
-/// Removes `path` and all below it. Links are removed, not followed; what is mounted in the tree is refused; one that
-/// is gone is fine. Directories that their owner may not write are opened up.
+/// Removes `path` and all below it. Links are removed, not followed. A path that does not exist is no error. Directories that
+/// their owner may not write are made writable first.
 ///
-/// The tree must be at rest: where directories are moved meanwhile, this ends with an error.
+/// # Errors
+/// A file system is mounted in the tree, directories are moved meanwhile, or a system call fails.
 pub fn remove(path: &Path) -> Result<(), Error> {
     let failed = |action, error: Errno| Error::file(action, path, error);
     let above = match path.parent() {

@@ -11,26 +11,26 @@ use rustix::io::Errno;
 use crate::tree::{DIRECTORY, FILE, INSIDE, is_something_else};
 use crate::{Error, cancel};
 
-/// Directories within directories that a tree may have. Each level costs an open file while it is walked.
+/// The most levels of nested directories. Each level costs an open file while it is walked.
 pub const MAX_DEPTH: usize = 256;
 
-/// What is to be done with a directory after it was seen.
+/// Whether a walk enters a directory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Visit {
-    /// Its entries come next. Means nothing for what is no directory.
+    /// Its entries come next. Has no effect on other entries than directories.
     Into,
     /// They are left out.
     Skip,
 }
 
-/// Something in a tree.
+/// A file, directory, link or other entry of a tree.
 #[derive(Debug)]
 pub struct Entry<'a> {
     parent: BorrowedFd<'a>,
     name: &'a CString,
-    /// Where, from the tree's root; empty for the root itself.
+    /// Its path from the tree's root; empty for the root itself.
     pub path: &'a Path,
-    /// What it is.
+    /// Its kind, mode, owner, size and times.
     pub stat: Stat,
     root: &'a Path,
 }
@@ -46,7 +46,7 @@ impl Entry<'_> {
         OsStr::from_bytes(self.name.as_bytes())
     }
 
-    /// Its path with that of the tree, for messages alone: a name on it may be a link by now.
+    /// Its path with that of the tree, for messages only: a name in it may have become a link meanwhile.
     pub fn shown(&self) -> PathBuf {
         if self.path.as_os_str().is_empty() {
             self.root.to_owned()

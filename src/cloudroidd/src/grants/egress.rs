@@ -1,7 +1,7 @@
-//! Which hosts may be reached, and at which of their addresses. A name says nothing about where it leads: whoever keeps it, or
-//! answers for it, can point it at this machine's loopback, at a neighbour, or at the address where a cloud tells its
-//! machines their keys. So what a name resolves to is looked at before it is dialled ([`Way::permits`]), and only
-//! addresses of the public internet need nobody's word (docs/adr/032).
+//! Which hosts a servant may connect to, and at which of their addresses. A name's owner decides what it resolves to: this
+//! machine's loopback, another machine of the lab, or a cloud's metadata service. So each resolved address is checked before
+//! it is connected to ([`Way::permits`]). Public addresses are allowed; others need a line in the configuration
+//! (docs/adr/032).
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
@@ -12,9 +12,9 @@ use api::Grants;
 use super::{GrantError, not_allowed};
 use crate::config::Allow;
 
-/// What a push may ask for.
+/// What a push has to write.
 const ASKED: &str = "a HOST:PORT to connect to";
-/// What the configuration may say.
+/// What the configuration has to write.
 const WRITTEN: &str =
     "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
 
@@ -23,7 +23,7 @@ const WRITTEN: &str =
 pub struct Way {
     /// The host, as its push named it.
     pub host: String,
-    /// The address that stands for it inside.
+    /// The loopback address that the host's name has inside the servant.
     pub inside: Ipv4Addr,
     /// The port, inside and outside.
     pub port: u16,
@@ -55,28 +55,28 @@ struct Network {
     prefix: u8,
 }
 
-/// What an address leads to.
+/// The kind of an address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reach {
-    /// The internet.
+    /// An address of the public internet.
     Public,
-    /// Somebody's own network.
+    /// An address of a private network (10.0.0.0/8, 192.168.0.0/16, fd00::/8, …).
     Private,
-    /// This machine.
+    /// This machine's loopback.
     Loopback,
-    /// This machine, by an address that others know it by.
+    /// Another address of this machine.
     ThisMachine,
-    /// Whoever is on the same wire.
+    /// A link-local address (169.254.0.0/16, fe80::/10).
     LinkLocal,
-    /// Where clouds tell their machines about themselves.
+    /// A metadata service of a cloud (169.254.169.254 and others).
     Metadata,
-    /// Nobody.
+    /// 0.0.0.0 or ::.
     Unspecified,
-    /// Many.
+    /// A multicast address.
     Multicast,
-    /// An IPv4 address dressed as an IPv6 one.
+    /// An IPv4 address written as an IPv6 one.
     Mapped,
-    /// Something that the internet keeps for itself.
+    /// Any other reserved address.
     Reserved,
 }
 
@@ -294,7 +294,7 @@ fn reach(address: IpAddr) -> Reach {
     }
 }
 
-/// Only its own addresses can be bound.
+/// Whether an address is this machine's: the kernel binds only its own addresses.
 fn is_of_this_machine(address: IpAddr) -> bool {
     std::net::UdpSocket::bind((address, 0)).is_ok()
 }

@@ -1,4 +1,4 @@
-//! Bodies of requests that are held in memory: as they come, within the client's budget and a time.
+//! Reads bodies of requests into memory, within the client's budget and a time.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use futures_util::StreamExt;
 
 use crate::errors::Error;
 
-/// Bodies up to this size count in no budget.
+/// Bytes up to which a body counts in no budget.
 const UNCOUNTED: usize = 64 * 1024;
 /// Bigger ones count in steps of this size.
 const STEP: usize = 1 << 20;
@@ -18,7 +18,7 @@ const STEP: usize = 1 << 20;
 pub struct Held {
     /// The bytes.
     pub bytes: Bytes,
-    /// To be kept for as long as any of them is.
+    /// To be kept for as long as the bytes are.
     pub permit: Permit,
 }
 

@@ -1,12 +1,13 @@
-//! Who asks, and may they: before any handler, and closed unless opened here.
+//! Access control: decides for each request, before its handler, whether the caller may make it. An address that is not
+//! opened here by name is refused.
 //!
-//! Where tokens are configured, whoever comes by TCP shows one, from this machine, too: a web server that stands in front of
-//! the portal, and whatever else can connect to loopback, comes from this machine. Without one only the page (which asks
-//! for it), health, and the handshake of a robot (whose first message may be rosbridge's `auth`) are let through.
+//! Where tokens are configured, each TCP request needs one, also from this machine, because requests of a web server in front
+//! of the portal come from this machine, too. Without a token only the page (which asks for one), its assets, `/healthz`
+//! and a robot's WebSocket handshake (whose first message must be rosbridge's `auth`) are answered.
 //!
-//! Where none are, the portal listens on loopback alone and nobody needs one. A web page from elsewhere must not be able to
-//! ask through the browser of somebody on this machine then: requests that name another host (DNS rebinding) or
-//! another origin (cross-site requests and WebSockets) are refused, and so is what a proxy passes on.
+//! Where no tokens are configured the portal listens on loopback only, and requests need none. Web pages of other sites must
+//! not use the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS
+//! rebinding), with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
@@ -24,9 +25,9 @@ use crate::errors::Error;
 use crate::names;
 use crate::tokens::{self, TokenHash, Tokens};
 
-/// The same refusal is logged again after so long.
+/// Shortest time between two log lines about the same refusal.
 const AGAIN: Duration = Duration::from_secs(60);
-/// So many different ones meanwhile; what they say is the client's to choose.
+/// Most different refusals that are logged within that time; their text is chosen by the client.
 const DIFFERENT: usize = 32;
 
 /// The other end of a connection.
@@ -52,9 +53,9 @@ impl fmt::Display for Peer {
 pub struct Caller {
     /// From where.
     pub peer: Peer,
-    /// With which token; where none are configured also any other, which then only owns robots' names.
+    /// The hash of its token. Where no tokens are configured, any token is taken; it then only owns robots' names.
     pub token: Option<TokenHash>,
-    /// May ask. Who is not gets the page, health, and a WebSocket on which to send rosbridge's `auth` first.
+    /// Has access. A caller without gets the page, `/healthz`, and a WebSocket on which it must first send `auth`.
     pub trusted: bool,
 }
 
@@ -92,7 +93,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     }
 }
 
-/// A refusal that the operator may want to end is logged: once in a while, for a page asks again and again.
+/// Logs a refusal, so that the operator can allow it; at most once a minute, because pages repeat their requests.
 fn tell(peer: Peer, what: &str, next: &str) {
     static TOLD: Mutex<Vec<(Instant, String)>> = Mutex::new(Vec::new());
     let mut told = TOLD.lock();
@@ -195,7 +196,7 @@ fn admit_user(peer: Peer, uid: u32) -> Result<Caller, Error> {
     })
 }
 
-/// Headers by which proxies tell whom they ask for.
+/// Headers that proxies add.
 const FORWARDED: [&str; 6] = [
     "forwarded",
     "via",
@@ -205,7 +206,7 @@ const FORWARDED: [&str; 6] = [
     "x-real-ip",
 ];
 
-/// Who comes through a proxy is somebody from elsewhere, whatever host the request names.
+/// Refuses requests with a proxy's headers: their callers are on other machines, whatever `Host` says.
 fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
         None => Ok(()),
@@ -220,8 +221,8 @@ fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     }
 }
 
-/// What is answered without a token: the page (which asks for one), health, and the handshake of a robot (which may send
-/// one as its first message).
+/// Whether a request is answered without a token: the page (which asks for one), its assets, `/healthz`, and a robot's
+/// handshake (which must send `auth` as its first message).
 fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
     if is_upgrade(headers) {
@@ -236,7 +237,7 @@ fn is_asset(path: &str) -> bool {
         .is_some_and(|name| !name.is_empty() && !name.contains('/'))
 }
 
-/// The address of a service that there may be: `/NAME`, or `/NAME/`.
+/// Whether a path can be that of a service: `/NAME`, or `/NAME/`.
 fn is_service(path: &str) -> bool {
     let name = path.strip_prefix('/').unwrap_or_default();
     names::service(name.strip_suffix('/').unwrap_or(name)).is_ok()

@@ -1,6 +1,6 @@
 //! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`.
 //!
-//! Who comes without a token where some are configured is let in only to send one: no servant is asked for, nothing is told.
+//! Where tokens are configured, a client without one can only send `auth`: it gets no servant and no information before.
 
 use std::sync::Arc;
 
@@ -153,7 +153,7 @@ impl Asked {
 }
 
 impl Asked {
-    /// The resume token, as whoever shows it is known by it.
+    /// The resume token, bound to the caller's bearer token.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
         Some(tokens::bound_to(caller.token.as_ref(), token))
@@ -388,7 +388,7 @@ async fn session<S>(
     }
 }
 
-/// The servant that is asked for, once it is there, and the right to it.
+/// The servant that is asked for, once it is ready, and its lease.
 async fn servant(
     app: &App,
     asked: &Asked,

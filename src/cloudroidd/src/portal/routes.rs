@@ -1,5 +1,5 @@
-//! Every address that the portal answers, in one table: the router is made of it, and the stories walk it to see that
-//! nothing is answered without a token where tokens are configured.
+//! Every address that the portal answers, in one table. The router is made of it, and a test checks for each row that it is
+//! not answered without a token where tokens are configured.
 
 use axum::extract::{DefaultBodyLimit, OriginalUri};
 use axum::response::{IntoResponse, Response};
@@ -17,7 +17,7 @@ pub struct Route {
     pub method: &'static str,
     /// Its address as axum writes it; `{…}` is one segment.
     pub path: &'static str,
-    /// Makes what answers.
+    /// Makes its handler.
     pub handler: fn() -> MethodRouter<Arc<App>>,
 }
 
@@ -33,7 +33,7 @@ const fn at(
     }
 }
 
-/// All of them. Who may ask is not said here: [`super::guard`] refuses whatever it does not open by name.
+/// All routes. Access is not decided here: [`super::guard`] refuses each address that it does not open by name.
 pub const ROUTES: &[Route] = &[
     at("ANY", "/", || any(robots::root)),
     at("GET", "/healthz", || get(api_v1::health)),
@@ -92,7 +92,7 @@ pub const ROUTES: &[Route] = &[
     at("ANY", "/{service}/", || any(robots::service_with_slash)),
 ];
 
-/// What is in no row.
+/// Answers paths that are in no row: 404.
 pub async fn nothing(uri: OriginalUri) -> Response {
     if uri.path().starts_with("/v2/") {
         return oci::nothing(uri).await;
