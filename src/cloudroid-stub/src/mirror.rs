@@ -42,7 +42,7 @@ use outputs::Outputs;
 use parameters::Parameters;
 use promise::Promise;
 
-/// For a node of a new session to register what it had before.
+/// How long a node of a new session may take to register what it had before.
 const SETTLE: Duration = Duration::from_secs(3);
 
 /// The node on the robot.
@@ -61,7 +61,7 @@ pub struct Mirror {
     /// Messages dropped on this side, but for the session's own.
     drops: Drops,
     promise: OnceLock<Promise>,
-    /// How long a service of the robot may take.
+    /// How long a call of a robot's service may take.
     call_limit: Duration,
     /// What is registered here; locked while it is changed.
     applied: tokio::sync::Mutex<Applied>,

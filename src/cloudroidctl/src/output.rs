@@ -27,12 +27,12 @@ pub fn json_line(value: &impl Serialize) -> anyhow::Result<()> {
     write_line(&terminal::safe_json(&serde_json::to_string(value)?))
 }
 
-/// Prints a line, at once, as it may be printed.
+/// Prints a line at once, without control sequences.
 pub fn line(text: &str) -> anyhow::Result<()> {
     write_line(&terminal::safe(text, std::io::stdout().is_terminal()))
 }
 
-/// Prints a line on standard error, as it may be printed.
+/// Prints a line on standard error, without control sequences.
 pub fn complain(text: &str) {
     let shown = terminal::safe(text, std::io::stderr().is_terminal());
     // There is nobody left to tell.

@@ -1,15 +1,15 @@
-//! Text of strangers on a terminal. What nodes and compilers print passes through here, and a terminal obeys what is
-//! in it: sequences can rename the window, put words on the command line, or make a line look like another one.
+//! Makes text from nodes and compilers safe to print. Terminals interpret control sequences in text: these can rename the
+//! window, type on the command line, or make a line look like another one.
 //!
-//! Control characters are shown as what they are. Colours (SGR, `ESC [ … m`) are kept on a terminal, because compilers'
-//! are of use, and are ended with their line.
+//! Control characters are shown as visible text. Colours (SGR, `ESC [ … m`) are kept on a terminal, because compilers'
+//! colours are useful, and are reset at the end of their line.
 
 use std::borrow::Cow;
 
 /// How many characters of parameters a colour may have.
 const LONGEST_COLOUR: usize = 32;
 
-/// `text` as it may be printed. Lines and tabs stay; `colours`: so do colours.
+/// `text` without control sequences. Line ends and tabs stay; colours stay if `colours`.
 pub fn safe(text: &str, colours: bool) -> Cow<'_, str> {
     if !text.contains(is_dangerous) {
         return Cow::Borrowed(text);
@@ -41,8 +41,7 @@ pub fn safe(text: &str, colours: bool) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// JSON as it may be printed: control characters that its own rules let through are written as `\u…`, which means the
-/// same. (They can only stand in its texts.)
+/// JSON without control characters: those that JSON allows in its strings are written as `\u…`, which means the same.
 pub fn safe_json(json: &str) -> Cow<'_, str> {
     if !json.contains(is_dangerous) {
         return Cow::Borrowed(json);
@@ -58,7 +57,7 @@ pub fn safe_json(json: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Control characters (C0, DEL, C1) but for lines and tabs, and those that change the direction of what follows.
+/// Control characters (C0, DEL, C1) except line ends and tabs, and characters that change the direction of text.
 fn is_dangerous(c: char) -> bool {
     (c.is_control() && c != '\n' && c != '\t')
         || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{200e}' | '\u{200f}' | '\u{61c}')

@@ -11,11 +11,11 @@ use rustix::io::Errno;
 
 use crate::Error;
 
-/// Neither out of the tree nor through a link.
+/// Resolves paths inside the tree only, and through no link.
 pub(crate) const INSIDE: ResolveFlags = ResolveFlags::BENEATH
     .union(ResolveFlags::NO_SYMLINKS)
     .union(ResolveFlags::NO_MAGICLINKS);
-/// Not blocking: a pipe of this name must not stop us.
+/// Non-blocking, because opening a pipe would wait for its other end.
 pub(crate) const FILE: OFlags = OFlags::RDONLY
     .union(OFlags::NOFOLLOW)
     .union(OFlags::NONBLOCK)
@@ -26,35 +26,35 @@ pub(crate) const DIRECTORY: OFlags = OFlags::RDONLY
     .union(OFlags::NOFOLLOW)
     .union(OFlags::CLOEXEC);
 
-/// A directory of a tree, by its descriptor: whatever happens to names above it, this one is meant.
+/// A directory of a tree, held by its descriptor, so that renames and links above it have no effect.
 #[derive(Debug)]
 pub struct Tree {
     directory: OwnedFd,
     path: PathBuf,
 }
 
-/// What has a name where a directory is looked for.
+/// What is found at a path where a directory is expected.
 #[derive(Debug)]
 pub enum Found {
-    /// One.
+    /// A directory.
     Directory(Tree),
-    /// A file, a link, a device; or the path leads out of the tree.
+    /// A file, link, device or the like; or the path leads out of the tree.
     SomethingElse,
-    /// Nothing.
+    /// Nothing has that name.
     Nothing,
 }
 
 /// A regular file's content.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct File {
-    /// All of it.
+    /// The whole content.
     pub bytes: Vec<u8>,
-    /// Somebody may execute it.
+    /// One of its execute bits is set.
     pub executable: bool,
 }
 
 impl Tree {
-    /// Opens the tree's root. This one path is ours, and may lead through links.
+    /// Opens the tree's root. This path is ours and may contain links.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         let directory = rustix::fs::open(path, flags, Mode::empty())
@@ -65,7 +65,7 @@ impl Tree {
         })
     }
 
-    /// Where it was opened, for messages.
+    /// The path of the tree, for messages only.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -75,7 +75,7 @@ impl Tree {
         self.directory.as_fd()
     }
 
-    /// The same directory once more.
+    /// Another handle to the same directory.
     pub fn try_clone(&self) -> Result<Self, Error> {
         let directory = self.directory.try_clone();
         Ok(Self {
@@ -84,7 +84,7 @@ impl Tree {
         })
     }
 
-    /// What is at `path` in it, where a directory is looked for.
+    /// What is at `path` in this directory, where a directory is expected.
     pub fn directory(&self, path: impl AsRef<Path>) -> Result<Found, Error> {
         let shown = self.path.join(path.as_ref());
         match rustix::fs::openat2(
@@ -107,7 +107,7 @@ impl Tree {
     /// The regular file at `path` in it, of at most `limit` bytes; none when nothing has the name.
     ///
     /// # Errors
-    /// [`Error::NotAFile`] for everything that is there and no regular file, or behind a link, [`Error::Outside`] for a
+    /// [`Error::NotAFile`] for anything that is not a regular file, or is behind a link, [`Error::Outside`] for a
     /// path that leaves the tree; [`Error::TooLarge`] for a larger one, of which no more than the limit is read.
     pub fn file(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
         self.open_and_read(path.as_ref(), limit, INSIDE)

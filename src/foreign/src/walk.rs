@@ -102,7 +102,7 @@ pub fn walk<E: From<Error>>(
     .run()
 }
 
-/// The same in a tree that others change meanwhile: what disappears between being listed and being seen is left out.
+/// The same for a tree that other processes change meanwhile: entries that disappear after they were listed are skipped.
 pub fn walk_changing<E: From<Error>>(
     root: &Path,
     visit: impl FnMut(&Entry<'_>) -> Result<Visit, E>,

@@ -1,5 +1,5 @@
-//! What the robot's publishers have latched, for the local original: each is advertised in the private ROS system as it
-//! is on the robot, one advertisement for each publisher, so that a process that starts cold is given all of it.
+//! Keeps the messages that the robot's publishers have latched, for the local original. Each publisher gets an advertisement of
+//! its own in the private ROS system, so that a process that starts later gets all of them.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -37,13 +37,13 @@ impl Latched {
         Self { orders, task }
     }
 
-    /// Takes a message of a publisher that latches.
+    /// Keeps a message of a publisher that latches.
     pub fn keep(&self, topic: &Arc<str>, message: &Message) {
         let order = Order::Keep(topic.clone(), message.clone());
         let _ = self.orders.send(order);
     }
 
-    /// The publisher has gone.
+    /// The publisher has unregistered or ended.
     pub fn forget(&self, topic: &Arc<str>, publisher: &Arc<str>) {
         let order = Order::Forget(topic.clone(), publisher.clone());
         let _ = self.orders.send(order);
@@ -53,7 +53,7 @@ impl Latched {
 /// By topic and publisher: the MD5 of its type, and who repeats it here.
 type Repeated = HashMap<(Arc<str>, Arc<str>), (String, Box<dyn Publisher>)>;
 
-/// One order after the other: only the first message of a publisher takes longer than a moment.
+/// Handles requests one after the other; only a publisher's first message takes time, for its advertisement.
 async fn serve(place: Arc<Place>, mut orders: mpsc::UnboundedReceiver<Order>) {
     let mut all = Repeated::new();
     while let Some(order) = orders.recv().await {

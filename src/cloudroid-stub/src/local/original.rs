@@ -27,7 +27,8 @@ use super::process::{self, Program};
 
 /// Messages kept per topic: what waits longer is old.
 const QUEUE: usize = 16;
-/// For all of the interface to be registered, once the node is: what a version of its own lacks is not waited for.
+/// How long the original may take to register all of the interface once its node is registered; another version of it may
+/// lack a part.
 const SETTLE: Duration = Duration::from_secs(3);
 /// Pauses after crashes, at first and at last; and how long a life forgives them.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
@@ -183,7 +184,7 @@ impl Original {
         Ok(())
     }
 
-    /// What it has registered, types included.
+    /// What it has registered, with types.
     pub async fn registered(&self) -> Registered {
         self.place.registered_by(&self.node).await
     }
@@ -207,12 +208,12 @@ impl Original {
         let _ = timeout(SETTLE, all).await;
     }
 
-    /// A publisher has latched this: the process is given it when it starts, too, and at once if it runs.
+    /// A publisher has latched this message. The process gets it at once if it runs, and at each start.
     pub fn latch(&self, topic: &Arc<str>, message: &Message) {
         self.latched.keep(topic, message);
     }
 
-    /// This publisher of a topic has gone, and what it has latched with it.
+    /// This publisher of a topic has gone; its latched message is dropped.
     pub fn unlatch(&self, topic: &Arc<str>, publisher: &Arc<str>) {
         self.latched.forget(topic, publisher);
     }

@@ -44,7 +44,7 @@ struct Topic {
     counting: Mutex<Option<AbortHandle>>,
 }
 
-/// What newcomers are given: the last word of who speaks for the node.
+/// Latched messages for new subscribers: the last one of the side (cloud or original) that answers for the node.
 #[derive(Default)]
 struct Latched {
     /// What each side has latched last. Of the cloud only while somebody listens: else it sends nothing, and what is
@@ -63,7 +63,7 @@ enum Advertised {
 }
 
 impl Topic {
-    /// A side has published; `heard`: it speaks for the node.
+    /// A side has published; `heard`: it answers for the node.
     fn take(&self, side: Side, message: Bytes, latching: bool, heard: bool) {
         let mut latched = self.latched.lock();
         if latching {
@@ -104,7 +104,7 @@ impl Topic {
         }
     }
 
-    /// Nobody listens any more.
+    /// There are no subscribers any more.
     fn is_left(&self, local_speaks: bool) {
         let mut latched = self.latched.lock();
         latched.last[Side::Cloud.index()] = None;
@@ -146,7 +146,7 @@ impl Outputs {
         topic.take(Side::Cloud, data.message, data.latching, heard);
     }
 
-    /// The local original has published; `heard`: it speaks for the node.
+    /// The local original has published; `heard`: it answers for the node.
     pub fn take_local(&self, topic: &str, message: Message, heard: bool) {
         let topic = self.topics.lock().get(topic).cloned();
         if let Some(topic) = topic {
@@ -161,7 +161,7 @@ impl Outputs {
         }
     }
 
-    /// The local original has ended, and what it has latched with it.
+    /// The local original has ended; its latched messages are dropped.
     pub fn local_ended(&self) {
         for topic in self.all() {
             topic.latched.lock().last[Side::Local.index()] = None;

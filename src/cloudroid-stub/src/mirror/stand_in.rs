@@ -1,5 +1,5 @@
-//! A cloud that was never reached has not told what the node registers. While the local original stands in, that is what
-//! it has registered itself, in the ROS system of its own.
+//! Registers on the robot what the local original registers in its private ROS system, while the cloud was never reached
+//! and so has not said what the node registers.
 
 use std::sync::{Arc, Weak};
 
@@ -10,7 +10,7 @@ use super::Mirror;
 use super::outputs::NOWHERE;
 use crate::local::{Keeper, Original, Registered};
 
-/// Registers on the robot what the local original does, until the cloud tells.
+/// Registers on the robot what the local original registers, until the cloud has said what the node registers.
 pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
     // Not held while nothing changes: the original ends with its keeper.
     let original = || keeper.upgrade()?.original().cloned();
@@ -30,8 +30,8 @@ pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
 }
 
 impl Mirror {
-    /// Registers this in place of what the cloud would tell; false once it has. Nothing is taken back: the original may
-    /// have ended since the cloud is there, and that will tell.
+    /// Registers this in place of the cloud's interface; false once the cloud has sent its own. Nothing is unregistered: the
+    /// original may have ended because the cloud is there, and the cloud's interface follows.
     async fn stand_in(self: &Arc<Self>, original: &Original, registered: Registered) -> bool {
         let mut applied = self.applied.lock().await;
         if applied.graph.is_some() {
