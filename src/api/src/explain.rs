@@ -85,8 +85,8 @@ pub struct Link {
     /// The greatest age of an output, where that is promised instead.
     #[serde(default)]
     pub age: Option<f64>,
-    /// Nothing is promised: the local original stands in so long after the link was lost. Such links have no Q, and no
-    /// request of theirs is late.
+    /// Where no time is promised: seconds for which the link is down before the local original takes over. Such links have no
+    /// Q, and none of their requests counts as late.
     #[serde(default)]
     pub fallback_after: Option<f64>,
     /// Q after the last request.

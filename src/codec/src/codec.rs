@@ -81,8 +81,8 @@ impl Codec {
         }
     }
 
-    /// Whether frames hold a checksum of the message: those of codecs that predict what they decode from what they
-    /// have decoded before it, where one wrong byte would spoil all that follow.
+    /// Whether frames hold a checksum of the message: those of codecs that predict each value from earlier ones, where one
+    /// wrong byte spoils all values after it.
     pub(crate) fn has_checksum(self) -> bool {
         matches!(self, Self::Image | Self::Grid | Self::Scan | Self::Cloud)
     }

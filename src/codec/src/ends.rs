@@ -25,16 +25,16 @@ pub enum Policy {
     /// The lossless codec that pays.
     #[default]
     Lossless,
-    /// The codec that pays; pictures may lose detail when no lossless one keeps up.
+    /// The fastest codec; pictures may lose detail if no lossless codec keeps up.
     Lossy(Lossy),
 }
 
-/// How pictures may lose detail.
+/// The lossy codecs of pictures.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Lossy {
-    /// Each alone.
+    /// JPEG: each picture alone.
     Jpeg(JpegOptions),
-    /// Each as it differs from the one before; where it is built.
+    /// H.264: predicted from the picture before; only where it is built.
     Video(VideoOptions),
 }
 

@@ -34,7 +34,7 @@ pub enum Error {
         /// The limit given to the decoder.
         limit: usize,
     },
-    /// What was decoded is not what was encoded. It is not given out.
+    /// The decoded message has another checksum than the encoded one. It is not returned.
     #[error(
         "message decoded by `{codec}` has another checksum than the one sent; send it another way and report this"
     )]

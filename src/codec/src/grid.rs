@@ -1,6 +1,6 @@
 //! `nav_msgs/OccupancyGrid`: every grid whole, as what differs from its most common cell.
 //!
-//! A frame refers to none before it, so there is nothing to remember, to acknowledge or to lose (see docs/adr/040).
+//! Each frame can be decoded alone, so neither end keeps earlier grids (see docs/adr/040).
 //!
 //! Body: `head · mode · background · cells`.
 

@@ -1,5 +1,5 @@
-//! Pictures as JPEG, each understood alone: the pixels are lossy, so it is only used where the robot's configuration
-//! allows it. All other bytes of the message are exact, alpha included. Only what a camera saw is taken: 8-bit grey and
+//! Pictures as JPEG, each decodable alone. The pixels are lossy, so it is only used where the robot's configuration
+//! allows it. All other bytes of the message are exact, alpha included. Only camera encodings are taken: 8-bit grey and
 //! colour by name (`mono8`, `rgb8`, …), never `8UC1` and the like, which may hold labels.
 //!
 //! Body: `head · padding · [alpha] · JPEG (baseline, one interleaved scan)`.
@@ -16,11 +16,10 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// How much may be lost.
+/// Settings of the JPEG encoder.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct JpegOptions {
-    /// As JPEG's own encoders count it: 1 (smallest) to 100 (best). Below 90 colour is told for every second pixel of
-    /// every second row.
+    /// JPEG's usual quality: 1 (smallest) to 100 (best). Below 90 colour has half the resolution in both directions.
     pub quality: u8,
 }
 
@@ -30,7 +29,7 @@ impl Default for JpegOptions {
     }
 }
 
-/// The channels of a picture that can be told as JPEG.
+/// The channels of a picture that can be encoded as JPEG.
 fn channels(layout: &Image) -> Option<usize> {
     let Pixel::Bytes(channels @ (1 | 3 | 4)) = layout.pixel else {
         return None;
@@ -40,7 +39,7 @@ fn channels(layout: &Image) -> Option<usize> {
     fits.then_some(channels)
 }
 
-/// Appends the body of `message`; `None` when it is no picture that a camera saw.
+/// Appends the body of `message`; `None` if its encoding is not a camera's.
 pub(crate) fn encode(
     message: &[u8],
     layout: &Image,

@@ -95,7 +95,7 @@ pub struct HubOptions {
     pub call_timeout: Duration,
     /// How long first messages wait for the node to connect to their topic.
     pub warm_up: Duration,
-    /// Where what robots have begun to send counts; what does not fit ends its connection.
+    /// Budget for unfinished frames and records of robots; one that does not fit ends its connection.
     pub budget: Budget,
     /// A frame that was begun and is not complete after this time ends its connection.
     pub unfinished: Duration,
@@ -123,7 +123,7 @@ pub struct Hub {
     links: Mutex<BTreeMap<String, Arc<NodeLink>>>,
     /// Grows when links come, go, or change what they listen to.
     changes: watch::Sender<u64>,
-    /// Of one node, one link begins or ends at a time.
+    /// Serialises beginnings and ends of links, node by node.
     turns: Turns,
     parameters: parameters::Known,
     /// Services of the robot are lent already.

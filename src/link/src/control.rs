@@ -35,7 +35,7 @@ pub struct Hello {
     pub sla: Sla,
     /// Codecs that the robot decodes; none: messages come as they are.
     pub codecs: Vec<String>,
-    /// How good pictures are where they lose detail, from 1 to 100; the usual where absent.
+    /// Quality of JPEG pictures, 1 to 100; 80 where absent.
     pub quality: Option<u8>,
     /// Stamps stay as they are, whatever the clocks say.
     pub keep_stamps: bool,

@@ -14,7 +14,7 @@ const MAX_STREAMS: usize = 256;
 const MAX_PARTIAL: usize = MAX_RECORD + (64 << 20);
 /// Numbers that came before one still missing.
 const MAX_AHEAD: usize = 65_536;
-/// Set aside for a record before its bytes have come; as they come it doubles.
+/// Bytes allocated for a record before its bytes arrive; the buffer doubles as they do.
 const READ_AHEAD: usize = 1 << 20;
 
 /// What has come over the life of a session.
@@ -46,7 +46,7 @@ impl Default for Incoming {
 }
 
 impl Incoming {
-    /// Nothing yet; what is under way is to count in `budget`.
+    /// An empty state, whose unfinished records count in `budget`.
     pub(crate) fn within(budget: &Budget) -> Self {
         Self {
             budget: budget.clone(),

@@ -73,7 +73,7 @@ pub enum Error {
         /// How much may be.
         limit: u64,
     },
-    /// What is under way does not fit into the memory for it.
+    /// An unfinished record does not fit into its memory budget.
     #[error("a record cannot be received: {0}")]
     Exceeded(#[from] budget::Exceeded),
     /// Its WebSocket frames are not taken.

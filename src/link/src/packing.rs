@@ -16,7 +16,7 @@ use crate::MAX_RECORD;
 const FAST: f64 = 60e6;
 /// Topics that may be decoded at once.
 const MAX_TOPICS: usize = 1024;
-/// Part of T_max that the way to the other side may take before pictures lose detail, where they may.
+/// Part of T_max that encoding and sending may take; if it takes longer, and a lossy codec is allowed, that is used.
 const SHARE_OF_T_MAX: u32 = 4;
 /// What lossless encoding makes use of.
 const LOSSLESS: [Codec; 6] = [
@@ -103,7 +103,7 @@ impl Packing {
         }
     }
 
-    /// How good pictures are where they lose detail, from 1 to 100.
+    /// Sets the quality of JPEG pictures, 1 to 100; none: 80.
     pub(crate) fn set_quality(&mut self, quality: Option<u8>) {
         self.jpeg = quality.map_or_else(JpegOptions::default, |quality| JpegOptions { quality });
     }

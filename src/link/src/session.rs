@@ -168,7 +168,7 @@ impl Session {
         }
     }
 
-    /// Has the records that are under way to this end count in `budget`; one that does not fit ends its connection.
+    /// Counts records that are arriving in `budget`; one that does not fit ends its connection.
     pub fn within(self, budget: &Budget) -> Self {
         self.state.lock().incoming = Incoming::within(budget);
         self
@@ -278,7 +278,7 @@ impl Session {
         state.out.set_packable(channel);
     }
 
-    /// How good pictures are where they may lose detail: from 1 to 100; the usual where absent.
+    /// Quality of JPEG pictures, 1 to 100; 80 where absent.
     pub fn set_quality(&self, quality: Option<u8>) {
         self.state.lock().packing.set_quality(quality);
     }
@@ -296,7 +296,7 @@ impl Session {
         self.wake.notify_one();
     }
 
-    /// Nothing more will be sent as this channel; the peer is told after all that waits on it.
+    /// Closes a channel for sending; the peer is told after all messages that wait on it.
     pub fn closes(&self, channel: u32) {
         let json = serde_json::to_vec(&Control::Close { channel }).unwrap_or_default();
         let mut state = self.state.lock();

@@ -1,5 +1,5 @@
-//! What is let through to the JPEG library: only what our encoder writes, and only a picture of the very size declared,
-//! since the library makes room for what the stream tells.
+//! Checks a stream before the JPEG library reads it: only features that our encoder uses, and only a picture of exactly the
+//! declared size, because the library allocates memory for the size in the stream.
 
 use crate::Error;
 use crate::wire::Cursor;

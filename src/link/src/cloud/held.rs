@@ -20,7 +20,7 @@ pub(super) struct Held {
 
 #[derive(Default)]
 struct State {
-    /// What is waited for, each by its number.
+    /// The things that are waited for, by number.
     holds: BTreeSet<u64>,
     next: u64,
     bytes: usize,
@@ -76,7 +76,7 @@ impl Held {
         state.passing = false;
     }
 
-    /// One more thing is waited for; its number.
+    /// Adds a thing to wait for; returns its number.
     fn hold(&self) -> u64 {
         let mut state = self.state.lock();
         let number = state.next;
@@ -85,7 +85,7 @@ impl Held {
         number
     }
 
-    /// That is not waited for any longer.
+    /// Removes a thing to wait for.
     fn release(&self, number: u64) {
         self.state.lock().holds.remove(&number);
     }

@@ -1,5 +1,5 @@
-//! What begins, ends or takes up one node's link comes one after the other, so the second finds what the first left.
-//! What does so for another node does not wait for it: a node may take seconds to start, and to end.
+//! Serialises the operations that begin, end or take up a node's link, so that each finds the result of the one before.
+//! Operations of different nodes run in parallel: a node may take seconds to start, and to end.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ mod tests {
 
     use super::*;
 
-    /// What a future gives, if it does so at once.
+    /// The output of a future, if it is ready at once.
     fn now<F: Future>(future: F) -> Option<F::Output> {
         match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
             Poll::Ready(output) => Some(output),

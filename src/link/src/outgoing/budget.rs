@@ -1,17 +1,17 @@
-//! What counts one by one (latched messages, what belongs to actions) is not dropped for a newer one's sake while there
-//! is room, and there is room for so many bytes.
+//! Limits the bytes of waiting messages that must all arrive (latched messages, messages of actions). Within the limit such
+//! a message is not dropped in favour of a newer one.
 
 use std::collections::VecDeque;
 
 use super::{Out, Outgoing, count};
 use crate::drops::Cause;
 
-/// Bytes of such messages that wait beside the last one, over all topics, and that are kept in case they are lost.
+/// Bytes of such messages that may wait, over all topics, beside the last one; and that are kept until they are acknowledged.
 pub(super) const EACH: usize = 64 << 20;
-/// A topic with less than this is not where room is to be made while another has more than its last message.
+/// Bytes below which a topic's messages are not dropped, as long as another topic has more than its last message.
 const LITTLE: usize = 1 << 20;
 
-/// Whether this one may be kept beside so many bytes of others: the only one may be of any size.
+/// Whether a message may be kept beside so many bytes of others; a single message may have any size.
 pub(super) fn has_room(kept: usize, out: &Out) -> bool {
     kept == 0 || kept + out.held() <= EACH
 }
@@ -25,15 +25,15 @@ fn load(waiting: &VecDeque<Out>) -> (usize, usize) {
 }
 
 impl Out {
-    /// It is a message of which no newer one takes the place.
+    /// It is a message that no newer one replaces.
     fn counts(&self) -> bool {
         self.each && !self.closes
     }
 }
 
 impl Outgoing {
-    /// Makes room after a message of `channel` has come: at first where newer messages follow the oldest one, then
-    /// anywhere, in the biggest topic each time. What has come last stays.
+    /// Drops messages until the limit is kept, after one of `channel` was added: first messages that newer ones follow, then
+    /// any, each time of the topic with the most bytes. The newest message stays.
     pub(super) fn keep_to_budget(&mut self, channel: u32) {
         loop {
             let topics = self.topics.iter().map(|(of, waiting)| (*of, load(waiting)));
