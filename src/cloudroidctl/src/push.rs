@@ -54,7 +54,7 @@ pub struct Push {
     /// Name to remap; may be given several times.
     #[arg(long = "remap", value_name = "A:=B", value_parser = assignment)]
     remaps: Vec<(String, String)>,
-    /// What to add to the interface where a node cannot be woken at push (TOML or JSON).
+    /// TOML or JSON file with what to add to the interface, where the push cannot find all of it.
     #[arg(long, value_name = "FILE")]
     interface: Option<PathBuf>,
     /// Debian package that provides a dependency; may be given several times.
