@@ -39,7 +39,7 @@ pub struct PushOptions {
     /// Names to remap, from → to.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub remaps: BTreeMap<String, String>,
-    /// Supplement to the interface where a node cannot be woken at push: the text of a TOML or JSON file.
+    /// What to add to the interface, where the push cannot find all of it: the text of a TOML or JSON file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub interface: Option<String>,
     /// Dependencies by hand: rosdep key or ROS package → Debian package.

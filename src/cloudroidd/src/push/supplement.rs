@@ -1,4 +1,4 @@
-//! `--interface FILE`: what to add to the interface that was found, where a node cannot be woken at push.
+//! `--interface FILE`: what to add to the interface, where the push cannot find all of it.
 //!
 //! ```toml
 //! [[topics]]
