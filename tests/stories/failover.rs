@@ -145,7 +145,7 @@ impl Scene {
     fn happened(&self, kinds: &[&str]) -> Told {
         let deadline = Instant::now() + PATIENCE;
         loop {
-            let events = self.daemon.deployer().asks(&["events", "-n", "500"])?;
+            let events = self.daemon.deployer().asks(&["events", "-n", "10000"])?;
             let mine = events.as_array().context("a list")?.iter();
             let mine = mine.filter(|event| event["robot"] == *self.robot);
             let told: Vec<&str> = mine

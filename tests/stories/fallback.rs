@@ -288,7 +288,7 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
         says(&stub, back, before + round)?;
         robot.is_found((1, 1), &stub)?;
     }
-    let events = daemon.deployer().asks(&["events", "-n", "500"])?;
+    let events = daemon.deployer().asks(&["events", "-n", "10000"])?;
     let mine = events.as_array().context("a list")?.iter();
     let mine = mine.filter(|event| event["robot"] == "fallback-cut");
     let kinds: Vec<&str> = mine

@@ -70,9 +70,9 @@ dnsmasq --no-resolv --no-hosts --local=/#/ --host-record=brain.lab.example,10.9.
 pub fn a_server_is_found_by_multicast_dns() -> Told {
     let avahi = r#"
 rm -f /etc/resolv.conf
-printf '[server]\nhost-name=brain\nuse-ipv6=no\nenable-dbus=no\n[rlimits]\n' > /root/avahi.conf
+printf '[server]\nhost-name=brain\nallow-interfaces=lan0\nuse-ipv6=no\nenable-dbus=no\n[rlimits]\n' > /root/avahi.conf
 avahi-daemon --file /root/avahi.conf --no-drop-root --no-chroot > /root/avahi.log 2>&1 &
-until grep -q 'startup complete' /root/avahi.log; do kill -0 $! || { cat /root/avahi.log; exit 1; }; sleep 0.1; done
+until grep -q 'startup complete' /root/avahi.log && grep -q 'record for 10.9.8.7' /root/avahi.log; do kill -0 $! || { cat /root/avahi.log; exit 1; }; sleep 0.1; done
 "#;
     let names = ["brain.local", "nobody.local", "nobody"];
     let said = said(avahi, &names)?;

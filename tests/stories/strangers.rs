@@ -170,11 +170,11 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Told {
     // All of it has been taken up before the question comes.
     speaker.calls("/rosapi/get_time", json!({}))?;
     slow.says(json!({"op": "call_service", "id": "urgent", "service": "/rosapi/get_ros_version"}))?;
-    // The bridge has answered it when it has answered one that came later.
+    // Its answer waits in the queue when three answers have been put there.
     let answered = || -> anyhow::Result<u64> {
         let metrics = daemon.get("/metrics")?.1;
         let counts = metrics.lines().filter(|line| {
-            line.starts_with("cloudroid_bridge_calls_total{") && line.contains("backlog")
+            line.starts_with("cloudroid_bridge_answers_total{") && line.contains("backlog")
         });
         counts
             .map(|line| Ok(line.rsplit(' ').next().context("a value")?.parse::<u64>()?))

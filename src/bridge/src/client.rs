@@ -368,6 +368,9 @@ impl Client {
             fragment_size,
             answer,
         });
+        if answer {
+            self.shared.metrics.answers.add(1);
+        }
     }
 
     /// Sends a frame printed in JSON or CBOR as the client wants it.

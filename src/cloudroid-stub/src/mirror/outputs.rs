@@ -343,7 +343,10 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     };
     let waiting = std::mem::take(waiting);
     // Without one they are heard all the same; the next latched message asks again.
-    let publisher = advertised.as_ref().unwrap_or(&topic.publisher);
+    let publisher: &dyn Publisher = match &advertised {
+        Some(publisher) => publisher.as_ref(),
+        None => topic.publisher.as_ref(),
+    };
     for message in waiting {
         publisher.publish(message);
     }
