@@ -315,6 +315,10 @@ impl Push {
         if self.disk.0 == 0 || self.time.0.is_zero() || self.stall.0.is_zero() {
             bail!("a disk, time or stall of 0 would end every push");
         }
+        let sent = [self.archive.0, self.unpacked.0, self.entries];
+        if sent.contains(&0) || self.probe.0.is_zero() {
+            bail!("an archive, unpacked, entries or probe of 0 would refuse every push");
+        }
         check_limits(&Limits {
             cpus: self.cpus,
             memory: self.memory,
@@ -631,6 +635,10 @@ mod tests {
     fn bounds_that_no_push_could_meet_are_refused() {
         for text in [
             "at_once = 0",
+            "archive = 0",
+            "unpacked = 0",
+            "entries = 0",
+            "probe = 0",
             "disk = 0",
             "time = 0",
             "stall = 0",

@@ -9,6 +9,7 @@ use std::time::Duration;
 use api::{PushEvent, Size};
 use axum::body::Body;
 use futures_util::StreamExt;
+use image::Refusal;
 use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
@@ -100,6 +101,14 @@ pub(super) async fn unpack(
 
 fn refused(error: image::Error) -> Error {
     let next = match &error {
+        image::Error::Archive {
+            problem: Refusal::TooManyEntries { .. },
+            ..
+        } => Some("push less, or raise entries in [push] of the configuration".to_owned()),
+        image::Error::Archive {
+            problem: Refusal::TooLarge { .. },
+            ..
+        } => Some("push less, or raise unpacked in [push] of the configuration".to_owned()),
         image::Error::Archive { .. } => Some(
             "push a tar archive of a package, workspace or install space that keeps to itself"
                 .to_owned(),
