@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::apt::Apt;
+use crate::candidates::Candidates;
 use crate::contents::{Carriers, Contents, Part};
 use crate::error::Error;
 use crate::event::Progress;
@@ -14,7 +15,7 @@ pub(crate) struct Archive {
     pub(crate) apt: Apt,
     pub(crate) contents: Arc<Contents>,
     /// All installable packages.
-    pub(crate) names: BTreeSet<String>,
+    pub(crate) candidates: Candidates,
     /// Changes when the lists do.
     pub(crate) stamp: String,
     /// For `sources.list`.
@@ -40,12 +41,12 @@ impl Archive {
         }
         let root = apt.root().to_owned();
         let contents = crate::blocking::spawn(move || Contents::open(&root, &lists)).await??;
-        let names = apt.names().await?;
+        let candidates = apt.candidates().await?;
         let stamp = apt.stamp();
         Ok(Self {
             apt,
             contents: Arc::new(contents),
-            names,
+            candidates,
             stamp,
             sources,
         })
@@ -66,13 +67,13 @@ impl Archive {
         if bare.len() < 3 {
             return Vec::new();
         }
-        let mut near: Vec<&String> = self
-            .names
-            .iter()
+        let mut near: Vec<&str> = self
+            .candidates
+            .names()
             .filter(|name| name.contains(&bare))
             .collect();
-        near.sort_by_key(|name| (name.len(), name.as_str()));
-        near.into_iter().take(3).cloned().collect()
+        near.sort_by_key(|name| (name.len(), *name));
+        near.into_iter().take(3).map(str::to_owned).collect()
     }
 
     /// What to install to run with a ROS package, and which development packages hold files of it besides.

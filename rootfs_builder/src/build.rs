@@ -117,7 +117,7 @@ impl Build<'_> {
         for name in &self.request.with {
             if !self.archive.contents.ros_package(name).is_empty() {
                 ros.insert(name.clone());
-            } else if self.archive.names.contains(name) {
+            } else if self.archive.candidates.contains(name) {
                 ros.extend(
                     self.archive
                         .contents

@@ -31,8 +31,34 @@ pub(crate) enum Content {
     Link(PathBuf),
 }
 
+/// Raise it when [`wanted_of_development`] changes.
+const KEPT: &str = "members-1";
+
+/// Members that are [`wanted_of_development`], by path. They are kept below `cache`, named as the package's file is: most
+/// ROS packages are looked into again with every package that is near to them, and unpacking takes long. Blocking.
+pub(crate) fn at_run_time(deb: &Path, cache: &Path) -> Result<Vec<Member>, Error> {
+    let directory = cache.join(KEPT);
+    let name = Path::new(deb.file_name().unwrap_or_default()).with_extension("tar");
+    let path = directory.join(name);
+    if let Ok(file) = File::open(&path)
+        && let Ok(found) = of_archive(BufReader::new(file), &path, |_| true)
+    {
+        return Ok(found);
+    }
+    let mut found = members(deb, wanted_of_development)?;
+    found.sort_by(|a, b| a.path.cmp(&b.path));
+    found.dedup_by(|later, first| later.path == first.path);
+    std::fs::create_dir_all(&directory).at("making", &directory)?;
+    let made = tempfile::NamedTempFile::new_in(&directory).at("making a file in", &directory)?;
+    write_tar(&found, made.path())?;
+    made.as_file().sync_data().at("writing", &path)?;
+    made.persist(&path)
+        .map_err(|error| Error::io("writing", &path, error.error))?;
+    Ok(found)
+}
+
 /// Members that `keep` accepts. Blocking.
-pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
+fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
     let mut unpack = Command::new("dpkg-deb");
     unpack
         .arg("--fsys-tarfile")
@@ -47,52 +73,63 @@ pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Me
         },
         _ => Error::io("reading", deb, error),
     })?;
-    let mut found = Vec::new();
-    if let Some(stdout) = child.stdout.take() {
-        let mut archive = tar::Archive::new(BufReader::new(stdout));
-        for entry in archive.entries().at("reading", deb)? {
-            let mut entry = entry.at("reading", deb)?;
-            let path: PathBuf = entry
-                .path()
-                .at("reading", deb)?
-                .components()
-                .filter(|part| matches!(part, Component::Normal(_)))
-                .collect();
-            if !keep(&path) {
-                continue;
-            }
-            let header = entry.header();
-            let (mode, mtime) = (
-                header.mode().at("reading", deb)?,
-                header.mtime().at("reading", deb)?,
-            );
-            let kind = header.entry_type();
-            let content = if kind.is_symlink() {
-                match entry.link_name().at("reading", deb)? {
-                    Some(target) => Content::Link(target.into_owned()),
-                    None => continue,
-                }
-            } else if kind.is_file() {
-                let mut bytes = Vec::new();
-                entry.read_to_end(&mut bytes).at("reading", deb)?;
-                Content::File(bytes)
-            } else {
-                continue;
-            };
-            found.push(Member {
-                path,
-                mode: mode & 0o777,
-                mtime,
-                content,
-            });
-        }
-    }
+    let found = match child.stdout.take() {
+        Some(stdout) => of_archive(BufReader::new(stdout), deb, keep)?,
+        None => Vec::new(),
+    };
     let status = child.wait().at("reading", deb)?;
     if !status.success() {
         return Err(Error::Program {
             program: format!("dpkg-deb --fsys-tarfile {}", deb.display()),
             status: status.to_string(),
             last_lines: "the package is damaged: remove it from the cache and push again".into(),
+        });
+    }
+    Ok(found)
+}
+
+/// Files and links of a tar archive that is part of, or made of, the package `deb`.
+fn of_archive(
+    archive: impl Read,
+    deb: &Path,
+    keep: impl Fn(&Path) -> bool,
+) -> Result<Vec<Member>, Error> {
+    let mut found = Vec::new();
+    let mut archive = tar::Archive::new(archive);
+    for entry in archive.entries().at("reading", deb)? {
+        let mut entry = entry.at("reading", deb)?;
+        let path: PathBuf = entry
+            .path()
+            .at("reading", deb)?
+            .components()
+            .filter(|part| matches!(part, Component::Normal(_)))
+            .collect();
+        if !keep(&path) {
+            continue;
+        }
+        let header = entry.header();
+        let (mode, mtime) = (
+            header.mode().at("reading", deb)?,
+            header.mtime().at("reading", deb)?,
+        );
+        let kind = header.entry_type();
+        let content = if kind.is_symlink() {
+            match entry.link_name().at("reading", deb)? {
+                Some(target) => Content::Link(target.into_owned()),
+                None => continue,
+            }
+        } else if kind.is_file() {
+            let mut bytes = Vec::new();
+            entry.read_to_end(&mut bytes).at("reading", deb)?;
+            Content::File(bytes)
+        } else {
+            continue;
+        };
+        found.push(Member {
+            path,
+            mode: mode & 0o777,
+            mtime,
+            content,
         });
     }
     Ok(found)
@@ -176,6 +213,58 @@ mod tests {
         for path in not {
             assert!(!wanted_of_development(Path::new(path)), "{path}");
         }
+    }
+
+    /// A package with these files.
+    fn package(directory: &Path, files: &[(&str, &str)]) -> PathBuf {
+        let tree = directory.join("tree");
+        let control = "Package: robot-dev\nVersion: 1\nArchitecture: all\nMaintainer: a <a@b.invalid>\n\
+                       Description: d\n";
+        for (path, text) in files.iter().copied().chain([("DEBIAN/control", control)]) {
+            let path = tree.join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        let deb = directory.join("robot-dev_1_all.deb");
+        let mut build = Command::new("dpkg-deb");
+        build
+            .args(["--root-owner-group", "--build"])
+            .arg(&tree)
+            .arg(&deb);
+        let said = build.output().expect("run");
+        assert!(said.status.success(), "{said:?}");
+        deb
+    }
+
+    #[test]
+    fn a_package_is_unpacked_once() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let cache = directory.path().join("cache");
+        let files = [
+            ("usr/share/robot/package.xml", "<package/>"),
+            ("usr/share/robot/launch/a.launch", "<launch/>"),
+            ("usr/include/robot.h", "not wanted"),
+        ];
+        let deb = package(directory.path(), &files);
+        let first = at_run_time(&deb, &cache).expect("unpacked");
+        let paths: Vec<&str> = first
+            .iter()
+            .filter_map(|member| member.path.to_str())
+            .collect();
+        assert_eq!(
+            paths,
+            [
+                "usr/share/robot/launch/a.launch",
+                "usr/share/robot/package.xml"
+            ]
+        );
+        std::fs::remove_file(&deb).expect("removed");
+        assert_eq!(at_run_time(&deb, &cache).expect("kept"), first);
+        // Nor is anything kept of one that cannot be unpacked.
+        let torn = directory.path().join("torn_1_all.deb");
+        std::fs::write(&torn, "torn").expect("written");
+        at_run_time(&torn, &cache).expect_err("not a package");
+        assert!(!cache.join(KEPT).join("torn_1_all.tar").exists());
     }
 
     #[test]

@@ -14,6 +14,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use futures_util::{StreamExt, stream};
+
+use crate::apt::Deb;
 use crate::archive::{Archive, Depth};
 use crate::base::Base;
 use crate::contents::Part;
@@ -21,6 +24,9 @@ use crate::deb::{self, Content, Member};
 use crate::error::Error;
 use crate::event::Progress;
 use crate::manifest::{self, PluginLibrary};
+
+/// Packages that are unpacked at the same time, each by processes of its own.
+const AT_ONCE: usize = 4;
 
 /// What is wanted.
 #[derive(Debug, Default, Clone, PartialEq)]
@@ -67,12 +73,22 @@ pub(crate) async fn gather(
             }
         }
         round.retain(|deb| looked_into.insert(deb.clone()));
-        let debs = archive.apt.candidates(&round).await?;
+        let debs: Vec<Deb> = round
+            .iter()
+            .filter_map(|name| archive.candidates.get(name))
+            .collect();
         let files = archive.apt.download(&debs, progress).await?;
-        for (deb, file) in debs.iter().zip(files) {
-            let members =
-                crate::blocking::spawn(move || deb::members(&file, deb::wanted_of_development))
-                    .await??;
+        let kept = archive.apt.root().to_owned();
+        let looked = stream::iter(files).map(|file| {
+            let kept = kept.clone();
+            crate::blocking::spawn(move || deb::at_run_time(&file, &kept))
+        });
+        let mut looked = looked.buffered(AT_ONCE);
+        let mut of_round = Vec::new();
+        while let Some(members) = looked.next().await {
+            of_round.push(members??);
+        }
+        for (deb, members) in debs.iter().zip(of_round) {
             let told = tell(&members, base);
             let itself = matches!(depth, Depth::Itself { .. });
             for name in told.needed {
@@ -132,7 +148,7 @@ fn provided(archive: &Archive, base: &Base, name: &str) -> Provided {
     }
     let debs = match base.keys.get(name) {
         Some(debs) => debs.clone(),
-        None if archive.names.contains(name) => vec![name.to_owned()],
+        None if archive.candidates.contains(name) => vec![name.to_owned()],
         None => return Provided::Nothing,
     };
     Provided::Debs(
@@ -276,7 +292,7 @@ mod tests {
         Archive {
             apt: crate::apt::Apt::open(directory, "").expect("prepared"),
             contents: std::sync::Arc::new(contents),
-            names: names.iter().map(|&name| name.to_owned()).collect(),
+            candidates: crate::candidates::tests::named(names),
             stamp: String::new(),
             sources: String::new(),
         }

@@ -20,7 +20,7 @@ use crate::error::{Error, IoAt};
 use crate::event::Progress;
 use crate::key::{Key, sha256};
 use crate::sandbox::Run;
-use crate::split::split;
+use crate::split;
 use crate::workshop::{Layer, Packing, Workshop};
 
 /// What is put on top of some layers.
@@ -190,7 +190,7 @@ async fn at_hand(shop: &Workshop, keys: &[String]) -> Result<Option<Vec<Layer>>,
     Ok(Some(layers))
 }
 
-/// What a chain lacks, in at most `most` links: see [`split`].
+/// What a chain lacks, in at most `most` links: see [`split::split`].
 async fn rest(
     archive: &Archive,
     shop: &Workshop,
@@ -205,14 +205,14 @@ async fn rest(
         return Ok(Vec::new());
     }
     let mut parts = Vec::new();
-    if most > 1 && !left.debs.is_empty() {
+    if most > 1 && split::may_cut(left.debs.len()) {
         let of_ros = ros_sources(archive, shop).await?;
         let names = left
             .debs
             .iter()
             .map(|deb| format!("{}={}", deb.name, deb.version));
         let relations = archive.apt.relations(names).await?;
-        let (first, last) = split(&left.debs, &relations, |source| of_ros.contains(source));
+        let (first, last) = split::split(&left.debs, &relations, |source| of_ros.contains(source));
         if !first.is_empty() {
             parts.push(Part {
                 debs: first,
@@ -234,7 +234,7 @@ async fn ros_sources(archive: &Archive, shop: &Workshop) -> Result<BTreeSet<Stri
         return Ok(sources);
     }
     let mut carriers = archive.contents.ros_carriers();
-    carriers.retain(|name| archive.names.contains(name));
+    carriers.retain(|name| archive.candidates.contains(name));
     let sources: BTreeSet<String> = if carriers.is_empty() {
         BTreeSet::new()
     } else {

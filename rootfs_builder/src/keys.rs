@@ -58,7 +58,7 @@ pub(crate) fn resolve(
         if !archive.contents.ros_package(key).is_empty() {
             return Found::Ros;
         }
-        if archive.names.contains(key) {
+        if archive.candidates.contains(key) {
             return Found::Debs(vec![key.to_owned()]);
         }
         Found::Nothing
@@ -97,7 +97,7 @@ pub(crate) fn resolve(
     for (key, debs) in map {
         for deb in debs
             .split([',', ' '])
-            .filter(|deb| !deb.is_empty() && !archive.names.contains(*deb))
+            .filter(|deb| !deb.is_empty() && !archive.candidates.contains(*deb))
         {
             missing
                 .entry(deb.to_owned())
@@ -150,7 +150,7 @@ mod tests {
         let archive = Archive {
             apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
             contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
-            names: names.map(str::to_owned).into(),
+            candidates: crate::candidates::tests::named(&names),
             stamp: String::new(),
             sources: String::new(),
         };

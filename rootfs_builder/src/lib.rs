@@ -29,6 +29,7 @@ mod bootstrap;
 mod build;
 mod builder;
 mod cache;
+mod candidates;
 mod chain;
 mod compile;
 mod complaint;

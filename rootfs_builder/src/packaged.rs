@@ -17,7 +17,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     let (mut roots, mut debs) = build.extra_packages()?;
     let packages: Vec<String> = if !archive.contents.ros_package(name).is_empty() {
         vec![name.to_owned()]
-    } else if archive.names.contains(name) {
+    } else if archive.candidates.contains(name) {
         debs.insert(name.to_owned());
         archive
             .contents
@@ -28,7 +28,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     } else {
         Vec::new()
     };
-    if packages.is_empty() && archive.names.contains(name) {
+    if packages.is_empty() && archive.candidates.contains(name) {
         return Err(Error::NotRos {
             name: name.to_owned(),
         });
@@ -62,7 +62,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
             .map(str::to_owned),
     );
     debs.remove("");
-    let version = version(build, &packages[0]).await?;
+    let version = version(build, &packages[0]);
     let dependencies = build
         .add("dependencies", &build.on_base(), &debs, wanted.extras)
         .await?;
@@ -136,30 +136,12 @@ pub(crate) async fn wanted(
 }
 
 /// The archive's version of the Debian package that holds a ROS package's programs, or its package.xml.
-async fn version(build: &Build<'_>, package: &str) -> Result<String, Error> {
+fn version(build: &Build<'_>, package: &str) -> String {
     let carriers = build.archive.contents.ros_package(package);
-    let Some(deb) = carriers
+    let deb = carriers
         .keys()
         .find(|deb| !deb.ends_with("-dev"))
-        .or(carriers.keys().next())
-    else {
-        return Ok(String::new());
-    };
-    let key = Key::new("version")
-        .with("archive", &build.archive.stamp)
-        .with("deb", deb)
-        .finish();
-    if let Some(version) = build.shop.layers.note(&key) {
-        return Ok(version);
-    }
-    let found = build
-        .archive
-        .apt
-        .candidates(&BTreeSet::from([deb.clone()]))
-        .await?;
-    let version = found
-        .first()
-        .map_or_else(String::new, |deb| deb.version.clone());
-    build.shop.layers.keep_note(&key, &version)?;
-    Ok(version)
+        .or(carriers.keys().next());
+    deb.and_then(|deb| build.archive.candidates.get(deb))
+        .map_or_else(String::new, |deb| deb.version)
 }

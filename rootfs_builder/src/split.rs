@@ -11,6 +11,11 @@ use crate::apt::{Deb, Relations};
 /// Fewer packages than this are not worth a layer of their own.
 const FEW: usize = 8;
 
+/// Whether as many packages as this can be worth a cut, whatever they are.
+pub(crate) fn may_cut(count: usize) -> bool {
+    count > FEW
+}
+
 /// Cuts `debs`; both parts keep the order. The first part is empty where a cut is not worth it. `of_ros`: whether a
 /// source package is one of ROS.
 pub(crate) fn split(
@@ -55,7 +60,7 @@ pub(crate) fn split(
         .iter()
         .cloned()
         .partition(|deb| late.contains(deb.name.as_str()));
-    if first.len() < FEW || last.is_empty() {
+    if !may_cut(debs.len()) || first.len() < FEW || last.is_empty() {
         (Vec::new(), debs.to_vec())
     } else {
         (first, last)

@@ -1,19 +1,106 @@
 use super::*;
 
 #[test]
-fn apts_simulation_is_understood() {
-    let deb = parse_inst(
-        "Inst libssl3 [3.0.1-1] (3.0.17-1~deb12u2 Debian:12.12/oldstable, Debian-Security:12 [amd64]) []",
-    );
-    let deb = deb.expect("an installation");
-    assert_eq!(deb.to_string(), "libssl3=3.0.17-1~deb12u2:amd64");
-    let plain = parse_inst("Inst ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])")
-        .expect("an installation");
-    assert_eq!(plain.architecture, "all");
+fn what_apt_would_fetch_is_understood() {
+    let line = "'https://m.invalid/pool/o/openssl/libssl3_3.0.17-1%7edeb12u2_amd64.deb' \
+                libssl3_1%3a3.0.17-1~deb12u2_amd64.deb 2031860 SHA256:5c4b";
+    let deb = parse_uri(line).expect("a package");
+    assert_eq!(deb.to_string(), "libssl3=1:3.0.17-1~deb12u2:amd64");
+    let quoted = "'file:/srv/it's' x/a_1_all.deb' a_1_all.deb 1 ";
     assert_eq!(
-        parse_inst("Conf ros-std-msgs (0.5.13-2 Debian:12.12/oldstable [all])"),
+        parse_uri(quoted),
+        None,
+        "an address that ends early names no package"
+    );
+    assert_eq!(parse_uri("Reading package lists..."), None);
+    assert_eq!(
+        parse_uri("'https://m.invalid/dists/stable/InRelease' m.invalid_InRelease 0 "),
         None
     );
+}
+
+/// Lists as apt keeps them, of an archive that is never asked for anything.
+fn listed(root: &Path, packages: &str) -> Apt {
+    let sources = "deb [trusted=yes] https://m.invalid/debian stable main\n";
+    let apt = Apt::open(root, sources).expect("prepared");
+    let lists = root.join("state/lists");
+    let prefix = "m.invalid_debian_dists_stable";
+    let release = "Origin: Lab\nSuite: stable\nCodename: stable\nArchitectures: amd64 arm64\nComponents: main\n";
+    fs::write(lists.join(format!("{prefix}_Release")), release).expect("written");
+    for architecture in ["amd64", "arm64"] {
+        let name = format!("{prefix}_main_binary-{architecture}_Packages.gz");
+        let file = fs::File::create(lists.join(name)).expect("made");
+        let mut list = flate2::write::GzEncoder::new(file, flate2::Compression::fast());
+        std::io::Write::write_all(&mut list, packages.as_bytes()).expect("written");
+        list.finish().expect("written");
+    }
+    fs::write(root.join("updated"), "").expect("written");
+    apt
+}
+
+const LAB: &str = "Package: robot\nVersion: 1:2.0-1\nArchitecture: all\nDepends: arm (>= 1), leg | wheel\n\
+                   Filename: pool/robot_2.0-1_all.deb\nSize: 1\n\n\
+                   Package: arm\nVersion: 1.5\nArchitecture: all\nPre-Depends: bolt\n\
+                   Filename: pool/arm_1.5_all.deb\nSize: 1\n\n\
+                   Package: bolt\nVersion: 3\nArchitecture: all\nFilename: pool/bolt_3_all.deb\nSize: 1\n\n\
+                   Package: bolt\nVersion: 4\nArchitecture: all\nFilename: pool/bolt_4_all.deb\nSize: 1\n\n\
+                   Package: wheel\nVersion: 1\nArchitecture: all\nFilename: pool/wheel_1_all.deb\nSize: 1\n";
+
+#[tokio::test]
+async fn lists_are_plain_whatever_the_hosts_apt_does() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = listed(root.path(), LAB);
+    let before = apt.stamp();
+    let warning = apt
+        .refresh(false, &progress())
+        .await
+        .expect("nothing is fetched");
+    assert_eq!(warning, None);
+    assert_eq!(apt.compressed_lists().expect("read"), Vec::<PathBuf>::new());
+    let lists = root.path().join("state/lists");
+    let plain = lists.join("m.invalid_debian_dists_stable_main_binary-amd64_Packages");
+    assert_eq!(fs::read_to_string(plain).expect("there"), LAB);
+    assert_ne!(apt.stamp(), before);
+    // A list that cannot be read is apt's to complain about.
+    fs::write(lists.join("other_Packages.xz"), "torn").expect("written");
+    apt.refresh(false, &progress()).await.expect("not needed");
+    assert!(lists.join("other_Packages.xz").exists() && !lists.join("other_Packages").exists());
+}
+
+#[tokio::test]
+async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = listed(root.path(), LAB);
+    let names = BTreeSet::from(["robot".to_owned()]);
+    let debs = apt.resolve(None, &names).await.expect("resolved");
+    let told: Vec<String> = debs.iter().map(Deb::to_string).collect();
+    let place = |deb: &str| told.iter().position(|one| one == deb).expect(deb);
+    assert_eq!(told.len(), 4, "{told:?}");
+    assert!(place("bolt=4:all") < place("arm=1.5:all"), "{told:?}");
+    place("robot=1:2.0-1:all");
+    place("wheel=1:all");
+    // What is there already is not installed again.
+    let status = root.path().join("status");
+    let there = "Package: bolt\nStatus: install ok installed\nVersion: 4\nArchitecture: all\n";
+    fs::write(&status, there).expect("written");
+    let debs = apt.resolve(Some(&status), &names).await.expect("resolved");
+    assert!(
+        debs.len() == 3 && debs.iter().all(|deb| deb.name != "bolt"),
+        "{debs:?}"
+    );
+}
+
+#[tokio::test]
+async fn candidates_are_those_that_apt_would_take() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = listed(root.path(), LAB);
+    for from in ["apt", "the file"] {
+        let candidates = apt.candidates().await.expect(from);
+        let names: Vec<&str> = candidates.names().collect();
+        assert_eq!(names, ["arm", "bolt", "robot", "wheel"], "{from}");
+        let bolt = candidates.get("bolt").expect("there");
+        assert_eq!(bolt.to_string(), "bolt=4:all", "{from}");
+    }
 }
 
 #[test]
