@@ -200,7 +200,9 @@ fn stamp(lists: &[PathBuf]) -> Result<String, Error> {
             .modified()
             .ok()
             .and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
-        let text = format!("{} {} {:?}", list.display(), about.len(), changed);
+        // By its name alone: a cache may be moved.
+        let name = list.file_name().unwrap_or_default().to_string_lossy();
+        let text = format!("{name} {} {changed:?}", about.len());
         key = key.with("list", text);
     }
     Ok(key.finish()[..16].to_owned())

@@ -1,6 +1,6 @@
 //! A cache of this bench's own that begins with what the user's holds.
 
-use std::fs;
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -43,8 +43,8 @@ pub(crate) fn base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<(
     Ok(())
 }
 
-/// Copies what is below `from`, where there is anything; layers and packages, which are replaced and never written to, by
-/// a link.
+/// Copies what is below `from`, where there is anything; layers, packages and lists of files, which are replaced and never
+/// written to, by a link. What is copied keeps its time: by it lists are known, and found to be old.
 fn fill(from: &Path, to: &Path) -> Result<()> {
     let Ok(entries) = fs::read_dir(from) else {
         return Ok(());
@@ -59,13 +59,16 @@ fn fill(from: &Path, to: &Path) -> Result<()> {
             continue;
         }
         let name = entry.file_name().to_string_lossy().into_owned();
-        let whole = [".tar.gz", ".deb"]
-            .iter()
-            .any(|ending| name.ends_with(ending));
+        let whole = [".gz", ".deb"].iter().any(|ending| name.ends_with(ending));
         // A link fails on another filesystem; a copy may fail because another daemon has tidied up meanwhile.
         let linked = whole && fs::hard_link(&source, &target).is_ok();
         if kind.is_file() && !linked && source.exists() {
-            fs::copy(&source, &target).with_context(|| format!("copying {}", source.display()))?;
+            let copying = || format!("copying {}", source.display());
+            fs::copy(&source, &target).with_context(copying)?;
+            let time = source.metadata().and_then(|about| about.modified());
+            let file = File::options().write(true).open(&target);
+            file.and_then(|file| file.set_modified(time?))
+                .with_context(copying)?;
         }
     }
     Ok(())
