@@ -193,6 +193,7 @@ async fn look(
 ) -> Result<Found, ProbeError> {
     let mut watch = bus.graph();
     settle::registered(&mut watch, options).await?;
+    tracing::debug!("probe: all nodes are registered");
     let mut feed = Feed::begin(bus, registry, options).await;
     let mut look = Look {
         bus,
@@ -212,8 +213,14 @@ async fn look(
             options.restless
         ));
     }
+    tracing::debug!("probe: nothing changes");
     look.listen().await?;
+    tracing::debug!(
+        outputs = look.tried.len(),
+        "probe: all outputs are listened to"
+    );
     let bare = look.describe(&feed).await?;
+    tracing::debug!("probe: described as it is without a robot");
     // From here on a node may end of what it is given; then this is what is known of it.
     *unfed.lock() = Some(bare.clone());
     let mut found = bare.clone();
@@ -226,8 +233,11 @@ async fn look(
             settle,
             ..options.clone()
         };
+        tracing::debug!(?settle, "probe: something is given");
         settle::still(&mut look.watch, &options).await?;
-        if settle::shape(&look.graph()) == before {
+        let changed = settle::shape(&look.graph()) != before;
+        tracing::debug!(changed, "probe: nothing changes");
+        if !changed {
             continue;
         }
         look.listen().await?;

@@ -109,16 +109,15 @@ impl<'a> Feed<'a> {
     /// of it, or none if there was nothing to give.
     pub(super) async fn give(&mut self, graph: &Graph) -> Option<Duration> {
         let began = Instant::now();
-        let patience = if self.surroundings(graph).await {
+        let (patience, longest) = if self.surroundings(graph).await {
             // Whoever waits for these asks again now and then.
-            self.options.settle * 3
-        } else if self.inputs(graph).await {
-            self.options.settle * 2
+            (self.options.settle * 3, began.elapsed())
         } else {
-            return None;
+            (self.options.settle * 2, self.inputs(graph).await?)
         };
-        // On a busy machine everything takes longer.
-        Some(patience.max(began.elapsed() * 6).min(self.options.restless))
+        // On a busy machine everything takes longer. How long one of them took tells that; all together they only tell how
+        // many they are.
+        Some(patience.max(longest * 6).min(self.options.restless))
     }
 
     /// Services that were looked for since, with the nodes that did.
@@ -250,9 +249,10 @@ impl<'a> Feed<'a> {
         true
     }
 
-    /// One default message for each input that the package itself does not feed; whether there was any.
-    async fn inputs(&mut self, graph: &Graph) -> bool {
-        let mut new = false;
+    /// One default message for each input that the package itself does not feed. How long the slowest of them took; none
+    /// if there was none.
+    async fn inputs(&mut self, graph: &Graph) -> Option<Duration> {
+        let mut longest = None;
         for (name, topic) in &graph.topics {
             let (subscribed, published) = ends(graph, name, &self.options.own_name);
             let apart =
@@ -263,6 +263,7 @@ impl<'a> Feed<'a> {
             if !subscribed || published || apart || known || self.given.len() >= MOST_INPUTS {
                 continue;
             }
+            let began = Instant::now();
             match self.advertise(name, None).await {
                 Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
                     Ok(bytes) => {
@@ -271,7 +272,7 @@ impl<'a> Feed<'a> {
                         let _ = timeout(ANSWER, connected.wait_for(|count| *count > 0)).await;
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
-                        new = true;
+                        longest = longest.max(Some(began.elapsed()));
                     }
                     Err(error) => {
                         self.refused.insert(name.clone(), error.to_string());
@@ -285,7 +286,7 @@ impl<'a> Feed<'a> {
                 }
             }
         }
-        new
+        longest
     }
 
     /// Advertises a topic with the type that its subscribers ask for, or `usual` where they ask for none; nothing
