@@ -97,7 +97,7 @@ pub(crate) fn resolve(
     for (key, debs) in map {
         for deb in debs
             .split([',', ' '])
-            .filter(|deb| !deb.is_empty() && !archive.candidates.contains(*deb))
+            .filter(|deb| !deb.is_empty() && !archive.candidates.contains(deb))
         {
             missing
                 .entry(deb.to_owned())
