@@ -106,7 +106,8 @@ pub fn cores_are_shared_out_as_asked() -> Told {
             cores * 100.0,
             got * 100.0
         ));
-        ensure!((got - cores).abs() <= 0.05, "{told:?}");
+        // Usage and time are read one after the other, and a busy host stretches what lies between.
+        ensure!((got - cores).abs() <= 0.02 + cores * 0.1, "{told:?}");
     }
     println!("        {}", told.join("; "));
     let servant = daemon.servant_of("burglar_cpp", "burner")?;
