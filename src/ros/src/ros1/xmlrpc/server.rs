@@ -162,9 +162,8 @@ impl Server {
         }
         let keep = head.keeps_alive(version);
         let mut permit = self.limits.budget.permit();
-        if let Some(length) = head.content_length()?.filter(|length| *length > SMALL)
-            && length <= self.limits.body
-        {
+        let counts = |length: &usize| *length > SMALL && *length <= self.limits.body;
+        if let Some(length) = head.content_length()?.filter(counts) {
             let room = permit.wait(length * FORMS, self.limits.transfer).await;
             room.map_err(|full| HttpError::Bad(503, full.to_string()))?;
         }
