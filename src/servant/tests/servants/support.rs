@@ -167,8 +167,7 @@ impl World {
         );
         assert!(runtime.shim.open().unwrap().is_none(), "the shim is left");
         for pid in processes {
-            let cgroup = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
-            assert!(!cgroup.contains(id), "process {pid} is left");
+            assert_ended(*pid, id);
         }
         let mounts = std::fs::read_to_string("/proc/self/mountinfo").unwrap();
         assert!(!mounts.contains(id), "a mount is left");
@@ -196,6 +195,31 @@ impl Drop for World {
     }
 }
 
+/// Fails where a process of a servant does not end. One that has ended keeps its entry in /proc, cgroup included, until its
+/// parent has collected it: its end is awaited, not the disappearance of the entry.
+fn assert_ended(pid: i32, id: &str) {
+    let of_servant = || {
+        std::fs::read_to_string(format!("/proc/{pid}/cgroup"))
+            .is_ok_and(|cgroup| cgroup.contains(id))
+    };
+    let Ok(process) = servant::process::Identity::of(pid) else {
+        return;
+    };
+    // Looked at after its identity was taken: the same number may be another's by now.
+    if !of_servant() {
+        return;
+    }
+    let Ok(Some(pidfd)) = process.open() else {
+        return;
+    };
+    let mut watched = [nix::poll::PollFd::new(
+        pidfd.as_fd(),
+        nix::poll::PollFlags::POLLIN,
+    )];
+    let ended = nix::poll::poll(&mut watched, 10_000_u16).unwrap();
+    assert!(ended == 1, "process {pid} is left");
+}
+
 /// Kills a process and waits for its end.
 pub fn kill(pidfd: &std::os::fd::OwnedFd) {
     use std::os::fd::AsRawFd;
@@ -221,7 +245,8 @@ pub fn spec(nodes: Vec<NodeSpec>) -> Spec {
     static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
     let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
     Spec {
-        id: format!("test-{}-{number}", std::process::id()),
+        // Of one width: no id is the beginning of another.
+        id: format!("test-{}-{number:04}", std::process::id()),
         layers: vec![layer()],
         writable: None,
         profile: Profile::Servant,
