@@ -6,7 +6,7 @@ use anyhow::Context;
 
 use crate::config::Config;
 use crate::home::Home;
-use crate::private;
+use store::private;
 
 /// `images/` of the source tree.
 const BUILT_IN: [(&str, &str); 1] = [(

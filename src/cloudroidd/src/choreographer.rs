@@ -39,11 +39,11 @@ use crate::admission::{Admission, Amount, Permit, Refused};
 use crate::config::Config;
 use crate::definitions::Definitions;
 use crate::errors::Error;
-use crate::journal::Journal;
 use crate::memory::{Memory, SharedMemory};
 use crate::names;
 use crate::request_times::RequestTimes;
-use crate::state::{self, State};
+use store::Journal;
+use store::State;
 
 pub use handle::{Asked, Handle, Lease};
 pub use limits::engine_limits;
@@ -166,7 +166,7 @@ impl Choreographer {
                 anonymous,
                 Asked::new(revision.plan.limits, inner.config.limits),
                 revision,
-                state::now(),
+                store::now(),
             ));
             if linked {
                 handle.set_linked();

@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 use ros::schema::Registry;
 
 use crate::errors::Error;
-use crate::state::RevisionRecord;
+use store::RevisionRecord;
 
 type Texts = Arc<BTreeMap<String, String>>;
 

@@ -7,7 +7,6 @@ use axum::response::{IntoResponse, Response};
 
 use crate::admission;
 use crate::names::NameError;
-use crate::state::StateError;
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
@@ -163,7 +162,7 @@ pub enum Error {
     },
     /// The state database.
     #[error(transparent)]
-    State(#[from] StateError),
+    State(#[from] store::Error),
     /// The image store.
     #[error("the image store: {0}")]
     Image(#[from] image::Error),

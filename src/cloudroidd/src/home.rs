@@ -16,7 +16,7 @@ use nix::fcntl::{Flock, FlockArg};
 use servant::process::Identity;
 use tokio::net::UnixListener;
 
-use crate::private;
+use store::private;
 
 /// Why a directory cannot be the home.
 #[derive(Debug, thiserror::Error)]

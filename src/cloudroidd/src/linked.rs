@@ -20,10 +20,10 @@ use tokio::sync::mpsc;
 
 use crate::choreographer::{Handle, Inner, how_it_ended};
 use crate::definitions;
-use crate::journal::Journal;
 use crate::request_times::RequestTimes;
-use crate::state::{NewEvent, RevisionRecord, State};
 use crate::stubs;
+use store::Journal;
+use store::{NewEvent, RevisionRecord, State};
 
 use planned::Planned;
 
@@ -348,7 +348,7 @@ impl Nodes for LinkedNodes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::state::Plan;
+    use store::Plan;
 
     fn revision() -> RevisionRecord {
         let node = |name: &str, argv: &[&str]| NodeSpec {

@@ -19,18 +19,15 @@ mod errors;
 mod explain;
 mod grants;
 mod home;
-mod journal;
 mod linked;
 mod memory;
 mod names;
 mod portal;
-mod private;
 mod push;
 mod request_times;
 mod revisions;
 mod shim;
 mod sockets;
-mod state;
 mod stubs;
 mod supervision;
 mod tokens;
@@ -61,7 +58,7 @@ use config::{Config, IsolationMode};
 use home::Home;
 use portal::App;
 use push::Pusher;
-use state::State;
+use store::State;
 use tokens::Tokens;
 
 /// Robot packages as services, on this machine.
@@ -271,7 +268,7 @@ fn build(
     let config = Arc::new(config);
     let tokens = Tokens::new(&config.tokens)?;
     let state = Arc::new(State::open(&home.database())?);
-    tokio::spawn(state::watch(Arc::clone(&state)));
+    tokio::spawn(store::watch(Arc::clone(&state)));
     // Names bound to a token that is not known any more would be nobody's for ever.
     state.release_robots(tokens.hashes())?;
     let store = Arc::new(image::Store::open(&home.images(), &home.layers())?);
@@ -307,7 +304,7 @@ fn build(
         choreographer,
         pusher: Arc::new(pusher),
         machine,
-        started: state::now(),
+        started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),
         config,

@@ -14,10 +14,10 @@ use budget::{Budget, Exceeded, Shares};
 use parking_lot::Mutex;
 
 use crate::config;
-use crate::journal::Journal;
 use crate::portal::Peer;
-use crate::state::NewEvent;
 use crate::supervision;
+use store::Journal;
+use store::NewEvent;
 
 /// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
 /// `MOST` bytes.

@@ -41,8 +41,8 @@ use tokio_util::task::TaskTracker;
 use crate::choreographer::Choreographer;
 use crate::config::Config;
 use crate::push::Pusher;
-use crate::state::State;
 use crate::tokens::Tokens;
+use store::State;
 
 pub use api_v1::lines;
 pub use guard::{Peer, query};

@@ -42,10 +42,10 @@ use crate::choreographer::Choreographer;
 use crate::config::Config;
 use crate::errors::Error;
 use crate::home::Home;
-use crate::journal::Journal;
 use crate::names;
-use crate::private;
-use crate::state::{self, NewEvent, Plan, RevisionRecord, State};
+use store::Journal;
+use store::private;
+use store::{NewEvent, Plan, RevisionRecord, State};
 
 /// Events that may wait for a slow client before the build waits for it.
 const EVENTS_AHEAD: usize = 256;
@@ -206,7 +206,7 @@ impl Pusher {
             service: name.clone(),
             number: 0,
             image: built.image.to_string(),
-            published: state::now(),
+            published: store::now(),
             package: built.package.clone(),
             source: options.source.clone(),
             plan,

@@ -2,7 +2,7 @@
 
 use package::difference::Difference;
 
-use crate::state::{RevisionRecord, State};
+use store::{RevisionRecord, State};
 
 /// How many differences are named.
 const NAMED: usize = 8;

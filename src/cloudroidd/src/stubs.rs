@@ -12,7 +12,7 @@ use tar::{EntryType, Header};
 
 use crate::definitions;
 use crate::errors::Error;
-use crate::state::RevisionRecord;
+use store::RevisionRecord;
 
 /// The time of every file: the same input gives the same archive.
 const MTIME: u64 = 1_700_000_000;
@@ -251,7 +251,7 @@ mod tests {
     use std::io::Read;
 
     use super::*;
-    use crate::state::Plan;
+    use store::Plan;
 
     fn revision(argv: &[&[&str]]) -> RevisionRecord {
         RevisionRecord {

@@ -8,8 +8,7 @@ use anyhow::bail;
 use parking_lot::Mutex;
 use sha2::{Digest, Sha256, Sha512};
 
-/// SHA-256 of a token, lower-case hex.
-pub type TokenHash = String;
+pub use store::TokenHash;
 
 /// The tokens of the configuration.
 #[derive(Debug, Clone, Default)]

@@ -8,8 +8,8 @@ use package::interface as recorded;
 use crate::choreographer::Handle;
 use crate::errors::Error;
 use crate::portal::App;
-use crate::state::{RevisionRecord, State};
 use crate::supervision;
+use store::{RevisionRecord, State};
 
 /// The current revision of a service that exists.
 pub fn current(state: &State, name: &str) -> Result<Arc<RevisionRecord>, Error> {

@@ -13,7 +13,7 @@ use crate::config::{Config, NonFinite};
 use crate::grants::Relays;
 use crate::linked::LinkedNodes;
 use crate::sockets::ServantSockets;
-use crate::state::RevisionRecord;
+use store::RevisionRecord;
 
 /// Where every servant's ROS Master listens, as seen from inside.
 pub const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);

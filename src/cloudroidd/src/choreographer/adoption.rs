@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::driver::{self, Beginning};
 use super::{Asked, Choreographer, Handle};
 use crate::errors::Error;
-use crate::state::{NewEvent, RevisionRecord, ServantRecord};
+use store::{NewEvent, RevisionRecord, ServantRecord};
 
 impl Choreographer {
     /// Takes over the servants that an earlier daemon left, and forgets those that are gone.

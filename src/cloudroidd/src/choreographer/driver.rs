@@ -19,8 +19,8 @@ use crate::admission::Permit;
 use crate::definitions;
 use crate::errors::{Error, with_last_words};
 use crate::grants;
-use crate::state::{self, NewEvent, RevisionRecord, ServantRecord};
 use crate::works::Works;
+use store::{NewEvent, RevisionRecord, ServantRecord};
 
 /// Lines of the log that explain a failure.
 const LOG_LINES: usize = 20;
@@ -196,7 +196,7 @@ async fn run(
     }
     handle.set_phase(Phase::Ready);
     inner.spares.look();
-    let took = state::now().saturating_sub(handle.created);
+    let took = store::now().saturating_sub(handle.created);
     let message = if fresh {
         format!(
             "servant {} of {} is ready for {} after {took} ms",
@@ -445,7 +445,7 @@ async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
     let mut connections = handle.watch_connections();
     loop {
         let _ = connections.wait_for(|count| *count == 0).await;
-        handle.set_idle_until(Some(state::now() + grace.as_millis() as u64));
+        handle.set_idle_until(Some(store::now() + grace.as_millis() as u64));
         // Somebody may have been waiting for longer.
         inner.make_room();
         let returned = tokio::time::timeout(grace, connections.wait_for(|count| *count > 0))

@@ -10,8 +10,8 @@ use tokio_util::sync::CancellationToken;
 
 use crate::admission::{Promise, Refused};
 use crate::errors::Error;
-use crate::state::{NewEvent, RevisionRecord};
 use crate::works::Works;
+use store::{NewEvent, RevisionRecord};
 
 /// Why a servant failed.
 #[derive(Debug, Clone, PartialEq)]

@@ -16,8 +16,8 @@ use tokio::sync::Notify;
 use super::{Asked, Inner, driver};
 use crate::errors::Error;
 use crate::names;
-use crate::state::RevisionRecord;
 use crate::works::Works;
+use store::RevisionRecord;
 
 /// A servant without nodes.
 pub(super) struct Spare {

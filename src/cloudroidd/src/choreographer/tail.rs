@@ -7,8 +7,6 @@ use std::path::{Path, PathBuf};
 
 use servant::engine::LogLine;
 
-use crate::state;
-
 /// Bytes read at once, from the end of the file on.
 const BLOCK: usize = 64 * 1024;
 
@@ -79,7 +77,7 @@ pub fn is_after(line: &LogLine, last: Option<u64>) -> bool {
 /// A line as the API shows it.
 pub fn record(line: LogLine) -> api::LogLine {
     api::LogLine {
-        time: state::millis(line.time),
+        time: store::millis(line.time),
         node: line.node,
         stream: line.stream,
         line: line.line,

@@ -5,7 +5,7 @@ use servant::engine::{Adopted, Servant};
 use servant::spec::Spec;
 
 use super::*;
-use crate::state::{Plan, RevisionRecord};
+use store::{Plan, RevisionRecord};
 
 /// No servant is started here.
 struct NoEngine;
@@ -29,7 +29,7 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
         service: "detect".into(),
         number: 0,
         image: image.into(),
-        published: state::now(),
+        published: store::now(),
         package: "detect".into(),
         source: "a test".into(),
         plan: Plan {

@@ -22,8 +22,8 @@ use super::Pusher;
 use super::probe::{self, NODE};
 use crate::errors::Error;
 use crate::sockets::ServantSockets;
-use crate::state::Plan;
 use crate::works::MASTER;
+use store::Plan;
 
 /// Where the node of an index is while its name is looked for.
 fn namespace(index: usize) -> String {

@@ -22,8 +22,8 @@ use crate::choreographer;
 use crate::errors::Error;
 use crate::grants::Relays;
 use crate::sockets::ServantSockets;
-use crate::state::Plan;
 use crate::works::MASTER;
+use store::Plan;
 
 /// The name of the looking node.
 pub(super) const NODE: &str = "/cloudroid_probe";

@@ -8,8 +8,8 @@ use image::Store;
 
 use super::{Pusher, blocking};
 use crate::errors::Error;
-use crate::state::{NewEvent, RevisionRecord};
 use crate::views;
+use store::{NewEvent, RevisionRecord};
 
 impl Pusher {
     /// Writes the revision; from here on it is what new servants are started from.

@@ -57,7 +57,7 @@ pub(super) async fn unpack(
     let destination = tree.to_owned();
     let work = blocking::spawn(move || {
         let parent = destination.parent().unwrap_or(&destination);
-        crate::private::make_directory(parent).map_err(|error| Error::Push {
+        store::private::make_directory(parent).map_err(|error| Error::Push {
             message: format!("cannot make {}: {error}", parent.display()),
             next: None,
             log: Vec::new(),

@@ -20,8 +20,8 @@ use crate::errors::Error;
 use crate::grants;
 use crate::names;
 use crate::portal::App;
-use crate::state::NewEvent;
 use crate::views;
+use store::NewEvent;
 
 /// How long the last event waits for a client that does not read.
 const FAREWELL: Duration = Duration::from_secs(5);

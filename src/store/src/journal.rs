@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use api::Level;
 
-use crate::state::{NewEvent, State};
+use super::{NewEvent, State};
 
 /// Where events go.
 #[derive(Clone)]

@@ -7,7 +7,7 @@ use api::Millis;
 use rusqlite::{OptionalExtension, Row, params};
 use serde::{Deserialize, Serialize};
 
-use super::{State, StateError, to_json};
+use super::{Error, State, to_json};
 
 /// A published revision.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,7 +72,7 @@ pub struct Plan {
 
 impl State {
     /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns.
-    pub fn publish(&self, revision: &RevisionRecord) -> Result<u64, StateError> {
+    pub fn publish(&self, revision: &RevisionRecord) -> Result<u64, Error> {
         let plan = to_json(&revision.plan, &revision.service)?;
         let interface = to_json(&revision.interface, &revision.service)?;
         self.durably(|connection| {
@@ -108,7 +108,7 @@ impl State {
     }
 
     /// Makes an earlier (or later) revision the current one; false when there is none of that number.
-    pub fn set_current(&self, service: &str, number: u64) -> Result<bool, StateError> {
+    pub fn set_current(&self, service: &str, number: u64) -> Result<bool, Error> {
         self.durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?2 WHERE name = ?1
@@ -120,7 +120,7 @@ impl State {
     }
 
     /// Forgets a service and its revisions; false when there is none.
-    pub fn remove_service(&self, name: &str) -> Result<bool, StateError> {
+    pub fn remove_service(&self, name: &str) -> Result<bool, Error> {
         self.durably(|connection| {
             connection.execute("DELETE FROM services WHERE name = ?1", [name])
         })
@@ -128,7 +128,7 @@ impl State {
     }
 
     /// Names of all services.
-    pub fn service_names(&self) -> Result<Vec<String>, StateError> {
+    pub fn service_names(&self) -> Result<Vec<String>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached("SELECT name FROM services ORDER BY name")?
@@ -138,7 +138,7 @@ impl State {
     }
 
     /// The ROS package that a service was first made of.
-    pub fn service_package(&self, name: &str) -> Result<Option<String>, StateError> {
+    pub fn service_package(&self, name: &str) -> Result<Option<String>, Error> {
         self.read(|connection| {
             connection
                 .query_row(
@@ -151,7 +151,7 @@ impl State {
     }
 
     /// The current revision of a service.
-    pub fn current(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, StateError> {
+    pub fn current(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, Error> {
         let current: Option<u64> = self.read(|connection| {
             connection
                 .prepare_cached("SELECT current FROM services WHERE name = ?1")?
@@ -169,7 +169,7 @@ impl State {
         &self,
         service: &str,
         number: u64,
-    ) -> Result<Option<Arc<RevisionRecord>>, StateError> {
+    ) -> Result<Option<Arc<RevisionRecord>>, Error> {
         let key = (service.to_owned(), number);
         if let Some(known) = self.revisions.lock().get(&key) {
             return Ok(Some(Arc::clone(known)));
@@ -184,11 +184,7 @@ impl State {
         Ok(Some(record))
     }
 
-    fn read_revision(
-        &self,
-        service: &str,
-        number: u64,
-    ) -> Result<Option<RevisionRecord>, StateError> {
+    fn read_revision(&self, service: &str, number: u64) -> Result<Option<RevisionRecord>, Error> {
         let read = |row: &Row<'_>| -> rusqlite::Result<(RevisionRecord, String, String)> {
             let record = RevisionRecord {
                 service: service.to_owned(),
@@ -215,7 +211,7 @@ impl State {
         let Some((record, plan, interface)) = found else {
             return Ok(None);
         };
-        let unreadable = |source| StateError::Record {
+        let unreadable = |source| Error::Record {
             what: format!("revision {number} of {service}"),
             source,
         };
@@ -227,12 +223,12 @@ impl State {
     }
 
     /// All revisions of a service in short, newest first.
-    pub fn revisions(&self, service: &str) -> Result<Vec<RevisionLine>, StateError> {
+    pub fn revisions(&self, service: &str) -> Result<Vec<RevisionLine>, Error> {
         self.lines("WHERE service = ?1", [service])
     }
 
     /// All revisions of all services in short.
-    pub fn all_revisions(&self) -> Result<Vec<RevisionLine>, StateError> {
+    pub fn all_revisions(&self) -> Result<Vec<RevisionLine>, Error> {
         self.lines("", [])
     }
 
@@ -240,7 +236,7 @@ impl State {
         &self,
         condition: &str,
         values: impl rusqlite::Params,
-    ) -> Result<Vec<RevisionLine>, StateError> {
+    ) -> Result<Vec<RevisionLine>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!(

@@ -4,7 +4,7 @@ use api::{Event, Level, Millis};
 use rusqlite::{Connection, params};
 
 use super::backlog::Write;
-use super::{State, StateError, now};
+use super::{Error, State, now};
 
 /// Events beyond are forgotten, oldest first.
 const EVENTS_KEPT: i64 = 10_000;
@@ -72,7 +72,7 @@ impl State {
     }
 
     /// The newest `limit` events after number `since`, oldest first.
-    pub fn events(&self, since: i64, limit: u32) -> Result<Vec<Event>, StateError> {
+    pub fn events(&self, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
         // First, so that none is missed that is being written meanwhile.
         let kept = self.backlog.events(since);
         let mut events = self.written_events(since, limit)?;
@@ -82,7 +82,7 @@ impl State {
         Ok(events.split_off(beyond))
     }
 
-    fn written_events(&self, since: i64, limit: u32) -> Result<Vec<Event>, StateError> {
+    fn written_events(&self, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(

@@ -8,7 +8,10 @@
 
 mod backlog;
 mod events;
-mod lives;
+mod journal;
+pub mod private;
+mod robots;
+mod servants;
 mod services;
 
 use std::collections::HashMap;
@@ -24,18 +27,20 @@ use serde::Serialize;
 use backlog::Backlog;
 pub use backlog::watch;
 pub use events::NewEvent;
-pub use lives::ServantRecord;
+pub use journal::Journal;
+pub use robots::TokenHash;
+pub use servants::ServantRecord;
 pub use services::{Plan, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
 const MIGRATIONS: [&str; 2] = [
-    include_str!("state/001-start.sql"),
-    include_str!("state/002-limits.sql"),
+    include_str!("001-start.sql"),
+    include_str!("002-limits.sql"),
 ];
 
 /// What can go wrong.
 #[derive(Debug, thiserror::Error)]
-pub enum StateError {
+pub enum Error {
     /// SQLite refused.
     #[error("the state database {path}: {source}")]
     Database {
@@ -95,14 +100,14 @@ fn cannot_open(error: &std::io::Error) -> rusqlite::Error {
 
 impl State {
     /// Opens the database, making or migrating it.
-    pub fn open(path: &Path) -> Result<State, StateError> {
+    pub fn open(path: &Path) -> Result<State, Error> {
         let name = path.display().to_string();
-        let failed = |source| StateError::Database {
+        let failed = |source| Error::Database {
             path: name.clone(),
             source,
         };
         // It holds hashes of tokens. SQLite's own files beside it get the rights that this one has.
-        crate::private::open(path).map_err(|error| failed(cannot_open(&error)))?;
+        private::open(path).map_err(|error| failed(cannot_open(&error)))?;
         let mut connection = Connection::open(path).map_err(failed)?;
         connection
             .execute_batch(
@@ -134,7 +139,7 @@ impl State {
     fn run<T>(
         &self,
         work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, StateError> {
+    ) -> Result<T, Error> {
         let outcome = {
             let mut connection = self
                 .connection
@@ -149,15 +154,12 @@ impl State {
     }
 
     /// Runs `work`, which only reads.
-    fn read<T>(
-        &self,
-        work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, StateError> {
+    fn read<T>(&self, work: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, Error> {
         work(&self.reader.lock()).map_err(|source| self.failed(source))
     }
 
-    fn failed(&self, source: rusqlite::Error) -> StateError {
-        StateError::Database {
+    fn failed(&self, source: rusqlite::Error) -> Error {
+        Error::Database {
             path: self.path.clone(),
             source,
         }
@@ -167,7 +169,7 @@ impl State {
     fn durably<T>(
         &self,
         work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, StateError> {
+    ) -> Result<T, Error> {
         self.run(|connection| {
             connection.pragma_update(None, "synchronous", "FULL")?;
             let outcome = work(connection);
@@ -200,8 +202,8 @@ fn aside<T>(wait: impl FnOnce() -> T) -> T {
     }
 }
 
-fn migrate(connection: &mut Connection, path: &str) -> Result<(), StateError> {
-    let failed = |source| StateError::Database {
+fn migrate(connection: &mut Connection, path: &str) -> Result<(), Error> {
+    let failed = |source| Error::Database {
         path: path.to_owned(),
         source,
     };
@@ -209,7 +211,7 @@ fn migrate(connection: &mut Connection, path: &str) -> Result<(), StateError> {
         .query_row("PRAGMA user_version", [], |row| row.get(0))
         .map_err(failed)?;
     if found > MIGRATIONS.len() {
-        return Err(StateError::TooNew {
+        return Err(Error::TooNew {
             path: path.to_owned(),
             found,
             known: MIGRATIONS.len(),
@@ -226,8 +228,8 @@ fn migrate(connection: &mut Connection, path: &str) -> Result<(), StateError> {
     Ok(())
 }
 
-fn to_json(value: &impl Serialize, what: &str) -> Result<String, StateError> {
-    serde_json::to_string(value).map_err(|source| StateError::Record {
+fn to_json(value: &impl Serialize, what: &str) -> Result<String, Error> {
+    serde_json::to_string(value).map_err(|source| Error::Record {
         what: what.to_owned(),
         source,
     })

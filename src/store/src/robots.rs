@@ -1,0 +1,59 @@
+//! Names of robots and whose they are.
+
+use rusqlite::{OptionalExtension, params};
+
+use super::backlog::Write;
+use super::{Error, State, now};
+
+/// SHA-256 of a bearer token, lower-case hex.
+pub type TokenHash = String;
+
+impl State {
+    /// Binds `robot` to `owner` when it is new, and with `claim` also when nobody owns it yet; then says to whom it
+    /// is bound.
+    pub fn robot_owner(
+        &self,
+        robot: &str,
+        owner: Option<&TokenHash>,
+        claim: bool,
+    ) -> Result<Option<TokenHash>, Error> {
+        // Who is known comes in even while nothing can be written.
+        let known: Option<Option<TokenHash>> = self.read(|connection| {
+            connection
+                .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
+                .query_row([robot], |row| row.get(0))
+                .optional()
+        })?;
+        if let Some(known) = known
+            && (known.is_some() || !claim)
+        {
+            self.robot_seen(robot);
+            return Ok(known);
+        }
+        self.run(|connection| {
+            connection
+                .prepare_cached(
+                    "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
+                     ON CONFLICT (name) DO UPDATE SET last_seen = ?3,
+                     owner = CASE WHEN ?4 THEN COALESCE(owner, ?2) ELSE owner END RETURNING owner",
+                )?
+                .query_row(params![robot, owner, now() as i64, claim], |row| row.get(0))
+        })
+    }
+
+    /// Forgets robots bound to tokens that are not in `tokens` any more, so that their names can be used again.
+    pub fn release_robots(&self, tokens: &[TokenHash]) -> Result<usize, Error> {
+        let kept = serde_json::Value::from(tokens).to_string();
+        self.run(|connection| {
+            connection.execute(
+                "DELETE FROM robots WHERE owner IS NOT NULL AND owner NOT IN (SELECT value FROM json_each(?1))",
+                [kept],
+            )
+        })
+    }
+
+    /// Remembers that a robot came.
+    fn robot_seen(&self, robot: &str) {
+        self.write_or_keep(Write::RobotSeen(robot.to_owned(), now()));
+    }
+}
