@@ -32,15 +32,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use api::Phase;
+use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
 use servant::engine::Engine;
 
 use crate::admission::{Admission, Amount, Permit, Refused};
 use crate::config::Config;
-use crate::definitions::Definitions;
 use crate::errors::Error;
 use crate::memory::{Memory, SharedMemory};
-use crate::names;
 use crate::request_times::RequestTimes;
 use store::Journal;
 use store::State;
@@ -64,10 +63,9 @@ pub(crate) struct Inner {
     pub(crate) config: Arc<Config>,
     pub(crate) state: Arc<State>,
     pub(crate) journal: Journal,
-    pub(crate) store: Arc<image::Store>,
+    pub(crate) catalogue: Arc<Catalogue>,
     pub(crate) engine: Arc<dyn Engine>,
     pub(crate) admission: Admission,
-    pub(crate) definitions: Definitions,
     pub(crate) request_times: Arc<RequestTimes>,
     pub(crate) memory: SharedMemory,
     servants: Mutex<Servants>,
@@ -89,11 +87,11 @@ impl Choreographer {
     /// One that starts servants by `engine`.
     pub fn new(
         config: Arc<Config>,
-        state: Arc<State>,
-        store: Arc<image::Store>,
+        catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         admission: Admission,
     ) -> Choreographer {
+        let state = Arc::clone(catalogue.state());
         let journal = Journal::new(Arc::clone(&state));
         let memory = Memory::new(&config.memory, journal.clone());
         let inner = Inner {
@@ -101,10 +99,9 @@ impl Choreographer {
             config,
             state,
             journal,
-            store,
+            catalogue,
             engine,
             admission,
-            definitions: Definitions::default(),
             request_times: Arc::default(),
             servants: Mutex::default(),
             spares: Spares::default(),
@@ -140,12 +137,7 @@ impl Choreographer {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
             // followed by one of the revision before.
-            let Some(revision) = inner.state.current(service)? else {
-                return Err(Error::UnknownService {
-                    name: service.to_owned(),
-                    exists: inner.state.service_names()?,
-                });
-            };
+            let revision = inner.catalogue.current(service)?;
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
@@ -260,22 +252,6 @@ impl Choreographer {
     /// Spare containers that there are.
     pub fn spares(&self) -> usize {
         self.inner.spares.count()
-    }
-
-    /// Reads the definitions of everything published, so that no robot waits for that.
-    pub async fn read_definitions(&self) -> Result<(), Error> {
-        let inner = &self.inner;
-        for service in inner.state.service_names()? {
-            if let Some(revision) = inner.state.current(&service)? {
-                inner.definitions.read(&inner.store, &revision.image).await;
-            }
-        }
-        Ok(())
-    }
-
-    /// Forgets the definitions of all images but those.
-    pub fn keep_definitions(&self, images: &BTreeSet<String>) {
-        self.inner.definitions.keep_only(images);
     }
 
     /// What may be held for clients and servants.

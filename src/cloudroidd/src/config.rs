@@ -406,10 +406,10 @@ impl Config {
             .context("egress in [allow] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
         if let Some(service) = &self.default_service {
-            crate::names::service(service).context("default_service of the configuration")?;
+            catalogue::names::service(service).context("default_service of the configuration")?;
         }
         if let Some(robot) = &self.default_robot {
-            crate::names::robot(robot).context("default_robot of the configuration")?;
+            catalogue::names::robot(robot).context("default_robot of the configuration")?;
         }
         self.memory
             .check()

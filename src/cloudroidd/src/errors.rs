@@ -4,21 +4,13 @@ use api::Problem;
 use api::problem::PROBLEM_JSON;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use catalogue::names::NameError;
 
 use crate::admission;
-use crate::names::NameError;
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No such service.
-    #[error("there is no service {name:?}")]
-    UnknownService {
-        /// Asked for.
-        name: String,
-        /// What there is.
-        exists: Vec<String>,
-    },
     /// No such servant.
     #[error("there is no servant {id:?}")]
     UnknownServant {
@@ -35,47 +27,12 @@ pub enum Error {
         /// Those that are served.
         exists: Vec<String>,
     },
-    /// No such revision.
-    #[error("service {service} has no revision {revision}")]
-    UnknownRevision {
-        /// The service.
-        service: String,
-        /// Asked for.
-        revision: String,
-        /// What there is.
-        exists: Vec<String>,
-    },
-    /// No such image or blob.
-    #[error("there is no {what} in the image store")]
-    UnknownImage {
-        /// Asked for.
-        what: String,
-    },
-    /// No stub can be made of it.
-    #[error("there is no stub of {service}: {reason}")]
-    NoStub {
-        /// The service.
-        service: String,
-        /// Why not.
-        reason: String,
-    },
-    /// The robot's program is not held for an architecture.
-    #[error("this server holds no cloudroid-stub for {asked:?}")]
-    UnknownArchitecture {
-        /// Asked for.
-        asked: String,
-        /// What there is.
-        exists: Vec<String>,
-    },
     /// Nothing is served there.
     #[error("nothing is served at {path}")]
     UnknownPath {
         /// Asked for.
         path: String,
     },
-    /// A name that cannot be given.
-    #[error(transparent)]
-    Name(#[from] NameError),
     /// A reserved name is asked for as if it were a service.
     #[error(
         "the service name {name} is taken: it was made of the package {package}, and this one is {newcomer}"
@@ -160,6 +117,9 @@ pub enum Error {
         /// The time that it may take.
         after: std::time::Duration,
     },
+    /// What is published.
+    #[error(transparent)]
+    Catalogue(#[from] catalogue::Error),
     /// The state database.
     #[error(transparent)]
     State(#[from] store::Error),
@@ -210,11 +170,13 @@ impl Error {
             ..Problem::default()
         };
         match self {
-            Error::UnknownService { exists, .. }
-            | Error::UnknownServant { exists, .. }
+            Error::UnknownServant { exists, .. }
             | Error::UnknownRobot { exists, .. }
-            | Error::UnknownRevision { exists, .. }
-            | Error::UnknownArchitecture { exists, .. } => problem.exists = exists.clone(),
+            | Error::Catalogue(
+                catalogue::Error::UnknownService { exists, .. }
+                | catalogue::Error::UnknownRevision { exists, .. }
+                | catalogue::Error::UnknownArchitecture { exists, .. },
+            ) => problem.exists = exists.clone(),
             Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
             Error::Full(admission::Refused::TooBig { .. }) => {}
             Error::Full(_) | Error::Memory(_) | Error::Ending => {
@@ -228,18 +190,10 @@ impl Error {
     fn kind(&self) -> (StatusCode, &'static str, &'static str) {
         use StatusCode as S;
         match self {
-            Error::UnknownService { .. } => (S::NOT_FOUND, "unknown-service", "unknown service"),
             Error::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
-            Error::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
-            Error::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
-            Error::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
-            Error::UnknownArchitecture { .. } => {
-                (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
-            }
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
-            Error::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
-            Error::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
+            Error::Catalogue(error) => kind_of_catalogue(error),
             Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
             Error::BodyTooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
             Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
@@ -273,18 +227,9 @@ impl Error {
 
     fn next(&self) -> Option<String> {
         let text = match self {
-            Error::UnknownService { exists, .. } if exists.is_empty() => "publish one with: cloudroidctl push".into(),
-            Error::UnknownService { .. } => "use one that exists, or publish it with: cloudroidctl push".into(),
             Error::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
             Error::UnknownRobot { .. } => {
                 "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
-            }
-            Error::UnknownRevision { service, .. } => {
-                format!("see those that exist with: cloudroidctl services {service}")
-            }
-            Error::NoStub { service, .. } => format!("mend the package and push {service} again"),
-            Error::UnknownArchitecture { .. } => {
-                "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".into()
             }
             Error::NameTaken { name, .. } => {
                 format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
@@ -301,12 +246,54 @@ impl Error {
                 format!("see cloudroidctl events, and push {service} again when its package is mended")
             }
             Error::Push { next, .. } => return next.clone(),
+            Error::Catalogue(error) => return next_of_catalogue(error),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
             Error::TooLarge { .. } => "leave out what is not needed, or raise archive in [push] of the configuration".into(),
             _ => return None,
         };
         Some(text)
     }
+}
+
+fn kind_of_catalogue(error: &catalogue::Error) -> (StatusCode, &'static str, &'static str) {
+    use StatusCode as S;
+    use catalogue::Error as C;
+    match error {
+        C::UnknownService { .. } => (S::NOT_FOUND, "unknown-service", "unknown service"),
+        C::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
+        C::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
+        C::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
+        C::UnknownArchitecture { .. } => {
+            (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
+        }
+        C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
+        C::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
+        C::Definitions(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
+        C::State(_) | C::Image(_) | C::Internal(_) => {
+            (S::INTERNAL_SERVER_ERROR, "internal", "the daemon failed")
+        }
+    }
+}
+
+fn next_of_catalogue(error: &catalogue::Error) -> Option<String> {
+    use catalogue::Error as C;
+    let text = match error {
+        C::UnknownService { exists, .. } if exists.is_empty() => {
+            "publish one with: cloudroidctl push".to_owned()
+        }
+        C::UnknownService { .. } => {
+            "use one that exists, or publish it with: cloudroidctl push".to_owned()
+        }
+        C::UnknownRevision { service, .. } => {
+            format!("see those that exist with: cloudroidctl services {service}")
+        }
+        C::NoStub { service, .. } => format!("mend the package and push {service} again"),
+        C::UnknownArchitecture { .. } => {
+            "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".to_owned()
+        }
+        _ => return None,
+    };
+    Some(text)
 }
 
 impl IntoResponse for Error {
@@ -353,11 +340,11 @@ mod tests {
 
     #[test]
     fn an_unknown_service_lists_those_that_exist() {
-        let error = Error::UnknownService {
+        let error = catalogue::Error::UnknownService {
             name: "nope".into(),
             exists: vec!["opencv_apps".into()],
         };
-        let problem = error.problem();
+        let problem = Error::from(error).problem();
         assert_eq!(
             (problem.status, problem.kind.as_str()),
             (404, "urn:cloudroid:unknown-service")
@@ -389,7 +376,8 @@ mod tests {
 
     #[test]
     fn a_reserved_name_says_so() {
-        let problem = Error::from(NameError::Reserved("api".into())).problem();
+        let reserved = catalogue::Error::from(NameError::Reserved("api".into()));
+        let problem = Error::from(reserved).problem();
         assert_eq!(problem.status, 409);
         assert!(
             problem.detail.contains("reserved") && problem.detail.contains("api"),

@@ -8,6 +8,7 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
+use catalogue::stubs;
 use foreign::Tree;
 use futures_util::FutureExt;
 use link::cloud::Nodes;
@@ -19,9 +20,7 @@ use servant::spec::NodeSpec;
 use tokio::sync::mpsc;
 
 use crate::choreographer::{Handle, Inner, how_it_ended};
-use crate::definitions;
 use crate::request_times::RequestTimes;
-use crate::stubs;
 use store::Journal;
 use store::{NewEvent, RevisionRecord, State};
 
@@ -78,9 +77,7 @@ impl LinkedNodes {
         revision: &RevisionRecord,
         container: &Arc<dyn Servant>,
     ) -> LinkedNodes {
-        let (store, digest) = (Arc::clone(&inner.store), revision.image.clone());
-        let layers =
-            tokio::task::spawn_blocking(move || definitions::layers(&store, &digest)).await;
+        let layers = inner.catalogue.layers(revision).await;
         LinkedNodes {
             revision: revision.clone(),
             state: Arc::clone(&inner.state),
@@ -90,7 +87,7 @@ impl LinkedNodes {
             handle: OnceLock::new(),
             container: Arc::clone(container),
             planned: Planned::default(),
-            layers: layers.ok().and_then(Result::ok).unwrap_or_default(),
+            layers: layers.unwrap_or_default(),
         }
     }
 
@@ -122,7 +119,7 @@ impl LinkedNodes {
         );
         prefixes.push("/usr".into());
         for layer in &self.layers {
-            let distributions = definitions::directories(layer, "opt/ros");
+            let distributions = catalogue::directories(layer, "opt/ros");
             prefixes.extend(distributions.iter().map(|path| Path::new("/").join(path)));
         }
         let mut seen = BTreeSet::new();
@@ -190,7 +187,7 @@ impl Nodes for LinkedNodes {
     async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
         let handle = self.handle()?;
         let (state, revision, made_of) = (&self.state, &self.revision, node.revision);
-        crate::revisions::fits(state, revision, made_of, &node.image)?;
+        catalogue::fits(state, revision, made_of, &node.image)?;
         let Some(program) = program(&self.revision, node) else {
             return Err(format!(
                 "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",

@@ -13,7 +13,6 @@ mod admission;
 mod bases;
 mod choreographer;
 mod config;
-mod definitions;
 mod doctor;
 mod errors;
 mod explain;
@@ -21,14 +20,11 @@ mod grants;
 mod home;
 mod linked;
 mod memory;
-mod names;
 mod portal;
 mod push;
 mod request_times;
-mod revisions;
 mod shim;
 mod sockets;
-mod stubs;
 mod supervision;
 mod tokens;
 mod trial;
@@ -44,6 +40,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use catalogue::Catalogue;
 use clap::{Parser, Subcommand};
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
@@ -248,7 +245,7 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
         home.path().display()
     );
     supervision::ready();
-    app.choreographer.read_definitions().await?;
+    app.catalogue.read_definitions().await?;
     app.choreographer.keep_spares();
     asked.cancelled().await;
     supervision::stopping();
@@ -271,7 +268,8 @@ fn build(
     tokio::spawn(store::watch(Arc::clone(&state)));
     // Names bound to a token that is not known any more would be nobody's for ever.
     state.release_robots(tokens.hashes())?;
-    let store = Arc::new(image::Store::open(&home.images(), &home.layers())?);
+    let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
+    let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
     let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(&config, home)?)?);
     let room = &config.room;
     let memory = room
@@ -280,8 +278,7 @@ fn build(
     let capacity = Amount::new(room.cpus.unwrap_or_else(config::machine_cores), memory);
     let choreographer = Choreographer::new(
         Arc::clone(&config),
-        Arc::clone(&state),
-        Arc::clone(&store),
+        Arc::clone(&catalogue),
         Arc::clone(&engine),
         Admission::new(capacity, room.queue),
     );
@@ -289,8 +286,7 @@ fn build(
     let pusher = Pusher::new(
         &config,
         home,
-        Arc::clone(&state),
-        Arc::clone(&store),
+        Arc::clone(&catalogue),
         engine,
         choreographer.clone(),
         definitions,
@@ -300,7 +296,7 @@ fn build(
         listen,
         home: home.path().to_owned(),
         state,
-        store,
+        catalogue,
         choreographer,
         pusher: Arc::new(pusher),
         machine,

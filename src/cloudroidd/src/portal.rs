@@ -27,6 +27,7 @@ use std::time::Duration;
 
 use api::Millis;
 use axum::Router;
+use catalogue::Catalogue;
 use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
@@ -64,8 +65,8 @@ pub struct App {
     pub home: std::path::PathBuf,
     /// The database.
     pub state: Arc<State>,
-    /// Images.
-    pub store: Arc<image::Store>,
+    /// What is published.
+    pub catalogue: Arc<Catalogue>,
     /// Servants.
     pub choreographer: Choreographer,
     /// Pushes.

@@ -26,7 +26,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use anyhow::Context;
 use api::{PushEvent, PushOptions};
 use axum::body::Body;
-use image::Store;
+use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
@@ -42,7 +42,6 @@ use crate::choreographer::Choreographer;
 use crate::config::Config;
 use crate::errors::Error;
 use crate::home::Home;
-use crate::names;
 use store::Journal;
 use store::private;
 use store::{NewEvent, Plan, RevisionRecord, State};
@@ -59,7 +58,7 @@ pub struct Pusher {
     config: Arc<Config>,
     home: PathBuf,
     state: Arc<State>,
-    store: Arc<Store>,
+    catalogue: Arc<Catalogue>,
     engine: Arc<dyn Engine>,
     choreographer: Choreographer,
     builder: Builder,
@@ -83,8 +82,7 @@ impl Pusher {
     pub fn new(
         config: &Arc<Config>,
         home: &Home,
-        state: Arc<State>,
-        store: Arc<Store>,
+        catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         choreographer: Choreographer,
         bases_dir: PathBuf,
@@ -100,7 +98,7 @@ impl Pusher {
             build_dir: home.path().join("build"),
             logs_dir: home.path().join("logs"),
             sources: rootfs_builder::Sources::default(),
-            store: Arc::clone(&store),
+            store: Arc::clone(catalogue.images()),
             engine: Arc::clone(&engine),
             limits: config.push.limits(),
         })
@@ -108,9 +106,9 @@ impl Pusher {
         Ok(Pusher {
             config: Arc::clone(config),
             home: home.path().to_owned(),
-            journal: Journal::new(Arc::clone(&state)),
-            state,
-            store,
+            journal: Journal::new(Arc::clone(catalogue.state())),
+            state: Arc::clone(catalogue.state()),
+            catalogue,
             engine,
             choreographer,
             builder,
@@ -180,7 +178,7 @@ impl Pusher {
             .name
             .clone()
             .unwrap_or_else(|| built.package.clone());
-        names::service(&name)?;
+        names::service(&name).map_err(catalogue::Error::from)?;
         let _turn = match early {
             Some(turn) if known.as_ref() == Some(&name) => turn,
             _ => self.turn(&name).await,
@@ -214,7 +212,7 @@ impl Pusher {
         };
         tell.step("publishing").await;
         let number = self.publish(record).await?;
-        self.choreographer.read_definitions().await?;
+        self.catalogue.read_definitions().await?;
         let about = NewEvent {
             service: Some(&name),
             ..NewEvent::default()
@@ -285,15 +283,6 @@ impl Pusher {
         };
         turn.lock_owned().await
     }
-}
-
-async fn blocking<T: Send + 'static>(
-    what: &'static str,
-    work: impl FnOnce() -> Result<T, Error> + Send + 'static,
-) -> Result<T, Error> {
-    tokio::task::spawn_blocking(work)
-        .await
-        .map_err(|_| Error::Internal(what))?
 }
 
 fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use api::trial::{Fed, Heard, Times, Trial};
 use bytes::Bytes;
+use catalogue::names;
 use package::interface::{Direction, Interface, Topic};
 use ros::bag::Recorded;
 use ros::bus::{AdvertiseOptions, Bus, Publisher, SubscribeOptions, Subscription, WireType};
@@ -19,9 +20,7 @@ use tokio::time::timeout;
 pub use picture::Picture;
 
 use crate::errors::Error;
-use crate::names;
 use crate::portal::App;
-use crate::views;
 
 /// For the servant's nodes to listen, and for one answer.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -45,7 +44,7 @@ pub enum Material {
 
 /// Tries the current revision of a service.
 pub async fn run(app: &App, service: &str, material: Material) -> Result<Trial, Error> {
-    let revision = views::current(&app.state, service)?;
+    let revision = app.catalogue.current(service)?;
     let robot = format!("~try-{}", names::random(6));
     let lease = app.choreographer.ensure(service, &robot, true)?;
     lease.admitted().await?;

@@ -9,18 +9,7 @@ use crate::choreographer::Handle;
 use crate::errors::Error;
 use crate::portal::App;
 use crate::supervision;
-use store::{RevisionRecord, State};
-
-/// The current revision of a service that exists.
-pub fn current(state: &State, name: &str) -> Result<Arc<RevisionRecord>, Error> {
-    match state.current(name)? {
-        Some(revision) => Ok(revision),
-        None => Err(Error::UnknownService {
-            name: name.to_owned(),
-            exists: state.service_names()?,
-        }),
-    }
-}
+use store::RevisionRecord;
 
 /// A service in a list.
 pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
@@ -47,7 +36,7 @@ pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
 
 /// A service with everything known of it.
 pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
-    let current = current(&app.state, name)?;
+    let current = app.catalogue.current(name)?;
     let revisions = app.state.revisions(name)?;
     Ok(ServiceDetail {
         summary: summary(app, &current),

@@ -50,7 +50,7 @@ impl Works {
         };
         let (bus, registry) = tokio::join!(
             Ros1Bus::connect_with(sockets, joining),
-            inner.definitions.registry(&inner.store, revision),
+            inner.catalogue.registry(revision),
         );
         let bus: Arc<dyn Bus> = bus?;
         let nodes = Arc::new(LinkedNodes::new(inner, revision, container).await);

@@ -30,7 +30,7 @@ pub use events::NewEvent;
 pub use journal::Journal;
 pub use robots::TokenHash;
 pub use servants::ServantRecord;
-pub use services::{Plan, RevisionRecord};
+pub use services::{Plan, RevisionLine, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
 const MIGRATIONS: [&str; 2] = [

@@ -16,7 +16,6 @@ use super::nodes::Nodes;
 use super::spares::{self, Spare};
 use super::{Inner, engine_limits, readiness, tail};
 use crate::admission::Permit;
-use crate::definitions;
 use crate::errors::{Error, with_last_words};
 use crate::grants;
 use crate::works::Works;
@@ -333,11 +332,7 @@ pub(super) async fn spec(
     limits: &api::Limits,
     nodes: Vec<NodeSpec>,
 ) -> Result<Spec, Error> {
-    let store = Arc::clone(&inner.store);
-    let digest = revision.image.clone();
-    let layers = tokio::task::spawn_blocking(move || definitions::layers(&store, &digest))
-        .await
-        .map_err(|_| Error::Internal("extracting layers"))??;
+    let layers = inner.catalogue.layers(revision).await?;
     let plan = &revision.plan;
     let granted = grants::resolve(&plan.grants, &inner.config.allow)?;
     for what in &granted.unfulfilled {

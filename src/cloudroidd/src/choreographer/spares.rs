@@ -8,6 +8,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use catalogue::names;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
 use servant::engine::{ContainerState, Servant};
@@ -15,7 +16,6 @@ use tokio::sync::Notify;
 
 use super::{Asked, Inner, driver};
 use crate::errors::Error;
-use crate::names;
 use crate::works::Works;
 use store::RevisionRecord;
 

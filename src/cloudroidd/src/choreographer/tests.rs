@@ -52,8 +52,7 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
         .expect("a store");
     let choreographer = Choreographer::new(
         Arc::new(Config::default()),
-        Arc::new(state),
-        Arc::new(store),
+        Arc::new(Catalogue::new(Arc::new(state), Arc::new(store))),
         Arc::new(NoEngine),
         Admission::new(Amount::new(2.0, 0), 16),
     );

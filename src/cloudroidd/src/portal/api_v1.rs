@@ -98,7 +98,7 @@ pub async fn interface(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> Answer<package::interface::Interface> {
-    Ok(Json(views::current(&app.state, &name)?.interface.clone()))
+    Ok(Json(app.catalogue.current(&name)?.interface.clone()))
 }
 
 /// Removes a service, its servants and its images.
@@ -106,7 +106,7 @@ pub async fn remove_service(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> Answer<Stopped> {
-    views::current(&app.state, &name)?;
+    app.catalogue.current(&name)?;
     Ok(Json(Stopped {
         stopped: app.pusher.remove(&name).await?,
     }))
@@ -236,7 +236,7 @@ pub async fn stop_servants(
     Query(of): Query<OfService>,
 ) -> Answer<Stopped> {
     if let Some(service) = &of.service {
-        views::current(&app.state, service)?;
+        app.catalogue.current(service)?;
     }
     let chosen = |handle: &choreographer::Handle| {
         of.service

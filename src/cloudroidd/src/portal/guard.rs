@@ -18,11 +18,11 @@ use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use catalogue::names;
 use parking_lot::Mutex;
 
 use super::App;
 use crate::errors::Error;
-use crate::names;
 use crate::tokens::{self, TokenHash, Tokens};
 
 /// Shortest time between two log lines about the same refusal.

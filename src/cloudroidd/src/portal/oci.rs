@@ -70,7 +70,7 @@ pub async fn manifest(
             &format!("there is no image {name}:{reference}"),
         ));
     };
-    let store = Arc::clone(&app.store);
+    let store = Arc::clone(app.catalogue.images());
     let found = tokio::task::spawn_blocking(move || store.manifest(&image))
         .await
         .map_err(|_| Error::Internal("reading a manifest"))??;
@@ -99,7 +99,7 @@ pub async fn blob(
             &format!("{digest} is not a digest"),
         ));
     };
-    let store = Arc::clone(&app.store);
+    let store = Arc::clone(app.catalogue.images());
     let found = tokio::task::spawn_blocking(move || store.blob(&parsed))
         .await
         .map_err(|_| Error::Internal("reading a blob"))??;

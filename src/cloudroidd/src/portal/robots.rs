@@ -11,6 +11,7 @@ use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use bridge::{SessionEnd, SessionOptions, Waiting};
 use bytes::BytesMut;
+use catalogue::names;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use hyper_util::rt::TokioIo;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
@@ -20,8 +21,8 @@ use super::guard::{self, Caller, Peer};
 use super::{App, auth, handshake, page};
 use crate::choreographer::Lease;
 use crate::errors::Error;
+use crate::tokens;
 use crate::works::{Works, bridge_options};
-use crate::{names, tokens};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
@@ -46,12 +47,8 @@ pub async fn root(
         // What there is, is told to those who may ask.
         None if !caller.trusted => Error::Unauthorised("a token is needed").into_response(),
         None => {
-            let exists = app.state.service_names().unwrap_or_default();
-            Error::UnknownService {
-                name: String::new(),
-                exists,
-            }
-            .into_response()
+            let refusal = app.catalogue.unknown("");
+            Error::from(refusal.unwrap_or_else(|error| error)).into_response()
         }
     }
 }
@@ -92,12 +89,7 @@ fn explain(app: &App, service: &str, method: &Method) -> Result<Response, Error>
             "{method} is not answered here; services are reached by WebSocket"
         )));
     }
-    let Some(revision) = app.state.current(service)? else {
-        return Err(Error::UnknownService {
-            name: service.to_owned(),
-            exists: app.state.service_names()?,
-        });
-    };
+    let revision = app.catalogue.current(service)?;
     let answer = serde_json::json!({
         "service": service,
         "revision": revision.number,
@@ -135,7 +127,7 @@ impl Asked {
             named
         };
         if let Some(robot) = &robot {
-            names::robot(robot)?;
+            names::robot(robot).map_err(catalogue::Error::from)?;
         }
         if link && robot.is_none() {
             return Err(Error::BadRequest(
@@ -175,10 +167,7 @@ async fn connect(
     }
     // Who has yet to show a token is not told what there is, nor whether this is: the auth message comes first.
     if caller.trusted && app.state.service_package(&asked.service)?.is_none() {
-        return Err(Error::UnknownService {
-            exists: app.state.service_names()?,
-            name: asked.service,
-        });
+        return Err(app.catalogue.unknown(&asked.service)?.into());
     }
     // Who has shown a token is told by status when there is no room; who has not must be let in to show one.
     let lease = if caller.trusted {

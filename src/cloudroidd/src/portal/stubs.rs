@@ -9,14 +9,13 @@ use axum::extract::{OriginalUri, Path, Query, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
+use catalogue::stubs::{self, Programs};
 use serde::Deserialize;
 use tokio_util::io::ReaderStream;
 
 use super::App;
 use super::guard::{Caller, Peer};
 use crate::errors::Error;
-use crate::stubs::{self, Programs};
-use crate::views;
 
 /// Read from the archive at a time.
 const CHUNK: usize = 64 << 10;
@@ -52,10 +51,10 @@ pub async fn archive(
             path: format!("{}; a stub is at /stubs/NAME.tar.gz", uri.path()),
         });
     };
-    let revision = views::current(&app.state, name)?;
+    let revision = app.catalogue.current(name)?;
     let program = Programs::look().of(asked.arch.as_deref())?;
     let server = server(&app, &caller, &headers);
-    let store = Arc::clone(&app.store);
+    let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
     let file =
         tokio::task::spawn_blocking(move || stubs::archive(&store, &revision, &program, &server))

@@ -241,7 +241,7 @@ pub(super) async fn spec(
     plan: &Plan,
     options: &PushOptions,
 ) -> Result<Spec, Error> {
-    let store = Arc::clone(&pusher.store);
+    let store = Arc::clone(pusher.catalogue.images());
     let infos: Vec<_> = built.layers.iter().map(|layer| layer.info).collect();
     let extracted = blocking::spawn(move || {
         infos

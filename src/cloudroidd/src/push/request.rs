@@ -8,6 +8,7 @@ use api::{PushEvent, PushOptions};
 use axum::body::Body;
 use axum::extract::{OriginalUri, State as Extracted};
 use axum::response::{IntoResponse, Response};
+use catalogue::names;
 use futures_util::StreamExt;
 use rootfs_builder::blocking;
 use tokio::sync::mpsc;
@@ -18,7 +19,6 @@ use super::{EVENTS_AHEAD, Published, Pusher, bounds, receive};
 use crate::config;
 use crate::errors::Error;
 use crate::grants;
-use crate::names;
 use crate::portal::App;
 use crate::views;
 use store::NewEvent;
@@ -110,7 +110,7 @@ impl Pusher {
             return Err(Error::Ending);
         }
         if let Some(name) = &options.name {
-            names::service(name)?;
+            names::service(name).map_err(catalogue::Error::from)?;
         }
         config::check_limits(&options.limits)
             .map_err(|error| Error::BadRequest(error.to_string()))?;

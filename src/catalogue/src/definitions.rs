@@ -8,9 +8,9 @@ use std::sync::Arc;
 use foreign::{Found, Tree};
 use parking_lot::Mutex;
 use ros::schema::Registry;
-
-use crate::errors::Error;
 use store::RevisionRecord;
+
+use crate::Error;
 
 type Texts = Arc<BTreeMap<String, String>>;
 
@@ -76,11 +76,7 @@ impl Definitions {
 fn read_image(store: &image::Store, image: &str) -> Result<BTreeMap<String, String>, Error> {
     let layers = layers(store, image)?;
     let shares = shares(&layers);
-    package::definitions::read(&layers, &shares).map_err(|error| Error::Push {
-        message: error.to_string(),
-        next: None,
-        log: Vec::new(),
-    })
+    package::definitions::read(&layers, &shares).map_err(Error::Definitions)
 }
 
 /// The extracted layers of an image, lowest first.

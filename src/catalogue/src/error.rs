@@ -1,0 +1,61 @@
+use crate::names::NameError;
+
+/// Why something of the catalogue cannot be had or changed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No such service.
+    #[error("there is no service {name:?}")]
+    UnknownService {
+        /// Asked for.
+        name: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// No such revision.
+    #[error("service {service} has no revision {revision}")]
+    UnknownRevision {
+        /// The service.
+        service: String,
+        /// Asked for.
+        revision: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// No such image or blob.
+    #[error("there is no {what} in the image store")]
+    UnknownImage {
+        /// Asked for.
+        what: String,
+    },
+    /// No stub can be made of it.
+    #[error("there is no stub of {service}: {reason}")]
+    NoStub {
+        /// The service.
+        service: String,
+        /// Why not.
+        reason: String,
+    },
+    /// The robot's program is not held for an architecture.
+    #[error("this server holds no cloudroid-stub for {asked:?}")]
+    UnknownArchitecture {
+        /// Asked for.
+        asked: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// A name that cannot be given.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// The message definitions of an image cannot be read.
+    #[error(transparent)]
+    Definitions(package::Error),
+    /// The state database.
+    #[error(transparent)]
+    State(#[from] store::Error),
+    /// The image store.
+    #[error("the image store: {0}")]
+    Image(#[from] image::Error),
+    /// A task of the daemon broke.
+    #[error("the daemon failed at {0}; its log says more")]
+    Internal(&'static str),
+}
