@@ -80,7 +80,7 @@ fn read_image(store: &image::Store, image: &str) -> Result<BTreeMap<String, Stri
 }
 
 /// The extracted layers of an image, lowest first.
-pub fn layers(store: &image::Store, image: &str) -> Result<Vec<PathBuf>, Error> {
+pub(crate) fn layers(store: &image::Store, image: &str) -> Result<Vec<PathBuf>, Error> {
     let digest = image.parse().map_err(|_| Error::UnknownImage {
         what: image.to_owned(),
     })?;
@@ -114,7 +114,7 @@ fn shares(layers: &[PathBuf]) -> Vec<String> {
 }
 
 /// Directories below `parent` in a layer, behind no link: an absolute link in a layer points into the host.
-pub fn directories(layer: &Path, parent: &str) -> Vec<String> {
+pub(crate) fn directories(layer: &Path, parent: &str) -> Vec<String> {
     let Ok(Found::Directory(parent_directory)) =
         Tree::open(layer).and_then(|tree| tree.directory(parent))
     else {

@@ -14,6 +14,7 @@ mod definitions;
 mod error;
 mod fit;
 pub mod names;
+mod prefixes;
 mod publish;
 pub mod stubs;
 
@@ -23,9 +24,9 @@ use std::sync::Arc;
 use ros::schema::Registry;
 use store::{RevisionRecord, State};
 
-pub use definitions::directories;
 pub use error::Error;
 pub use fit::fits;
+pub use prefixes::prefixes;
 pub use publish::{RolledBack, Withdrawn};
 
 use definitions::Definitions;

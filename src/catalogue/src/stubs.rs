@@ -295,6 +295,12 @@ mod tests {
         ]);
         let names: Vec<String> = super::outsourced(&revision).into_iter().collect();
         assert_eq!(names, ["node", "tool.py"]);
+        let programs = programs(&revision);
+        assert_eq!(
+            programs.get("tool.py").map(PathBuf::as_path),
+            Some(Path::new("/opt/mine/share/p/scripts/tool.py"))
+        );
+        assert!(!programs.contains_key("nice") && !programs.contains_key("other"));
         assert_eq!(prefixes(&revision), ["opt/mine", "usr", "opt/other"]);
     }
 

@@ -20,7 +20,7 @@ mod driver;
 mod handle;
 mod limits;
 mod nodes;
-mod readiness;
+mod reaching;
 mod restart;
 mod room;
 mod spares;
@@ -34,19 +34,18 @@ use std::time::Duration;
 use api::Phase;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
+use reach::RequestTimes;
 use servant::engine::Engine;
 
 use crate::admission::{Admission, Amount, Permit, Refused};
 use crate::config::Config;
 use crate::errors::Error;
 use crate::memory::{Memory, SharedMemory};
-use crate::request_times::RequestTimes;
 use store::Journal;
 use store::State;
 
 pub use handle::{Asked, Handle, Lease};
 pub use limits::engine_limits;
-pub(crate) use nodes::how_it_ended;
 pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
 use driver::Beginning;
@@ -360,7 +359,7 @@ impl Servants {
 /// A servant as the API shows it.
 pub async fn describe(handle: &Handle) -> api::Servant {
     let life = handle.life();
-    let works = handle.works();
+    let reach = handle.reach();
     let running = matches!(life.phase, Phase::Created | Phase::Starting | Phase::Ready);
     let container = handle.container().filter(|_| running);
     let enforced = container.as_ref().map(|container| container.enforced());
@@ -399,7 +398,7 @@ pub async fn describe(handle: &Handle) -> api::Servant {
             }),
         }),
         pids,
-        dropped: works.map_or(0, |works| works.dropped()),
+        dropped: reach.map_or(0, |reach| reach.dropped()),
     }
 }
 

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use api::{Limits, Size};
+use bridge::BridgeOptions;
 use serde::{Deserialize, Deserializer};
 
 use crate::tokens::Tokens;
@@ -402,7 +403,7 @@ impl Config {
             );
         }
         check_limits(&self.limits).context("[limits] of the configuration")?;
-        crate::grants::check_egress(&self.allow)
+        reach::egress::check(&self.allow.egress)
             .context("egress in [allow] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
         if let Some(service) = &self.default_service {
@@ -459,6 +460,26 @@ impl Memory {
             bail!("shim_cpus = {} is not between 0.1 and 64", self.shim_cpus);
         }
         Ok(())
+    }
+}
+
+/// What the configuration says of bridges.
+pub fn bridge_options(config: &Config) -> BridgeOptions {
+    let bytes = |size: Size| usize::try_from(size.0).unwrap_or(usize::MAX);
+    BridgeOptions {
+        max_frame: bytes(config.portal.max_frame),
+        max_message: bytes(config.portal.max_message),
+        max_encoded: bytes(config.portal.max_encoded),
+        unfinished: config.memory.unfinished.0,
+        ping_interval: config.portal.ping.0,
+        idle_timeout: config.portal.idle.0,
+        non_finite: match config.portal.non_finite {
+            NonFinite::Null => ros::codec::NonFinite::Null,
+            NonFinite::Text => ros::codec::NonFinite::String,
+            NonFinite::Bare => ros::codec::NonFinite::Bare,
+        },
+        resume_grace: config.servant.grace.0,
+        ..BridgeOptions::default()
     }
 }
 

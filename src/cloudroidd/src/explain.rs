@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight, dominant};
 use api::{Event, Phase};
-use link::cloud::LinkStatus;
 use link::control::Request;
+use reach::links::LinkStatus;
 
 use crate::choreographer::{Handle, describe};
 use crate::errors::Error;
@@ -78,7 +78,7 @@ async fn served(handle: &Handle) -> Served {
 
 /// The links to a servant, if it has got that far.
 fn links(handle: &Handle) -> Vec<Link> {
-    let status = handle.works().map(|works| works.hub.status());
+    let status = handle.reach().map(|reach| reach.hub.status());
     status.unwrap_or_default().into_iter().map(link).collect()
 }
 

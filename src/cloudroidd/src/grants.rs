@@ -4,8 +4,6 @@
 //! Looked at anew at each start: what is not allowed any more is not given any more.
 
 mod cdi;
-mod egress;
-mod relay;
 mod volume;
 
 use std::collections::BTreeMap;
@@ -13,12 +11,10 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use api::Grants;
+use reach::egress::{self, Way};
 use servant::spec::Mount;
 
 use crate::config::Allow;
-
-pub use egress::check as check_egress;
-pub use relay::Relays;
 
 /// Why something is not given.
 #[derive(Debug, thiserror::Error)]
@@ -28,34 +24,14 @@ pub enum GrantError {
         "{kind} {name} is not allowed here; its operator may add it to {kind}s of [allow] in the configuration"
     )]
     NotAllowed {
-        /// `device`, `volume` or `egress`.
+        /// `device` or `volume`.
         kind: &'static str,
         /// Which.
         name: String,
     },
-    /// It cannot be understood.
-    #[error("{name:?} is not {form}")]
-    Malformed {
-        /// Which.
-        name: String,
-        /// What it should be.
-        form: &'static str,
-    },
-    /// An address that only its own name allows.
-    #[error(
-        "egress {name} leads to {reach}, which *:{port} does not allow; its operator may name the address in [allow] of the \
-         configuration: egress = [\"{address}:{port}\"]"
-    )]
-    Inward {
-        /// As asked for.
-        name: String,
-        /// Its address.
-        address: IpAddr,
-        /// Its port.
-        port: u16,
-        /// What the address leads to.
-        reach: egress::Reach,
-    },
+    /// A way out.
+    #[error(transparent)]
+    Egress(#[from] egress::Refused),
     /// A volume is not there.
     #[error("volume {path} cannot be used: {source}")]
     Volume {
@@ -118,12 +94,17 @@ pub fn resolve(grants: &Grants, allow: &Allow) -> Result<Granted, GrantError> {
         }
         cdi::add(name, &cdi::directories(), &mut granted)?;
     }
-    for way in egress::ways_out(grants, allow)? {
+    for way in ways_out(grants, allow)? {
         if way.host.parse::<IpAddr>().is_err() {
             granted.hosts.push((IpAddr::V4(way.inside), way.host));
         }
     }
     Ok(granted)
+}
+
+/// Each host asked for, if it is allowed.
+pub fn ways_out(grants: &Grants, allow: &Allow) -> Result<Vec<Way>, GrantError> {
+    Ok(egress::ways_out(&grants.egress, &allow.egress)?)
 }
 
 fn not_allowed(kind: &'static str, name: &str) -> GrantError {

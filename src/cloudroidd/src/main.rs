@@ -18,18 +18,14 @@ mod errors;
 mod explain;
 mod grants;
 mod home;
-mod linked;
 mod memory;
 mod portal;
 mod push;
-mod request_times;
 mod shim;
-mod sockets;
 mod supervision;
 mod tokens;
 mod trial;
 mod views;
-mod works;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;
@@ -353,8 +349,8 @@ async fn drain(app: &App) {
             app.choreographer.servants().len()
         );
         for handle in app.choreographer.servants() {
-            if let Some(works) = handle.works() {
-                works
+            if let Some(reach) = handle.reach() {
+                reach
                     .bridge
                     .close("the daemon is being restarted; connect again");
             }

@@ -48,8 +48,8 @@ pub async fn run(app: &App, service: &str, material: Material) -> Result<Trial, 
     let robot = format!("~try-{}", names::random(6));
     let lease = app.choreographer.ensure(service, &robot, true)?;
     lease.admitted().await?;
-    let works = lease.ready().await?;
-    let trial = attempt(&works.bus, service, &revision.interface, material).await;
+    let reach = lease.ready().await?;
+    let trial = attempt(&reach.bus, service, &revision.interface, material).await;
     lease.handle().end("its trial is over");
     trial
 }

@@ -1,5 +1,5 @@
-//! The link between a robot's stub and the cloud: the protocol, a session that outlives its connections, and the
-//! cloud's end of it.
+//! The link between a robot's stub and the cloud: the protocol, and a session that outlives its connections. Both ends
+//! share it.
 //!
 //! ```text
 //!  records ─▶ Outgoing: urgent first, small before big, newest wins ─▶ frames ─▶ WebSocket
@@ -20,7 +20,6 @@
 #![forbid(unsafe_code)]
 
 pub mod clock;
-pub mod cloud;
 pub mod control;
 pub mod drops;
 pub mod frame;

@@ -8,12 +8,12 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::SessionOptions;
-use link::cloud::{Hub, HubOptions, Nodes};
 use link::control::{Exit, Hello, Node, Output, Welcome};
 use link::record::Data;
 use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD};
 use qos::{Side, Sla};
+use reach::links::{Hub, HubOptions, Nodes};
 use ros::bus::{
     AdvertiseOptions, Graph as Seen, Publisher, ServiceHandler, ServiceType, SubscribeOptions,
     Subscription,

@@ -105,7 +105,7 @@ impl Choreographer {
             revision,
             record.created,
         ));
-        if crate::linked::has_no_planned_node(&handle, &servant) {
+        if reach::has_none_of(&handle.revision.plan.nodes, &servant) {
             handle.set_linked();
         }
         {

@@ -1,12 +1,14 @@
 //! The task of one servant: from asked for to gone. It alone changes the servant's state.
 
 use std::pin::pin;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use api::Phase;
 use futures_util::future::join_all;
 use package::interface::Interface;
+use reach::master::resident_config;
+use reach::{Reach, readiness};
 use servant::engine::{ContainerState, Servant};
 use servant::spec::{NodeSpec, Profile, Spec};
 use tokio::time::{Instant, timeout_at};
@@ -14,11 +16,10 @@ use tokio::time::{Instant, timeout_at};
 use super::handle::{Failure, Handle};
 use super::nodes::Nodes;
 use super::spares::{self, Spare};
-use super::{Inner, engine_limits, readiness, tail};
+use super::{Inner, engine_limits, reaching, tail};
 use crate::admission::Permit;
 use crate::errors::{Error, with_last_words};
 use crate::grants;
-use crate::works::Works;
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 /// Lines of the log that explain a failure.
@@ -46,9 +47,9 @@ pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     };
     handle.set_over(&outcome);
     let farewell = tell_end(&inner, &handle, &outcome);
-    if let Some(works) = handle.take_works() {
-        works.hub.close(&farewell);
-        works.bridge.close(&farewell);
+    if let Some(reach) = handle.take_reach() {
+        reach.hub.close(&farewell);
+        reach.bridge.close(&farewell);
     }
     if let Some(container) = handle.container()
         && let Err(error) = container.stop().await
@@ -115,7 +116,7 @@ async fn live(
     beginning: &mut Beginning,
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
-    let (container, works, fresh) = match beginning {
+    let (container, reach, fresh) = match beginning {
         Beginning::Asked(spare) => {
             let permit = tokio::select! {
                 permit = admit(inner, handle) => permit?,
@@ -130,7 +131,7 @@ async fn live(
             handle.set_phase(Phase::Admitted);
             record(inner, handle)?;
             match use_spare(handle, spare.take()).await {
-                Some(spare) => (spare.container, Some(spare.works), true),
+                Some(spare) => (spare.container, Some(spare.reach), true),
                 None => (start(inner, handle).await?, None, true),
             }
         }
@@ -146,7 +147,7 @@ async fn live(
     handle.set_phase(Phase::Created);
     tell_unmet(inner, handle, &container);
     let mut nodes = Nodes::new(inner, handle, &container);
-    let mut supervised = pin!(run(inner, handle, &container, works, &mut nodes, fresh));
+    let mut supervised = pin!(run(inner, handle, &container, reach, &mut nodes, fresh));
     tokio::select! {
         // A node's end says more than that of its container, and comes first where both come at once.
         biased;
@@ -176,20 +177,21 @@ async fn run(
     inner: &Arc<Inner>,
     handle: &Arc<Handle>,
     container: &Arc<dyn Servant>,
-    reached: Option<Arc<Works>>,
+    reached: Option<Arc<Reach>>,
     nodes: &mut Nodes<'_>,
     fresh: bool,
 ) -> Result<String, Failure> {
     let deadline = Instant::now() + inner.config.servant.start.0;
-    let works = match reached {
-        Some(works) => works,
+    let reach = match reached {
+        Some(reach) => reach,
         None => reach(inner, handle, container, deadline).await?,
     };
-    works.nodes.bind(handle);
-    handle.set_works(Arc::clone(&works));
+    let tenant: Weak<Handle> = Arc::downgrade(handle);
+    reach.nodes.bind(tenant);
+    handle.set_reach(Arc::clone(&reach));
     handle.set_phase(Phase::Starting);
     tokio::select! {
-        ready = interface_there(inner, handle, &works, deadline, fresh), if !handle.is_linked() => ready?,
+        ready = interface_there(inner, handle, &reach, deadline, fresh), if !handle.is_linked() => ready?,
         () = std::future::ready(()), if handle.is_linked() => {}
         failure = nodes.supervise() => return Err(failure),
     }
@@ -313,12 +315,12 @@ async fn reach(
     handle: &Arc<Handle>,
     container: &Arc<dyn Servant>,
     deadline: Instant,
-) -> Result<Arc<Works>, Failure> {
+) -> Result<Arc<Reach>, Failure> {
     let late = |_| {
         let limit = inner.config.servant.start.0.as_secs();
         Failure::broken(format!("did not start its ROS Master within {limit} s"))
     };
-    timeout_at(deadline, Works::reach(inner, &handle.revision, container))
+    timeout_at(deadline, reaching::open(inner, &handle.revision, container))
         .await
         .map_err(late)?
         .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))
@@ -355,7 +357,7 @@ pub(super) async fn spec(
         owned_directories: Vec::new(),
         mounts: granted.mounts,
         hosts: granted.hosts,
-        resident: crate::shim::resident_config(&plan.parameters),
+        resident: resident_config(&plan.parameters),
     })
 }
 
@@ -380,13 +382,13 @@ async fn container_over(container: &Arc<dyn Servant>) -> Failure {
 async fn interface_there(
     inner: &Inner,
     handle: &Handle,
-    works: &Works,
+    reach: &Reach,
     deadline: Instant,
     fresh: bool,
 ) -> Result<(), Failure> {
     let interface: &Interface = &handle.revision.interface;
     let patient = fresh && !inner.incomplete.lock().contains(&handle.revision.image);
-    let mut graphs = works.bus.graph();
+    let mut graphs = reach.bus.graph();
     loop {
         let graph = graphs.borrow_and_update().clone();
         let missing = readiness::missing(interface, &graph);

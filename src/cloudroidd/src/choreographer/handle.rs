@@ -5,12 +5,12 @@ use std::sync::{Arc, OnceLock};
 
 use api::{Limits, Millis, Phase};
 use parking_lot::Mutex;
+use reach::{Reach, Tenant};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::admission::{Promise, Refused};
 use crate::errors::Error;
-use crate::works::Works;
 use store::{NewEvent, RevisionRecord};
 
 /// Why a servant failed.
@@ -118,7 +118,7 @@ pub struct Handle {
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
-    works: Mutex<Option<Arc<Works>>>,
+    reach: Mutex<Option<Arc<Reach>>>,
 }
 
 impl Handle {
@@ -151,7 +151,7 @@ impl Handle {
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
             container: OnceLock::new(),
-            works: Mutex::default(),
+            reach: Mutex::default(),
         }
     }
 
@@ -228,8 +228,8 @@ impl Handle {
     }
 
     /// Its ROS and its bridge, once reached.
-    pub fn works(&self) -> Option<Arc<Works>> {
-        self.works.lock().clone()
+    pub fn reach(&self) -> Option<Arc<Reach>> {
+        self.reach.lock().clone()
     }
 
     /// When it is ended if nobody connects before.
@@ -280,13 +280,13 @@ impl Handle {
         let _ = self.container.set(container);
     }
 
-    pub(super) fn set_works(&self, works: Arc<Works>) {
-        *self.works.lock() = Some(works);
+    pub(super) fn set_reach(&self, reach: Arc<Reach>) {
+        *self.reach.lock() = Some(reach);
     }
 
     /// Nobody reaches its ROS from here on; gives what was there.
-    pub(super) fn take_works(&self) -> Option<Arc<Works>> {
-        self.works.lock().take()
+    pub(super) fn take_reach(&self) -> Option<Arc<Reach>> {
+        self.reach.lock().take()
     }
 
     pub(super) fn set_idle_until(&self, until: Option<Millis>) {
@@ -320,6 +320,20 @@ impl Handle {
     }
 }
 
+impl Tenant for Handle {
+    fn robot(&self) -> &str {
+        &self.robot
+    }
+
+    fn limits(&self) -> Limits {
+        Handle::limits(self)
+    }
+
+    fn take_over(&self) -> bool {
+        self.set_linked()
+    }
+}
+
 /// The right to use a servant; while one lives the servant is not idle.
 pub struct Lease {
     handle: Arc<Handle>,
@@ -343,10 +357,10 @@ impl Lease {
     }
 
     /// Waits until the servant's interface is there.
-    pub async fn ready(&self) -> Result<Arc<Works>, Error> {
+    pub async fn ready(&self) -> Result<Arc<Reach>, Error> {
         self.reached(Phase::Ready).await?;
         self.handle
-            .works()
+            .reach()
             .ok_or(Error::Internal("reaching a ready servant"))
     }
 

@@ -11,12 +11,12 @@ use std::sync::Arc;
 use catalogue::names;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
+use reach::Reach;
 use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 
-use super::{Asked, Inner, driver};
+use super::{Asked, Inner, driver, reaching};
 use crate::errors::Error;
-use crate::works::Works;
 use store::RevisionRecord;
 
 /// A servant without nodes.
@@ -24,7 +24,7 @@ pub(super) struct Spare {
     /// Its container.
     pub(super) container: Arc<dyn Servant>,
     /// Its ROS and its bridge.
-    pub(super) works: Arc<Works>,
+    pub(super) reach: Arc<Reach>,
     revision: Arc<RevisionRecord>,
 }
 
@@ -60,7 +60,7 @@ impl Spare {
 
     /// Ends it; nothing is left.
     pub(super) async fn end(self) {
-        self.works.bridge.close("the spare is not needed");
+        self.reach.bridge.close("the spare is not needed");
         if let Err(error) = self.container.stop().await {
             let id = self.container.id();
             tracing::warn!("spare {id} could not be cleaned up: {error}");
@@ -194,11 +194,11 @@ async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare
     let spec = driver::spec(inner, &id, &revision, &limits, Vec::new()).await?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.config.servant.start.0;
-    let reached = tokio::time::timeout(limit, Works::reach(inner, &revision, &container)).await;
+    let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
     match reached {
-        Ok(Ok(works)) => Ok(Spare {
+        Ok(Ok(reach)) => Ok(Spare {
             container,
-            works,
+            reach,
             revision,
         }),
         failed => {

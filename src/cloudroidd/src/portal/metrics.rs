@@ -107,10 +107,10 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     );
     let bridges: Vec<_> = handles
         .iter()
-        .filter_map(|handle| Some((labels_of(handle), handle.works()?)))
+        .filter_map(|handle| Some((labels_of(handle), handle.reach()?)))
         .collect();
-    let messages = bridges.iter().flat_map(|(of, works)| {
-        let metrics = works.bridge.metrics();
+    let messages = bridges.iter().flat_map(|(of, reach)| {
+        let metrics = reach.bridge.metrics();
         [
             (
                 format!("{of},direction=\"in\""),
@@ -131,7 +131,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     );
     let dropped = bridges
         .iter()
-        .map(|(of, works)| (of.clone(), works.dropped() as f64));
+        .map(|(of, reach)| (of.clone(), reach.dropped() as f64));
     family(
         out,
         "cloudroid_dropped_total",
@@ -140,8 +140,8 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         dropped,
     );
     Metrics::prometheus_help(out);
-    for (of, works) in &bridges {
-        works.bridge.metrics().prometheus(out, of);
+    for (of, reach) in &bridges {
+        reach.bridge.metrics().prometheus(out, of);
     }
 }
 

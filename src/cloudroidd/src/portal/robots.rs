@@ -14,15 +14,16 @@ use bytes::BytesMut;
 use catalogue::names;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use hyper_util::rt::TokioIo;
+use reach::Reach;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 
 use super::guard::{self, Caller, Peer};
 use super::{App, auth, handshake, page};
 use crate::choreographer::Lease;
+use crate::config::bridge_options;
 use crate::errors::Error;
 use crate::tokens;
-use crate::works::{Works, bridge_options};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
@@ -338,7 +339,7 @@ async fn session<S>(
     let budget = memory.client(caller.peer, asked.robot.as_deref());
     let mut waiting = Waiting::new(io, &read_ahead, &bridge_options(&app.config)).within(&budget);
     let taking = servant(&app, &asked, &caller, lease);
-    let (lease, works) = match waiting.until(taking).await {
+    let (lease, reach) = match waiting.until(taking).await {
         Ok(Ok(taken)) => taken,
         Ok(Err(error)) => return waiting.refuse(TRY_AGAIN_LATER, &error.in_a_line()).await,
         // With its lease its place in the queue is given up, and the servant that only it could have used.
@@ -358,7 +359,7 @@ async fn session<S>(
         resume: asked.bound_resume(&caller),
         ..SessionOptions::default()
     };
-    let end = works.bridge.serve_waiting(waiting, options).await;
+    let end = reach.bridge.serve_waiting(waiting, options).await;
     let handle = lease.handle();
     match end {
         SessionEnd::Client { code, .. } => {
@@ -383,7 +384,7 @@ async fn servant(
     asked: &Asked,
     caller: &Caller,
     lease: Option<Lease>,
-) -> Result<(Lease, Arc<Works>), Error> {
+) -> Result<(Lease, Arc<Reach>), Error> {
     let lease = match lease {
         Some(lease) => lease,
         None => {
@@ -392,8 +393,8 @@ async fn servant(
             lease
         }
     };
-    let works = lease.ready().await?;
-    Ok((lease, works))
+    let reach = lease.ready().await?;
+    Ok((lease, reach))
 }
 
 /// A connection of a robot's stub.
@@ -418,13 +419,13 @@ async fn linked<S>(
             return;
         }
     };
-    let works = match ready {
-        Ok(works) => works,
+    let reach = match ready {
+        Ok(reach) => reach,
         Err(error) => return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await,
     };
     let robot = asked.robot.as_deref().unwrap_or_default();
     let lost = tokio::select! {
-        lost = works.hub.serve(io, &read_ahead) => lost.to_string(),
+        lost = reach.hub.serve(io, &read_ahead) => lost.to_string(),
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
     };
     tracing::info!(

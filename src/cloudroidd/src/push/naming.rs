@@ -11,6 +11,7 @@ use std::time::Duration;
 use api::PushOptions;
 use package::interface::Interface;
 use package::names::is_graph_name;
+use reach::{ServantSockets, master};
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
 use ros::bus::{Bus, Graph};
@@ -21,8 +22,6 @@ use tokio::time::timeout;
 use super::Pusher;
 use super::probe::{self, NODE};
 use crate::errors::Error;
-use crate::sockets::ServantSockets;
-use crate::works::MASTER;
 use store::Plan;
 
 /// Where the node of an index is while its name is looked for.
@@ -78,7 +77,7 @@ async fn look(
         log: Vec::new(),
     };
     let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-    let bus = Ros1Bus::connect(sockets, MASTER, NODE)
+    let bus = Ros1Bus::connect(sockets, master::ADDRESS, NODE)
         .await
         .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
     let mut graph = bus.graph();

@@ -6,6 +6,8 @@ use std::time::Duration;
 use api::PushOptions;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
+use reach::egress::Relays;
+use reach::{ServantSockets, how_it_ended, master};
 use rootfs_builder::probe::{Found, ProbeOptions, Work};
 use rootfs_builder::{BuildOutcome, blocking};
 use ros::bus::Bus;
@@ -20,9 +22,7 @@ use super::{Pusher, naming, supplement};
 use crate::admission::Permit;
 use crate::choreographer;
 use crate::errors::Error;
-use crate::grants::Relays;
-use crate::sockets::ServantSockets;
-use crate::works::MASTER;
+use crate::grants;
 use store::Plan;
 
 /// The name of the looking node.
@@ -45,7 +45,9 @@ pub(super) async fn interface(
     let spec = self::spec(pusher, id, built, plan, options).await?;
     let (servant, trial) = start(pusher, spec).await?;
     let endpoint = servant.endpoint();
-    let _ways_out = Relays::open(&endpoint, &plan.grants, &pusher.config.allow).await;
+    // Refused already where one is not allowed.
+    let ways_out = grants::ways_out(&plan.grants, &pusher.config.allow).unwrap_or_default();
+    let _ways_out = Relays::open(&endpoint, &ways_out).await;
     let unmet = servant
         .enforced()
         .unmet(&choreographer::engine_limits(&options.limits));
@@ -134,7 +136,7 @@ async fn look(
             // First: of a node that ended, nothing else is worth saying.
             biased;
             words = ended(servant, plan) => return Err(failed(words)),
-            bus = Ros1Bus::connect(sockets, MASTER, NODE) => {
+            bus = Ros1Bus::connect(sockets, master::ADDRESS, NODE) => {
                 bus.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
             }
         };
@@ -191,7 +193,7 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
                 // Launch files have nodes that do one thing and end.
                 Ok(NodeExit { code: Some(0), .. }) if left > 0 => {}
                 Ok(exit) => {
-                    let how = choreographer::how_it_ended(&exit, &plan.limits);
+                    let how = how_it_ended(&exit, &plan.limits);
                     return format!("{name} {how} before its interface was seen");
                 }
                 // The container's own state says more.
@@ -252,7 +254,7 @@ pub(super) async fn spec(
     let layers = extracted
         .await
         .map_err(|_| Error::Internal("extracting layers"))??;
-    let granted = crate::grants::resolve(&plan.grants, &pusher.config.allow)?;
+    let granted = grants::resolve(&plan.grants, &pusher.config.allow)?;
     Ok(Spec {
         id: format!("{id}-probe"),
         layers,
@@ -264,7 +266,7 @@ pub(super) async fn spec(
         owned_directories: Vec::new(),
         mounts: granted.mounts,
         hosts: granted.hosts,
-        resident: crate::shim::resident_config(&plan.parameters),
+        resident: master::resident_config(&plan.parameters),
     })
 }
 

@@ -15,12 +15,12 @@ use super::given::Given;
 use super::held::Hold;
 use super::inputs::{Mark, mark};
 use super::node_link::NodeLink;
-use crate::Quality;
-use crate::clock::now;
-use crate::drops::Cause;
-use crate::record::{Answered, Data};
-use crate::skew::Way;
-use crate::stamps::Stamps;
+use link::Quality;
+use link::clock::now;
+use link::drops::Cause;
+use link::record::{Answered, Data};
+use link::skew::Way;
+use link::stamps::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;

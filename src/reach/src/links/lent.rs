@@ -23,9 +23,9 @@ use tokio::time::{Instant as Moment, timeout_at};
 
 use super::Hub;
 use super::node_link::NodeLink;
-use crate::control::{Control, Served};
-use crate::skew::Way;
-use crate::stamps::Stamps;
+use link::control::{Control, Served};
+use link::skew::Way;
+use link::stamps::Stamps;
 
 /// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
 const PATIENCE: Duration = Duration::from_millis(1200);

@@ -9,7 +9,7 @@ use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
 use super::{Hub, RUNS};
-use crate::control::{Control, Hello, Node};
+use link::control::{Control, Hello, Node};
 
 /// Those of a Master itself.
 const OWN: [&str; 5] = [

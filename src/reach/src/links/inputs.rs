@@ -10,12 +10,12 @@ use ros::schema::MessageType;
 
 use super::Hub;
 use super::node_link::within;
-use crate::clock::now;
-use crate::control::Input;
-use crate::drops::{Cause, Drops};
-use crate::record::{Answered, Data};
-use crate::skew::{Skew, Way};
-use crate::stamps::Stamps;
+use link::clock::now;
+use link::control::Input;
+use link::drops::{Cause, Drops};
+use link::record::{Answered, Data};
+use link::skew::{Skew, Way};
+use link::stamps::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 256;

@@ -1,22 +1,57 @@
 //! Which hosts a servant may connect to, and at which of their addresses. A name's owner decides what it resolves to: this
 //! machine's loopback, another machine of the lab, or a cloud's metadata service. So each resolved address is checked before
 //! it is connected to ([`Way::permits`]). Public addresses are allowed; others need a line in the configuration
-//! (docs/adr/032).
+//! (docs/adr/032). What is allowed is passed on from inside by [`Relays`].
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::str::FromStr;
 
-use api::Grants;
+mod relay;
 
-use super::{GrantError, not_allowed};
-use crate::config::Allow;
+pub use relay::Relays;
 
 /// What a push has to write.
 const ASKED: &str = "a HOST:PORT to connect to";
 /// What the configuration has to write.
 const WRITTEN: &str =
     "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
+
+/// Why a way out is not given.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// The configuration does not allow it.
+    #[error(
+        "egress {name} is not allowed here; its operator may add it to egress of [allow] in the configuration"
+    )]
+    NotAllowed {
+        /// Which.
+        name: String,
+    },
+    /// It cannot be understood.
+    #[error("{name:?} is not {form}")]
+    Malformed {
+        /// Which.
+        name: String,
+        /// What it should be.
+        form: &'static str,
+    },
+    /// An address that only its own name allows.
+    #[error(
+        "egress {name} leads to {reach}, which *:{port} does not allow; its operator may name the address in [allow] of the \
+         configuration: egress = [\"{address}:{port}\"]"
+    )]
+    Inward {
+        /// As asked for.
+        name: String,
+        /// Its address.
+        address: IpAddr,
+        /// Its port.
+        port: u16,
+        /// What the address leads to.
+        reach: Destination,
+    },
+}
 
 /// One host and port that a servant may reach.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,7 +92,7 @@ struct Network {
 
 /// The kind of an address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reach {
+pub enum Destination {
     /// An address of the public internet.
     Public,
     /// An address of a private network (10.0.0.0/8, 192.168.0.0/16, fd00::/8, …).
@@ -80,19 +115,19 @@ pub enum Reach {
     Reserved,
 }
 
-impl fmt::Display for Reach {
+impl fmt::Display for Destination {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
-            Reach::Public => "a public address",
-            Reach::Private => "a private address",
-            Reach::Loopback => "a loopback address",
-            Reach::ThisMachine => "an address of this machine",
-            Reach::LinkLocal => "a link-local address",
-            Reach::Metadata => "an address where clouds serve metadata",
-            Reach::Unspecified => "the unspecified address",
-            Reach::Multicast => "a multicast address",
-            Reach::Mapped => "an IPv4-mapped address",
-            Reach::Reserved => "a reserved address",
+            Destination::Public => "a public address",
+            Destination::Private => "a private address",
+            Destination::Loopback => "a loopback address",
+            Destination::ThisMachine => "an address of this machine",
+            Destination::LinkLocal => "a link-local address",
+            Destination::Metadata => "an address where clouds serve metadata",
+            Destination::Unspecified => "the unspecified address",
+            Destination::Multicast => "a multicast address",
+            Destination::Mapped => "an IPv4-mapped address",
+            Destination::Reserved => "a reserved address",
         })
     }
 }
@@ -136,10 +171,10 @@ impl FromStr for Network {
 }
 
 impl FromStr for Rule {
-    type Err = GrantError;
+    type Err = Refused;
 
-    fn from_str(text: &str) -> Result<Rule, GrantError> {
-        let malformed = || GrantError::Malformed {
+    fn from_str(text: &str) -> Result<Rule, Refused> {
+        let malformed = || Refused::Malformed {
             name: text.to_owned(),
             form: WRITTEN,
         };
@@ -170,25 +205,23 @@ fn is_name(host: &str) -> bool {
     !host.is_empty() && host.chars().all(plain)
 }
 
-/// Refuses a configuration in which something cannot be understood.
-pub fn check(allow: &Allow) -> Result<(), GrantError> {
-    allow
-        .egress
+/// Refuses a configuration (`egress` in `[allow]`) in which something cannot be understood.
+pub fn check(allowed: &[String]) -> Result<(), Refused> {
+    allowed
         .iter()
         .try_for_each(|text| text.parse::<Rule>().map(drop))
 }
 
-/// Each host asked for, if it is allowed. One address inside for each host, so that several can be reached on the same port.
-pub fn ways_out(grants: &Grants, allow: &Allow) -> Result<Vec<Way>, GrantError> {
-    let rules: Vec<Rule> = allow
-        .egress
+/// Each host `asked` for, if it is `allowed`. One address inside for each host, so that several can be reached on the same port.
+pub fn ways_out(asked: &[String], allowed: &[String]) -> Result<Vec<Way>, Refused> {
+    let rules: Vec<Rule> = allowed
         .iter()
         .map(|text| text.parse())
         .collect::<Result<_, _>>()?;
     let mut hosts: Vec<&str> = Vec::new();
     let mut ways = Vec::new();
-    for name in &grants.egress {
-        let malformed = || GrantError::Malformed {
+    for name in asked {
+        let malformed = || Refused::Malformed {
             name: name.clone(),
             form: ASKED,
         };
@@ -222,7 +255,7 @@ fn way(
     port: u16,
     inside: Ipv4Addr,
     rules: &[Rule],
-) -> Result<Way, GrantError> {
+) -> Result<Way, Refused> {
     let literal: Option<IpAddr> = host.parse().ok();
     let of_port = || rules.iter().filter(|rule| rule.port == port);
     let networks: Vec<Network> = of_port()
@@ -237,7 +270,9 @@ fn way(
     let in_network =
         literal.is_some_and(|address| networks.iter().any(|network| network.contains(address)));
     if !(any || by_name || in_network) {
-        return Err(not_allowed("egress", name));
+        return Err(Refused::NotAllowed {
+            name: name.to_owned(),
+        });
     }
     let way = Way {
         host: host.to_owned(),
@@ -248,7 +283,7 @@ fn way(
     };
     // What is an address already need not wait for its first connection.
     match literal.map(|address| (address, way.permits(address))) {
-        Some((address, Err(reach))) => Err(GrantError::Inward {
+        Some((address, Err(reach))) => Err(Refused::Inward {
             name: name.to_owned(),
             address,
             port,
@@ -260,7 +295,7 @@ fn way(
 
 impl Way {
     /// Whether this address, to which the host was resolved, may be dialled; else what it leads to.
-    pub fn permits(&self, address: IpAddr) -> Result<(), Reach> {
+    pub fn permits(&self, address: IpAddr) -> Result<(), Destination> {
         if self
             .networks
             .iter()
@@ -269,10 +304,12 @@ impl Way {
             return Ok(());
         }
         match reach(address) {
-            Reach::Public => Ok(()),
+            Destination::Public => Ok(()),
             // Whoever names a host of their own network means that.
-            Reach::Private | Reach::ThisMachine if self.by_name => Ok(()),
-            Reach::Loopback if self.by_name && self.host.eq_ignore_ascii_case("localhost") => {
+            Destination::Private | Destination::ThisMachine if self.by_name => Ok(()),
+            Destination::Loopback
+                if self.by_name && self.host.eq_ignore_ascii_case("localhost") =>
+            {
                 Ok(())
             }
             reach => Err(reach),
@@ -281,14 +318,14 @@ impl Way {
 }
 
 /// What an address leads to, seen from this machine.
-fn reach(address: IpAddr) -> Reach {
+fn reach(address: IpAddr) -> Destination {
     let reach = match address {
         IpAddr::V4(address) => of_v4(address),
         IpAddr::V6(address) => of_v6(address),
     };
-    let may_be_ours = matches!(reach, Reach::Public | Reach::Private);
+    let may_be_ours = matches!(reach, Destination::Public | Destination::Private);
     if may_be_ours && is_of_this_machine(address) {
-        Reach::ThisMachine
+        Destination::ThisMachine
     } else {
         reach
     }
@@ -300,25 +337,27 @@ fn is_of_this_machine(address: IpAddr) -> bool {
 }
 
 /// By the registry of special-purpose addresses (IANA, RFC 6890).
-fn of_v4(address: Ipv4Addr) -> Reach {
+fn of_v4(address: Ipv4Addr) -> Destination {
     match address.octets() {
         // Alibaba's, in the space that RFC 6598 shares out; Oracle's; Azure's, which looks public.
-        [100, 100, 100, 200] | [192, 0, 0, 192] | [168, 63, 129, 16] => Reach::Metadata,
-        [169, 254, 169, 253 | 254] | [169, 254, 170, 2 | 23] => Reach::Metadata,
-        [169, 254, ..] => Reach::LinkLocal,
-        [0, 0, 0, 0] => Reach::Unspecified,
-        [0, ..] | [240..=255, ..] => Reach::Reserved,
-        [127, ..] => Reach::Loopback,
-        [10, ..] | [172, 16..=31, ..] | [192, 168, ..] | [100, 64..=127, ..] => Reach::Private,
-        [198, 18 | 19, ..] => Reach::Private,
-        [192, 0, 0 | 2, _] | [198, 51, 100, _] | [203, 0, 113, _] => Reach::Reserved,
-        [224..=239, ..] => Reach::Multicast,
-        _ => Reach::Public,
+        [100, 100, 100, 200] | [192, 0, 0, 192] | [168, 63, 129, 16] => Destination::Metadata,
+        [169, 254, 169, 253 | 254] | [169, 254, 170, 2 | 23] => Destination::Metadata,
+        [169, 254, ..] => Destination::LinkLocal,
+        [0, 0, 0, 0] => Destination::Unspecified,
+        [0, ..] | [240..=255, ..] => Destination::Reserved,
+        [127, ..] => Destination::Loopback,
+        [10, ..] | [172, 16..=31, ..] | [192, 168, ..] | [100, 64..=127, ..] => {
+            Destination::Private
+        }
+        [198, 18 | 19, ..] => Destination::Private,
+        [192, 0, 0 | 2, _] | [198, 51, 100, _] | [203, 0, 113, _] => Destination::Reserved,
+        [224..=239, ..] => Destination::Multicast,
+        _ => Destination::Public,
     }
 }
 
 /// By the registry of special-purpose addresses (IANA, RFC 6890).
-fn of_v6(address: Ipv6Addr) -> Reach {
+fn of_v6(address: Ipv6Addr) -> Destination {
     let segments = address.segments();
     let [.., above, below] = segments;
     let embedded = |above: u16, below: u16| {
@@ -327,20 +366,20 @@ fn of_v6(address: Ipv6Addr) -> Reach {
         ))
     };
     match segments {
-        [0, 0, 0, 0, 0, 0, 0, 0] => Reach::Unspecified,
-        [0, 0, 0, 0, 0, 0, 0, 1] => Reach::Loopback,
-        [0, 0, 0, 0, 0, 0xffff, ..] => Reach::Mapped,
+        [0, 0, 0, 0, 0, 0, 0, 0] => Destination::Unspecified,
+        [0, 0, 0, 0, 0, 0, 0, 1] => Destination::Loopback,
+        [0, 0, 0, 0, 0, 0xffff, ..] => Destination::Mapped,
         // Amazon's.
-        [0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254] => Reach::Metadata,
+        [0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254] => Destination::Metadata,
         // Through a translator to IPv4 (RFC 6052), by a relay to IPv4 (RFC 3056).
         [0x64, 0xff9b, 0, 0, 0, 0, ..] => embedded(above, below),
         [0x2002, above, below, ..] => embedded(above, below),
-        [0xfe80..=0xfebf, ..] => Reach::LinkLocal,
-        [0xfc00..=0xfdff, ..] | [0xfec0..=0xfeff, ..] => Reach::Private,
-        [0xff00..=0xffff, ..] => Reach::Multicast,
-        [0x2001, 0..=0x1ff | 0xdb8, ..] => Reach::Reserved,
-        [0x2000..=0x3fff, ..] => Reach::Public,
-        _ => Reach::Reserved,
+        [0xfe80..=0xfebf, ..] => Destination::LinkLocal,
+        [0xfc00..=0xfdff, ..] | [0xfec0..=0xfeff, ..] => Destination::Private,
+        [0xff00..=0xffff, ..] => Destination::Multicast,
+        [0x2001, 0..=0x1ff | 0xdb8, ..] => Destination::Reserved,
+        [0x2000..=0x3fff, ..] => Destination::Public,
+        _ => Destination::Reserved,
     }
 }
 
@@ -348,19 +387,12 @@ fn of_v6(address: Ipv6Addr) -> Reach {
 mod tests {
     use super::*;
 
-    fn allow(egress: &[&str]) -> Allow {
-        Allow {
-            egress: egress.iter().map(|rule| (*rule).to_owned()).collect(),
-            ..Allow::default()
-        }
+    fn list(written: &[&str]) -> Vec<String> {
+        written.iter().map(|text| (*text).to_owned()).collect()
     }
 
-    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Way>, GrantError> {
-        let grants = Grants {
-            egress: asked.iter().map(|name| (*name).to_owned()).collect(),
-            ..Grants::default()
-        };
-        ways_out(&grants, &allow(allowed))
+    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Way>, Refused> {
+        ways_out(&list(asked), &list(allowed))
     }
 
     /// Whether a host that the rules allow may be dialled at an address.
@@ -517,13 +549,13 @@ mod tests {
             ":80",
             "::1:80:",
         ] {
-            let refused = check(&allow(&["*:80", text])).expect_err(text).to_string();
+            let refused = check(&list(&["*:80", text])).expect_err(text).to_string();
             assert!(
                 refused.contains(text) && refused.contains("HOST:PORT"),
                 "{refused}"
             );
         }
-        check(&allow(&[
+        check(&list(&[
             "*:80",
             "a-b.example:443",
             "[::1]:80",

@@ -7,14 +7,12 @@ use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 
-use api::Grants;
 use parking_lot::Mutex;
 use servant::endpoint::Endpoint;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
-use super::egress::{Way, ways_out};
-use crate::config::Allow;
+use super::Way;
 
 /// The ways out of one servant; closed when dropped.
 #[derive(Debug, Default)]
@@ -24,14 +22,13 @@ pub struct Relays {
 
 impl Relays {
     /// Opens them. One that cannot be opened is told, and missing.
-    pub async fn open(endpoint: &Endpoint, grants: &Grants, allow: &Allow) -> Relays {
+    pub async fn open(endpoint: &Endpoint, ways_out: &[Way]) -> Relays {
         let mut listeners = JoinSet::new();
-        // Not allowed any more: then the servant would not have been started either.
-        for way in ways_out(grants, allow).unwrap_or_default() {
+        for way in ways_out {
             let inside = SocketAddr::from((way.inside, way.port));
             match endpoint.netns.listen(inside).await {
                 Ok(listener) => {
-                    listeners.spawn(pass_on(listener, way));
+                    listeners.spawn(pass_on(listener, way.clone()));
                 }
                 Err(error) => tracing::warn!("no way out to {}:{}: {error}", way.host, way.port),
             }
@@ -115,6 +112,7 @@ impl Far {
 mod tests {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
+    use super::super::ways_out;
     use super::*;
 
     /// Asks `host` on the port of a listener of this machine's loopback, through a relay; what came back.
@@ -126,15 +124,8 @@ mod tests {
                 let _ = stream.write_all(b"of the host").await;
             }
         });
-        let grants = Grants {
-            egress: vec![format!("{host}:{port}")],
-            ..Grants::default()
-        };
-        let allow = Allow {
-            egress: vec![rule(port)],
-            ..Allow::default()
-        };
-        let way = ways_out(&grants, &allow).expect("allowed").remove(0);
+        let asked = [format!("{host}:{port}")];
+        let way = ways_out(&asked, &[rule(port)]).expect("allowed").remove(0);
         let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let near = relay.local_addr().expect("bound");
         let relaying = tokio::spawn(pass_on(relay, way));

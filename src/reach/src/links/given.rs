@@ -12,7 +12,7 @@
 use std::collections::VecDeque;
 
 use super::inputs::Mark;
-use crate::record::Answered;
+use link::record::Answered;
 
 /// Inputs remembered.
 const RECENT: usize = 256;

@@ -5,8 +5,8 @@ use tokio::io::{DuplexStream, duplex};
 use tokio::net::TcpListener;
 
 use super::*;
-use crate::control::{Input, Resume};
-use crate::record::Record;
+use link::control::{Input, Resume};
+use link::record::Record;
 
 /// A servant whose nodes run from when they are started, and say nothing.
 #[derive(Default)]
@@ -268,7 +268,7 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     let link = hub.links.lock()["/detect"].clone();
     let tell = |control: &Control| {
         let json = serde_json::to_vec(control).unwrap();
-        crate::Handler::record(&link, Record::Control(json.into()), 0);
+        link::Handler::record(&*link, Record::Control(json.into()), 0);
     };
     tell(&Control::Open(Input {
         channel: 1,

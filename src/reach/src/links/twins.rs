@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::Hub;
 use super::node_link::NodeLink;
-use crate::control::{Control, Hello};
+use link::control::{Control, Hello};
 
 /// What to do about it.
 pub(super) const NEXT: &str =

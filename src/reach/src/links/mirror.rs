@@ -8,8 +8,8 @@ use ros::schema::MessageType;
 
 use super::Hub;
 use super::node_link::{NodeLink, Service};
-use crate::control::{Control, Graph, Output, Served, Wanted};
-use crate::stamps::Stamps;
+use link::control::{Control, Graph, Output, Served, Wanted};
+use link::stamps::Stamps;
 
 /// What was told so far.
 #[derive(Default)]

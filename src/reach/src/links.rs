@@ -38,12 +38,12 @@ use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use crate::control::{Control, Decision, Exit, Hello, Node, Request, Sla, Welcome};
-use crate::drops::Drop;
-use crate::packing::decoded_here;
-use crate::session::{Lost, SessionOptions, receive_open, send_open};
-use crate::skew::Skew;
-use crate::{MAX_FRAME, MAX_RECORD};
+use link::control::{Control, Decision, Exit, Hello, Node, Request, Sla, Welcome};
+use link::drops::Drop;
+use link::packing::decoded_here;
+use link::session::{Lost, SessionOptions, receive_open, send_open};
+use link::skew::Skew;
+use link::{MAX_FRAME, MAX_RECORD};
 
 use attempts::Attempts;
 use node_link::NodeLink;

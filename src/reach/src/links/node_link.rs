@@ -16,13 +16,13 @@ use super::outputs::Outputs;
 use super::twins::Machine;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
-use crate::clock::Sample;
-use crate::control::{Control, Hello, Request, Sla};
-use crate::drops::{Drop, Drops, Teller};
-use crate::record::Record;
-use crate::session::{Handler, Session, SessionOptions};
-use crate::skew::Way;
-use crate::stamps::Stamps;
+use link::clock::Sample;
+use link::control::{Control, Hello, Request, Sla};
+use link::drops::{Drop, Drops, Teller};
+use link::record::Record;
+use link::session::{Handler, Session, SessionOptions};
+use link::skew::Way;
+use link::stamps::Stamps;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;
@@ -78,7 +78,7 @@ impl NodeLink {
     ) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
         let (signals, sent) = mpsc::unbounded_channel();
-        let id = format!("{}-{:x}", hello.run, crate::clock::now());
+        let id = format!("{}-{:x}", hello.run, link::clock::now());
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
             run: hello.run.clone(),
@@ -249,20 +249,6 @@ impl NodeLink {
                 }),
             );
         });
-    }
-}
-
-impl Handler for Arc<NodeLink> {
-    fn record(&self, record: Record, arrived: i64) {
-        (**self).take(self, record, arrived);
-    }
-
-    fn undecodable(&self, channel: u32) {
-        (**self).undecodable(channel);
-    }
-
-    fn clock(&self, best: Sample) {
-        (**self).clock(best);
     }
 }
 

@@ -2,16 +2,14 @@
 
 mod planned;
 
-use std::collections::BTreeSet;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
+use api::Level;
 use async_trait::async_trait;
-use catalogue::stubs;
 use foreign::Tree;
 use futures_util::FutureExt;
-use link::cloud::Nodes;
 use link::control::{Decision, Exit, Node, Request, Sla};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
@@ -19,10 +17,8 @@ use servant::engine::{NodeExit, Servant};
 use servant::spec::NodeSpec;
 use tokio::sync::mpsc;
 
-use crate::choreographer::{Handle, Inner, how_it_ended};
-use crate::request_times::RequestTimes;
-use store::Journal;
-use store::{NewEvent, RevisionRecord, State};
+use crate::links::Nodes;
+use crate::{Observer, Recorded, Tenant, how_it_ended};
 
 use planned::Planned;
 
@@ -43,10 +39,10 @@ const KINDS: [&str; 6] = [
     "local-crashed",
 ];
 
-/// Whether a servant that an earlier daemon started runs for stubs: it never knew the revision's own nodes.
-pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> bool {
-    let mut planned = handle.revision.plan.nodes.iter();
-    planned.all(|node| {
+/// Whether none of `nodes` was ever started in a container: of a servant that an earlier daemon left, whether it runs
+/// for stubs.
+pub fn has_none_of(nodes: &[NodeSpec], container: &Arc<dyn Servant>) -> bool {
+    nodes.iter().all(|node| {
         matches!(
             container.wait_node(&node.name).now_or_never(),
             Some(Err(servant::Error::NoNode { .. }))
@@ -56,97 +52,62 @@ pub fn has_no_planned_node(handle: &Handle, container: &Arc<dyn Servant>) -> boo
 
 /// The nodes of one servant.
 pub struct LinkedNodes {
-    revision: RevisionRecord,
-    state: Arc<State>,
-    journal: Journal,
-    request_times: Arc<RequestTimes>,
+    recorded: Recorded,
+    observer: Arc<dyn Observer>,
     /// Decisions since then.
     decisions: Mutex<(Instant, u32)>,
     /// A container is made before anybody asks for it.
-    handle: OnceLock<Weak<Handle>>,
+    tenant: OnceLock<Weak<dyn Tenant>>,
     container: Arc<dyn Servant>,
     planned: Planned,
-    /// Extracted layers, lowest first.
-    layers: Vec<PathBuf>,
 }
 
 impl LinkedNodes {
     /// Those of a running container.
-    pub async fn new(
-        inner: &Inner,
-        revision: &RevisionRecord,
+    pub(crate) fn new(
+        recorded: Recorded,
         container: &Arc<dyn Servant>,
+        observer: Arc<dyn Observer>,
     ) -> LinkedNodes {
-        let layers = inner.catalogue.layers(revision).await;
         LinkedNodes {
-            revision: revision.clone(),
-            state: Arc::clone(&inner.state),
-            journal: inner.journal.clone(),
-            request_times: Arc::clone(&inner.request_times),
+            recorded,
+            observer,
             decisions: Mutex::new((Instant::now(), 0)),
-            handle: OnceLock::new(),
+            tenant: OnceLock::new(),
             container: Arc::clone(container),
             planned: Planned::default(),
-            layers: layers.unwrap_or_default(),
         }
     }
 
-    /// From now on it is this servant's.
-    pub fn bind(&self, handle: &Arc<Handle>) {
-        let _ = self.handle.set(Arc::downgrade(handle));
+    /// From now on it serves this one.
+    pub fn bind(&self, tenant: Weak<dyn Tenant>) {
+        let _ = self.tenant.set(tenant);
     }
 
     /// Where the image has a file, as seen from inside.
     fn has(&self, path: &Path) -> bool {
         let below = path.strip_prefix("/").unwrap_or(path);
-        let mut layers = self.layers.iter().rev();
+        let mut layers = self.recorded.layers.iter().rev();
         let found = layers.find_map(|layer| Tree::open(layer).ok()?.kind_in_root(below));
         // A character device is a whiteout.
         found.is_some_and(|found| found.is_file() || found.is_dir() || found.is_symlink())
     }
 
-    /// Install spaces, as the image's environment and its nodes name them.
-    fn prefixes(&self) -> Vec<PathBuf> {
-        let plan = &self.revision.plan;
-        let paths = plan
-            .environment
-            .get("CMAKE_PREFIX_PATH")
-            .map_or("", String::as_str);
-        let mut prefixes: Vec<PathBuf> = std::env::split_paths(paths).collect();
-        let programs = plan.nodes.iter().filter_map(|node| node.argv.first());
-        prefixes.extend(
-            programs.filter_map(|program| Some(Path::new(program).ancestors().nth(3)?.to_owned())),
-        );
-        prefixes.push("/usr".into());
-        for layer in &self.layers {
-            let distributions = catalogue::directories(layer, "opt/ros");
-            prefixes.extend(distributions.iter().map(|path| Path::new("/").join(path)));
-        }
-        let mut seen = BTreeSet::new();
-        let below = |prefix: &PathBuf| {
-            let mut parts = prefix.components();
-            prefix.is_absolute() && parts.all(|part| part != Component::ParentDir)
-        };
-        prefixes.retain(|prefix| below(prefix) && seen.insert(prefix.clone()));
-        prefixes
-    }
-
-    fn handle(&self) -> Result<Arc<Handle>, String> {
-        self.handle
+    fn tenant(&self) -> Result<Arc<dyn Tenant>, String> {
+        self.tenant
             .get()
             .and_then(Weak::upgrade)
             .ok_or_else(|| "the servant has ended".to_owned())
     }
 
     fn share(&self, node: &Node) -> Option<PathBuf> {
-        if node.package != self.revision.package {
+        if node.package != self.recorded.package {
             return None;
         }
-        let shares = self
-            .prefixes()
-            .into_iter()
-            .map(|prefix| prefix.join("share").join(&node.package));
-        shares.into_iter().find(|share| self.has(share))
+        let prefixes = self.recorded.prefixes.iter();
+        prefixes
+            .map(|prefix| prefix.join("share").join(&node.package))
+            .find(|share| self.has(share))
     }
 
     /// Where the program runs: as on the robot, or where ROS's own default leads.
@@ -162,39 +123,38 @@ impl LinkedNodes {
         if translated != node.directory {
             return translated;
         }
-        let home = self.revision.plan.environment.get("ROS_HOME").cloned();
+        let home = self.recorded.environment.get("ROS_HOME").cloned();
         home.unwrap_or_default()
     }
 
     /// The revision's own nodes end: a stub's take their place.
-    async fn end_planned(&self, handle: &Handle) {
-        let ending = || planned::end_all(&*self.container, &self.revision.plan.nodes);
-        self.planned.end(|| handle.set_linked(), ending).await;
+    async fn end_planned(&self, tenant: &dyn Tenant) {
+        let ending = || planned::end_all(&*self.container, &self.recorded.nodes);
+        self.planned.end(|| tenant.take_over(), ending).await;
     }
 }
 
 /// The program that a stub's node stands for. A robot says which, so nothing but what the push recorded is run: other
 /// programs of the image, by whatever path, are not.
-fn program(revision: &RevisionRecord, node: &Node) -> Option<PathBuf> {
-    if node.package != revision.package {
+fn program(recorded: &Recorded, node: &Node) -> Option<PathBuf> {
+    if node.package != recorded.package {
         return None;
     }
-    stubs::programs(revision).remove(&node.executable)
+    recorded.programs.get(&node.executable).cloned()
 }
 
 #[async_trait]
 impl Nodes for LinkedNodes {
     async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
-        let handle = self.handle()?;
-        let (state, revision, made_of) = (&self.state, &self.revision, node.revision);
-        catalogue::fits(state, revision, made_of, &node.image)?;
-        let Some(program) = program(&self.revision, node) else {
+        let tenant = self.tenant()?;
+        self.observer.fits(node.revision, &node.image)?;
+        let Some(program) = program(&self.recorded, node) else {
             return Err(format!(
                 "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",
-                self.revision.service, node.executable, node.package
+                self.recorded.service, node.executable, node.package
             ));
         };
-        self.end_planned(&handle).await;
+        self.end_planned(&*tenant).await;
         let (namespace, name) = node.name.rsplit_once('/').unwrap_or(("", &node.name));
         let mut argv = vec![program.to_string_lossy().into_owned()];
         argv.extend(
@@ -225,8 +185,8 @@ impl Nodes for LinkedNodes {
 
     async fn ended(&self, node: &str) -> Exit {
         let limits = self
-            .handle()
-            .map(|handle| handle.limits())
+            .tenant()
+            .map(|tenant| tenant.limits())
             .unwrap_or_default();
         match self.container.wait_node(node).await {
             Ok(exit) => Exit {
@@ -247,7 +207,7 @@ impl Nodes for LinkedNodes {
     }
 
     fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)> {
-        let plan = &self.revision.plan;
+        let plan = &self.recorded;
         let same = |planned: &&NodeSpec| {
             let mut programs = planned.argv.iter().map(Path::new);
             programs.any(|path| {
@@ -277,7 +237,7 @@ impl Nodes for LinkedNodes {
     }
 
     fn decided(&self, node: &str, decision: &Decision) {
-        let Ok(handle) = self.handle() else { return };
+        let Ok(tenant) = self.tenant() else { return };
         let count = {
             let mut decisions = self.decisions.lock();
             if decisions.0.elapsed() > DECISIONS.1 {
@@ -287,7 +247,11 @@ impl Nodes for LinkedNodes {
             decisions.1
         };
         if count > DECISIONS.0 {
-            tracing::debug!(servant = handle.id, ?decision, "one of too many decisions");
+            tracing::debug!(
+                servant = self.container.id(),
+                ?decision,
+                "one of too many decisions"
+            );
             return;
         }
         let known = KINDS.iter().find(|kind| **kind == decision.kind);
@@ -297,27 +261,24 @@ impl Nodes for LinkedNodes {
             ago if (2.0..1e9).contains(&ago) => format!(", {ago:.0} s ago"),
             _ => String::new(),
         };
-        let message = format!("robot {}: {node}: {text}{ago}", handle.robot);
-        let about = handle.about();
-        if decision.warning {
-            self.journal.warning(kind, &message, &about);
+        let robot = tenant.robot();
+        let message = format!("robot {robot}: {node}: {text}{ago}");
+        let level = if decision.warning {
+            Level::Warning
         } else {
-            self.journal.info(kind, &message, &about);
-        }
+            Level::Info
+        };
+        self.observer.event(level, kind, &message, Some(robot));
     }
 
     fn measured(&self, request: &Request) {
-        self.request_times.note(&self.revision.service, request);
+        self.observer.measured(request);
     }
 
     fn warn(&self, kind: &str, text: &str) {
-        let handle = self.handle();
-        let about = NewEvent {
-            service: Some(&self.revision.service),
-            servant: Some(self.container.id()),
-            robot: handle.as_ref().ok().map(|handle| handle.robot.as_str()),
-        };
-        self.journal.warning(kind, text, &about);
+        let tenant = self.tenant().ok();
+        let robot = tenant.as_ref().map(|tenant| tenant.robot());
+        self.observer.event(Level::Warning, kind, text, robot);
     }
 
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
@@ -345,37 +306,24 @@ impl Nodes for LinkedNodes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use store::Plan;
 
-    fn revision() -> RevisionRecord {
-        let node = |name: &str, argv: &[&str]| NodeSpec {
-            name: name.to_owned(),
-            argv: argv.iter().map(|word| (*word).to_owned()).collect(),
-            environment: Default::default(),
-            directory: String::new(),
-            respawn: false,
-            respawn_delay: 0.0,
-            required: false,
-        };
-        RevisionRecord {
+    fn recorded() -> Recorded {
+        Recorded {
             service: "vision".into(),
-            number: 1,
-            image: "sha256:1".into(),
-            published: 0,
             package: "vision".into(),
-            source: String::new(),
-            plan: Plan {
-                nodes: vec![
-                    node("/see", &["/opt/mine/lib/vision/see", "_rate:=10"]),
-                    node(
-                        "/look",
-                        &["/bin/nice", "/opt/mine/share/vision/scripts/look.py"],
-                    ),
-                    node("/relay", &["/usr/lib/topic_tools/relay", "/a", "/b"]),
-                ],
-                ..Plan::default()
-            },
-            interface: Default::default(),
+            environment: Default::default(),
+            nodes: Vec::new(),
+            parameters: Default::default(),
+            programs: [
+                ("see", "/opt/mine/lib/vision/see"),
+                ("look.py", "/opt/mine/share/vision/scripts/look.py"),
+            ]
+            .map(|(name, path)| (name.to_owned(), path.into()))
+            .into(),
+            prefixes: Vec::new(),
+            layers: Vec::new(),
+            registry: Default::default(),
+            ways_out: Vec::new(),
         }
     }
 
@@ -391,7 +339,7 @@ mod tests {
             revision: None,
             image: String::new(),
         };
-        program(&revision(), &node)
+        program(&recorded(), &node)
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 
 use super::node_link::NodeLink;
-use crate::record::Record;
+use link::record::Record;
 
 /// More do not wait, and bytes of messages.
 const MOST: (usize, usize) = (256, 32 << 20);

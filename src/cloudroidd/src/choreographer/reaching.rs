@@ -1,0 +1,98 @@
+//! Reaching what runs in a container: what is recorded of its revision, and what it tells of itself.
+
+use std::sync::Arc;
+
+use api::Level;
+use catalogue::{Catalogue, stubs};
+use link::control::Request;
+use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
+use ros::bus::BusError;
+use servant::engine::Servant;
+use store::{Journal, NewEvent, RevisionRecord};
+
+use super::Inner;
+use crate::config::bridge_options;
+use crate::grants;
+
+/// Connects to the ROS of a container that was started from `revision`.
+pub(super) async fn open(
+    inner: &Inner,
+    revision: &Arc<RevisionRecord>,
+    container: &Arc<dyn Servant>,
+) -> Result<Arc<Reach>, BusError> {
+    let memory = &inner.memory;
+    let options = ReachOptions {
+        bridge: bridge_options(&inner.config),
+        grace: inner.config.servant.grace.0,
+        budget: memory.servant(container.id()),
+        unfinished: memory.unfinished,
+    };
+    let told = Told {
+        id: container.id().to_owned(),
+        revision: Arc::clone(revision),
+        catalogue: Arc::clone(&inner.catalogue),
+        journal: inner.journal.clone(),
+        request_times: Arc::clone(&inner.request_times),
+    };
+    Reach::open(
+        container,
+        recorded(inner, revision),
+        options,
+        Arc::new(told),
+    )
+    .await
+}
+
+async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
+    let (registry, layers) = tokio::join!(
+        inner.catalogue.registry(revision),
+        inner.catalogue.layers(revision),
+    );
+    let layers = layers.unwrap_or_default();
+    let plan = &revision.plan;
+    Recorded {
+        service: revision.service.clone(),
+        package: revision.package.clone(),
+        environment: plan.environment.clone(),
+        nodes: plan.nodes.clone(),
+        parameters: plan.parameters.clone(),
+        programs: stubs::programs(revision),
+        prefixes: catalogue::prefixes(revision, &layers),
+        layers,
+        registry,
+        // Not allowed any more: then the servant would not have been started either.
+        ways_out: grants::ways_out(&plan.grants, &inner.config.allow).unwrap_or_default(),
+    }
+}
+
+/// Who hears of what a servant and its robot tell.
+struct Told {
+    id: String,
+    revision: Arc<RevisionRecord>,
+    catalogue: Arc<Catalogue>,
+    journal: Journal,
+    request_times: Arc<RequestTimes>,
+}
+
+impl Observer for Told {
+    fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
+        catalogue::fits(self.catalogue.state(), &self.revision, made_of, image)
+    }
+
+    fn event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {
+        let about = NewEvent {
+            service: Some(&self.revision.service),
+            servant: Some(&self.id),
+            robot,
+        };
+        match level {
+            Level::Info => self.journal.info(kind, message, &about),
+            Level::Warning => self.journal.warning(kind, message, &about),
+            Level::Error => self.journal.error(kind, message, &about),
+        }
+    }
+
+    fn measured(&self, request: &Request) {
+        self.request_times.note(&self.revision.service, request);
+    }
+}
