@@ -1,11 +1,13 @@
 //! `make bench ONLY=portal`: how fast messages and calls pass the daemon, between a client on loopback and a roscpp node
 //! in a servant. Beside it, in turns: the same node by raw TCPROS; a process that moves the bytes over the same hops;
-//! one that converts them by way of a tree of values. Needs root. The program calls itself for the relays
+//! one that converts them by way of a tree of values. Before that, WebSocket framing alone, beside other libraries of it
+//! (`make bench ONLY=portal`; the words `framing of` as an argument run that part alone). Needs root. The program calls itself for the relays
 //! (`relay PID HOW …`).
 
 #![forbid(unsafe_code)]
 
 mod contestants;
+mod framing;
 mod line;
 mod node;
 mod rates;
@@ -45,6 +47,12 @@ fn main() -> Result<()> {
 
 /// All figures whose names contain `only`.
 fn measure(only: &str) -> Result<()> {
+    let mut report = Report::new("portal");
+    framing::measure(&mut report, only)?;
+    if only.starts_with("framing") {
+        report.finish()?;
+        return Ok(());
+    }
     let root = std::fs::metadata("/proc/self").is_ok_and(|about| {
         use std::os::unix::fs::MetadataExt;
         about.uid() == 0
@@ -65,7 +73,6 @@ fn measure(only: &str) -> Result<()> {
     ])?;
     let node = Node::find(&daemon)?;
     let watch = Watch::over(daemon.pid());
-    let mut report = Report::new("portal");
     trips::measure(&mut report, &daemon, &node, only)?;
     rates::measure(&mut report, &daemon, &node, only)?;
     slow_reader::measure(&mut report, &daemon, &node, only)?;

@@ -1,0 +1,294 @@
+//! WebSocket framing alone, server side: the crate `ws` beside tokio-tungstenite, fastwebsockets and the bare socket.
+//!
+//! One connection on loopback; the other end is a thread that writes frames made ahead, or reads and forgets. A figure is
+//! the processor time of the server's thread per message, system calls included: the best of [`ROUNDS`], taken in turns.
+
+use std::future::poll_fn;
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, TcpListener, TcpStream};
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use bench_report::{Report, Target, thread_time};
+use bytes::Bytes;
+use fastwebsockets::{FragmentCollector, Frame, OpCode, Payload, Role};
+use futures_util::{SinkExt, StreamExt};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::{self, WebSocketConfig};
+
+/// So many count, after one that does not.
+const ROUNDS: usize = 7;
+
+/// Name, bytes and messages of a round: a state, a scan, and a picture of 640x480 in RGB.
+const SIZES: [(&str, usize, usize); 3] = [
+    ("64 B", 64, 40_000),
+    ("4 KiB", 4096, 10_000),
+    ("0.9 MB", 921_600, 100),
+];
+
+/// Bytes that are gathered before they are written, and tokio-tungstenite's own default for its buffers.
+const BATCH: usize = 128 * 1024;
+
+/// The longest frame and message, in bytes.
+const LIMIT: usize = 16 << 20;
+
+/// A mask that changes something.
+const MASK: [u8; 4] = [0x5a, 0xc3, 0x17, 0x99];
+
+#[derive(Clone, Copy)]
+enum Framing {
+    Ours,
+    Tungstenite,
+    Fast,
+    /// The same bytes without a look at them.
+    Socket,
+}
+
+const FRAMINGS: [Framing; 4] = [
+    Framing::Ours,
+    Framing::Tungstenite,
+    Framing::Fast,
+    Framing::Socket,
+];
+
+/// Messages of one size, from the client (`inward`) or to it.
+#[derive(Clone, Copy)]
+struct Load {
+    inward: bool,
+    bytes: usize,
+    count: usize,
+}
+
+/// A figure per direction and size.
+pub fn measure(report: &mut Report, only: &str) -> Result<()> {
+    for inward in [true, false] {
+        for (size, bytes, count) in SIZES {
+            let way = if inward { "in" } else { "out" };
+            let name = format!("framing of {size} {way}, processor time of a message");
+            if !name.contains(only) {
+                continue;
+            }
+            let load = Load {
+                inward,
+                bytes,
+                count,
+            };
+            let mut best = [Duration::MAX; FRAMINGS.len()];
+            for number in 0..=ROUNDS {
+                for (framing, best) in FRAMINGS.into_iter().zip(&mut best) {
+                    let took = round(framing, load)?;
+                    *best = if number == 0 { *best } else { took.min(*best) };
+                }
+            }
+            let [ours, tungstenite, fast, socket] =
+                best.map(|best| best.as_secs_f64() * 1e6 / count as f64);
+            report
+                .figure(name, "µs", ours)
+                .beside("tokio-tungstenite", tungstenite)
+                .reach(Target::RatioAtMost(1.0))
+                .note(format!(
+                    "fastwebsockets {fast:.2} µs (ratio {:.2}); the socket alone {socket:.2} µs (ratio {:.2})",
+                    ours / fast,
+                    ours / socket
+                ));
+        }
+    }
+    Ok(())
+}
+
+/// The processor time of a server's thread for one load.
+fn round(framing: Framing, load: Load) -> Result<Duration> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
+    let client = TcpStream::connect(listener.local_addr()?)?;
+    let (server, _) = listener.accept()?;
+    server.set_nodelay(true)?;
+    server.set_nonblocking(true)?;
+    let other = thread::spawn(move || client_end(client, load));
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .enable_time()
+        .build()?;
+    let start = thread_time();
+    runtime.block_on(async {
+        let server = tokio::net::TcpStream::from_std(server)?;
+        match (framing, load.inward) {
+            (Framing::Ours, true) => ours_in(server, load).await,
+            (Framing::Ours, false) => ours_out(server, load).await,
+            (Framing::Tungstenite, true) => tungstenite_in(server, load).await,
+            (Framing::Tungstenite, false) => tungstenite_out(server, load).await,
+            (Framing::Fast, true) => fast_in(server, load).await,
+            (Framing::Fast, false) => fast_out(server, load).await,
+            (Framing::Socket, true) => socket_in(server, load).await,
+            (Framing::Socket, false) => socket_out(server, load).await,
+        }
+    })?;
+    let took = thread_time() - start;
+    let transferred = other
+        .join()
+        .ok()
+        .context("the client's thread panicked")??;
+    let expected = load.count * (load.bytes + header(load).len());
+    ensure!(
+        transferred == expected,
+        "{transferred} bytes passed, not {expected}"
+    );
+    Ok(took)
+}
+
+/// What precedes a message's payload: the mask is a client's.
+fn header(load: Load) -> Vec<u8> {
+    let mut header = vec![0x82];
+    let mask = if load.inward { 0x80 } else { 0 };
+    match load.bytes {
+        short @ 0..126 => header.push(mask | short as u8),
+        medium @ 126..0x1_0000 => {
+            header.push(mask | 126);
+            header.extend((medium as u16).to_be_bytes());
+        }
+        long => {
+            header.push(mask | 127);
+            header.extend((long as u64).to_be_bytes());
+        }
+    }
+    if load.inward {
+        header.extend(MASK);
+    }
+    header
+}
+
+fn payload(load: Load) -> Vec<u8> {
+    (0..load.bytes).map(|index| (index * 7) as u8).collect()
+}
+
+/// Writes what is for the server, or reads what is from it; bytes.
+fn client_end(mut client: TcpStream, load: Load) -> Result<usize> {
+    if !load.inward {
+        let mut buffer = vec![0; 1 << 20];
+        let mut total = 0;
+        loop {
+            match client.read(&mut buffer)? {
+                0 => return Ok(total),
+                read => total += read,
+            }
+        }
+    }
+    let mut frame = header(load);
+    let masked = payload(load);
+    frame.extend(masked.iter().zip(MASK.iter().cycle()).map(|(a, b)| a ^ b));
+    let together = (BATCH / frame.len()).clamp(1, load.count);
+    let batch = frame.repeat(together);
+    let mut left = load.count * frame.len();
+    while left > 0 {
+        let part = &batch[..batch.len().min(left)];
+        client.write_all(part)?;
+        left -= part.len();
+    }
+    Ok(load.count * frame.len())
+}
+
+async fn ours_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = ws::WebSocket::new(server, &[], LIMIT, LIMIT);
+    for _ in 0..load.count {
+        match poll_fn(|cx| socket.poll_next(cx)).await? {
+            ws::Message::Binary(payload) if payload.len() == load.bytes => {}
+            other => bail!("not the message that was sent: {other:?}"),
+        }
+    }
+    Ok(())
+}
+
+async fn ours_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = ws::WebSocket::new(server, &[], LIMIT, LIMIT);
+    let payload = Bytes::from(payload(load));
+    for _ in 0..load.count {
+        socket.queue(ws::frame::BINARY, payload.clone());
+        if socket.queued() >= BATCH {
+            poll_fn(|cx| socket.poll_flush(cx)).await?;
+        }
+    }
+    poll_fn(|cx| socket.poll_flush(cx)).await?;
+    Ok(())
+}
+
+async fn tungstenite(server: tokio::net::TcpStream) -> WebSocketStream<tokio::net::TcpStream> {
+    let config = WebSocketConfig::default()
+        .read_buffer_size(BATCH)
+        .write_buffer_size(BATCH)
+        .max_frame_size(Some(LIMIT))
+        .max_message_size(Some(LIMIT));
+    WebSocketStream::from_raw_socket(server, protocol::Role::Server, Some(config)).await
+}
+
+async fn tungstenite_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = tungstenite(server).await;
+    for _ in 0..load.count {
+        match socket.next().await.context("the connection ended")?? {
+            Message::Binary(payload) if payload.len() == load.bytes => {}
+            other => bail!("not the message that was sent: {other:?}"),
+        }
+    }
+    Ok(())
+}
+
+async fn tungstenite_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = tungstenite(server).await;
+    let payload = Bytes::from(payload(load));
+    for _ in 0..load.count {
+        socket.feed(Message::Binary(payload.clone())).await?;
+    }
+    socket.flush().await?;
+    Ok(())
+}
+
+async fn fast_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = fastwebsockets::WebSocket::after_handshake(server, Role::Server);
+    socket.set_max_message_size(LIMIT);
+    let mut socket = FragmentCollector::new(socket);
+    for _ in 0..load.count {
+        let frame = socket.read_frame().await?;
+        ensure!(
+            frame.opcode == OpCode::Binary && frame.payload.len() == load.bytes,
+            "not the message that was sent"
+        );
+    }
+    Ok(())
+}
+
+async fn fast_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut socket = fastwebsockets::WebSocket::after_handshake(server, Role::Server);
+    socket.set_writev(true);
+    let payload = payload(load);
+    for _ in 0..load.count {
+        socket
+            .write_frame(Frame::binary(Payload::Borrowed(&payload)))
+            .await?;
+    }
+    socket.flush().await?;
+    Ok(())
+}
+
+async fn socket_in(mut server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let mut buffer = vec![0; BATCH];
+    let mut left = load.count * (load.bytes + header(load).len());
+    while left > 0 {
+        match server.read(&mut buffer).await? {
+            0 => bail!("the connection ended"),
+            read => left -= read,
+        }
+    }
+    Ok(())
+}
+
+async fn socket_out(mut server: tokio::net::TcpStream, load: Load) -> Result<()> {
+    let buffer = vec![0; BATCH];
+    let mut left = load.count * (load.bytes + header(load).len());
+    while left > 0 {
+        let part = &buffer[..buffer.len().min(left)];
+        server.write_all(part).await?;
+        left -= part.len();
+    }
+    Ok(())
+}
