@@ -60,7 +60,7 @@ stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it 
 test-cross: stub-cross build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
-	@CLOUDROID_CROSS=1 cargo test --locked -p stories --test stories -- cross::
+	@CLOUDROID_CROSS=1 cargo test $(DEV) --test stories -- cross::
 
 .PHONY: build
 build: ## build the daemon, the command line tool and the servants' init, optimised
@@ -70,10 +70,14 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 	@cargo build --locked --release -p cloudroidd -p cloudroidctl
 	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
+# One selection of packages for all that is built for tests: Cargo compiles a library once per set of features, and each selection
+# has a set of its own.
+DEV := --locked --workspace
+
 .PHONY: build-dev
 build-dev:
 	@$(MAKE) init stub-dev
-	@cargo build --locked -p cloudroidd -p cloudroidctl
+	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --test stories
 	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/debug/cloudroid-init"
 
 .PHONY: demo
@@ -81,15 +85,16 @@ demo: demo-deps build ## push Debian's people_detect and find people in real pic
 	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/release" demo/demo
 
 .PHONY: test
-test: test-deps lint unit stories test-vm ## format, lints, unit tests, stories, stories in a virtual machine
+test: ## format, lints, unit tests, stories, stories in a virtual machine; says how long each took
+	@scripts/parts test-deps lint unit stories test-vm
 
 .PHONY: lint
 lint:
 	@echo "== format"
 	@cargo fmt --all --check
 	@echo "== clippy, warnings denied"
-	@cargo clippy --locked --workspace --all-targets -- -D warnings
-	@cargo clippy --locked -p codec --all-targets -- -D warnings # alone: without its feature video
+	@cargo clippy $(DEV) --all-targets -- -D warnings
+	@cargo clippy $(DEV) --features codec/video --test properties -- -D warnings
 
 # A change is judged by the same cases every time; `make unit SEED=$RANDOM` looks for new ones.
 SEED ?= 1
@@ -97,8 +102,9 @@ SEED ?= 1
 .PHONY: unit
 unit: build-dev ## the crates' own tests; SEED=n for other random cases than the usual
 	@echo "== unit tests"
-	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked --workspace --exclude stories
-	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties video # alone: without its feature video
+	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --exclude stories
+	@echo "== unit tests of the feature video"
+	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --features codec/video --test properties --test replay -- video the_corpus
 
 .PHONY: robots
 robots:
@@ -108,13 +114,13 @@ robots:
 .PHONY: stories
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
-	@cargo test --locked -p stories --test stories -- $(ONLY)
+	@cargo test $(DEV) --test stories -- $(ONLY)
 
 .PHONY: test-vm
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
 	@scripts/deps build run vm
 	@echo "== stories in a virtual machine"
-	@cargo test --locked -q -p stories --test vm --no-run
+	@cargo test $(DEV) -q --test vm --no-run
 	@tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
 
 .PHONY: bench
