@@ -9,8 +9,12 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use api::{Limits, Size};
 use bridge::BridgeOptions;
+use choreographer::MemoryOptions;
+use choreographer::grants::Allow;
+use choreographer::limits::check as check_limits;
 use serde::{Deserialize, Deserializer};
 
+use crate::supervision::machine_memory;
 use crate::tokens::Tokens;
 
 /// Everything that can be configured.
@@ -153,18 +157,6 @@ pub struct Memory {
     pub shim_cpus: f64,
 }
 
-/// What of this machine a service may be given; nothing by default.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Allow {
-    /// CDI devices: `vendor.com/class=name`, or `vendor.com/class=*`.
-    pub devices: Vec<String>,
-    /// Directories and files; what is below a directory is allowed, too.
-    pub volumes: Vec<PathBuf>,
-    /// `HOST:PORT`, `*:PORT` (any on the internet), `ADDRESS:PORT` or `ADDRESS/PREFIX:PORT`.
-    pub egress: Vec<String>,
-}
-
 /// How big pushes may be, and what building them may take.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -194,6 +186,11 @@ pub struct Push {
     /// Processes and threads of each.
     pub pids: u64,
 }
+
+/// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
+/// `MOST` bytes.
+const PART: u64 = 4;
+const MOST: u64 = 1 << 30;
 
 /// A duration: `"500ms"`, `"30s"`, `"5m"`, `"1h"`, or a number of seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -320,12 +317,12 @@ impl Push {
         if sent.contains(&0) || self.probe.0.is_zero() {
             bail!("an archive, unpacked, entries or probe of 0 would refuse every push");
         }
-        check_limits(&Limits {
+        Ok(check_limits(&Limits {
             cpus: self.cpus,
             memory: self.memory,
             pids: Some(self.pids),
             ..Limits::default()
-        })
+        })?)
     }
 }
 
@@ -426,6 +423,30 @@ impl Config {
         Ok(())
     }
 
+    /// What of it is the choreographer's.
+    pub fn choreographer(&self) -> choreographer::Options {
+        let (servant, memory) = (&self.servant, &self.memory);
+        let daemon = memory.daemon.map(|size| size.0);
+        choreographer::Options {
+            limits: self.limits,
+            reserve_cpus: servant.reserve_cpus,
+            reserve_memory: servant.reserve_memory.0,
+            deadline: self.room.deadline.0,
+            start: servant.start.0,
+            grace: servant.grace.0,
+            anonymous_grace: servant.anonymous_grace.0,
+            spares: servant.spares,
+            allow: self.allow.clone(),
+            bridge: bridge_options(self),
+            memory: MemoryOptions {
+                daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),
+                client: memory.client.0,
+                servant: memory.servant.0,
+                unfinished: memory.unfinished.0,
+            },
+        }
+    }
+
     /// Whether servants outlive this daemon when it is ended.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
@@ -464,7 +485,7 @@ impl Memory {
 }
 
 /// What the configuration says of bridges.
-pub fn bridge_options(config: &Config) -> BridgeOptions {
+fn bridge_options(config: &Config) -> BridgeOptions {
     let bytes = |size: Size| usize::try_from(size.0).unwrap_or(usize::MAX);
     BridgeOptions {
         max_frame: bytes(config.portal.max_frame),
@@ -486,40 +507,6 @@ pub fn bridge_options(config: &Config) -> BridgeOptions {
 /// Cores of this machine that this process may use.
 pub fn machine_cores() -> f64 {
     std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
-}
-
-/// Refuses limits that no kernel takes.
-pub fn check_limits(limits: &Limits) -> anyhow::Result<()> {
-    if let Some(cpus) = limits.cpus
-        && !(cpus.is_finite() && (0.01..=4096.0).contains(&cpus))
-    {
-        bail!("cpus = {cpus} is not between 0.01 and 4096");
-    }
-    if let Some(weight) = limits.cpu_weight
-        && !(1..=10_000).contains(&weight)
-    {
-        bail!("cpu_weight = {weight} is not between 1 and 10000");
-    }
-    if let Some(memory) = limits.memory
-        && memory.0 < 4 << 20
-    {
-        bail!("memory = {memory} is too little for any node; at least 4M");
-    }
-    for (name, limit) in [
-        ("memory_high", limits.memory_high),
-        ("io_read", limits.io_read),
-        ("io_write", limits.io_write),
-    ] {
-        if limit == Some(Size(0)) {
-            bail!("{name} = 0 would stop the servant; leave it out for no limit");
-        }
-    }
-    if let Some(pids) = limits.pids
-        && pids < 4
-    {
-        bail!("pids = {pids} is too few for any node; at least 4");
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -5,20 +5,11 @@ use api::problem::PROBLEM_JSON;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
-
-use crate::admission;
+use choreographer::{Refused, with_last_words};
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No such servant.
-    #[error("there is no servant {id:?}")]
-    UnknownServant {
-        /// Asked for.
-        id: String,
-        /// What there is.
-        exists: Vec<String>,
-    },
     /// No robot of that name is served, or was lately.
     #[error("robot {name:?} is not served, and nothing is known of it")]
     UnknownRobot {
@@ -45,9 +36,6 @@ pub enum Error {
         /// Who wants it.
         newcomer: String,
     },
-    /// Something is asked for that is not granted.
-    #[error(transparent)]
-    Grant(#[from] crate::grants::GrantError),
     /// Something in the request is not what it should be.
     #[error("{0}")]
     BadRequest(String),
@@ -68,21 +56,6 @@ pub enum Error {
     /// Another token owns the robot's name.
     #[error("the robot name {0:?} belongs to another token")]
     RobotTaken(String),
-    /// There is no room.
-    #[error(transparent)]
-    Full(#[from] admission::Refused),
-    /// The servant could not be started, or ended.
-    #[error("the servant of {service} for robot {robot} {reason}")]
-    Servant {
-        /// Its service.
-        service: String,
-        /// Its robot.
-        robot: String,
-        /// What happened, beginning with a verb.
-        reason: String,
-        /// Last lines of its log.
-        log: Vec<String>,
-    },
     /// The daemon is ending.
     #[error("the daemon is ending")]
     Ending,
@@ -117,6 +90,9 @@ pub enum Error {
         /// The time that it may take.
         after: std::time::Duration,
     },
+    /// Servants.
+    #[error(transparent)]
+    Choreographer(#[from] choreographer::Error),
     /// What is published.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),
@@ -137,25 +113,25 @@ pub enum Error {
 impl Error {
     /// What happened and, where a log explains it, its last line: for a status message.
     pub fn in_a_line(&self) -> String {
-        match self {
-            Error::Servant { log, .. } | Error::Push { log, .. } => {
-                with_last_words(&self.to_string(), log)
-            }
-            _ => self.to_string(),
+        match self.log() {
+            Some(log) => with_last_words(&self.to_string(), log),
+            None => self.to_string(),
         }
-    }
-}
-
-/// `text` and the last line of a log that says something.
-pub fn with_last_words(text: &str, log: &[String]) -> String {
-    match log.iter().rev().find(|line| !line.trim().is_empty()) {
-        Some(line) => format!("{text}; its log ends with: {line}"),
-        None => text.to_owned(),
     }
 }
 
 /// Seconds after which a full machine may be asked again.
 const RETRY_AFTER: u64 = 10;
+
+/// Status, kind and title of a problem.
+type Kind = (StatusCode, &'static str, &'static str);
+
+const INTERNAL: Kind = (
+    StatusCode::INTERNAL_SERVER_ERROR,
+    "internal",
+    "the daemon failed",
+);
+const ENDING: Kind = (StatusCode::SERVICE_UNAVAILABLE, "ending", "daemon ending");
 
 impl Error {
     /// The problem that a client is told.
@@ -169,31 +145,50 @@ impl Error {
             next: self.next(),
             ..Problem::default()
         };
-        match self {
-            Error::UnknownServant { exists, .. }
-            | Error::UnknownRobot { exists, .. }
-            | Error::Catalogue(
-                catalogue::Error::UnknownService { exists, .. }
-                | catalogue::Error::UnknownRevision { exists, .. }
-                | catalogue::Error::UnknownArchitecture { exists, .. },
-            ) => problem.exists = exists.clone(),
-            Error::Servant { log, .. } | Error::Push { log, .. } => problem.log = log.clone(),
-            Error::Full(admission::Refused::TooBig { .. }) => {}
-            Error::Full(_) | Error::Memory(_) | Error::Ending => {
-                problem.retry_after = Some(RETRY_AFTER)
-            }
-            _ => {}
+        if let Error::UnknownRobot { exists, .. }
+        | Error::Choreographer(choreographer::Error::UnknownServant { exists, .. }) = self
+        {
+            problem.exists = exists.clone();
         }
+        if let Some(
+            catalogue::Error::UnknownService { exists, .. }
+            | catalogue::Error::UnknownRevision { exists, .. }
+            | catalogue::Error::UnknownArchitecture { exists, .. },
+        ) = self.of_catalogue()
+        {
+            problem.exists = exists.clone();
+        }
+        if let Some(log) = self.log() {
+            problem.log = log.to_vec();
+        }
+        let again = status == StatusCode::SERVICE_UNAVAILABLE;
+        problem.retry_after = again.then_some(RETRY_AFTER);
         problem
     }
 
-    fn kind(&self) -> (StatusCode, &'static str, &'static str) {
+    /// The refusal of the catalogue that it passes on.
+    fn of_catalogue(&self) -> Option<&catalogue::Error> {
+        match self {
+            Error::Catalogue(error)
+            | Error::Choreographer(choreographer::Error::Catalogue(error)) => Some(error),
+            _ => None,
+        }
+    }
+
+    /// The log that explains it.
+    fn log(&self) -> Option<&[String]> {
+        match self {
+            Error::Choreographer(choreographer::Error::Servant { log, .. })
+            | Error::Push { log, .. } => Some(log),
+            _ => None,
+        }
+    }
+
+    fn kind(&self) -> Kind {
         use StatusCode as S;
         match self {
-            Error::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
-            Error::Catalogue(error) => kind_of_catalogue(error),
             Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
             Error::BodyTooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
             Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
@@ -207,27 +202,18 @@ impl Error {
             Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::RobotTaken(_) => (S::FORBIDDEN, "robot-taken", "robot name taken"),
-            Error::Full(admission::Refused::TooBig { .. }) => {
-                (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit")
-            }
-            Error::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
-            Error::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
-            Error::Ending => (S::SERVICE_UNAVAILABLE, "ending", "daemon ending"),
             Error::Push { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
             Error::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
-            Error::Grant(_) => (S::FORBIDDEN, "not-granted", "not granted"),
-            Error::Engine(servant::Error::Refused { .. }) => {
-                (S::CONFLICT, "refused", "the servant refused")
-            }
-            Error::State(_) | Error::Image(_) | Error::Engine(_) | Error::Internal(_) => {
-                (S::INTERNAL_SERVER_ERROR, "internal", "the daemon failed")
-            }
+            Error::Ending => ENDING,
+            Error::Choreographer(error) => kind_of_choreographer(error),
+            Error::Catalogue(error) => kind_of_catalogue(error),
+            Error::Engine(error) => kind_of_engine(error),
+            Error::State(_) | Error::Image(_) | Error::Internal(_) => INTERNAL,
         }
     }
 
     fn next(&self) -> Option<String> {
         let text = match self {
-            Error::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
             Error::UnknownRobot { .. } => {
                 "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
             }
@@ -240,22 +226,56 @@ impl Error {
             }
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
-            Error::Full(admission::Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
-            Error::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [room] in the configuration".into(),
-            Error::Servant { service, .. } => {
-                format!("see cloudroidctl events, and push {service} again when its package is mended")
-            }
             Error::Push { next, .. } => return next.clone(),
-            Error::Catalogue(error) => return next_of_catalogue(error),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
             Error::TooLarge { .. } => "leave out what is not needed, or raise archive in [push] of the configuration".into(),
+            Error::Choreographer(error) => return next_of_choreographer(error),
+            Error::Catalogue(error) => return next_of_catalogue(error),
             _ => return None,
         };
         Some(text)
     }
 }
 
-fn kind_of_catalogue(error: &catalogue::Error) -> (StatusCode, &'static str, &'static str) {
+fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
+    use StatusCode as S;
+    use choreographer::Error as C;
+    match error {
+        C::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
+        C::Full(Refused::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
+        C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
+        C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
+        C::Grant(_) => (S::FORBIDDEN, "not-granted", "not granted"),
+        C::Ending => ENDING,
+        C::Catalogue(error) => kind_of_catalogue(error),
+        C::Engine(error) => kind_of_engine(error),
+        C::State(_) | C::Internal(_) => INTERNAL,
+    }
+}
+
+fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
+    use choreographer::Error as C;
+    let text = match error {
+        C::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
+        C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
+        C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [room] in the configuration".into(),
+        C::Servant { service, .. } => {
+            format!("see cloudroidctl events, and push {service} again when its package is mended")
+        }
+        C::Catalogue(error) => return next_of_catalogue(error),
+        _ => return None,
+    };
+    Some(text)
+}
+
+fn kind_of_engine(error: &servant::Error) -> Kind {
+    match error {
+        servant::Error::Refused { .. } => (StatusCode::CONFLICT, "refused", "the servant refused"),
+        _ => INTERNAL,
+    }
+}
+
+fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
     use StatusCode as S;
     use catalogue::Error as C;
     match error {
@@ -269,9 +289,7 @@ fn kind_of_catalogue(error: &catalogue::Error) -> (StatusCode, &'static str, &'s
         C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
         C::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
         C::Definitions(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
-        C::State(_) | C::Image(_) | C::Internal(_) => {
-            (S::INTERNAL_SERVER_ERROR, "internal", "the daemon failed")
-        }
+        C::State(_) | C::Image(_) | C::Internal(_) => INTERNAL,
     }
 }
 
@@ -338,6 +356,10 @@ pub fn respond(problem: &Problem) -> Response {
 mod tests {
     use super::*;
 
+    fn refused(refused: Refused) -> Error {
+        choreographer::Error::from(refused).into()
+    }
+
     #[test]
     fn an_unknown_service_lists_those_that_exist() {
         let error = catalogue::Error::UnknownService {
@@ -356,7 +378,7 @@ mod tests {
 
     #[test]
     fn a_full_machine_says_when_to_come_again() {
-        let response = Error::Full(admission::Refused::QueueFull { waiting: 3 }).into_response();
+        let response = refused(Refused::QueueFull { waiting: 3 }).into_response();
         assert_eq!(response.status(), 503);
         assert_eq!(response.headers()[header::RETRY_AFTER], "10");
         assert_eq!(response.headers()[header::CONTENT_TYPE], PROBLEM_JSON);
@@ -364,8 +386,8 @@ mod tests {
 
     #[test]
     fn what_can_never_fit_is_not_to_be_tried_again() {
-        let amount = admission::Amount::new(64.0, 1);
-        let problem = Error::Full(admission::Refused::TooBig {
+        let amount = choreographer::Amount::new(64.0, 1);
+        let problem = refused(Refused::TooBig {
             wanted: amount,
             capacity: amount,
         })

@@ -8,9 +8,9 @@ use api::{Event, Phase};
 use link::control::Request;
 use reach::links::LinkStatus;
 
-use crate::choreographer::{Handle, describe};
 use crate::errors::Error;
 use crate::portal::App;
+use choreographer::{Handle, describe};
 
 /// Between two looks at what a servant uses.
 const MOMENT: Duration = Duration::from_millis(400);

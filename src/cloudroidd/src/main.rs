@@ -9,16 +9,12 @@
 
 #![deny(unsafe_code)]
 
-mod admission;
 mod bases;
-mod choreographer;
 mod config;
 mod doctor;
 mod errors;
 mod explain;
-mod grants;
 mod home;
-mod memory;
 mod portal;
 mod push;
 mod shim;
@@ -37,6 +33,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use catalogue::Catalogue;
+use choreographer::{Admission, Amount, Choreographer};
 use clap::{Parser, Subcommand};
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
@@ -45,8 +42,6 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing_subscriber::EnvFilter;
 
-use admission::{Admission, Amount};
-use choreographer::Choreographer;
 use config::{Config, IsolationMode};
 use home::Home;
 use portal::App;
@@ -273,7 +268,7 @@ fn build(
         .map_or_else(supervision::machine_memory, |size| size.0);
     let capacity = Amount::new(room.cpus.unwrap_or_else(config::machine_cores), memory);
     let choreographer = Choreographer::new(
-        Arc::clone(&config),
+        config.choreographer(),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
         Admission::new(capacity, room.queue),

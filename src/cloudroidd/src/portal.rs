@@ -39,10 +39,10 @@ use tokio::net::{TcpListener, TcpStream, UnixListener};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::choreographer::Choreographer;
 use crate::config::Config;
 use crate::push::Pusher;
 use crate::tokens::Tokens;
+use choreographer::Choreographer;
 use store::State;
 
 pub use api_v1::lines;

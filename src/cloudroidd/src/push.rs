@@ -38,10 +38,10 @@ use bounds::Places;
 use request::Tell;
 pub use request::handle;
 
-use crate::choreographer::Choreographer;
 use crate::config::Config;
 use crate::errors::Error;
 use crate::home::Home;
+use choreographer::Choreographer;
 use store::Journal;
 use store::private;
 use store::{NewEvent, Plan, RevisionRecord, State};
@@ -186,7 +186,7 @@ impl Pusher {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         tell.step("starting it once to find its interface").await;
         let mut plan = plan_of(&built, options);
-        let granted = crate::grants::resolve(&plan.grants, &self.config.allow)?;
+        let granted = self.choreographer.grant(&plan.grants)?;
         for warning in granted.unfulfilled {
             tell.warning(warning).await;
         }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
 use package::interface as recorded;
 
-use crate::choreographer::Handle;
 use crate::errors::Error;
 use crate::portal::App;
 use crate::supervision;
+use choreographer::Handle;
 use store::RevisionRecord;
 
 /// A service in a list.

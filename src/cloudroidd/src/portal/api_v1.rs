@@ -15,10 +15,10 @@ use tokio_stream::wrappers::ReceiverStream;
 use super::App;
 use super::body::{self, Held};
 use super::guard::Caller;
-use crate::choreographer::{self, describe};
 use crate::errors::Error;
 use crate::trial::Material;
 use crate::views;
+use choreographer::describe;
 
 type Answer<T> = Result<Json<T>, Error>;
 
@@ -138,7 +138,7 @@ const LARGEST_WORDS: usize = 64 << 10;
 /// A body, within what its sender may have held.
 async fn held(app: &App, caller: &Caller, body: Body, max: usize) -> Result<Held, Error> {
     let memory = app.choreographer.memory();
-    let budget = memory.client(caller.peer, None);
+    let budget = memory.client(&caller.peer.client(None));
     body::read(body, max, &budget, memory.unfinished).await
 }
 
@@ -200,7 +200,7 @@ pub async fn set_limits(
     let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
-    crate::config::check_limits(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
+    choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
     app.choreographer.set_limits(&id, change).await?;
     Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
 }

@@ -48,6 +48,18 @@ impl fmt::Display for Peer {
     }
 }
 
+impl Peer {
+    /// The name of its memory budget: its IP address or, for connections from this machine (a proxy's), its robot's name.
+    pub fn client(&self, robot: Option<&str>) -> String {
+        match (self, robot) {
+            (Peer::Tcp(address), _) if !address.ip().is_loopback() => address.ip().to_string(),
+            (_, Some(robot)) => robot.to_owned(),
+            (Peer::Tcp(address), None) => address.ip().to_string(),
+            (Peer::Unix(uid), None) => format!("user {uid}"),
+        }
+    }
+}
+
 /// Who asks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {

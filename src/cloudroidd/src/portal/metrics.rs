@@ -11,8 +11,8 @@ use axum::response::{IntoResponse, Response};
 use bridge::Metrics;
 
 use super::App;
-use crate::choreographer::{Choreographer, Handle, describe};
 use crate::errors::Error;
+use choreographer::{Choreographer, Handle, describe};
 
 const PHASES: [Phase; 6] = [
     Phase::Requested,

@@ -20,10 +20,9 @@ use tokio::net::{TcpStream, UnixStream};
 
 use super::guard::{self, Caller, Peer};
 use super::{App, auth, handshake, page};
-use crate::choreographer::Lease;
-use crate::config::bridge_options;
 use crate::errors::Error;
 use crate::tokens;
+use choreographer::Lease;
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
@@ -229,15 +228,18 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     let Some(robot) = &asked.robot else {
         let (robot, anonymous) = nameless(asked.bound_resume(caller).as_deref());
-        return app.choreographer.ensure(&asked.service, &robot, anonymous);
+        let lease = app
+            .choreographer
+            .ensure(&asked.service, &robot, anonymous)?;
+        return Ok(lease);
     };
     if !asked.shared {
         check_owner(app, robot, caller)?;
     }
     if asked.link {
-        return app.choreographer.ensure_linked(&asked.service, robot);
+        return Ok(app.choreographer.ensure_linked(&asked.service, robot)?);
     }
-    app.choreographer.ensure(&asked.service, robot, false)
+    Ok(app.choreographer.ensure(&asked.service, robot, false)?)
 }
 
 /// Nobody takes over another's robot.
@@ -336,8 +338,9 @@ async fn session<S>(
         }
     }
     let memory = app.choreographer.memory();
-    let budget = memory.client(caller.peer, asked.robot.as_deref());
-    let mut waiting = Waiting::new(io, &read_ahead, &bridge_options(&app.config)).within(&budget);
+    let budget = memory.client(&caller.peer.client(asked.robot.as_deref()));
+    let mut waiting =
+        Waiting::new(io, &read_ahead, app.choreographer.bridge_options()).within(&budget);
     let taking = servant(&app, &asked, &caller, lease);
     let (lease, reach) = match waiting.until(taking).await {
         Ok(Ok(taken)) => taken,
@@ -421,7 +424,10 @@ async fn linked<S>(
     };
     let reach = match ready {
         Ok(reach) => reach,
-        Err(error) => return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await,
+        Err(error) => {
+            let error = Error::from(error);
+            return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
+        }
     };
     let robot = asked.robot.as_deref().unwrap_or_default();
     let lost = tokio::select! {

@@ -19,10 +19,8 @@ use tokio_util::task::TaskTracker;
 
 use super::request::Tell;
 use super::{Pusher, naming, supplement};
-use crate::admission::Permit;
-use crate::choreographer;
 use crate::errors::Error;
-use crate::grants;
+use choreographer::Permit;
 use store::Plan;
 
 /// The name of the looking node.
@@ -46,7 +44,10 @@ pub(super) async fn interface(
     let (servant, trial) = start(pusher, spec).await?;
     let endpoint = servant.endpoint();
     // Refused already where one is not allowed.
-    let ways_out = grants::ways_out(&plan.grants, &pusher.config.allow).unwrap_or_default();
+    let ways_out = pusher
+        .choreographer
+        .ways_out(&plan.grants)
+        .unwrap_or_default();
     let _ways_out = Relays::open(&endpoint, &ways_out).await;
     let unmet = servant
         .enforced()
@@ -254,13 +255,15 @@ pub(super) async fn spec(
     let layers = extracted
         .await
         .map_err(|_| Error::Internal("extracting layers"))??;
-    let granted = grants::resolve(&plan.grants, &pusher.config.allow)?;
+    let granted = pusher.choreographer.grant(&plan.grants)?;
     Ok(Spec {
         id: format!("{id}-probe"),
         layers,
         writable: None,
         profile: Profile::Servant,
-        limits: choreographer::engine_limits(&options.limits.or(pusher.config.limits)),
+        limits: choreographer::engine_limits(
+            &options.limits.or(pusher.choreographer.default_limits()),
+        ),
         environment: granted.environment_over(&plan.environment),
         nodes: plan.nodes.clone(),
         owned_directories: Vec::new(),

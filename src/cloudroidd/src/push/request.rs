@@ -16,9 +16,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 
 use super::{EVENTS_AHEAD, Published, Pusher, bounds, receive};
-use crate::config;
 use crate::errors::Error;
-use crate::grants;
 use crate::portal::App;
 use crate::views;
 use store::NewEvent;
@@ -112,10 +110,10 @@ impl Pusher {
         if let Some(name) = &options.name {
             names::service(name).map_err(catalogue::Error::from)?;
         }
-        config::check_limits(&options.limits)
+        choreographer::limits::check(&options.limits)
             .map_err(|error| Error::BadRequest(error.to_string()))?;
-        grants::resolve(&options.grants, &self.config.allow)?;
-        self.choreographer.check_limits(&options.limits)
+        self.choreographer.grant(&options.grants)?;
+        Ok(self.choreographer.check_limits(&options.limits)?)
     }
 
     /// Pushes when it is its turn, within what a push may use.

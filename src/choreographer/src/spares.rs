@@ -16,7 +16,7 @@ use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 
 use super::{Asked, Inner, driver, reaching};
-use crate::errors::Error;
+use crate::Error;
 use store::RevisionRecord;
 
 /// A servant without nodes.
@@ -162,9 +162,7 @@ pub(super) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
     let _turn = inner.spares.turn.lock().await;
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
-    let deserving = inner
-        .spares
-        .deserving(published, inner.config.servant.spares);
+    let deserving = inner.spares.deserving(published, inner.options.spares);
     for service in deserving {
         wanted.extend(inner.state.current(&service)?);
     }
@@ -190,10 +188,10 @@ pub(super) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare, Error> {
     let id = names::servant_id(&revision.service);
-    let limits = Asked::new(revision.plan.limits, inner.config.limits).limits();
+    let limits = Asked::new(revision.plan.limits, inner.options.limits).limits();
     let spec = driver::spec(inner, &id, &revision, &limits, Vec::new()).await?;
     let container = inner.engine.start(spec).await?;
-    let limit = inner.config.servant.start.0;
+    let limit = inner.options.start;
     let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
     match reached {
         Ok(Ok(reach)) => Ok(Spare {

@@ -18,8 +18,8 @@ use super::nodes::Nodes;
 use super::spares::{self, Spare};
 use super::{Inner, engine_limits, reaching, tail};
 use crate::admission::Permit;
-use crate::errors::{Error, with_last_words};
 use crate::grants;
+use crate::{Error, with_last_words};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 /// Lines of the log that explain a failure.
@@ -181,7 +181,7 @@ async fn run(
     nodes: &mut Nodes<'_>,
     fresh: bool,
 ) -> Result<String, Failure> {
-    let deadline = Instant::now() + inner.config.servant.start.0;
+    let deadline = Instant::now() + inner.options.start;
     let reach = match reached {
         Some(reach) => reach,
         None => reach(inner, handle, container, deadline).await?,
@@ -230,7 +230,7 @@ async fn run(
 }
 
 async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
-    let deadline = inner.config.room.deadline.0;
+    let deadline = inner.options.deadline;
     let wanted = inner.promised(handle);
     let admitted = inner
         .admission
@@ -317,7 +317,7 @@ async fn reach(
     deadline: Instant,
 ) -> Result<Arc<Reach>, Failure> {
     let late = |_| {
-        let limit = inner.config.servant.start.0.as_secs();
+        let limit = inner.options.start.as_secs();
         Failure::broken(format!("did not start its ROS Master within {limit} s"))
     };
     timeout_at(deadline, reaching::open(inner, &handle.revision, container))
@@ -336,7 +336,7 @@ pub(super) async fn spec(
 ) -> Result<Spec, Error> {
     let layers = inner.catalogue.layers(revision).await?;
     let plan = &revision.plan;
-    let granted = grants::resolve(&plan.grants, &inner.config.allow)?;
+    let granted = grants::resolve(&plan.grants, &inner.options.allow)?;
     for what in &granted.unfulfilled {
         let about = NewEvent {
             service: Some(&revision.service),
@@ -420,7 +420,7 @@ async fn interface_there(
                 return Ok(());
             }
             Err(_) => {
-                let limit = inner.config.servant.start.0.as_secs();
+                let limit = inner.options.start.as_secs();
                 return Err(Failure::broken(format!(
                     "did not become ready within {limit} s: {} did not register ({} missing)",
                     nodes_missing.join(", "),
@@ -433,11 +433,11 @@ async fn interface_there(
 
 /// Comes back when nobody has been connected for the grace time.
 async fn unneeded(inner: &Inner, handle: &Arc<Handle>) -> String {
-    let times = &inner.config.servant;
+    let times = &inner.options;
     let grace = if handle.anonymous {
-        times.anonymous_grace.0
+        times.anonymous_grace
     } else {
-        times.grace.0
+        times.grace
     };
     let mut connections = handle.watch_connections();
     loop {

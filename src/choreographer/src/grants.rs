@@ -12,9 +12,20 @@ use std::path::PathBuf;
 
 use api::Grants;
 use reach::egress::{self, Way};
+use serde::Deserialize;
 use servant::spec::Mount;
 
-use crate::config::Allow;
+/// What of this machine a service may be given; nothing by default.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Allow {
+    /// CDI devices: `vendor.com/class=name`, or `vendor.com/class=*`.
+    pub devices: Vec<String>,
+    /// Directories and files; what is below a directory is allowed, too.
+    pub volumes: Vec<PathBuf>,
+    /// `HOST:PORT`, `*:PORT` (any on the internet), `ADDRESS:PORT` or `ADDRESS/PREFIX:PORT`.
+    pub egress: Vec<String>,
+}
 
 /// Why something is not given.
 #[derive(Debug, thiserror::Error)]

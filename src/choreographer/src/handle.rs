@@ -9,8 +9,8 @@ use reach::{Reach, Tenant};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use crate::Error;
 use crate::admission::{Promise, Refused};
-use crate::errors::Error;
 use store::{NewEvent, RevisionRecord};
 
 /// Why a servant failed.

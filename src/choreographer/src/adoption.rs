@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::driver::{self, Beginning};
 use super::{Asked, Choreographer, Handle};
-use crate::errors::Error;
+use crate::Error;
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 impl Choreographer {
@@ -95,7 +95,7 @@ impl Choreographer {
         servant: Arc<dyn servant::engine::Servant>,
     ) {
         let inner = &self.inner;
-        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.config.limits);
+        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.options.limits);
         let key = (record.service, record.robot.clone());
         let handle = Arc::new(Handle::new(
             record.id.clone(),

@@ -11,7 +11,6 @@ use servant::engine::Servant;
 use store::{Journal, NewEvent, RevisionRecord};
 
 use super::Inner;
-use crate::config::bridge_options;
 use crate::grants;
 
 /// Connects to the ROS of a container that was started from `revision`.
@@ -22,8 +21,8 @@ pub(super) async fn open(
 ) -> Result<Arc<Reach>, BusError> {
     let memory = &inner.memory;
     let options = ReachOptions {
-        bridge: bridge_options(&inner.config),
-        grace: inner.config.servant.grace.0,
+        bridge: inner.options.bridge.clone(),
+        grace: inner.options.grace,
         budget: memory.servant(container.id()),
         unfinished: memory.unfinished,
     };
@@ -61,7 +60,7 @@ async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
         layers,
         registry,
         // Not allowed any more: then the servant would not have been started either.
-        ways_out: grants::ways_out(&plan.grants, &inner.config.allow).unwrap_or_default(),
+        ways_out: grants::ways_out(&plan.grants, &inner.options.allow).unwrap_or_default(),
     }
 }
 

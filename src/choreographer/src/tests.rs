@@ -44,6 +44,28 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
     }
 }
 
+fn options() -> Options {
+    let memory = 64 << 20;
+    Options {
+        limits: api::Limits::default(),
+        reserve_cpus: 0.01,
+        reserve_memory: memory,
+        deadline: Duration::from_secs(10),
+        start: Duration::from_secs(30),
+        grace: Duration::from_secs(60),
+        anonymous_grace: Duration::ZERO,
+        spares: 8,
+        allow: grants::Allow::default(),
+        bridge: BridgeOptions::default(),
+        memory: MemoryOptions {
+            daemon: memory,
+            client: memory,
+            servant: memory,
+            unfinished: Duration::from_secs(300),
+        },
+    }
+}
+
 /// A choreographer of a machine with two cores.
 fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let home = tempfile::tempdir().expect("a directory");
@@ -51,7 +73,7 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
         .expect("a store");
     let choreographer = Choreographer::new(
-        Arc::new(Config::default()),
+        options(),
         Arc::new(Catalogue::new(Arc::new(state), Arc::new(store))),
         Arc::new(NoEngine),
         Admission::new(Amount::new(2.0, 0), 16),
@@ -68,7 +90,7 @@ async fn runs(
 ) -> Arc<Handle> {
     let inner = &choreographer.inner;
     let revision = Arc::new(revision("sha256:1", cpus));
-    let asked = Asked::new(revision.plan.limits, inner.config.limits);
+    let asked = Asked::new(revision.plan.limits, inner.options.limits);
     let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
     let permit = inner.admission.adopt(inner.promised(&handle));
     handle.set_promise(permit.promise());

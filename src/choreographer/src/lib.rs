@@ -15,11 +15,18 @@
 //! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided under one
 //! short lock: a servant that is being ended is never given to anyone.
 
+#![forbid(unsafe_code)]
+
+mod admission;
 mod adoption;
 mod driver;
+mod error;
+pub mod grants;
 mod handle;
-mod limits;
+pub mod limits;
+mod memory;
 mod nodes;
+mod options;
 mod reaching;
 mod restart;
 mod room;
@@ -32,23 +39,25 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use api::Phase;
+use bridge::BridgeOptions;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
 use reach::RequestTimes;
+use reach::egress::Way;
 use servant::engine::Engine;
+use store::{Journal, State};
 
-use crate::admission::{Admission, Amount, Permit, Refused};
-use crate::config::Config;
-use crate::errors::Error;
-use crate::memory::{Memory, SharedMemory};
-use store::Journal;
-use store::State;
-
+pub use admission::{Admission, Amount, Permit, Refused};
+pub use error::{Error, with_last_words};
 pub use handle::{Asked, Handle, Lease};
 pub use limits::engine_limits;
+pub use memory::{Memory, MemoryOptions};
+pub use options::Options;
 pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
 use driver::Beginning;
+use grants::Granted;
+use memory::SharedMemory;
 use spares::Spares;
 
 /// Decides which servants live. Cheap to clone.
@@ -59,7 +68,7 @@ pub struct Choreographer {
 
 /// What the choreographer and its drivers share.
 pub(crate) struct Inner {
-    pub(crate) config: Arc<Config>,
+    pub(crate) options: Options,
     pub(crate) state: Arc<State>,
     pub(crate) journal: Journal,
     pub(crate) catalogue: Arc<Catalogue>,
@@ -85,17 +94,17 @@ struct Servants {
 impl Choreographer {
     /// One that starts servants by `engine`.
     pub fn new(
-        config: Arc<Config>,
+        options: Options,
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         admission: Admission,
     ) -> Choreographer {
         let state = Arc::clone(catalogue.state());
         let journal = Journal::new(Arc::clone(&state));
-        let memory = Memory::new(&config.memory, journal.clone());
+        let memory = Memory::new(&options.memory, journal.clone());
         let inner = Inner {
             memory: Arc::new(memory),
-            config,
+            options,
             state,
             journal,
             catalogue,
@@ -155,7 +164,7 @@ impl Choreographer {
                 id.unwrap_or_else(|| names::servant_id(service)),
                 robot.to_owned(),
                 anonymous,
-                Asked::new(revision.plan.limits, inner.config.limits),
+                Asked::new(revision.plan.limits, inner.options.limits),
                 revision,
                 store::now(),
             ));
@@ -269,16 +278,36 @@ impl Choreographer {
         asked: &api::Limits,
         deadline: Duration,
         on_wait: impl FnOnce(),
-    ) -> Result<Permit, Refused> {
+    ) -> Result<Permit, Error> {
         let wanted = self.inner.promised_for(asked);
         let make_room = || {
             on_wait();
             self.inner.make_room();
         };
-        self.inner
-            .admission
+        let admission = &self.inner.admission;
+        Ok(admission
             .admit_yielding(wanted, deadline, make_room)
-            .await
+            .await?)
+    }
+
+    /// Limits of a servant where its push says nothing.
+    pub fn default_limits(&self) -> api::Limits {
+        self.inner.options.limits
+    }
+
+    /// Sessions of rosbridge before each servant.
+    pub fn bridge_options(&self) -> &BridgeOptions {
+        &self.inner.options.bridge
+    }
+
+    /// What a push asks for beyond a container, if it is allowed and there.
+    pub fn grant(&self, asked: &api::Grants) -> Result<Granted, Error> {
+        Ok(grants::resolve(asked, &self.inner.options.allow)?)
+    }
+
+    /// Hosts that a push may connect to, of those that it asks for.
+    pub fn ways_out(&self, asked: &api::Grants) -> Result<Vec<Way>, Error> {
+        Ok(grants::ways_out(asked, &self.inner.options.allow)?)
     }
 
     /// Refuses limits that would never be admitted.
@@ -314,10 +343,11 @@ impl Inner {
 
     /// Limits asked for at push are a promise; else the configured reserve is.
     fn promised_for(&self, asked: &api::Limits) -> Amount {
-        let reserve = &self.config.servant;
+        let options = &self.options;
+        let memory = asked.memory.map(|memory| memory.0);
         Amount::new(
-            asked.cpus.unwrap_or(reserve.reserve_cpus),
-            asked.memory.unwrap_or(reserve.reserve_memory).0,
+            asked.cpus.unwrap_or(options.reserve_cpus),
+            memory.unwrap_or(options.reserve_memory),
         )
     }
 

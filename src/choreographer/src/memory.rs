@@ -13,20 +13,26 @@ use std::time::{Duration, Instant};
 use budget::{Budget, Exceeded, Shares};
 use parking_lot::Mutex;
 
-use crate::config;
-use crate::portal::Peer;
-use crate::supervision;
 use store::Journal;
 use store::NewEvent;
 
-/// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
-/// `MOST` bytes.
-const PART: u64 = 4;
-const MOST: u64 = 1 << 30;
 /// Shortest time between two events about the same client or servant.
 const TOLD_AGAIN: Duration = Duration::from_secs(60);
 /// How many clients and servants are remembered for that.
 const REMEMBERED: usize = 1000;
+
+/// Limits of memory outside of servants' containers.
+#[derive(Debug, Clone)]
+pub struct MemoryOptions {
+    /// Bytes for all clients and servants together.
+    pub daemon: u64,
+    /// Bytes for one client: its unfinished messages, and bodies of its requests.
+    pub client: u64,
+    /// Bytes for one servant: unfinished messages of its nodes and links, and JSON or CBOR made of its messages.
+    pub servant: u64,
+    /// Time from the first byte of a message, frame or body to its last.
+    pub unfinished: Duration,
+}
 
 /// The daemon's budgets.
 #[derive(Debug)]
@@ -41,11 +47,8 @@ pub struct Memory {
 
 impl Memory {
     /// Budgets as configured; refusals are written to the journal.
-    pub fn new(config: &config::Memory, journal: Journal) -> Memory {
-        let bytes = |size: api::Size| usize::try_from(size.0).unwrap_or(usize::MAX);
-        let whole = config
-            .daemon
-            .unwrap_or_else(|| api::Size((supervision::machine_memory() / PART).min(MOST)));
+    pub fn new(options: &MemoryOptions, journal: Journal) -> Memory {
+        let bytes = |size: u64| usize::try_from(size).unwrap_or(usize::MAX);
         let refused = Arc::<AtomicU64>::default();
         let count = Arc::clone(&refused);
         let told: Mutex<HashMap<String, Instant>> = Mutex::default();
@@ -64,26 +67,19 @@ impl Memory {
                 tell(&journal, who, full);
             }
         };
-        let whole = Budget::observed("the daemon", bytes(whole), Box::new(observer));
+        let whole = Budget::observed("the daemon", bytes(options.daemon), Box::new(observer));
         Memory {
-            clients: Shares::new(&whole, "client", bytes(config.client)),
-            servants: Shares::new(&whole, "servant", bytes(config.servant)),
+            clients: Shares::new(&whole, "client", bytes(options.client)),
+            servants: Shares::new(&whole, "servant", bytes(options.servant)),
             whole,
             refused,
-            unfinished: config.unfinished.0,
+            unfinished: options.unfinished,
         }
     }
 
-    /// The budget of a client: of its IP address or, for connections from this machine (a proxy's), of its robot's name.
-    pub fn client(&self, peer: Peer, robot: Option<&str>) -> Budget {
-        match (peer, robot) {
-            (Peer::Tcp(address), _) if !address.ip().is_loopback() => {
-                self.clients.of(&address.ip().to_string())
-            }
-            (_, Some(robot)) => self.clients.of(robot),
-            (Peer::Tcp(address), None) => self.clients.of(&address.ip().to_string()),
-            (Peer::Unix(uid), None) => self.clients.of(&format!("user {uid}")),
-        }
+    /// The budget of the client of this name.
+    pub fn client(&self, name: &str) -> Budget {
+        self.clients.of(name)
     }
 
     /// The budget of a servant.
@@ -123,4 +119,4 @@ fn tell(journal: &Journal, who: &str, full: &Exceeded) {
 }
 
 /// The daemon's budgets, shared by its parts.
-pub type SharedMemory = Arc<Memory>;
+pub(crate) type SharedMemory = Arc<Memory>;

@@ -1,0 +1,56 @@
+use crate::admission::Refused;
+use crate::grants::GrantError;
+
+/// Why a servant cannot be had, used or changed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No such servant.
+    #[error("there is no servant {id:?}")]
+    UnknownServant {
+        /// Asked for.
+        id: String,
+        /// What there is.
+        exists: Vec<String>,
+    },
+    /// Something is asked for that is not granted.
+    #[error(transparent)]
+    Grant(#[from] GrantError),
+    /// There is no room.
+    #[error(transparent)]
+    Full(#[from] Refused),
+    /// The servant could not be started, or ended.
+    #[error("the servant of {service} for robot {robot} {reason}")]
+    Servant {
+        /// Its service.
+        service: String,
+        /// Its robot.
+        robot: String,
+        /// What happened, beginning with a verb.
+        reason: String,
+        /// Last lines of its log.
+        log: Vec<String>,
+    },
+    /// The daemon is ending.
+    #[error("the daemon is ending")]
+    Ending,
+    /// What is published.
+    #[error(transparent)]
+    Catalogue(#[from] catalogue::Error),
+    /// The state database.
+    #[error(transparent)]
+    State(#[from] store::Error),
+    /// The engine.
+    #[error(transparent)]
+    Engine(#[from] servant::Error),
+    /// A task of the daemon broke.
+    #[error("the daemon failed at {0}; its log says more")]
+    Internal(&'static str),
+}
+
+/// `text` and the last line of a log that says something.
+pub fn with_last_words(text: &str, log: &[String]) -> String {
+    match log.iter().rev().find(|line| !line.trim().is_empty()) {
+        Some(line) => format!("{text}; its log ends with: {line}"),
+        None => text.to_owned(),
+    }
+}
