@@ -447,6 +447,22 @@ impl Config {
         }
     }
 
+    /// What of it is for pushes.
+    pub fn push(&self) -> push::Options {
+        let push = &self.push;
+        push::Options {
+            archive: push.archive,
+            unpacked: push.unpacked,
+            entries: push.entries,
+            probe: push.probe.0,
+            stall: push.stall.0,
+            at_once: push.at_once,
+            queue: push.queue,
+            time: push.time.0,
+            disk: push.disk,
+        }
+    }
+
     /// Whether servants outlive this daemon when it is ended.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants

@@ -24,18 +24,6 @@ pub enum Error {
         /// Asked for.
         path: String,
     },
-    /// A reserved name is asked for as if it were a service.
-    #[error(
-        "the service name {name} is taken: it was made of the package {package}, and this one is {newcomer}"
-    )]
-    NameTaken {
-        /// The name.
-        name: String,
-        /// Whose it is.
-        package: String,
-        /// Who wants it.
-        newcomer: String,
-    },
     /// Something in the request is not what it should be.
     #[error("{0}")]
     BadRequest(String),
@@ -56,26 +44,7 @@ pub enum Error {
     /// Another token owns the robot's name.
     #[error("the robot name {0:?} belongs to another token")]
     RobotTaken(String),
-    /// The daemon is ending.
-    #[error("the daemon is ending")]
-    Ending,
-    /// A push that failed.
-    #[error("{message}")]
-    Push {
-        /// What failed.
-        message: String,
-        /// What to do.
-        next: Option<String>,
-        /// What explains it.
-        log: Vec<String>,
-    },
-    /// The body is too big.
-    #[error("the archive is bigger than {limit}")]
-    TooLarge {
-        /// What is allowed.
-        limit: api::Size,
-    },
-    /// A body other than an archive is too big.
+    /// A body is too big.
     #[error("the body is bigger than {limit}")]
     BodyTooLarge {
         /// What is allowed.
@@ -90,6 +59,9 @@ pub enum Error {
         /// The time that it may take.
         after: std::time::Duration,
     },
+    /// Pushes.
+    #[error(transparent)]
+    Push(#[from] push::Error),
     /// Servants.
     #[error(transparent)]
     Choreographer(#[from] choreographer::Error),
@@ -102,9 +74,6 @@ pub enum Error {
     /// The image store.
     #[error("the image store: {0}")]
     Image(#[from] image::Error),
-    /// The engine.
-    #[error(transparent)]
-    Engine(#[from] servant::Error),
     /// A task of the daemon broke.
     #[error("the daemon failed at {0}; its log says more")]
     Internal(&'static str),
@@ -145,9 +114,10 @@ impl Error {
             next: self.next(),
             ..Problem::default()
         };
-        if let Error::UnknownRobot { exists, .. }
-        | Error::Choreographer(choreographer::Error::UnknownServant { exists, .. }) = self
-        {
+        if let Error::UnknownRobot { exists, .. } = self {
+            problem.exists = exists.clone();
+        }
+        if let Some(choreographer::Error::UnknownServant { exists, .. }) = self.of_choreographer() {
             problem.exists = exists.clone();
         }
         if let Some(
@@ -166,21 +136,35 @@ impl Error {
         problem
     }
 
+    /// The refusal of the choreographer that it passes on.
+    fn of_choreographer(&self) -> Option<&choreographer::Error> {
+        match self {
+            Error::Choreographer(error) | Error::Push(push::Error::Choreographer(error)) => {
+                Some(error)
+            }
+            _ => None,
+        }
+    }
+
     /// The refusal of the catalogue that it passes on.
     fn of_catalogue(&self) -> Option<&catalogue::Error> {
         match self {
-            Error::Catalogue(error)
-            | Error::Choreographer(choreographer::Error::Catalogue(error)) => Some(error),
-            _ => None,
+            Error::Catalogue(error) | Error::Push(push::Error::Catalogue(error)) => Some(error),
+            _ => match self.of_choreographer()? {
+                choreographer::Error::Catalogue(error) => Some(error),
+                _ => None,
+            },
         }
     }
 
     /// The log that explains it.
     fn log(&self) -> Option<&[String]> {
         match self {
-            Error::Choreographer(choreographer::Error::Servant { log, .. })
-            | Error::Push { log, .. } => Some(log),
-            _ => None,
+            Error::Push(push::Error::Failed { log, .. }) => Some(log),
+            _ => match self.of_choreographer()? {
+                choreographer::Error::Servant { log, .. } => Some(log),
+                _ => None,
+            },
         }
     }
 
@@ -189,7 +173,6 @@ impl Error {
         match self {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
-            Error::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
             Error::BodyTooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
             Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
             Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body not complete"),
@@ -202,12 +185,9 @@ impl Error {
             Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::RobotTaken(_) => (S::FORBIDDEN, "robot-taken", "robot name taken"),
-            Error::Push { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
-            Error::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
-            Error::Ending => ENDING,
+            Error::Push(error) => kind_of_push(error),
             Error::Choreographer(error) => kind_of_choreographer(error),
             Error::Catalogue(error) => kind_of_catalogue(error),
-            Error::Engine(error) => kind_of_engine(error),
             Error::State(_) | Error::Image(_) | Error::Internal(_) => INTERNAL,
         }
     }
@@ -217,24 +197,55 @@ impl Error {
             Error::UnknownRobot { .. } => {
                 "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
             }
-            Error::NameTaken { name, .. } => {
-                format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
-            }
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unauthorised(_) => {
                 "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
-            Error::Push { next, .. } => return next.clone(),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
-            Error::TooLarge { .. } => "leave out what is not needed, or raise archive in [push] of the configuration".into(),
+            Error::Push(error) => return next_of_push(error),
             Error::Choreographer(error) => return next_of_choreographer(error),
             Error::Catalogue(error) => return next_of_catalogue(error),
             _ => return None,
         };
         Some(text)
     }
+}
+
+fn kind_of_push(error: &push::Error) -> Kind {
+    use StatusCode as S;
+    use push::Error as P;
+    match error {
+        P::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
+        P::Options(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
+        P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
+        P::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
+        P::Ending => ENDING,
+        P::Choreographer(error) => kind_of_choreographer(error),
+        P::Catalogue(error) => kind_of_catalogue(error),
+        P::Engine(error) => kind_of_engine(error),
+        P::State(_) | P::Image(_) | P::Internal(_) => INTERNAL,
+    }
+}
+
+fn next_of_push(error: &push::Error) -> Option<String> {
+    use push::Error as P;
+    let text = match error {
+        P::NameTaken { name, .. } => {
+            format!(
+                "choose another name with --name, or remove the service with: cloudroidctl rm {name}"
+            )
+        }
+        P::Failed { next, .. } => return next.clone(),
+        P::TooLarge { .. } => {
+            "leave out what is not needed, or raise archive in [push] of the configuration".into()
+        }
+        P::Choreographer(error) => return next_of_choreographer(error),
+        P::Catalogue(error) => return next_of_catalogue(error),
+        _ => return None,
+    };
+    Some(text)
 }
 
 fn kind_of_choreographer(error: &choreographer::Error) -> Kind {

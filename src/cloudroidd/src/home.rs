@@ -76,6 +76,21 @@ pub fn default_path(
 }
 
 impl Home {
+    /// Shared between daemons: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; below the home where neither is known.
+    pub fn cache(&self) -> PathBuf {
+        let variable = |name| {
+            std::env::var_os(name)
+                .filter(|value| !value.is_empty())
+                .map(PathBuf::from)
+        };
+        variable("XDG_CACHE_HOME")
+            .or_else(|| variable("HOME").map(|user| user.join(".cache")))
+            .map_or_else(
+                || self.path().join("cache"),
+                |cache| cache.join("cloudroid"),
+            )
+    }
+
     /// Makes what is missing of the directory and locks it.
     pub fn open(path: &Path) -> Result<Home, HomeError> {
         let path = std::path::absolute(path).map_err(io("resolve", path))?;

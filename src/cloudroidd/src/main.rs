@@ -16,7 +16,6 @@ mod errors;
 mod explain;
 mod home;
 mod portal;
-mod push;
 mod shim;
 mod supervision;
 mod tokens;
@@ -35,6 +34,8 @@ use anyhow::{Context, bail};
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
 use clap::{Parser, Subcommand};
+use push::Pusher;
+use rootfs_builder::Builder;
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
 use tokio::net::TcpListener;
@@ -45,7 +46,6 @@ use tracing_subscriber::EnvFilter;
 use config::{Config, IsolationMode};
 use home::Home;
 use portal::App;
-use push::Pusher;
 use store::State;
 use tokens::Tokens;
 
@@ -274,14 +274,15 @@ fn build(
         Admission::new(capacity, room.queue),
     );
     let definitions = bases::directory(&config, home)?;
+    let builder = builder(&config, home, definitions, catalogue.images(), &engine)?;
     let pusher = Pusher::new(
-        &config,
-        home,
+        config.push(),
+        home.path().to_owned(),
+        builder,
         Arc::clone(&catalogue),
         engine,
         choreographer.clone(),
-        definitions,
-    )?;
+    );
     Ok(Arc::new(App {
         tokens,
         listen,
@@ -296,6 +297,32 @@ fn build(
         ending: CancellationToken::new(),
         config,
     }))
+}
+
+/// What makes images of pushes.
+fn builder(
+    config: &Config,
+    home: &Home,
+    bases_dir: PathBuf,
+    images: &Arc<image::Store>,
+    engine: &Arc<dyn Engine>,
+) -> anyhow::Result<Builder> {
+    let cache = home.cache();
+    // What was compiled lies there, too.
+    store::private::make_directory(&cache)
+        .and_then(|()| store::private::close(&cache))
+        .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
+    Builder::new(rootfs_builder::Config {
+        cache_dir: cache,
+        bases_dir,
+        build_dir: home.path().join("build"),
+        logs_dir: home.path().join("logs"),
+        sources: rootfs_builder::Sources::default(),
+        store: Arc::clone(images),
+        engine: Arc::clone(engine),
+        limits: config.push.limits(),
+    })
+    .context("cannot prepare for building images")
 }
 
 fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConfig> {
@@ -336,7 +363,7 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
 /// Lets pushes, sessions and, unless they are to be kept, servants end.
 async fn drain(app: &App) {
     app.choreographer.close();
-    app.pusher.cancel_all().await;
+    app.pusher.cancel_all(app.config.portal.drain.0).await;
     app.choreographer.end_spares().await;
     if app.config.keeps_servants() {
         tracing::info!(

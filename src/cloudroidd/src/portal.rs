@@ -17,6 +17,7 @@ mod handshake;
 mod metrics;
 mod oci;
 mod page;
+mod push;
 mod robots;
 mod routes;
 mod stubs;
@@ -40,13 +41,11 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::config::Config;
-use crate::push::Pusher;
 use crate::tokens::Tokens;
 use choreographer::Choreographer;
 use store::State;
 
-pub use api_v1::lines;
-pub use guard::{Peer, query};
+pub use guard::Peer;
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
@@ -70,7 +69,7 @@ pub struct App {
     /// Servants.
     pub choreographer: Choreographer,
     /// Pushes.
-    pub pusher: Arc<Pusher>,
+    pub pusher: Arc<::push::Pusher>,
     /// The state of this machine, as checked at start.
     pub machine: crate::doctor::Machine,
     /// When the daemon started.

@@ -7,7 +7,7 @@ use axum::routing::{MethodRouter, any, delete, get, patch, post};
 
 use std::sync::Arc;
 
-use super::{App, api_v1, metrics, oci, page, robots, stubs};
+use super::{App, api_v1, metrics, oci, page, push, robots, stubs};
 use crate::errors::Error;
 
 /// One method at one address.
@@ -75,7 +75,7 @@ pub const ROUTES: &[Route] = &[
         get(api_v1::explain)
     }),
     at("POST", "/api/v1/push", || {
-        post(crate::push::handle).layer(DefaultBodyLimit::disable())
+        post(push::push).layer(DefaultBodyLimit::disable())
     }),
     at("GET", "/api/v1/openapi.json", || get(api_v1::openapi)),
     at("GET", "/v2", || get(oci::version)),

@@ -21,7 +21,7 @@ use tokio::time::timeout;
 
 use super::Pusher;
 use super::probe::{self, NODE};
-use crate::errors::Error;
+use crate::Error;
 use store::Plan;
 
 /// Where the node of an index is while its name is looked for.
@@ -71,7 +71,7 @@ async fn look(
     alone: &Plan,
     unnamed: &[usize],
 ) -> Result<Vec<(usize, String)>, Error> {
-    let failed = |message: String| Error::Push {
+    let failed = |message: String| Error::Failed {
         message,
         next: None,
         log: Vec::new(),
@@ -82,7 +82,7 @@ async fn look(
         .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
     let mut graph = bus.graph();
     let seen = graph.clone();
-    let patience = pusher.config.push.probe.0;
+    let patience = pusher.options.probe;
     let all_there = |graph: &Arc<Graph>| names(graph, unnamed).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
@@ -102,7 +102,7 @@ async fn look(
 
 fn never_registered(alone: &Plan, after: Duration) -> Error {
     let nodes = alone.nodes.iter().map(|node| node.name.clone()).collect();
-    Error::Push {
+    Error::Failed {
         message: ProbeError::NeverRegistered {
             nodes,
             after,

@@ -4,7 +4,7 @@ use catalogue::RolledBack;
 use store::{NewEvent, RevisionRecord};
 
 use super::Pusher;
-use crate::errors::Error;
+use crate::Error;
 
 impl Pusher {
     /// Publishes the revision, and has a spare made of it.

@@ -5,9 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use axum::body::{Body, Bytes};
+use bytes::Bytes;
 use futures_util::{Stream, StreamExt};
 use tokio_util::sync::CancellationToken;
+
+use crate::Archive;
 
 /// Whether a body stopped coming.
 #[derive(Clone, Default)]
@@ -22,13 +24,12 @@ impl Stalled {
 /// The chunks of a body. It ends with an error when none comes for `patience`, which `stalled` then says, or when
 /// `ended` is cancelled.
 pub(super) fn chunks(
-    body: Body,
+    archive: Archive,
     patience: Duration,
     stalled: Stalled,
     ended: CancellationToken,
 ) -> impl Stream<Item = io::Result<Bytes>> + Send {
-    let stream = body.into_data_stream();
-    futures_util::stream::unfold(Some(stream), move |stream| {
+    futures_util::stream::unfold(Some(archive), move |stream| {
         let (stalled, ended) = (stalled.clone(), ended.clone());
         async move {
             let mut stream = stream?;
@@ -41,7 +42,7 @@ pub(super) fn chunks(
             };
             match next {
                 Ok(Some(Ok(chunk))) => Some((Ok(chunk), Some(stream))),
-                Ok(Some(Err(error))) => Some((Err(io::Error::other(error)), None)),
+                Ok(Some(Err(error))) => Some((Err(error), None)),
                 Ok(None) => None,
                 Err(_) => {
                     stalled.0.store(true, Ordering::Relaxed);

@@ -19,7 +19,7 @@ use tokio_util::task::TaskTracker;
 
 use super::request::Tell;
 use super::{Pusher, naming, supplement};
-use crate::errors::Error;
+use crate::Error;
 use choreographer::Permit;
 use store::Plan;
 
@@ -84,7 +84,7 @@ pub(super) async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servan
 /// Room for it, as for any servant of these limits: waited for where there is none.
 async fn room(pusher: &Pusher, options: &PushOptions, tell: &Tell) -> Result<Permit, Error> {
     let (full, is_full) = tokio::sync::oneshot::channel();
-    let patience = pusher.config.push.time.0;
+    let patience = pusher.options.time;
     let admitted = pusher
         .choreographer
         .admit_like_a_servant(&options.limits, patience, || {
@@ -110,7 +110,7 @@ async fn look(
     plan: &Plan,
     push: &PushOptions,
 ) -> Result<Found, Error> {
-    let failed = |message: String| Error::Push {
+    let failed = |message: String| Error::Failed {
         message,
         next: None,
         log: Vec::new(),
@@ -119,7 +119,7 @@ async fn look(
         .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
     let working = Arc::clone(servant);
     let options = ProbeOptions {
-        patience: pusher.config.push.probe.0,
+        patience: pusher.options.probe,
         types: push
             .interface
             .as_deref()
@@ -157,13 +157,13 @@ async fn look(
 /// With the option that adds what the nodes say is missing.
 async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
     match error {
-        Error::Push {
+        Error::Failed {
             message,
             next: None,
             log,
         } => {
             let advice = pusher.builder.advice(&built.base, &log.join("\n")).await;
-            Error::Push {
+            Error::Failed {
                 message,
                 next: (!advice.is_empty()).then(|| advice.join("; ")),
                 log,
@@ -225,13 +225,13 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
 /// With the last lines that the nodes printed.
 pub(super) fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
     match error {
-        Error::Push { message, next, log } if log.is_empty() => {
+        Error::Failed { message, next, log } if log.is_empty() => {
             let lines = choreographer::read_log(&servant.log_path(), LOG_LINES, None);
             let log = lines
                 .into_iter()
                 .map(|line| format!("{}: {}", line.node, line.line))
                 .collect();
-            Error::Push { message, next, log }
+            Error::Failed { message, next, log }
         }
         other => other,
     }

@@ -1,4 +1,4 @@
-//! `POST /api/v1/push`: from an archive to a published revision, told line by line.
+//! From an archive to a published revision, told line by line; rolling back and removing what is published.
 //!
 //! ```text
 //!  body ─▶ unpack (nothing leaves the tree) ─▶ build (layers, image) ─▶ probe (start once, record the interface)
@@ -9,8 +9,12 @@
 //! Until the database has the revision nothing of it can be seen, so whatever fails, and whenever the client goes
 //! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
 
+#![forbid(unsafe_code)]
+
 mod bounds;
+mod error;
 mod naming;
+mod options;
 mod patience;
 mod probe;
 mod publish;
@@ -22,11 +26,11 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
-use anyhow::Context;
 use api::{PushEvent, PushOptions};
-use axum::body::Body;
 use catalogue::{Catalogue, names};
+use choreographer::Choreographer;
 use parking_lot::Mutex;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
@@ -36,18 +40,15 @@ use tokio_util::task::TaskTracker;
 
 use bounds::Places;
 use request::Tell;
-pub use request::handle;
+use store::{Journal, NewEvent, Plan, RevisionRecord, State};
 
-use crate::config::Config;
-use crate::errors::Error;
-use crate::home::Home;
-use choreographer::Choreographer;
-use store::Journal;
-use store::private;
-use store::{NewEvent, Plan, RevisionRecord, State};
+pub use error::Error;
+pub use options::Options;
+pub use receive::Archive;
+pub use request::Published;
 
 /// Events that may wait for a slow client before the build waits for it.
-const EVENTS_AHEAD: usize = 256;
+pub const EVENTS_AHEAD: usize = 256;
 /// The unpacked archive, in the directory of its build.
 const PUSHED: &str = "pushed";
 /// Where nodes run, and keep what they write: a tmpfs.
@@ -55,7 +56,7 @@ const HOME_INSIDE: &str = "/root";
 
 /// Publishes, rolls back and removes services.
 pub struct Pusher {
-    config: Arc<Config>,
+    options: Options,
     home: PathBuf,
     state: Arc<State>,
     catalogue: Arc<Catalogue>,
@@ -71,54 +72,32 @@ pub struct Pusher {
     tasks: TaskTracker,
 }
 
-/// What a push came to.
-struct Published {
-    service: String,
-    layers: Vec<api::push::Layer>,
-}
-
 impl Pusher {
-    /// With half-made things below `home`.
+    /// With half-made things below `home`, the state directory.
     pub fn new(
-        config: &Arc<Config>,
-        home: &Home,
+        options: Options,
+        home: PathBuf,
+        builder: Builder,
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         choreographer: Choreographer,
-        bases_dir: PathBuf,
-    ) -> anyhow::Result<Pusher> {
-        let cache = cache_directory(home);
-        // What was compiled lies there, too.
-        private::make_directory(&cache)
-            .and_then(|()| private::close(&cache))
-            .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
-        let builder = Builder::new(rootfs_builder::Config {
-            cache_dir: cache,
-            bases_dir,
-            build_dir: home.path().join("build"),
-            logs_dir: home.path().join("logs"),
-            sources: rootfs_builder::Sources::default(),
-            store: Arc::clone(catalogue.images()),
-            engine: Arc::clone(&engine),
-            limits: config.push.limits(),
-        })
-        .context("cannot prepare for building images")?;
-        Ok(Pusher {
-            config: Arc::clone(config),
-            home: home.path().to_owned(),
+    ) -> Pusher {
+        Pusher {
+            places: Places::new(&options),
+            options,
+            home,
             journal: Journal::new(Arc::clone(catalogue.state())),
             state: Arc::clone(catalogue.state()),
             catalogue,
             engine,
             choreographer,
             builder,
-            places: Places::new(&config.push),
             turns: Mutex::default(),
             published: AtomicU64::new(0),
             failed: AtomicU64::new(0),
             cancel: CancellationToken::new(),
             tasks: TaskTracker::new(),
-        })
+        }
     }
 
     /// Pushes that succeeded and failed since the start.
@@ -129,12 +108,11 @@ impl Pusher {
         )
     }
 
-    /// Cancels every push and waits until nothing is left of them, for a while: what is left then is swept by the
+    /// Cancels every push and waits until nothing is left of them, for `patience`: what is left then is swept by the
     /// next daemon.
-    pub async fn cancel_all(&self) {
+    pub async fn cancel_all(&self, patience: Duration) {
         self.cancel.cancel();
         self.tasks.close();
-        let patience = self.config.portal.drain.0;
         if tokio::time::timeout(patience, self.tasks.wait())
             .await
             .is_err()
@@ -147,9 +125,10 @@ impl Pusher {
         &self,
         id: &str,
         options: &PushOptions,
-        body: Body,
+        archive: Archive,
         tell: &Tell,
     ) -> Result<Published, Error> {
+        let began = Instant::now();
         let known = options.name.clone().or_else(|| options.apt.clone());
         let early = match &known {
             Some(name) => Some(self.turn(name).await),
@@ -166,7 +145,7 @@ impl Pusher {
             None => {
                 tell.step("receiving the package").await;
                 let tree = self.home.join("build").join(id).join(PUSHED);
-                receive::unpack(body, &tree, &self.config.push, tell).await?;
+                receive::unpack(archive, &tree, &self.options, tell).await?;
                 if let Some(name) = &options.name {
                     self.check_owner(name, &receive::packages_of(&tree))?;
                 }
@@ -197,7 +176,7 @@ impl Pusher {
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
             supplement::add(&mut interface, text, &built.definitions)
-                .map_err(|error| Error::BadRequest(format!("the interface supplement: {error}")))?;
+                .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         bounds::check_interface(&interface)?;
         let record = RevisionRecord {
@@ -231,6 +210,7 @@ impl Pusher {
         Ok(Published {
             service: name,
             layers: built.layers.iter().map(layer).collect(),
+            took: began.elapsed(),
         })
     }
 
@@ -345,7 +325,7 @@ fn push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error
             Vec::new(),
         ),
     };
-    Error::Push { message, next, log }
+    Error::Failed { message, next, log }
 }
 
 /// Names what was pushed as the pusher did (`source`), and leaves out where the build is: that means nothing to him.
@@ -365,21 +345,6 @@ fn as_the_pusher_knows_it(text: &str, home: &Path, source: &str) -> String {
         }
     }
     mended
-}
-
-/// Shared between daemons: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; below the home where neither is known.
-fn cache_directory(home: &Home) -> PathBuf {
-    let variable = |name| {
-        std::env::var_os(name)
-            .filter(|value| !value.is_empty())
-            .map(PathBuf::from)
-    };
-    variable("XDG_CACHE_HOME")
-        .or_else(|| variable("HOME").map(|user| user.join(".cache")))
-        .map_or_else(
-            || home.path().join("cache"),
-            |cache| cache.join("cloudroid"),
-        )
 }
 
 #[cfg(test)]
@@ -412,13 +377,17 @@ mod tests {
                 "the CMake package warp is missing: push with `--with libwarp-dev`".into(),
             ],
         };
-        let problem = push_error(&failed, Path::new("/home"), "broken").problem();
-        assert_eq!(problem.detail, "the build of broken failed");
+        let Error::Failed { message, next, log } =
+            push_error(&failed, Path::new("/home"), "broken")
+        else {
+            panic!("it failed");
+        };
+        assert_eq!(message, "the build of broken failed");
         assert_eq!(
-            problem.log,
+            log,
             ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]
         );
-        let next = problem.next.expect("what to do");
+        let next = next.expect("what to do");
         assert!(next.contains("`--with libwarp-dev`"), "{next}");
     }
 }

@@ -7,8 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use api::{PushEvent, Size};
-use axum::body::Body;
+use bytes::Bytes;
 use futures_util::StreamExt;
+use futures_util::stream::BoxStream;
 use image::Refusal;
 use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
@@ -16,8 +17,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::patience::{self, Stalled};
 use super::request::Tell;
-use crate::config::Push;
-use crate::errors::Error;
+use crate::Error;
+use crate::Options;
 
 /// How often it is told how far the archive has come.
 const TOLD_EVERY: Duration = Duration::from_millis(500);
@@ -28,11 +29,14 @@ const DEPTH: usize = 6;
 /// The largest package.xml that is looked at, in bytes.
 const MANIFEST: u64 = 1 << 20;
 
-/// Unpacks the body into `tree`, which is made.
+/// The bytes of an archive, as they come.
+pub type Archive = BoxStream<'static, io::Result<Bytes>>;
+
+/// Unpacks the archive into `tree`, which is made.
 pub(super) async fn unpack(
-    body: Body,
+    archive: Archive,
     tree: &Path,
-    limits: &Push,
+    limits: &Options,
     tell: &Tell,
 ) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
@@ -40,9 +44,9 @@ pub(super) async fn unpack(
     let ended = CancellationToken::new();
     let _ended = ended.clone().drop_guard();
     let stalled = Stalled::default();
-    let chunks = patience::chunks(body, limits.stall.0, stalled.clone(), ended);
+    let chunks = patience::chunks(archive, limits.stall, stalled.clone(), ended);
     let stream = StreamReader::new(chunks.boxed());
-    let mut archive = Counted {
+    let mut counted = Counted {
         inner: SyncIoBridge::new(stream),
         received: Arc::clone(&received),
         limit: limits.archive.0,
@@ -53,21 +57,21 @@ pub(super) async fn unpack(
         bytes: limits.unpacked.0,
         ..image::Limits::default()
     };
-    let (limit, patience) = (limits.archive, limits.stall.0);
+    let (limit, patience) = (limits.archive, limits.stall);
     let destination = tree.to_owned();
     let work = blocking::spawn(move || {
         let parent = destination.parent().unwrap_or(&destination);
-        store::private::make_directory(parent).map_err(|error| Error::Push {
+        store::private::make_directory(parent).map_err(|error| Error::Failed {
             message: format!("cannot make {}: {error}", parent.display()),
             next: None,
             log: Vec::new(),
         })?;
-        let outcome = image::unpack(&mut archive, &destination, &unpacked);
-        if archive.exceeded {
+        let outcome = image::unpack(&mut counted, &destination, &unpacked);
+        if counted.exceeded {
             return Err(Error::TooLarge { limit });
         }
         if stalled.is() {
-            return Err(Error::Push {
+            return Err(Error::Failed {
                 message: format!("nothing of the archive came for {} s", patience.as_secs()),
                 next: Some(
                     "look at the connection and push again, or raise stall in [push] of the configuration"
@@ -115,7 +119,7 @@ fn refused(error: image::Error) -> Error {
         ),
         _ => None,
     };
-    Error::Push {
+    Error::Failed {
         message: error.to_string(),
         next,
         log: Vec::new(),
@@ -123,11 +127,10 @@ fn refused(error: image::Error) -> Error {
 }
 
 /// Reads what a refused client still sends, for a while.
-pub(super) async fn discard(body: Body, limit: Size, ending: CancellationToken) {
-    let mut stream = body.into_data_stream();
+pub(super) async fn discard(mut archive: Archive, limit: Size, ending: CancellationToken) {
     let read = async {
         let mut seen = 0;
-        while let Some(Ok(chunk)) = stream.next().await {
+        while let Some(Ok(chunk)) = archive.next().await {
             seen += chunk.len() as u64;
             if seen > limit.0 {
                 break;
@@ -206,7 +209,6 @@ mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
-    use crate::config::Time;
 
     fn archive(files: &[(&str, &str)]) -> Vec<u8> {
         let mut builder = tar::Builder::new(Vec::new());
@@ -224,11 +226,12 @@ mod tests {
         builder.into_inner().expect("into memory")
     }
 
-    async fn unpacked(bytes: Vec<u8>, limits: &Push) -> Result<Vec<String>, Error> {
+    async fn unpacked(bytes: Vec<u8>, limits: &Options) -> Result<Vec<String>, Error> {
         let place = tempfile::tempdir().expect("a directory");
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
-        unpack(Body::from(bytes), &tree, limits, &Tell(sender)).await?;
+        let whole = futures_util::stream::iter([Ok(Bytes::from(bytes))]).boxed();
+        unpack(whole, &tree, limits, &Tell(sender)).await?;
         Ok(packages_of(&tree))
     }
 
@@ -246,7 +249,7 @@ mod tests {
             ),
         ]);
         assert_eq!(
-            unpacked(bytes, &Push::default()).await.expect("good"),
+            unpacked(bytes, &Options::wide()).await.expect("good"),
             ["one", "two"]
         );
     }
@@ -254,12 +257,12 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn an_archive_over_the_limit_is_refused() {
         let bytes = archive(&[("package.xml", &"x".repeat(10_000))]);
-        let limits = Push {
+        let limits = Options {
             archive: Size(2000),
-            ..Push::default()
+            ..Options::wide()
         };
         let refused = unpacked(bytes, &limits).await.expect_err("too big");
-        assert_eq!(refused.problem().status, 413, "{refused}");
+        assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
     }
 
     #[tokio::test(flavor = "multi_thread")]
@@ -268,11 +271,11 @@ mod tests {
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
         let beginning = archive(&[("package.xml", &"x".repeat(10_000))])[..2000].to_vec();
-        let chunks = futures_util::stream::iter([Ok::<_, io::Error>(beginning)]);
-        let body = Body::from_stream(chunks.chain(futures_util::stream::pending()));
-        let limits = Push {
-            stall: Time(Duration::from_millis(50)),
-            ..Push::default()
+        let chunks = futures_util::stream::iter([Ok(Bytes::from(beginning))]);
+        let body = chunks.chain(futures_util::stream::pending()).boxed();
+        let limits = Options {
+            stall: Duration::from_millis(50),
+            ..Options::wide()
         };
         let refused = unpack(body, &tree, &limits, &Tell(sender))
             .await
@@ -296,11 +299,11 @@ mod tests {
         let never = futures_util::stream::poll_fn(move |_| {
             let _ = &held;
             asked.take().map(|asked| asked.send(()));
-            std::task::Poll::<Option<io::Result<Vec<u8>>>>::Pending
+            std::task::Poll::<Option<io::Result<Bytes>>>::Pending
         });
         let push = tokio::spawn(async move {
-            let body = Body::from_stream(never);
-            unpack(body, &tree, &Push::default(), &Tell(sender)).await
+            let body = never.boxed();
+            unpack(body, &tree, &Options::wide(), &Tell(sender)).await
         });
         waiting.await.expect("it reads");
         push.abort();
@@ -309,10 +312,10 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread")]
     async fn what_is_no_archive_is_refused() {
-        let refused = unpacked(b"hello, this is no archive".repeat(100), &Push::default())
+        let refused = unpacked(b"hello, this is no archive".repeat(100), &Options::wide())
             .await
             .expect_err("text");
-        assert_eq!(refused.problem().status, 422, "{refused}");
+        assert!(matches!(refused, Error::Failed { .. }), "{refused}");
         assert!(refused.to_string().contains("archive"), "{refused}");
     }
 }

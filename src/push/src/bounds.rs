@@ -18,8 +18,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use super::request::Tell;
-use crate::config::Push;
-use crate::errors::Error;
+use crate::Error;
+use crate::Options;
 
 /// How often it is looked whether the file system fills.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
@@ -42,12 +42,12 @@ pub(super) struct Places {
 }
 
 impl Places {
-    pub(super) fn new(config: &Push) -> Places {
+    pub(super) fn new(options: &Options) -> Places {
         Places {
-            free: Arc::new(Semaphore::new(config.at_once)),
+            free: Arc::new(Semaphore::new(options.at_once)),
             waiting: AtomicUsize::new(0),
-            at_once: config.at_once,
-            queue: config.queue,
+            at_once: options.at_once,
+            queue: options.queue,
         }
     }
 
@@ -58,7 +58,7 @@ impl Places {
         }
         let waiting = Waiting::among(&self.waiting);
         if waiting.before >= self.queue {
-            return Err(Error::Push {
+            return Err(Error::Failed {
                 message: format!(
                     "{} pushes are being built, and {} wait already",
                     self.at_once, waiting.before
@@ -100,18 +100,18 @@ impl Drop for Waiting<'_> {
 }
 
 /// Returns when the push that works in `directory` has exceeded a limit, with the error for its client.
-pub(super) async fn exceeded(config: &Push, directory: &Path) -> Error {
+pub(super) async fn exceeded(options: &Options, directory: &Path) -> Error {
     let (what, next) = tokio::select! {
-        () = tokio::time::sleep(config.time.0) => (
-            format!("it took longer than {} s", config.time.0.as_secs()),
+        () = tokio::time::sleep(options.time) => (
+            format!("it took longer than {} s", options.time.as_secs()),
             "push only what is needed, or raise time in [push] of the configuration",
         ),
-        what = overfull(config.disk, directory) => (
+        what = overfull(options.disk, directory) => (
             what,
             "push only what is needed, or raise disk in [push] of the configuration",
         ),
     };
-    Error::Push {
+    Error::Failed {
         message: format!("the push was ended: {what}"),
         next: Some(next.to_owned()),
         log: Vec::new(),
@@ -156,7 +156,7 @@ pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
     let parameters = interface.parameters.iter().map(|parameter| &parameter.name);
     let names = topics.chain(services).chain(actions).chain(parameters);
     let refused = |message: String| {
-        Err(Error::Push {
+        Err(Error::Failed {
             message,
             next: Some("look at what the nodes register".to_owned()),
             log: Vec::new(),
@@ -217,23 +217,25 @@ mod tests {
 
     use super::*;
 
-    fn config() -> Push {
-        Push {
+    fn options() -> Options {
+        Options {
             at_once: 1,
             queue: 1,
             disk: Size(1 << 20),
-            ..Push::default()
+            ..Options::wide()
         }
     }
 
     fn words(error: Error) -> String {
-        let problem = error.problem();
-        format!("{}; {}", problem.detail, problem.next.unwrap_or_default())
+        let Error::Failed { message, next, .. } = error else {
+            panic!("it failed");
+        };
+        format!("{message}; {}", next.unwrap_or_default())
     }
 
     #[tokio::test]
     async fn pushes_take_turns_and_no_more_wait_than_may() {
-        let places = Arc::new(Places::new(&config()));
+        let places = Arc::new(Places::new(&options()));
         let (sender, mut told) = mpsc::channel(16);
         let tell = Tell(sender);
         let first = places.take(&tell).await.expect("free");
@@ -258,8 +260,8 @@ mod tests {
     async fn a_build_that_writes_too_much_is_told_so() {
         let place = tempfile::tempdir().expect("a directory");
         let directory = place.path().join("push-1");
-        let config = config();
-        let exceeded = exceeded(&config, &directory);
+        let options = options();
+        let exceeded = exceeded(&options, &directory);
         let written = directory.clone();
         tokio::task::spawn_blocking(move || {
             std::fs::create_dir_all(written.join("upper")).expect("made");
@@ -278,18 +280,18 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let directory = place.path().join("push-1");
         std::fs::create_dir_all(directory.join(vec!["d"; 300].join("/"))).expect("made");
-        let config = Push {
+        let options = Options {
             disk: Size(1 << 30),
-            ..config()
+            ..options()
         };
-        let told = words(exceeded(&config, &directory).await);
+        let told = words(exceeded(&options, &directory).await);
         assert!(told.contains("directories deep"), "{told}");
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_push_that_takes_too_long_is_told_so() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = words(exceeded(&config(), &place.path().join("none")).await);
+        let told = words(exceeded(&options(), &place.path().join("none")).await);
         assert!(
             told.contains("longer than 7200 s") && told.contains("raise time"),
             "{told}"

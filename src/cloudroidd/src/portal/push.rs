@@ -1,0 +1,101 @@
+//! `POST /api/v1/push`: options in the query, the archive in the body, events as JSON lines in the answer.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::{PushEvent, PushOptions};
+use axum::body::Body;
+use axum::extract::{OriginalUri, State};
+use axum::response::{IntoResponse, Response};
+use futures_util::{StreamExt, TryStreamExt};
+use push::Published;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::App;
+use super::api_v1::lines;
+use super::guard::query;
+use crate::errors::Error;
+use crate::views;
+
+/// How long the last event waits for a client that does not read.
+const FAREWELL: Duration = Duration::from_secs(5);
+
+/// Answers a push.
+pub async fn push(
+    State(app): State<Arc<App>>,
+    OriginalUri(uri): OriginalUri,
+    body: Body,
+) -> Response {
+    let archive = body.into_data_stream().map_err(io::Error::other).boxed();
+    let pusher = Arc::clone(&app.pusher);
+    let options = match read_options(uri.query()).and_then(|options| {
+        pusher.check(&options)?;
+        Ok(options)
+    }) {
+        Ok(options) => options,
+        Err(error) => {
+            pusher.discard(archive);
+            return error.into_response();
+        }
+    };
+    let (sender, receiver) = mpsc::channel(push::EVENTS_AHEAD);
+    let last = sender.clone();
+    // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
+    let guard = pusher.begin(options, archive, sender, |outcome| async move {
+        let event = match outcome
+            .map_err(Error::from)
+            .and_then(|done| told(&app, done))
+        {
+            Ok(event) => event,
+            Err(error) => PushEvent::Error {
+                problem: error.problem(),
+            },
+        };
+        // A client that does not read it must not keep the push, and with it the daemon, from ending.
+        let _ = tokio::time::timeout(FAREWELL, last.send(event)).await;
+    });
+    lines(ReceiverStream::new(receiver).map(move |event| {
+        let _ = &guard;
+        event
+    }))
+}
+
+fn told(app: &App, published: Published) -> Result<PushEvent, Error> {
+    Ok(PushEvent::Done {
+        service: Box::new(views::service(app, &published.service)?),
+        layers: published.layers,
+        took: published.took.as_millis() as u64,
+    })
+}
+
+fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
+    let uri: axum::http::Uri = format!("/?{}", query_of.unwrap_or_default())
+        .parse()
+        .map_err(|_| Error::BadRequest("the push options cannot be read".to_owned()))?;
+    match query(&uri, "options") {
+        Some(text) => serde_json::from_str(&text).map_err(|error| {
+            Error::BadRequest(format!("the push options cannot be read: {error}"))
+        }),
+        None => Ok(PushOptions::default()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_come_in_the_query() {
+        let options =
+            read_options(Some("options=%7B%22apt%22%3A%22opencv_apps%22%7D")).expect("valid");
+        assert_eq!(options.apt.as_deref(), Some("opencv_apps"));
+        assert_eq!(read_options(None).expect("none"), PushOptions::default());
+        let refused = read_options(Some("options=%7B%22nope%22%3A1%7D"))
+            .expect_err("unknown")
+            .problem();
+        assert_eq!(refused.status, 400);
+        assert!(refused.detail.contains("nope"), "{refused:?}");
+    }
+}

@@ -1,0 +1,56 @@
+/// Why something is not pushed, set back or removed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The name is that of a service of another package.
+    #[error(
+        "the service name {name} is taken: it was made of the package {package}, and this one is {newcomer}"
+    )]
+    NameTaken {
+        /// The name.
+        name: String,
+        /// Whose it is.
+        package: String,
+        /// Who wants it.
+        newcomer: String,
+    },
+    /// Something in the options is not what it should be.
+    #[error("{0}")]
+    Options(String),
+    /// A push that failed.
+    #[error("{message}")]
+    Failed {
+        /// What failed.
+        message: String,
+        /// What to do.
+        next: Option<String>,
+        /// What explains it.
+        log: Vec<String>,
+    },
+    /// The archive is too big.
+    #[error("the archive is bigger than {limit}")]
+    TooLarge {
+        /// What is allowed.
+        limit: api::Size,
+    },
+    /// The daemon is ending.
+    #[error("the daemon is ending")]
+    Ending,
+    /// Servants.
+    #[error(transparent)]
+    Choreographer(#[from] choreographer::Error),
+    /// What is published.
+    #[error(transparent)]
+    Catalogue(#[from] catalogue::Error),
+    /// The state database.
+    #[error(transparent)]
+    State(#[from] store::Error),
+    /// The image store.
+    #[error("the image store: {0}")]
+    Image(#[from] image::Error),
+    /// The engine.
+    #[error(transparent)]
+    Engine(#[from] servant::Error),
+    /// A task of the daemon broke.
+    #[error("the daemon failed at {0}; its log says more")]
+    Internal(&'static str),
+}

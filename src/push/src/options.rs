@@ -1,0 +1,44 @@
+use std::time::Duration;
+
+use api::Size;
+
+/// How big pushes may be, and what building them may take.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Bytes of the archive as sent.
+    pub archive: Size,
+    /// Bytes of the files in it, unpacked.
+    pub unpacked: Size,
+    /// How many files the archive may have.
+    pub entries: u64,
+    /// How long the nodes may take to show their interface.
+    pub probe: Duration,
+    /// How long the archive may pause while it is sent.
+    pub stall: Duration,
+    /// Pushes that are built at once; others wait.
+    pub at_once: usize,
+    /// Pushes that may wait.
+    pub queue: usize,
+    /// Time from the start of a push's build (after waiting) to its end.
+    pub time: Duration,
+    /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
+    pub disk: Size,
+}
+
+#[cfg(test)]
+impl Options {
+    /// Limits that no test reaches unless it sets one.
+    pub(crate) fn wide() -> Options {
+        Options {
+            archive: Size(2 << 30),
+            unpacked: Size(8 << 30),
+            entries: 500_000,
+            probe: Duration::from_secs(30),
+            stall: Duration::from_secs(60),
+            at_once: 2,
+            queue: 16,
+            time: Duration::from_secs(7200),
+            disk: Size(20 << 30),
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! A push as a task of its own: begun, bounded, cancelled as a whole, and told of.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use api::{PushEvent, PushOptions};
+use catalogue::names;
+use rootfs_builder::blocking;
+use store::NewEvent;
+use tokio::sync::mpsc;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+use super::{Archive, Error, Pusher, bounds, receive};
+
+/// Tells the client what is being done. It may have gone away: that cancels the push by itself.
+#[derive(Clone)]
+pub(super) struct Tell(pub(super) mpsc::Sender<PushEvent>);
+
+impl Tell {
+    pub(super) async fn step(&self, title: &str) {
+        self.event(PushEvent::Step {
+            title: title.to_owned(),
+        })
+        .await;
+    }
+
+    pub(super) async fn warning(&self, message: String) {
+        self.event(PushEvent::Warning { message }).await;
+    }
+
+    pub(super) async fn event(&self, event: PushEvent) {
+        let _ = self.0.send(event).await;
+    }
+}
+
+/// What a push came to.
+#[derive(Debug)]
+pub struct Published {
+    /// The service.
+    pub service: String,
+    /// Layers of its image.
+    pub layers: Vec<api::push::Layer>,
+    /// How long it took, waiting aside.
+    pub took: Duration,
+}
+
+impl Pusher {
+    /// Begins a push; `events` are told what is done, and `finished` what it came to. It is cancelled when what this
+    /// gives is dropped.
+    pub fn begin<F>(
+        self: &Arc<Self>,
+        options: PushOptions,
+        archive: Archive,
+        events: mpsc::Sender<PushEvent>,
+        finished: impl FnOnce(Result<Published, Error>) -> F + Send + 'static,
+    ) -> DropGuard
+    where
+        F: Future<Output = ()> + Send,
+    {
+        let cancel = self.cancel.child_token();
+        let guard = cancel.clone().drop_guard();
+        let pusher = Arc::clone(self);
+        self.tasks.spawn(async move {
+            let outcome = pusher.run(&options, archive, &Tell(events), cancel).await;
+            let failed = outcome.is_err();
+            finished(outcome).await;
+            if failed && !pusher.cancel.is_cancelled() {
+                // What the failed push had made is of no use any more.
+                pusher.collect_garbage().await;
+            }
+        });
+        guard
+    }
+
+    /// Reads what a refused client still sends, for a while: were it cut off, it might not see why.
+    pub fn discard(&self, archive: Archive) {
+        let limit = self.options.archive;
+        let ending = self.cancel.clone();
+        self.tasks.spawn(receive::discard(archive, limit, ending));
+    }
+
+    /// Refuses what can be refused before anything is received.
+    pub fn check(&self, options: &PushOptions) -> Result<(), Error> {
+        if self.cancel.is_cancelled() {
+            return Err(Error::Ending);
+        }
+        if let Some(name) = &options.name {
+            names::service(name).map_err(catalogue::Error::from)?;
+        }
+        choreographer::limits::check(&options.limits)
+            .map_err(|error| Error::Options(error.to_string()))?;
+        self.choreographer.grant(&options.grants)?;
+        Ok(self.choreographer.check_limits(&options.limits)?)
+    }
+
+    /// Pushes when it is its turn, within what a push may use.
+    async fn bounded(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        archive: Archive,
+        tell: &Tell,
+    ) -> Result<Published, Error> {
+        let _place = self.places.take(tell).await?;
+        let directory = self.home.join("build").join(id);
+        tokio::select! {
+            outcome = self.push(id, options, archive, tell) => outcome,
+            error = bounds::exceeded(&self.options, &directory) => Err(error),
+        }
+    }
+
+    /// Pushes from beginning to end.
+    async fn run(
+        &self,
+        options: &PushOptions,
+        archive: Archive,
+        tell: &Tell,
+        cancel: CancellationToken,
+    ) -> Result<Published, Error> {
+        let began = Instant::now();
+        let id = format!("push-{}", names::random(8));
+        let outcome = tokio::select! {
+            outcome = blocking::cancellable(self.bounded(&id, options, archive, tell)) => outcome,
+            () = cancel.cancelled() => Err(Error::Ending),
+        };
+        // First what the builder has in there: it goes when its containers have ended.
+        self.builder.removed(&id).await;
+        let build = self.home.join("build").join(&id);
+        let removed = tokio::task::spawn_blocking(move || foreign::remove(&build)).await;
+        if let Ok(Err(error)) = removed {
+            tracing::warn!("what the push {id} left remains until the next start: {error}");
+        }
+        match outcome {
+            Ok(published) => {
+                self.published.fetch_add(1, Ordering::Relaxed);
+                let took = began.elapsed();
+                Ok(Published { took, ..published })
+            }
+            Err(error) => {
+                self.failed.fetch_add(1, Ordering::Relaxed);
+                let name = options.name.as_deref().or(options.apt.as_deref());
+                let what = if cancel.is_cancelled() {
+                    "was cancelled".to_owned()
+                } else {
+                    format!("failed: {error}")
+                };
+                let message = format!("the push of {} {what}", name.unwrap_or(&options.source));
+                let about = NewEvent {
+                    service: name,
+                    ..NewEvent::default()
+                };
+                self.journal.warning("push-failed", &message, &about);
+                Err(error)
+            }
+        }
+    }
+}
