@@ -8,7 +8,7 @@ use support::robot::Robot;
 use support::world::{ADDER, world};
 
 /// The portal's own table, so that an address that is added to it is walked, too.
-const TABLE: &str = include_str!("../../src/cloudroidd/src/portal/routes.rs");
+const TABLE: &str = include_str!("../../src/portal/src/routes.rs");
 const METHODS: [&str; 8] = [
     "GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE",
 ];

@@ -12,10 +12,10 @@ use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 use choreographer::grants::Allow;
 use choreographer::limits::check as check_limits;
+use portal::Tokens;
 use serde::{Deserialize, Deserializer};
 
 use crate::supervision::machine_memory;
-use crate::tokens::Tokens;
 
 /// Everything that can be configured.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -460,6 +460,18 @@ impl Config {
             queue: push.queue,
             time: push.time.0,
             disk: push.disk,
+        }
+    }
+
+    /// What of it is the portal's.
+    pub fn portal(&self) -> portal::Options {
+        portal::Options {
+            origins: self.origins.clone(),
+            default_service: self.default_service.clone(),
+            default_robot: self.default_robot.clone(),
+            handshake: self.portal.handshake.0,
+            drain: self.portal.drain.0,
+            isolation: self.isolation.to_string(),
         }
     }
 

@@ -8,23 +8,13 @@ use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 
 use api::{Check, CheckStatus, Doctor, Size};
+use portal::Machine;
 
 /// Overlays of idmapped layers are known since Linux 5.19.
 const OLDEST_KERNEL: (u32, u32) = (5, 19);
 /// A base image and one package with its dependencies.
 const ROOM_NEEDED: u64 = 2 << 30;
 const ROOM_WANTED: u64 = 10 << 30;
-
-/// What the daemon keeps of a first look.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Machine {
-    /// Version of the usable cgroup controllers; 0: none.
-    pub cgroup_version: u8,
-    /// Limits that cannot be set.
-    pub missing_limits: Vec<String>,
-    /// What does not work as it should.
-    pub warnings: Vec<String>,
-}
 
 /// Every check. `listening`: the portal that runs already and holds its port.
 pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {

@@ -12,15 +12,9 @@
 mod bases;
 mod config;
 mod doctor;
-mod errors;
-mod explain;
 mod home;
-mod portal;
 mod shim;
 mod supervision;
-mod tokens;
-mod trial;
-mod views;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;
@@ -34,6 +28,7 @@ use anyhow::{Context, bail};
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
 use clap::{Parser, Subcommand};
+use portal::{App, Machine, Tokens};
 use push::Pusher;
 use rootfs_builder::Builder;
 use servant::engine::Engine;
@@ -45,9 +40,7 @@ use tracing_subscriber::EnvFilter;
 
 use config::{Config, IsolationMode};
 use home::Home;
-use portal::App;
 use store::State;
-use tokens::Tokens;
 
 /// Robot packages as services, on this machine.
 #[derive(Debug, Parser)]
@@ -149,7 +142,7 @@ fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
 }
 
 /// Everything that can be refused without having changed anything but the state directory.
-fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, doctor::Machine)> {
+fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
     let mut config = Config::read(arguments.config.as_deref())?;
     config.listen = arguments.listen.unwrap_or(config.listen);
     config.check()?;
@@ -201,14 +194,14 @@ fn as_root() -> String {
     format!("sudo {}", command.join(" "))
 }
 
-async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Result<()> {
+async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()> {
     let socket = home.socket();
     let asked = supervision::end_asked(move || {
         let _ = std::fs::remove_file(socket);
     })?;
     let listener = listen(config.listen).await?;
     let socket = home.listen()?;
-    let app = build(config, &home, machine, listener.local_addr()?)?;
+    let app = build(&config, &home, machine, listener.local_addr()?)?;
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
     }
@@ -240,7 +233,7 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
     app.choreographer.keep_spares();
     asked.cancelled().await;
     supervision::stopping();
-    drain(&app).await;
+    drain(&app, config.keeps_servants()).await;
     app.ending.cancel();
     let _ = tokio::join!(tcp, unix);
     let _ = std::fs::remove_file(home.socket());
@@ -248,12 +241,11 @@ async fn run(config: Config, home: Home, machine: doctor::Machine) -> anyhow::Re
 }
 
 fn build(
-    config: Config,
+    config: &Config,
     home: &Home,
-    machine: doctor::Machine,
+    machine: Machine,
     listen: SocketAddr,
 ) -> anyhow::Result<Arc<App>> {
-    let config = Arc::new(config);
     let tokens = Tokens::new(&config.tokens)?;
     let state = Arc::new(State::open(&home.database())?);
     tokio::spawn(store::watch(Arc::clone(&state)));
@@ -261,7 +253,7 @@ fn build(
     state.release_robots(tokens.hashes())?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
-    let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(&config, home)?)?);
+    let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(config, home)?)?);
     let room = &config.room;
     let memory = room
         .memory
@@ -273,8 +265,8 @@ fn build(
         Arc::clone(&engine),
         Admission::new(capacity, room.queue),
     );
-    let definitions = bases::directory(&config, home)?;
-    let builder = builder(&config, home, definitions, catalogue.images(), &engine)?;
+    let definitions = bases::directory(config, home)?;
+    let builder = builder(config, home, definitions, catalogue.images(), &engine)?;
     let pusher = Pusher::new(
         config.push(),
         home.path().to_owned(),
@@ -283,6 +275,7 @@ fn build(
         engine,
         choreographer.clone(),
     );
+    let examined = home.path().to_owned();
     Ok(Arc::new(App {
         tokens,
         listen,
@@ -295,7 +288,8 @@ fn build(
         started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),
-        config,
+        options: config.portal(),
+        examine: Box::new(move || doctor::examine(&examined, Some(listen))),
     }))
 }
 
@@ -361,11 +355,11 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
 }
 
 /// Lets pushes, sessions and, unless they are to be kept, servants end.
-async fn drain(app: &App) {
+async fn drain(app: &App, keep_servants: bool) {
     app.choreographer.close();
-    app.pusher.cancel_all(app.config.portal.drain.0).await;
+    app.pusher.cancel_all(app.options.drain).await;
     app.choreographer.end_spares().await;
-    if app.config.keeps_servants() {
+    if keep_servants {
         tracing::info!(
             "ending; {} servants go on",
             app.choreographer.servants().len()
@@ -385,7 +379,7 @@ async fn drain(app: &App) {
         tracing::info!("ending; {} servants ended", ended.len());
     }
     app.sessions.close();
-    let _ = tokio::time::timeout(app.config.portal.drain.0, app.sessions.wait()).await;
+    let _ = tokio::time::timeout(app.options.drain, app.sessions.wait()).await;
 }
 
 #[cfg(test)]

@@ -57,21 +57,6 @@ fn tell(state: &[NotifyState<'_>]) {
     }
 }
 
-/// How much the whole machine waits; none where its kernel does not tell (PSI).
-pub fn machine_pressure() -> Option<api::Pressure> {
-    let some = |name: &str| {
-        let text = std::fs::read_to_string(format!("/proc/pressure/{name}")).ok()?;
-        let line = text.lines().find_map(|line| line.strip_prefix("some "))?;
-        line.split(' ')
-            .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
-    };
-    Some(api::Pressure {
-        cpu: some("cpu")?,
-        memory: some("memory")?,
-        io: some("io")?,
-    })
-}
-
 /// Nine tenths of the machine's memory.
 pub fn machine_memory() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();

@@ -40,7 +40,7 @@ pub async fn root(
     if !guard::is_upgrade(request.headers()) {
         return page::index(request.method());
     }
-    match app.config.default_service.clone() {
+    match app.options.default_service.clone() {
         Some(service) => connect(app, service, caller, request)
             .await
             .unwrap_or_else(IntoResponse::into_response),
@@ -120,9 +120,9 @@ struct Asked {
 impl Asked {
     fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<Asked, Error> {
         let named = guard::query(uri, "robot");
-        let shared = named.is_none() && uri.path() == "/" && app.config.default_robot.is_some();
+        let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
         let robot = if shared {
-            app.config.default_robot.clone()
+            app.options.default_robot.clone()
         } else {
             named
         };
@@ -325,7 +325,7 @@ async fn session<S>(
     }
     if lease.is_none() {
         let awaited = auth::first_message(&mut io, read_ahead, &app.tokens);
-        match tokio::time::timeout(app.config.portal.handshake.0, awaited).await {
+        match tokio::time::timeout(app.options.handshake, awaited).await {
             Ok(Ok((token, rest))) => {
                 read_ahead = rest;
                 caller.token = Some(token);

@@ -6,22 +6,22 @@ use axum::response::{IntoResponse, Response};
 
 use crate::errors::Error;
 
-const INDEX: &str = include_str!("../../../../web/index.html");
+const INDEX: &str = include_str!("../../../web/index.html");
 const ASSETS: [(&str, &str, &str); 3] = [
     (
         "portal.css",
         "text/css; charset=utf-8",
-        include_str!("../../../../web/portal.css"),
+        include_str!("../../../web/portal.css"),
     ),
     (
         "portal.js",
         "text/javascript; charset=utf-8",
-        include_str!("../../../../web/portal.js"),
+        include_str!("../../../web/portal.js"),
     ),
     (
         "icon.svg",
         "image/svg+xml",
-        include_str!("../../../../web/icon.svg"),
+        include_str!("../../../web/icon.svg"),
     ),
 ];
 /// Nothing but our own files, and nobody frames the page.

@@ -9,8 +9,8 @@ use link::control::Request;
 use reach::links::LinkStatus;
 
 use crate::errors::Error;
-use crate::portal::App;
-use choreographer::{Handle, describe};
+use choreographer::{Choreographer, Handle, describe};
+use store::State;
 
 /// Between two looks at what a servant uses.
 const MOMENT: Duration = Duration::from_millis(400);
@@ -29,10 +29,14 @@ const QUEUE: f64 = 5.0;
 const LEFT_OUT: f64 = 0.1;
 
 /// Explains one robot.
-pub async fn robot(app: &App, name: &str) -> Result<Explanation, Error> {
-    let all = app.choreographer.servants();
+pub async fn robot(
+    choreographer: &Choreographer,
+    state: &State,
+    name: &str,
+) -> Result<Explanation, Error> {
+    let all = choreographer.servants();
     let mine: Vec<&Arc<Handle>> = all.iter().filter(|handle| handle.robot == name).collect();
-    let events = events(app, name)?;
+    let events = events(state, name)?;
     if mine.is_empty() && events.is_empty() {
         let mut exists: Vec<String> = all.iter().map(|handle| handle.robot.clone()).collect();
         exists.sort();
@@ -51,8 +55,8 @@ pub async fn robot(app: &App, name: &str) -> Result<Explanation, Error> {
     })
 }
 
-fn events(app: &App, robot: &str) -> Result<Vec<Event>, Error> {
-    let mut events = app.state.events(0, EVENTS_SEARCHED)?;
+fn events(state: &State, robot: &str) -> Result<Vec<Event>, Error> {
+    let mut events = state.events(0, EVENTS_SEARCHED)?;
     events.retain(|event| event.robot.as_deref() == Some(robot));
     let skipped = events.len().saturating_sub(EVENTS);
     Ok(events.split_off(skipped))

@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use anyhow::bail;
 use parking_lot::Mutex;
 use sha2::{Digest, Sha256, Sha512};
 
@@ -18,6 +17,17 @@ pub struct Tokens {
     secrets: Vec<String>,
     /// MACs that have let somebody in, and until when (seconds since 1970) each would again.
     used: Arc<Mutex<HashMap<String, f64>>>,
+}
+
+/// A token that cannot be one.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TokenError {
+    /// No hash follows `sha256:`.
+    #[error("token \"sha256:{0}\" is not followed by 64 hexadecimal digits")]
+    Digest(String),
+    /// It can be guessed.
+    #[error("a token of {0} characters is too short; use at least 8")]
+    Short(usize),
 }
 
 /// Why an `auth` message lets nobody in.
@@ -69,7 +79,7 @@ pub fn hash(token: &str) -> TokenHash {
 
 impl Tokens {
     /// Reads the configuration's list.
-    pub fn new(written: &[String]) -> anyhow::Result<Tokens> {
+    pub fn new(written: &[String]) -> Result<Tokens, TokenError> {
         let mut tokens = Tokens::default();
         for text in written {
             match text.strip_prefix("sha256:") {
@@ -78,13 +88,8 @@ impl Tokens {
                 {
                     tokens.hashes.push(digest.to_ascii_lowercase());
                 }
-                Some(digest) => {
-                    bail!("token \"sha256:{digest}\" is not followed by 64 hexadecimal digits")
-                }
-                None if text.len() < 8 => bail!(
-                    "a token of {} characters is too short; use at least 8",
-                    text.len()
-                ),
+                Some(digest) => return Err(TokenError::Digest(digest.to_owned())),
+                None if text.len() < 8 => return Err(TokenError::Short(text.len())),
                 None => {
                     tokens.hashes.push(hash(text));
                     tokens.secrets.push(text.clone());

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use api::trial::{Fed, Heard, Times, Trial};
 use bytes::Bytes;
-use catalogue::names;
+use catalogue::{Catalogue, names};
+use choreographer::Choreographer;
 use package::interface::{Direction, Interface, Topic};
 use ros::bag::Recorded;
 use ros::bus::{AdvertiseOptions, Bus, Publisher, SubscribeOptions, Subscription, WireType};
@@ -20,7 +21,6 @@ use tokio::time::timeout;
 pub use picture::Picture;
 
 use crate::errors::Error;
-use crate::portal::App;
 
 /// For the servant's nodes to listen, and for one answer.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -43,10 +43,15 @@ pub enum Material {
 }
 
 /// Tries the current revision of a service.
-pub async fn run(app: &App, service: &str, material: Material) -> Result<Trial, Error> {
-    let revision = app.catalogue.current(service)?;
+pub async fn run(
+    catalogue: &Catalogue,
+    choreographer: &Choreographer,
+    service: &str,
+    material: Material,
+) -> Result<Trial, Error> {
+    let revision = catalogue.current(service)?;
     let robot = format!("~try-{}", names::random(6));
-    let lease = app.choreographer.ensure(service, &robot, true)?;
+    let lease = choreographer.ensure(service, &robot, true)?;
     lease.admitted().await?;
     let reach = lease.ready().await?;
     let trial = attempt(&reach.bus, service, &revision.interface, material).await;

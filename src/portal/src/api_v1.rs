@@ -12,9 +12,9 @@ use futures_util::StreamExt;
 use serde::Deserialize;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::App;
 use super::body::{self, Held};
 use super::guard::Caller;
+use crate::app::App;
 use crate::errors::Error;
 use crate::trial::Material;
 use crate::views;
@@ -47,9 +47,7 @@ pub async fn clock() -> Json<api::Clock> {
 
 /// All checks of the machine, made anew.
 pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
-    let home = app.home.clone();
-    let listen = app.listen;
-    let doctor = tokio::task::spawn_blocking(move || crate::doctor::examine(&home, Some(listen)))
+    let doctor = tokio::task::spawn_blocking(move || (app.examine)())
         .await
         .map_err(|_| Error::Internal("examining the machine"))?;
     Ok(Json(doctor))
@@ -173,7 +171,7 @@ pub async fn trial(
     let material = material
         .await
         .map_err(|_| Error::Internal("reading what a service is tried with"))??;
-    let trial = crate::trial::run(&app, &name, material).await;
+    let trial = crate::trial::run(&app.catalogue, &app.choreographer, &name, material).await;
     // Messages of a recording were cut from the body.
     drop(permit);
     Ok(Json(trial?))
@@ -210,7 +208,9 @@ pub async fn explain(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> Answer<api::explain::Explanation> {
-    Ok(Json(crate::explain::robot(&app, &name).await?))
+    Ok(Json(
+        crate::explain::robot(&app.choreographer, &app.state, &name).await?,
+    ))
 }
 
 /// Ends one servant.

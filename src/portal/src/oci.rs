@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde_json::json;
 use tokio_util::io::ReaderStream;
 
-use super::App;
+use crate::app::App;
 use crate::errors::Error;
 
 const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");

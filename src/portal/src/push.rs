@@ -13,9 +13,9 @@ use push::Published;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::App;
 use super::api_v1::lines;
 use super::guard::query;
+use crate::app::App;
 use crate::errors::Error;
 use crate::views;
 

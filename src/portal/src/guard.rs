@@ -21,7 +21,7 @@ use axum::response::{IntoResponse, Response};
 use catalogue::names;
 use parking_lot::Mutex;
 
-use super::App;
+use crate::app::App;
 use crate::errors::Error;
 use crate::tokens::{self, TokenHash, Tokens};
 
@@ -86,7 +86,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     let rules = Rules {
         loopback: app.listen.ip().is_loopback(),
         tokens: &app.tokens,
-        origins: &app.config.origins,
+        origins: &app.options.origins,
     };
     let Some(peer) = request.extensions().get::<Peer>().copied() else {
         return Error::Internal("telling who asks").into_response();

@@ -9,9 +9,14 @@
 //!                                                        └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
 
+#![forbid(unsafe_code)]
+
 mod api_v1;
+mod app;
 mod auth;
 mod body;
+mod errors;
+mod explain;
 mod guard;
 mod handshake;
 mod metrics;
@@ -21,14 +26,15 @@ mod push;
 mod robots;
 mod routes;
 mod stubs;
+mod tokens;
+mod trial;
+mod views;
 
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use api::Millis;
 use axum::Router;
-use catalogue::Catalogue;
 use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
@@ -37,72 +43,17 @@ use hyper_util::service::TowerToHyperService;
 use socket2::SockRef;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream, UnixListener};
-use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::config::Config;
-use crate::tokens::Tokens;
-use choreographer::Choreographer;
-use store::State;
+pub use app::{App, Machine, Options};
+pub use tokens::{TokenError, Tokens};
 
-pub use guard::Peer;
+use guard::Peer;
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Bytes that the kernel takes for a connection beyond those that are on their way.
 const UNSENT: u32 = 128 * 1024;
-
-/// What requests are answered from.
-pub struct App {
-    /// The configuration.
-    pub config: Arc<Config>,
-    /// Its tokens.
-    pub tokens: Tokens,
-    /// Where the portal listens, as bound.
-    pub listen: std::net::SocketAddr,
-    /// The state directory.
-    pub home: std::path::PathBuf,
-    /// The database.
-    pub state: Arc<State>,
-    /// What is published.
-    pub catalogue: Arc<Catalogue>,
-    /// Servants.
-    pub choreographer: Choreographer,
-    /// Pushes.
-    pub pusher: Arc<::push::Pusher>,
-    /// The state of this machine, as checked at start.
-    pub machine: crate::doctor::Machine,
-    /// When the daemon started.
-    pub started: Millis,
-    /// Sessions under way.
-    pub sessions: TaskTracker,
-    /// Cancelled when the daemon ends.
-    pub ending: CancellationToken,
-}
-
-impl App {
-    /// Where robots reach a service.
-    pub fn address(&self, service: &str) -> String {
-        let mut address = self.listen;
-        if address.ip().is_unspecified() {
-            let local: std::net::IpAddr = match address.ip() {
-                std::net::IpAddr::V4(_) => std::net::Ipv4Addr::LOCALHOST.into(),
-                std::net::IpAddr::V6(_) => std::net::Ipv6Addr::LOCALHOST.into(),
-            };
-            let host = nix::unistd::gethostname()
-                .ok()
-                .and_then(|name| name.into_string().ok());
-            return match host {
-                Some(host) => format!("ws://{host}:{}/{service}", address.port()),
-                None => {
-                    address.set_ip(local);
-                    format!("ws://{address}/{service}")
-                }
-            };
-        }
-        format!("ws://{address}/{service}")
-    }
-}
 
 /// The routes, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
@@ -181,7 +132,7 @@ pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener) {
 
 async fn drain(app: &App, connections: TaskTracker) {
     connections.close();
-    let _ = tokio::time::timeout(app.config.portal.drain.0, connections.wait()).await;
+    let _ = tokio::time::timeout(app.options.drain, connections.wait()).await;
 }
 
 async fn serve(
@@ -198,7 +149,7 @@ async fn serve(
     });
     let connection = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
-        .header_read_timeout(app.config.portal.handshake.0)
+        .header_read_timeout(app.options.handshake)
         .serve_connection(TokioIo::new(stream), service)
         .with_upgrades();
     tokio::pin!(connection);

@@ -5,9 +5,8 @@ use std::sync::Arc;
 use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
 use package::interface as recorded;
 
+use crate::app::App;
 use crate::errors::Error;
-use crate::portal::App;
-use crate::supervision;
 use choreographer::Handle;
 use store::RevisionRecord;
 
@@ -30,7 +29,7 @@ pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
             .iter()
             .filter(|servant| servant.service() == revision.service)
             .count(),
-        limits: revision.plan.limits.or(app.config.limits),
+        limits: revision.plan.limits.or(app.choreographer.default_limits()),
     }
 }
 
@@ -127,10 +126,10 @@ pub async fn status(app: &App) -> Result<Status, Error> {
         pid: std::process::id(),
         home: app.home.display().to_string(),
         listen: app.listen.to_string(),
-        default_service: app.config.default_service.clone(),
+        default_service: app.options.default_service.clone(),
         started: app.started,
         isolation: Isolation {
-            mode: app.config.isolation.to_string(),
+            mode: app.options.isolation.clone(),
             cgroup_version: app.machine.cgroup_version,
             missing: app.machine.missing_limits.clone(),
         },
@@ -141,7 +140,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
             memory_reserved: taken.memory,
             waiting,
         },
-        limits: app.config.limits,
+        limits: app.choreographer.default_limits(),
         services: app.state.service_names()?.len(),
         servants: servants.len(),
         spares: app.choreographer.spares(),
@@ -160,7 +159,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
 /// What they use together, and how much the machine waits.
 async fn used(servants: &[Arc<Handle>]) -> api::Usage {
     let mut sum = api::Usage {
-        pressure: supervision::machine_pressure(),
+        pressure: machine_pressure(),
         ..api::Usage::default()
     };
     for container in servants.iter().filter_map(|servant| servant.container()) {
@@ -174,4 +173,19 @@ async fn used(servants: &[Arc<Handle>]) -> api::Usage {
         }
     }
     sum
+}
+
+/// How much the whole machine waits; none where its kernel does not tell (PSI).
+fn machine_pressure() -> Option<api::Pressure> {
+    let some = |name: &str| {
+        let text = std::fs::read_to_string(format!("/proc/pressure/{name}")).ok()?;
+        let line = text.lines().find_map(|line| line.strip_prefix("some "))?;
+        line.split(' ')
+            .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
+    };
+    Some(api::Pressure {
+        cpu: some("cpu")?,
+        memory: some("memory")?,
+        io: some("io")?,
+    })
 }

@@ -13,8 +13,8 @@ use catalogue::stubs::{self, Programs};
 use serde::Deserialize;
 use tokio_util::io::ReaderStream;
 
-use super::App;
 use super::guard::{Caller, Peer};
+use crate::app::App;
 use crate::errors::Error;
 
 /// Read from the archive at a time.

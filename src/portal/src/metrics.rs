@@ -10,7 +10,7 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use bridge::Metrics;
 
-use super::App;
+use crate::app::App;
 use crate::errors::Error;
 use choreographer::{Choreographer, Handle, describe};
 

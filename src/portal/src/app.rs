@@ -1,0 +1,96 @@
+//! What requests are answered from.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::Millis;
+use catalogue::Catalogue;
+use choreographer::Choreographer;
+use push::Pusher;
+use store::State;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::tokens::Tokens;
+
+/// What the operator decides of the portal.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Web origins besides this machine's own whose pages may use the portal without a token.
+    pub origins: Vec<String>,
+    /// Where a plain `ws://host:9090` goes.
+    pub default_service: Option<String>,
+    /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
+    pub default_robot: Option<String>,
+    /// How long a request's header may take, and the `auth` message where one is awaited.
+    pub handshake: Duration,
+    /// How long connections may take to end when the daemon ends.
+    pub drain: Duration,
+    /// What is done on a machine that cannot set limits, as the configuration names it.
+    pub isolation: String,
+}
+
+/// What the daemon keeps of its first look at the machine.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Machine {
+    /// Version of the usable cgroup controllers; 0: none.
+    pub cgroup_version: u8,
+    /// Limits that cannot be set.
+    pub missing_limits: Vec<String>,
+    /// What does not work as it should.
+    pub warnings: Vec<String>,
+}
+
+/// What requests are answered from.
+pub struct App {
+    /// What the operator decides.
+    pub options: Options,
+    /// Its tokens.
+    pub tokens: Tokens,
+    /// Where the portal listens, as bound.
+    pub listen: std::net::SocketAddr,
+    /// The state directory.
+    pub home: std::path::PathBuf,
+    /// The database.
+    pub state: Arc<State>,
+    /// What is published.
+    pub catalogue: Arc<Catalogue>,
+    /// Servants.
+    pub choreographer: Choreographer,
+    /// Pushes.
+    pub pusher: Arc<Pusher>,
+    /// The state of this machine, as checked at start.
+    pub machine: Machine,
+    /// Makes all checks of this machine anew; blocks.
+    pub examine: Box<dyn Fn() -> api::Doctor + Send + Sync>,
+    /// When the daemon started.
+    pub started: Millis,
+    /// Sessions under way.
+    pub sessions: TaskTracker,
+    /// Cancelled when the daemon ends.
+    pub ending: CancellationToken,
+}
+
+impl App {
+    /// Where robots reach a service.
+    pub fn address(&self, service: &str) -> String {
+        let mut address = self.listen;
+        if address.ip().is_unspecified() {
+            let local: std::net::IpAddr = match address.ip() {
+                std::net::IpAddr::V4(_) => std::net::Ipv4Addr::LOCALHOST.into(),
+                std::net::IpAddr::V6(_) => std::net::Ipv6Addr::LOCALHOST.into(),
+            };
+            let host = nix::unistd::gethostname()
+                .ok()
+                .and_then(|name| name.into_string().ok());
+            return match host {
+                Some(host) => format!("ws://{host}:{}/{service}", address.port()),
+                None => {
+                    address.set_ip(local);
+                    format!("ws://{address}/{service}")
+                }
+            };
+        }
+        format!("ws://{address}/{service}")
+    }
+}
