@@ -18,13 +18,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
+use bytes::Bytes;
 use tokio::sync::Notify;
 
 pub use shares::Shares;
 
+/// Up to this size a single message, body or queue counts in no budget: the number of connections limits their sum.
+pub const UNCOUNTED: usize = 64 * 1024;
+
 /// A limit in bytes, and how many of them are in use. Clones are handles to the same budget.
 #[derive(Clone)]
-pub struct Budget(Arc<Node>);
+pub struct Budget {
+    node: Arc<Node>,
+    /// Permits of this handle do not count in the budgets above.
+    alone: bool,
+}
 
 struct Node {
     name: String,
@@ -79,7 +87,7 @@ impl Budget {
     }
 
     fn node(name: String, limit: usize, above: Option<Budget>, observer: Option<Observer>) -> Self {
-        Self(Arc::new(Node {
+        Self::from(Arc::new(Node {
             name,
             limit,
             used: AtomicUsize::new(0),
@@ -90,24 +98,33 @@ impl Budget {
         }))
     }
 
+    /// The same budget without those above it. Its permits are for bytes that count above already, because another permit
+    /// holds them: a message that many clients share counts once for the daemon and in the budget of each client.
+    pub fn alone(&self) -> Self {
+        Self {
+            node: self.node.clone(),
+            alone: true,
+        }
+    }
+
     /// Its name, as errors call it.
     pub fn name(&self) -> &str {
-        &self.0.name
+        &self.node.name
     }
 
     /// Its limit in bytes.
     pub fn limit(&self) -> usize {
-        self.0.limit
+        self.node.limit
     }
 
     /// Bytes of its permits now.
     pub fn used(&self) -> usize {
-        self.0.used.load(Ordering::Relaxed)
+        self.node.used.load(Ordering::Relaxed)
     }
 
     /// How many refusals it has caused.
     pub fn refused(&self) -> u64 {
-        self.0.refused.load(Ordering::Relaxed)
+        self.node.refused.load(Ordering::Relaxed)
     }
 
     /// The most bytes that one permit can hold, when nothing else is held.
@@ -149,14 +166,19 @@ impl Budget {
         Ok(permit)
     }
 
-    /// This one and those above it.
-    fn chain(&self) -> impl Iterator<Item = &Budget> {
-        std::iter::successors(Some(self), |budget| budget.0.above.as_ref())
+    /// The next one in which its permits count.
+    fn above(&self) -> Option<&Budget> {
+        self.node.above.as_ref().filter(|_| !self.alone)
     }
 
-    fn add(&self, bytes: usize) -> Result<(), Exceeded> {
+    /// This one and those above it.
+    fn chain(&self) -> impl Iterator<Item = &Budget> {
+        std::iter::successors(Some(self), |budget| budget.above())
+    }
+
+    fn add(&self, bytes: usize) -> Result<(), Full> {
         for (depth, budget) in self.chain().enumerate() {
-            let node = &budget.0;
+            let node = &budget.node;
             let more = |used: usize| used.checked_add(bytes).filter(|sum| *sum <= node.limit);
             let added = node
                 .used
@@ -165,26 +187,30 @@ impl Budget {
                 self.chain()
                     .take(depth)
                     .for_each(|below| below.sub_here(bytes));
-                return Err(Exceeded {
+                let exceeded = Exceeded {
                     name: node.name.clone(),
                     asked: bytes,
                     used,
                     limit: node.limit,
+                };
+                return Err(Full {
+                    at: node.clone(),
+                    exceeded,
                 });
             }
         }
         Ok(())
     }
 
-    fn tell(&self, full: &Exceeded) {
-        for budget in self.chain() {
-            if budget.name() == full.name {
-                budget.0.refused.fetch_add(1, Ordering::Relaxed);
-            }
-            if let Some(observer) = &budget.0.observer {
-                observer(self.name(), full);
-            }
+    /// Counts and reports a refusal. Budgets are compared by identity: two of them may have the same name.
+    fn tell(&self, full: Full) -> Exceeded {
+        full.at.refused.fetch_add(1, Ordering::Relaxed);
+        // Those above are told even if nothing is counted there.
+        let all = std::iter::successors(Some(self), |budget| budget.node.above.as_ref());
+        for observer in all.filter_map(|budget| budget.node.observer.as_ref()) {
+            observer(self.name(), &full.exceeded);
         }
+        full.exceeded
     }
 
     fn sub(&self, bytes: usize) {
@@ -192,8 +218,20 @@ impl Budget {
     }
 
     fn sub_here(&self, bytes: usize) {
-        self.0.used.fetch_sub(bytes, Ordering::Relaxed);
-        self.0.released.notify_waiters();
+        self.node.used.fetch_sub(bytes, Ordering::Relaxed);
+        self.node.released.notify_waiters();
+    }
+}
+
+/// Where bytes did not fit.
+struct Full {
+    at: Arc<Node>,
+    exceeded: Exceeded,
+}
+
+impl From<Arc<Node>> for Budget {
+    fn from(node: Arc<Node>) -> Self {
+        Self { node, alone: false }
     }
 }
 
@@ -227,10 +265,10 @@ impl Permit {
     /// More bytes do not fit; it keeps its size. Fewer bytes always succeed.
     pub fn resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.try_resize(bytes)
-            .inspect_err(|full| self.budget.tell(full))
+            .map_err(|full| self.budget.tell(full))
     }
 
-    fn try_resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
+    fn try_resize(&mut self, bytes: usize) -> Result<(), Full> {
         match bytes.checked_sub(self.bytes) {
             Some(0) => {}
             Some(more) => self.budget.add(more)?,
@@ -245,24 +283,67 @@ impl Permit {
         self.resize(bytes.max(self.bytes))
     }
 
-    /// The same, waiting at most for `patience` until others have given back enough.
+    /// Sets its size for something that holds `bytes` bytes and changes often, such as a queue: in steps of [`UNCOUNTED`], and
+    /// zero up to there, so that most changes touch no budget.
+    ///
+    /// # Errors
+    /// More bytes do not fit; it keeps its size.
+    pub fn count(&mut self, bytes: usize) -> Result<(), Exceeded> {
+        let steps = match bytes {
+            0..=UNCOUNTED => 0,
+            more => more.checked_next_multiple_of(UNCOUNTED).unwrap_or(more),
+        };
+        self.resize(steps)
+    }
+
+    /// Divides it in two that together count as it did: one in its budget alone, one in the budgets above (none for a
+    /// topmost budget).
+    pub fn split(mut self) -> (Permit, Option<Permit>) {
+        let bytes = std::mem::take(&mut self.bytes);
+        let above = self.budget.above().cloned();
+        let alone = Permit {
+            budget: self.budget.alone(),
+            bytes,
+        };
+        (alone, above.map(|budget| Permit { budget, bytes }))
+    }
+
+    /// These bytes, which hold the permit until the last handle to any part of them is dropped.
+    pub fn around(self, bytes: impl AsRef<[u8]> + Send + 'static) -> Bytes {
+        Bytes::from_owner(Counted {
+            bytes,
+            _permit: self,
+        })
+    }
+
+    /// Grows it to `bytes`, waiting at most for `patience` until others have given back enough.
     pub async fn wait(&mut self, bytes: usize, patience: Duration) -> Result<(), Exceeded> {
         let deadline = tokio::time::Instant::now() + patience;
         let never = bytes > self.budget.most();
         // Whatever can make room stands below the topmost of them, and tells it, too.
         let top = self.budget.chain().last().unwrap_or(&self.budget).clone();
         loop {
-            let mut released = Box::pin(top.0.released.notified());
+            let mut released = Box::pin(top.node.released.notified());
             // Before looking: what is given back in between is not missed.
             released.as_mut().enable();
             let Err(full) = self.try_resize(bytes.max(self.bytes)) else {
                 return Ok(());
             };
             if never || tokio::time::timeout_at(deadline, released).await.is_err() {
-                self.budget.tell(&full);
-                return Err(full);
+                return Err(self.budget.tell(full));
             }
         }
+    }
+}
+
+struct Counted<B> {
+    bytes: B,
+    _permit: Permit,
+}
+
+impl<B: AsRef<[u8]>> AsRef<[u8]> for Counted<B> {
+    fn as_ref(&self) -> &[u8] {
+        self.bytes.as_ref()
     }
 }
 

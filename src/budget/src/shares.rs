@@ -32,13 +32,13 @@ impl Shares {
     pub fn of(&self, name: &str) -> Budget {
         let mut known = self.known.lock();
         if let Some(node) = known.get(name).and_then(Weak::upgrade) {
-            return Budget(node);
+            return Budget::from(node);
         }
         known.retain(|_, node| node.strong_count() > 0);
         let budget = self
             .whole
             .within(format!("{} {name}", self.what), self.each);
-        known.insert(name.to_owned(), Arc::downgrade(&budget.0));
+        known.insert(name.to_owned(), Arc::downgrade(&budget.node));
         budget
     }
 

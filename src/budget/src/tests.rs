@@ -128,3 +128,62 @@ async fn whoever_looks_after_all_is_told_who_was_refused_and_once() {
     let one = ("client a".to_owned(), "the daemon".to_owned());
     assert_eq!(both, [one.clone(), one]);
 }
+
+#[test]
+fn refusals_count_where_there_was_no_room_whatever_budgets_are_called() {
+    let outer = Budget::new("same", 100);
+    let inner = outer.within("same", 10);
+    inner.take(11).expect_err("too many");
+    assert_eq!((inner.refused(), outer.refused()), (1, 0));
+}
+
+#[test]
+fn what_others_have_counted_counts_in_one_budget_alone() {
+    let daemon = Budget::new("the daemon", 100);
+    let (a, b) = (daemon.within("client a", 60), daemon.within("client b", 60));
+    let made = daemon.take(50).expect("it fits");
+    let shared = (a.alone().take(50), b.alone().take(50));
+    assert_eq!((a.used(), b.used(), daemon.used()), (50, 50, 50));
+    let refused = a.alone().take(11).expect_err("60 are for client a");
+    assert_eq!(refused.name, "client a");
+    drop((made, shared));
+    assert_eq!((a.used(), b.used(), daemon.used()), (0, 0, 0));
+}
+
+#[test]
+fn a_permit_is_divided_between_its_budget_and_those_above() {
+    let daemon = Budget::new("the daemon", 100);
+    let servant = daemon.within("servant x", 60);
+    let (own, above) = servant.take(50).expect("it fits").split();
+    assert_eq!((servant.used(), daemon.used()), (50, 50));
+    drop(own);
+    assert_eq!((servant.used(), daemon.used()), (0, 50));
+    drop(above);
+    assert_eq!(daemon.used(), 0);
+    let (own, above) = daemon.take(10).expect("it fits").split();
+    assert!(above.is_none());
+    assert_eq!(own.bytes(), 10);
+}
+
+#[test]
+fn bytes_hold_their_permit_as_long_as_a_part_of_them_is_held() {
+    let budget = Budget::new("x", 100);
+    let whole = budget.take(10).expect("it fits").around(vec![7; 10]);
+    let part = whole.slice(8..);
+    drop(whole);
+    assert_eq!((&part[..], budget.used()), (&[7, 7][..], 10));
+    drop(part);
+    assert_eq!(budget.used(), 0);
+}
+
+#[test]
+fn queues_count_in_steps_and_not_while_they_are_short() {
+    let budget = Budget::new("x", 3 * UNCOUNTED);
+    let mut permit = budget.permit();
+    for (bytes, counted) in [(0, 0), (UNCOUNTED, 0), (UNCOUNTED + 1, 2), (5, 0)] {
+        permit.count(bytes).expect("it fits");
+        assert_eq!(budget.used(), counted * UNCOUNTED);
+    }
+    permit.count(4 * UNCOUNTED).expect_err("too many");
+    permit.count(usize::MAX).expect_err("sums do not wrap");
+}

@@ -19,7 +19,7 @@ use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
-use budget::{Budget, Permit};
+use budget::{Budget, Permit, UNCOUNTED};
 use bytes::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Instant, Sleep};
@@ -33,8 +33,6 @@ const COPIED: usize = 8 * 1024;
 const READ_SIZE: usize = 32 * 1024;
 /// Room made for a payload before any of it has come; more is added as it comes.
 const READ_AHEAD: usize = 4 << 20;
-/// Messages up to this size count in no budget: the number of connections bounds them.
-const UNCOUNTED: usize = 64 * 1024;
 /// Slices in one write.
 const MAX_SLICES: usize = 16;
 
