@@ -115,15 +115,11 @@ impl Server {
                     Ok(Ok(false)) | Err(_) => return Ok(()),
                 }
             }
-            let request = timeout(self.limits.transfer, self.request(&mut reader, &mut stream));
-            let (call, permit, keep) = match request.await {
-                Ok(Ok(request)) => request,
-                Ok(Err(HttpError::Io(error))) => return Err(error),
-                Ok(Err(HttpError::Bad(status, reason))) => {
+            let (call, permit, keep) = match self.request(&mut reader, &mut stream).await {
+                Ok(request) => request,
+                Err(HttpError::Io(error)) => return Err(error),
+                Err(HttpError::Bad(status, reason)) => {
                     return self.refuse(&mut stream, status, &reason).await;
-                }
-                Err(_) => {
-                    return self.refuse(&mut stream, 408, "the request stalled").await;
                 }
             };
             let (body, _permit) = {
@@ -143,13 +139,16 @@ impl Server {
         }
     }
 
-    /// One request and what it counts; whether the connection is kept after it.
+    /// One request and what it counts; whether the connection is kept after it. The time that the peer has for its head and for
+    /// its body does not run while this side waits for memory.
     async fn request(
         &self,
         reader: &mut Reader,
         stream: &mut TcpStream,
     ) -> Result<(Vec<u8>, Permit, bool), HttpError> {
-        let head = reader.head(stream).await?;
+        let stalled = |_| HttpError::Bad(408, "the request stalled".to_owned());
+        let head = timeout(self.limits.transfer, reader.head(stream));
+        let head = head.await.map_err(stalled)??;
         let mut words = head.start.split_whitespace();
         let method = words.next().unwrap_or_default();
         let version = words.nth(1).unwrap_or_default();
@@ -170,7 +169,10 @@ impl Server {
         if head.expects_continue() {
             stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
         }
-        let body = self.body(reader, stream, &head, &mut permit).await?;
+        let body = self.body(reader, stream, &head, &mut permit);
+        let body = timeout(self.limits.transfer, body)
+            .await
+            .map_err(stalled)??;
         if body.len() > SMALL {
             // Of a body without a length nobody knew before what it would take.
             let counted = permit.grow_to(body.len() * FORMS);

@@ -281,3 +281,25 @@ async fn a_server_that_hangs_costs_no_more_than_the_time_out() {
         assert!(matches!(error, Error::BadUri(_)), "{bad}");
     }
 }
+
+#[tokio::test]
+async fn who_waits_for_memory_in_vain_is_told_so() {
+    let limits = Limits {
+        body: 1 << 20,
+        budget: Budget::new("XML-RPC", 1 << 20),
+        ..short()
+    };
+    let held = limits.budget.take(1 << 20).unwrap();
+    let server = start(limits).await;
+    let answer = raw(&server, request("", &"x".repeat(200_000)).as_bytes()).await;
+    let status = answer.split_whitespace().nth(1);
+    assert_eq!(status, Some("503"), "{answer}");
+    assert!(answer.contains("the memory for XML-RPC"), "{answer}");
+    drop(held);
+    let answer = raw(
+        &server,
+        request("Connection: close\r\n", &"x".repeat(200_000)).as_bytes(),
+    )
+    .await;
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+}
