@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
@@ -20,6 +21,17 @@ pub(super) enum Kind {
 
 type Key = (Kind, String);
 
+/// A service that another node has registered as well is taken back after such a pause, which doubles each time, at most up
+/// to the second. Who calls it reaches the node that registered last.
+const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(600));
+
+/// Another node registers the same service.
+struct Contest {
+    /// It is not taken back before.
+    until: Instant,
+    pause: Duration,
+}
+
 #[derive(Default)]
 struct Slot {
     /// The type to be registered with, if it is to be registered.
@@ -34,6 +46,7 @@ pub(super) struct Registrar {
     slave_uri: String,
     service_uri: String,
     slots: Mutex<HashMap<Key, Arc<Slot>>>,
+    contests: Mutex<HashMap<String, Contest>>,
 }
 
 impl Registrar {
@@ -43,6 +56,7 @@ impl Registrar {
             slave_uri,
             service_uri,
             slots: Mutex::default(),
+            contests: Mutex::default(),
         }
     }
 
@@ -107,6 +121,9 @@ impl Registrar {
         let unused = Arc::strong_count(&slot) == 2 && slot.wanted.lock().is_none();
         if unused {
             slots.remove(key);
+            if key.0 == Kind::Service {
+                self.contests.lock().remove(&key.1);
+            }
         }
     }
 
@@ -154,6 +171,12 @@ impl Registrar {
                     && slot.wanted.lock().is_some()
             })
             .filter(|((kind, name), _)| !ours || !has(*kind, name))
+            .filter(|((kind, name), _)| match graph.services.get(name) {
+                Some(other) if *kind == Kind::Service && other != node => {
+                    self.takes_back(name, other)
+                }
+                _ => true,
+            })
             .map(|(key, _)| key.clone())
             .collect();
         if ours {
@@ -170,6 +193,29 @@ impl Registrar {
             wrong.extend(surplus);
         }
         wrong
+    }
+
+    /// Whether a service that `other` has registered is to be registered again now. Two nodes that did so each time they see
+    /// the other's registration would do nothing else.
+    fn takes_back(&self, name: &str, other: &str) -> bool {
+        let now = Instant::now();
+        let mut contests = self.contests.lock();
+        let Some(contest) = contests.get_mut(name) else {
+            tracing::warn!(
+                service = name,
+                "{other} serves it, too, and calls go to whoever registered last; it is registered again now and then"
+            );
+            let pause = PAUSES.0;
+            let until = now + pause;
+            contests.insert(name.to_owned(), Contest { until, pause });
+            return true;
+        };
+        if now < contest.until {
+            return false;
+        }
+        contest.pause = (contest.pause * 2).min(PAUSES.1);
+        contest.until = now + contest.pause;
+        true
     }
 
     /// Takes back a registration that the Master shows and nobody here wants.

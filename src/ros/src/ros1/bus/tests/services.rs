@@ -254,3 +254,31 @@ async fn callers_that_misbehave_are_refused_and_harm_nobody() {
         "fine"
     );
 }
+
+#[tokio::test]
+async fn two_that_serve_one_service_do_not_fight_for_it_for_ever() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let first = serve(&one).await;
+    let second = serve(&two).await;
+    let generation = || one.graph().borrow().generation;
+    let before = generation();
+    // They may try now and then, with pauses that double: not as often as they see each other.
+    for _ in 0..2000 {
+        master.call("getPid", &["/asks".into()]).await;
+    }
+    let changes = generation() - before;
+    assert!(changes < 60, "{changes} changes");
+    let three = join(&master, "/three").await;
+    assert_eq!(three.call("/echo", "x".into(), LONG).await.unwrap(), "x");
+    // Whoever is left has it, at once.
+    let (gone, left) = match one.graph().borrow().services["/echo"].as_str() {
+        "/one" => (first, "/two"),
+        _ => (second, "/one"),
+    };
+    drop(gone);
+    until(&three, |graph| {
+        graph.services.get("/echo").is_some_and(|node| node == left)
+    })
+    .await;
+}
