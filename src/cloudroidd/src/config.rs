@@ -420,6 +420,16 @@ impl Config {
                 "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
             );
         }
+        for (key, time, right) in [
+            ("[portal] handshake", self.portal.handshake, "10s"),
+            ("[servant] start", self.servant.start, "30s"),
+        ] {
+            if time.0.is_zero() {
+                bail!(
+                    "{key} = 0 in the configuration would give up before anything has begun; write a time such as \"{right}\""
+                );
+            }
+        }
         Ok(())
     }
 
@@ -664,6 +674,15 @@ mod tests {
             let config = Config::parse(&format!("[memory]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[memory]"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn times_in_which_nothing_can_happen_are_refused() {
+        for (section, key) in [("portal", "handshake"), ("servant", "start")] {
+            let config = Config::parse(&format!("[{section}]\n{key} = 0")).expect("well-formed");
+            let refused = config.check().expect_err(key).to_string();
+            assert!(refused.contains(&format!("[{section}] {key}")), "{refused}");
         }
     }
 
