@@ -128,7 +128,7 @@ pub async fn rollback(
     Ok(Json(views::service(&app, &name)?))
 }
 
-/// The largest recording for a trial: it is held in memory.
+/// The largest recording for a trial, where its sender may have so much: it is held in memory.
 const LARGEST_TRIAL: usize = 512 << 20;
 /// The longest of other bodies.
 const LARGEST_WORDS: usize = 64 << 10;
@@ -161,7 +161,13 @@ pub async fn trial(
     Extension(caller): Extension<Caller>,
     body: Body,
 ) -> Answer<api::trial::Trial> {
-    let Held { bytes, permit } = held(&app, &caller, body, LARGEST_TRIAL).await?;
+    let memory = app.choreographer.memory();
+    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.client(None)).most());
+    let read = held(&app, &caller, body, max).await;
+    let Held { bytes, permit } = read.map_err(|error| match error {
+        Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
+        error => error,
+    })?;
     let material = tokio::task::spawn_blocking(move || match with.kind {
         Kind::Image => crate::trial::Picture::read(&bytes).map(Material::Picture),
         Kind::Bag => ros::bag::read(&bytes, crate::trial::RECORDED)

@@ -3,13 +3,11 @@
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
-use budget::{Budget, Permit};
+use budget::{Budget, Permit, UNCOUNTED};
 use futures_util::StreamExt;
 
 use crate::errors::Error;
 
-/// Bytes up to which a body counts in no budget.
-const UNCOUNTED: usize = 64 * 1024;
 /// Bigger ones count in steps of this size.
 const STEP: usize = 1 << 20;
 
@@ -45,7 +43,8 @@ pub async fn read(
                 // It may take twice as much while it grows.
                 let room = (2 * bytes.capacity()).max(length).min(max);
                 if room > UNCOUNTED {
-                    permit.grow_to(room.next_multiple_of(STEP))?;
+                    // A budget need not be a multiple.
+                    permit.grow_to(room.next_multiple_of(STEP).min(budget.most().max(room)))?;
                 }
                 bytes.reserve_exact(room - bytes.len());
             }
@@ -102,6 +101,14 @@ mod tests {
         let refused = refused.expect_err("it never ends");
         assert_eq!(refused.problem().status, 408, "{refused}");
         assert_eq!(budget.used(), 0);
+    }
+
+    #[tokio::test]
+    async fn a_body_may_be_as_long_as_its_senders_budget() {
+        let most = (8 << 20) + 1000;
+        let budget = Budget::new("client x", most);
+        let held = read(Body::from(vec![7; most]), most, &budget, LONG).await;
+        assert_eq!(held.expect("it fits").bytes.len(), most);
     }
 
     #[tokio::test]

@@ -50,6 +50,12 @@ pub enum Error {
         /// What is allowed.
         limit: api::Size,
     },
+    /// What a service is tried with is too big.
+    #[error("the recording or picture is bigger than {limit}")]
+    TrialTooLarge {
+        /// What is allowed.
+        limit: api::Size,
+    },
     /// A body does not fit into its sender's memory budget.
     #[error("there is no memory for the body: {0}")]
     Memory(#[from] budget::Exceeded),
@@ -173,7 +179,9 @@ impl Error {
         match self {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
-            Error::BodyTooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
+            Error::BodyTooLarge { .. } | Error::TrialTooLarge { .. } => {
+                (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
+            }
             Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
             Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body not complete"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
@@ -204,6 +212,9 @@ impl Error {
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
+            Error::TrialTooLarge { .. } => {
+                "send a shorter one, or raise client and daemon in [memory] of the configuration; 512M is the most".into()
+            }
             Error::Push(error) => return next_of_push(error),
             Error::Choreographer(error) => return next_of_choreographer(error),
             Error::Catalogue(error) => return next_of_catalogue(error),
