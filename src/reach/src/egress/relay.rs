@@ -6,13 +6,18 @@ use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use parking_lot::Mutex;
 use servant::endpoint::Endpoint;
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
 use super::Way;
+
+/// Connections at a time through one way out. Each takes two descriptors of the daemon, and memory for what is passed on.
+const CONNECTIONS: usize = 128;
 
 /// The ways out of one servant; closed when dropped.
 #[derive(Debug, Default)]
@@ -43,7 +48,9 @@ async fn pass_on(listener: TcpListener, way: Way) {
     let far = Arc::new(Far {
         way,
         told: Mutex::default(),
+        told_full: AtomicBool::new(false),
     });
+    let room = Arc::new(Semaphore::new(CONNECTIONS));
     // Ended with the listener.
     let mut connections = JoinSet::new();
     loop {
@@ -54,8 +61,14 @@ async fn pass_on(listener: TcpListener, way: Way) {
                     tokio::time::sleep(std::time::Duration::from_millis(100)).await;
                     continue;
                 };
+                // A refusal is what a node understands; to wait would look like a host that is down.
+                let Ok(place) = Arc::clone(&room).try_acquire_owned() else {
+                    far.tell_full();
+                    continue;
+                };
                 let far = Arc::clone(&far);
                 connections.spawn(async move {
+                    let _place = place;
                     let Far { way, .. } = &*far;
                     match far.dial().await {
                         Ok(mut stream) => {
@@ -77,9 +90,21 @@ struct Far {
     way: Way,
     /// Addresses whose refusal was told.
     told: Mutex<BTreeSet<IpAddr>>,
+    /// Whether it was told that there were too many connections.
+    told_full: AtomicBool,
 }
 
 impl Far {
+    /// Tells, once, that connections are refused.
+    fn tell_full(&self) {
+        if !self.told_full.swap(true, Ordering::Relaxed) {
+            let Way { host, port, .. } = &self.way;
+            tracing::warn!(
+                "a servant has {CONNECTIONS} connections to {host}:{port}, as many as may be; further ones are closed until some end"
+            );
+        }
+    }
+
     /// Resolves the host and connects to the first of its addresses that may be dialled and answers. What is dialled is
     /// the address that was looked at: the name is not resolved again.
     async fn dial(&self) -> io::Result<TcpStream> {
@@ -142,6 +167,41 @@ mod tests {
         for host in ["localhost", "127.1"] {
             assert_eq!(asks(host, |port| format!("*:{port}")).await, "", "{host}");
         }
+    }
+
+    #[tokio::test]
+    async fn connections_beyond_the_limit_are_closed_until_others_end() {
+        let server = TcpListener::bind("127.0.0.1:0").await.expect("bound");
+        let port = server.local_addr().expect("bound").port();
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = server.accept().await {
+                tokio::spawn(async move {
+                    let _ = stream.write_all(b"x").await;
+                    // Until the other side has closed.
+                    let _ = stream.read_to_end(&mut Vec::new()).await;
+                });
+            }
+        });
+        let egress = vec![format!("127.0.0.1:{port}")];
+        let way = ways_out(&egress, &egress).expect("allowed").remove(0);
+        let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
+        let near = relay.local_addr().expect("bound");
+        let relaying = tokio::spawn(pass_on(relay, way));
+        // What the first byte of a connection is, if it has one.
+        let first = async || {
+            let mut stream = TcpStream::connect(near).await.expect("accepted");
+            let mut byte = [0];
+            let read = stream.read(&mut byte).await;
+            read.is_ok_and(|read| read == 1).then_some(stream)
+        };
+        let mut open = Vec::new();
+        for _ in 0..CONNECTIONS {
+            open.push(first().await.expect("there is room"));
+        }
+        assert!(first().await.is_none(), "one too many");
+        drop(open);
+        while first().await.is_none() {}
+        relaying.abort();
     }
 
     #[tokio::test]
