@@ -12,6 +12,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
+use ::budget::{Budget, Permit};
 use bytes::{BufMut, Bytes, BytesMut};
 
 use crate::drops::Cause;
@@ -33,7 +34,8 @@ const WAITING: (usize, usize) = (256, 2 << 20);
 const BIG_WAITING: usize = 1;
 /// Records kept in case they are lost, and their bytes. Messages beyond are not sent again.
 const KEPT: (usize, usize) = (2048, 4 << 20);
-/// Urgent records that may wait and be kept: beyond, the session is given up.
+/// Urgent records that may wait and be kept until the peer has them, and their bytes: beyond, the session is given up. A single
+/// one may have any size.
 const MAX_URGENT: usize = 65_536;
 const MAX_URGENT_BYTES: usize = 512 << 20;
 /// Smaller messages are not worth encoding.
@@ -125,8 +127,15 @@ pub(crate) struct Outgoing {
     sending: VecDeque<Sending>,
     kept: VecDeque<(u64, Kept)>,
     kept_bytes: usize,
+    /// Of urgent records.
+    kept_urgent: usize,
     /// Of big messages that count one by one.
     kept_big: usize,
+    /// For all that waits and is kept, but for the last `uncounted` bytes.
+    permit: Permit,
+    uncounted: usize,
+    /// Why the session must be given up.
+    full: Option<String>,
     in_a_row: u32,
     /// Messages of these topics are encoded before they are sent, while `packs`.
     packable: BTreeSet<u32>,
@@ -155,7 +164,11 @@ impl Outgoing {
             sending: VecDeque::new(),
             kept: VecDeque::new(),
             kept_bytes: 0,
+            kept_urgent: 0,
             kept_big: 0,
+            permit: Budget::unlimited().permit(),
+            uncounted: 0,
+            full: None,
             in_a_row: 0,
             packable: BTreeSet::new(),
             packs: false,
@@ -169,9 +182,15 @@ impl Outgoing {
         }
     }
 
-    /// Beyond what may wait: the peer does not take what it must.
-    pub(crate) fn is_full(&self) -> bool {
-        self.urgent.len() > MAX_URGENT || self.urgent_bytes > MAX_URGENT_BYTES
+    /// Counts what waits and is kept in `budget`. Messages that do not fit are dropped; an urgent record that does not fit is
+    /// the end of the session.
+    pub(crate) fn within(&mut self, budget: &Budget) {
+        self.permit = budget.permit();
+    }
+
+    /// Why more waits than may: the peer does not take what it must, or does not say that it has.
+    pub(crate) fn is_full(&self) -> Option<&str> {
+        self.full.as_deref()
     }
 
     pub(crate) fn push(&mut self, record: &Record, quality: Quality) {
@@ -190,10 +209,15 @@ impl Outgoing {
             closes: false,
         };
         let Some(channel) = channel else {
-            self.urgent_bytes += out.len();
-            self.urgent.push_back(out);
+            if self.takes_urgent(out.len()) {
+                self.urgent_bytes += out.len();
+                self.urgent.push_back(out);
+            }
             return;
         };
+        if !self.takes_message(channel, out.len()) {
+            return;
+        }
         let topic = self.topics.entry(channel).or_default();
         let small = out.len() <= SMALL;
         topic.push_back(out);
@@ -469,8 +493,9 @@ impl Outgoing {
         }
         let kept = match out.channel {
             Some(channel) if !again => Kept::Not(channel),
-            _ => {
+            channel => {
                 *self.bytes_kept(&out) += out.held();
+                self.kept_urgent += usize::from(channel.is_none());
                 Kept::Again(out)
             }
         };
@@ -498,6 +523,7 @@ impl Outgoing {
         while self.kept.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, Kept::Again(out))) = self.kept.pop_front() {
                 *self.bytes_kept(&out) -= out.held();
+                self.kept_urgent -= usize::from(out.channel.is_none());
                 // All that went before it has come, too.
                 if let Some(channel) = out.channel.filter(|_| out.closes) {
                     self.topics.remove(&channel);
@@ -506,6 +532,7 @@ impl Outgoing {
                 }
             }
         }
+        self.count_less();
     }
 
     /// A message came and could not be decoded: where each one counts it goes once more, unless a newer one of a
@@ -590,6 +617,7 @@ impl Outgoing {
             }
         }
         self.kept_bytes = 0;
+        self.kept_urgent = 0;
         self.kept_big = 0;
         self.turns = self
             .topics

@@ -83,9 +83,9 @@ pub enum Lost {
     /// The peer makes no sense.
     #[error(transparent)]
     Protocol(#[from] Error),
-    /// More waits for the peer than may.
-    #[error("the other end takes too little: too much waits for it")]
-    Full,
+    /// More waits for the peer than may; says what.
+    #[error("the other end takes too little: {0}")]
+    Full(String),
 }
 
 /// Takes what comes.
@@ -168,9 +168,14 @@ impl Session {
         }
     }
 
-    /// Counts records that are arriving in `budget`; one that does not fit ends its connection.
+    /// Counts records that are arriving in `budget`; one that does not fit ends its connection. Counts what waits for the peer,
+    /// too: messages that do not fit are dropped, a call or answer that does not fit ends the session.
     pub fn within(self, budget: &Budget) -> Self {
-        self.state.lock().incoming = Incoming::within(budget);
+        {
+            let mut state = self.state.lock();
+            state.incoming = Incoming::within(budget);
+            state.out.within(budget);
+        }
         self
     }
 

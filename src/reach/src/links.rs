@@ -291,7 +291,7 @@ impl Hub {
         };
         let for_good = matches!(
             lost,
-            Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full
+            Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full(_)
         );
         if matches!(lost, Lost::Closed { code: 1000, .. }) {
             self.attempts.ended(&hello.run);

@@ -1,9 +1,12 @@
-//! Limits the bytes of waiting messages that must all arrive (latched messages, messages of actions). Within the limit such
-//! a message is not dropped in favour of a newer one.
+//! Limits the bytes that wait for the peer: of messages that must all arrive (latched messages, messages of actions), which are
+//! within the limit not dropped in favour of newer ones; of urgent records; and of everything, in the budget of the session's
+//! owner.
 
 use std::collections::VecDeque;
 
-use super::{Out, Outgoing, count};
+use ::budget::{Exceeded, UNCOUNTED};
+
+use super::{MAX_URGENT, MAX_URGENT_BYTES, Out, Outgoing, count};
 use crate::drops::Cause;
 
 /// Bytes of such messages that may wait, over all topics, beside the last one; and that are kept until they are acknowledged.
@@ -32,6 +35,79 @@ impl Out {
 }
 
 impl Outgoing {
+    /// Whether an urgent record of `bytes` bytes may be queued beside those that wait, are under way and are kept until the peer
+    /// has them. If not, the session is given up: to leave one out would be to lose a call or its answer.
+    pub(super) fn takes_urgent(&mut self, bytes: usize) -> bool {
+        if self.full.is_some() {
+            return false;
+        }
+        let sending = self.sending.iter().filter(|one| one.out.channel.is_none());
+        let (started, started_bytes) = sending.fold((0, 0), |(count, sum), one| {
+            (count + 1, sum + one.out.held())
+        });
+        let count = self.urgent.len() + self.kept_urgent + started;
+        let sum = self.urgent_bytes + self.kept_bytes + started_bytes;
+        let too_much = count >= MAX_URGENT || (count > 0 && sum + bytes > MAX_URGENT_BYTES);
+        self.full = match self.count_more(bytes) {
+            _ if too_much => Some(format!(
+                "{count} records of {sum} bytes wait for it or are not acknowledged"
+            )),
+            Ok(()) => None,
+            Err(full) => Some(full.to_string()),
+        };
+        self.full.is_none()
+    }
+
+    /// Whether a message of `bytes` bytes may be queued. Where there is no room it takes the place of older ones of its topic;
+    /// without any it is dropped.
+    pub(super) fn takes_message(&mut self, channel: u32, bytes: usize) -> bool {
+        loop {
+            if self.count_more(bytes).is_ok() {
+                return true;
+            }
+            let waiting = self.topics.get_mut(&channel).filter(|all| all.len() > 1);
+            let replaced = waiting.and_then(|waiting| {
+                let at = waiting.iter().position(|out| !out.each)?;
+                waiting.remove(at)
+            });
+            if replaced.is_none() {
+                count(&mut self.dropped, channel, Cause::Full);
+                return false;
+            }
+            count(&mut self.dropped, channel, Cause::Replaced);
+        }
+    }
+
+    /// Bytes that wait, are under way, and are kept.
+    fn held(&self) -> usize {
+        let topics = self.topics.values().flatten();
+        let sending = self.sending.iter().map(|sending| &sending.out);
+        let packing = self.packing.iter().map(|(out, _)| out);
+        let all = topics.chain(sending).chain(packing).chain(&self.packed);
+        let bytes: usize = all.map(Out::held).sum();
+        bytes + self.urgent_bytes + self.kept_bytes + self.kept_big
+    }
+
+    /// Counts `bytes` more. The sum is made only when enough has come together.
+    fn count_more(&mut self, bytes: usize) -> Result<(), Exceeded> {
+        let uncounted = self.uncounted + bytes;
+        if uncounted > UNCOUNTED {
+            self.permit.count(self.held() + bytes)?;
+            self.uncounted = 0;
+        } else {
+            self.uncounted = uncounted;
+        }
+        Ok(())
+    }
+
+    /// Gives back what is held no more.
+    pub(super) fn count_less(&mut self) {
+        if self.permit.bytes() > 0 {
+            // Less always fits.
+            let _ = self.permit.count(self.held().min(self.permit.bytes()));
+        }
+    }
+
     /// Drops messages until the limit is kept, after one of `channel` was added: first messages that newer ones follow, then
     /// any, each time of the topic with the most bytes. The newest message stays.
     pub(super) fn keep_to_budget(&mut self, channel: u32) {

@@ -420,3 +420,81 @@ fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
     assert_eq!(out.closed, [1]);
     assert!(out.topics.is_empty() && out.packable.is_empty() && out.kept.is_empty());
 }
+
+fn answer(size: usize) -> Record {
+    Record::Answer {
+        id: 1,
+        taken: 0,
+        given: 0,
+        response: Ok(Bytes::from(vec![0; size])),
+    }
+}
+
+#[test]
+fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
+    for size in [10, SMALL / 2, 10 << 20] {
+        let mut out = Outgoing::new(None);
+        let mut pushed = 0;
+        // It reads everything, at once.
+        while out.is_full().is_none() {
+            assert!(pushed <= MAX_URGENT, "{pushed} answers of {size} bytes");
+            out.push(&answer(size), Quality::Each);
+            while out.next(0).is_some() {}
+            pushed += 1;
+        }
+        assert!(pushed * size <= MAX_URGENT_BYTES + size);
+        let reason = out.is_full().unwrap().to_owned();
+        assert!(reason.contains("not acknowledged"), "{reason}");
+        // What comes then is not kept any more.
+        let held = out.kept_bytes;
+        out.push(&answer(size), Quality::Each);
+        assert!((out.next(0).is_none(), out.kept_bytes) == (true, held));
+    }
+    // One that does may be sent as much as it likes, and one answer may be longer than all may be together.
+    let mut out = Outgoing::new(None);
+    for _ in 0..2 * MAX_URGENT {
+        out.push(&answer(10), Quality::Each);
+        out.next(0).unwrap();
+        out.acknowledge(out.next_number() - 1);
+    }
+    assert_eq!(
+        (out.is_full(), out.kept_urgent, out.kept_bytes),
+        (None, 0, 0)
+    );
+    out.push(&answer(MAX_URGENT_BYTES + 1), Quality::Each);
+    assert_eq!(out.is_full(), None);
+}
+
+#[test]
+fn what_waits_counts_and_beyond_the_budget_messages_go_before_answers_do() {
+    let budget = Budget::new("servant x", 8 << 20);
+    let mut out = Outgoing::new(None);
+    out.within(&budget);
+    for born in 0..20 {
+        for channel in 0..8 {
+            out.push(&data(channel, born, 1 << 20), Quality::Each);
+        }
+    }
+    assert!((6 << 20..=8 << 20).contains(&budget.used()), "{budget:?}");
+    let lost: u64 = out.dropped.values().sum();
+    assert!(lost >= 20 * 8 - 8, "{:?}", out.dropped);
+    assert_eq!(out.is_full(), None);
+    out.push(&answer(3 << 20), Quality::Each);
+    let reason = out.is_full().expect("there is no room for it").to_owned();
+    assert!(reason.contains("the memory for servant x"), "{reason}");
+
+    drop(out);
+
+    // Under way, kept and given back.
+    let mut out = Outgoing::new(None);
+    out.within(&budget);
+    assert_eq!(budget.used(), 0);
+    for _ in 0..100 {
+        out.push(&answer(2 << 20), Quality::Each);
+        assert!(budget.used() >= 2 << 20);
+        while out.next(0).is_some() {}
+        out.acknowledge(out.next_number() - 1);
+        assert_eq!(budget.used(), 0);
+    }
+    assert_eq!(out.is_full(), None);
+}

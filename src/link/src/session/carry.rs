@@ -44,7 +44,7 @@ impl Session {
             Lost::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
             Lost::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
             Lost::Protocol(error) => Some((1002, error.to_string())),
-            Lost::Full => Some((1008, lost.to_string())),
+            Lost::Full(_) => Some((1013, lost.to_string())),
             _ => None,
         };
         if let Some((code, reason)) = goodbye {
@@ -131,8 +131,8 @@ impl Session {
                     }
                 }
                 Event::Woken => {
-                    if self.state.lock().out.is_full() {
-                        return Err(Lost::Full);
+                    if let Some(reason) = self.state.lock().out.is_full() {
+                        return Err(Lost::Full(reason.to_owned()));
                     }
                 }
                 Event::Ended => return Err(Lost::Ended),
