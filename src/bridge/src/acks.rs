@@ -4,6 +4,8 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use budget::{Budget, Permit};
+
 use crate::outbox::Control;
 
 /// Answers kept.
@@ -16,11 +18,13 @@ const ASKED_ABOUT: usize = 4 << 20;
 const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Sent and not acknowledged, oldest first.
-#[derive(Default)]
 pub(crate) struct Acks {
     kept: VecDeque<Sent>,
     /// Bytes of those.
     bytes: usize,
+    /// Of those, bytes of answers that have no permit of their own, and the permit for them.
+    small: usize,
+    permit: Permit,
     /// Bytes of those with no ping behind them yet.
     unasked: usize,
     /// The number of the last ping.
@@ -35,16 +39,33 @@ struct Sent {
 }
 
 impl Acks {
+    /// Nothing yet, of a client with this budget.
+    pub(crate) fn new(budget: &Budget) -> Self {
+        Self {
+            kept: VecDeque::new(),
+            bytes: 0,
+            small: 0,
+            permit: budget.permit(),
+            unasked: 0,
+            pings: 0,
+        }
+    }
+
     /// An answer goes out.
     pub(crate) fn sent(&mut self, control: Control, at: Instant) {
         let size = control.frame.bytes.len();
         self.bytes += size;
+        self.small += control.small();
         self.unasked += size;
-        while self.kept.len() >= MAX_KEPT || self.bytes > MAX_KEPT_BYTES {
+        while self.kept.len() >= MAX_KEPT
+            || self.bytes > MAX_KEPT_BYTES
+            || self.permit.count(self.small).is_err()
+        {
             let Some(oldest) = self.kept.pop_front() else {
                 break;
             };
             self.bytes -= oldest.control.frame.bytes.len();
+            self.small -= oldest.control.small();
         }
         self.kept.push_back(Sent {
             control,
@@ -74,17 +95,21 @@ impl Acks {
     pub(crate) fn pong(&mut self, payload: &[u8]) {
         if let Ok(number) = payload.try_into().map(u64::from_be_bytes) {
             let known = self.kept.partition_point(|sent| sent.ping <= number);
-            let gone = self.kept.drain(..known);
-            self.bytes -= gone
-                .map(|sent| sent.control.frame.bytes.len())
-                .sum::<usize>();
+            for gone in self.kept.drain(..known) {
+                self.bytes -= gone.control.frame.bytes.len();
+                self.small -= gone.control.small();
+            }
+            // Less always fits.
+            let _ = self.permit.count(self.small);
         }
     }
 
     /// What was never acknowledged.
     pub(crate) fn take(&mut self) -> impl DoubleEndedIterator<Item = Control> + use<> {
         self.bytes = 0;
+        self.small = 0;
         self.unasked = 0;
+        let _ = self.permit.count(0);
         std::mem::take(&mut self.kept)
             .into_iter()
             .map(|sent| sent.control)
@@ -120,7 +145,7 @@ mod tests {
             },
             ..answer("")
         };
-        let mut acks = Acks::default();
+        let mut acks = Acks::new(&Budget::unlimited());
         acks.sent(big(5 << 20), now);
         assert_eq!(acks.ping_due(), Some(now));
         acks.ping();
@@ -139,7 +164,7 @@ mod tests {
     #[test]
     fn a_pong_acknowledges_what_was_sent_before_its_ping() {
         let now = Instant::now();
-        let mut acks = Acks::default();
+        let mut acks = Acks::new(&Budget::unlimited());
         assert_eq!(acks.ping_due(), None);
         acks.sent(answer("a"), now);
         assert_eq!(acks.ping_due(), Some(now + PATIENCE));

@@ -21,7 +21,7 @@ use rosbridge::{
 use tokio_util::sync::CancellationToken;
 
 use crate::SessionOptions;
-use crate::outbox::{Control, Outbox};
+use crate::outbox::{Control, Goodbye, Outbox};
 use crate::sample::Frame;
 use crate::shared::Shared;
 
@@ -35,6 +35,8 @@ pub(crate) struct Client {
     pub(crate) shared: Arc<Shared>,
     pub(crate) name: String,
     pub(crate) outbox: Arc<Outbox>,
+    /// Counts what waits for it.
+    pub(crate) budget: Budget,
     hears_clients: bool,
     resumable: bool,
     level: AtomicU8,
@@ -82,11 +84,14 @@ impl Inbox {
 
 impl Client {
     pub(crate) fn new(shared: Arc<Shared>, options: &SessionOptions) -> Arc<Self> {
-        let outbox = Arc::new(Outbox::new(&shared.options, shared.metrics.clone()));
+        let budget = options.budget.clone();
+        let outbox = Outbox::new(&shared.options, shared.metrics.clone(), &budget);
+        let outbox = Arc::new(outbox);
         Arc::new(Self {
             shared,
             name: options.client.clone(),
             outbox,
+            budget,
             hears_clients: options.hears_clients,
             resumable: options.resume.is_some(),
             level: AtomicU8::new(options.level as u8),
@@ -297,8 +302,7 @@ impl Client {
         }
         writer.boolean("result", false);
         writer.end();
-        let bytes = out.into();
-        self.send_frame(Frame { format, bytes }, None, true);
+        self.send_frame(Frame::new(format, out), None, true);
     }
 
     /// Fails the call or goal to which the client has sent an answer that cannot be used: no other answer will come.
@@ -352,17 +356,25 @@ impl Client {
     pub(crate) fn send(&self, op: Op<'_>, format: Format) {
         let mut out = Vec::with_capacity(128);
         op.print(&mut out, format);
-        self.send_frame(
-            Frame {
-                format,
-                bytes: out.into(),
-            },
-            None,
-            false,
-        );
+        self.send_frame(Frame::new(format, out), None, false);
     }
 
+    /// Sends a frame made for this client alone. It counts in the client's budget until it is written; one that does not fit
+    /// costs the client its connection, since an answer cannot be left out.
     pub(crate) fn send_frame(&self, frame: Frame, fragment_size: Option<usize>, answer: bool) {
+        let permit = match frame.is_big() {
+            true => match self.budget.take(frame.bytes.len()) {
+                Ok(permit) => Some(permit),
+                Err(full) => {
+                    return self.outbox.say_goodbye(Goodbye {
+                        code: 1013,
+                        reason: format!("an answer cannot be kept: {full}"),
+                    });
+                }
+            },
+            false => None,
+        };
+        let frame = frame.holding(permit);
         self.outbox.control(Control {
             frame,
             fragment_size,

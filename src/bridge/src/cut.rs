@@ -21,7 +21,8 @@ pub(crate) struct Cuts {
 }
 
 struct Cut {
-    text: String,
+    /// UTF-8; the frame's own bytes, not a copy.
+    text: Bytes,
     at: usize,
     size: usize,
     id: i64,
@@ -46,13 +47,13 @@ impl Cuts {
         let Some(size) = size.filter(|_| Self::is_long(frame, size)) else {
             return false;
         };
-        let Ok(text) = String::from_utf8(frame.bytes.to_vec()) else {
+        let Ok(text) = std::str::from_utf8(&frame.bytes) else {
             return false;
         };
-        let total = split_text(&text, size).count() as u64;
+        let total = split_text(text, size).count() as u64;
         self.ids += 1;
         self.cuts.push_back(Cut {
-            text,
+            text: frame.bytes.clone(),
             at: 0,
             size,
             id: self.ids,
@@ -81,7 +82,7 @@ impl Cuts {
     pub(crate) fn next(&mut self) -> Option<(Bytes, Option<TopicKey>)> {
         self.due = false;
         let mut cut = self.cuts.pop_front()?;
-        let piece = split_text(&cut.text[cut.at..], cut.size).next()?;
+        let piece = split_text(window(&cut.text[cut.at..], cut.size), cut.size).next()?;
         let mut out = Vec::with_capacity(piece.len() + piece.len() / 8 + 64);
         let fragment = Fragment {
             id: Id::Integer(cut.id),
@@ -97,6 +98,16 @@ impl Cuts {
         }
         self.cuts.push_back(cut);
         Some((out.into(), None))
+    }
+}
+
+/// The beginning of a UTF-8 text: `size` bytes, rounded to whole characters, and at least one character.
+fn window(text: &[u8], size: usize) -> &str {
+    // No character has more than 4 bytes.
+    let window = &text[..size.max(4).min(text.len())];
+    match std::str::from_utf8(window) {
+        Ok(window) => window,
+        Err(error) => std::str::from_utf8(&window[..error.valid_up_to()]).unwrap_or_default(),
     }
 }
 

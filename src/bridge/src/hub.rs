@@ -170,7 +170,16 @@ impl Hub {
 
     /// Hands a message to every listener.
     pub(crate) fn deliver(&self, message: Message, local: bool) {
-        let sample = Arc::new(Sample::new(message, local, self.types.clone()));
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        let sample = match Sample::new(message, local, self.types.clone(), &shared.options) {
+            Ok(sample) => Arc::new(sample),
+            Err(full) => {
+                tracing::debug!(topic = %self.topic, %full, "a message is left out");
+                return shared.metrics.dropped.add(1);
+            }
+        };
         let listeners = {
             let mut state = self.state.lock();
             if sample.latching {

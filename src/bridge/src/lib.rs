@@ -34,6 +34,7 @@ mod client;
 mod clock;
 mod cut;
 mod hub;
+mod kept;
 mod lacking;
 mod metrics;
 mod names;

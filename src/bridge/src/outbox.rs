@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::task::Waker;
 use std::time::Instant;
 
+use budget::{Budget, Exceeded, Permit};
 use parking_lot::Mutex;
 use rosbridge::Compression;
 use tokio::sync::watch;
@@ -62,10 +63,15 @@ struct Limits {
     topic: QueueLimits,
 }
 
-#[derive(Default)]
 struct Queues {
     control: VecDeque<Control>,
     control_bytes: usize,
+    /// Of those, bytes of frames that have no permit of their own.
+    control_small: usize,
+    /// For small frames and samples.
+    small: Permit,
+    /// For big samples, which count for the daemon by themselves: in the client's budget alone.
+    big: Permit,
     topics: HashMap<TopicKey, TopicQueue>,
     next_key: TopicKey,
     /// Topics with something to send, in turn.
@@ -73,6 +79,8 @@ struct Queues {
     /// Topics whose throttle rate holds them back, by when.
     later: BTreeSet<(Instant, TopicKey)>,
     bytes: usize,
+    /// Of those, bytes of big samples.
+    big_bytes: usize,
     goodbye: Option<Goodbye>,
     /// Which socket sends, and how to wake it.
     socket: u64,
@@ -80,7 +88,8 @@ struct Queues {
 }
 
 impl Outbox {
-    pub(crate) fn new(options: &BridgeOptions, metrics: Arc<Metrics>) -> Self {
+    /// For a client with this budget.
+    pub(crate) fn new(options: &BridgeOptions, metrics: Arc<Metrics>, budget: &Budget) -> Self {
         let limits = Limits {
             control_messages: options.control_messages,
             control_bytes: options.control_bytes,
@@ -91,7 +100,7 @@ impl Outbox {
             },
         };
         Self {
-            queues: Mutex::default(),
+            queues: Mutex::new(Queues::new(budget)),
             limits,
             metrics,
             attached: watch::Sender::default(),
@@ -148,7 +157,9 @@ impl Outbox {
             });
         } else {
             queues.control_bytes = length;
+            queues.control_small += control.small();
             queues.control.push_back(control);
+            queues.count_control();
         }
         queues.wake();
     }
@@ -158,8 +169,10 @@ impl Outbox {
         let mut queues = self.queues.lock();
         for control in controls.rev() {
             queues.control_bytes += control.frame.bytes.len();
+            queues.control_small += control.small();
             queues.control.push_front(control);
         }
+        queues.count_control();
         queues.wake();
     }
 
@@ -207,6 +220,8 @@ impl Outbox {
         let mut queues = self.queues.lock();
         if let Some(queue) = queues.topics.remove(&key) {
             queues.bytes -= queue.bytes;
+            queues.big_bytes -= queue.big;
+            let _ = queues.count();
             queues.ready.retain(|other| *other != key);
             queues.later.retain(|(_, other)| *other != key);
         }
@@ -219,7 +234,7 @@ impl Outbox {
         let Some(queue) = queues.topics.get_mut(&key) else {
             return;
         };
-        let size = sample.bytes.len();
+        let before = (queue.bytes, queue.big);
         let Pushed {
             throttled,
             mut dropped,
@@ -229,9 +244,17 @@ impl Outbox {
             self.metrics.throttled.add(1);
             return;
         }
-        queues.bytes += size;
-        queues.bytes -= dropped_bytes;
+        queues.bytes = queues.bytes + queue.bytes - before.0;
+        queues.big_bytes = queues.big_bytes + queue.big - before.1;
+        // The client's own messages give way to each other, beyond its queues' limits and beyond its budget.
         while let Some(lost) = queues.give_way(self.limits.session_bytes) {
+            dropped += 1;
+            dropped_bytes += lost;
+        }
+        while queues.count().is_err() {
+            let Some(lost) = queues.drop_largest(|_| true) else {
+                break;
+            };
             dropped += 1;
             dropped_bytes += lost;
         }
@@ -284,8 +307,7 @@ impl Outbox {
     pub(crate) fn next(&self, now: Instant) -> Option<Outgoing> {
         let mut queues = self.queues.lock();
         let queues = &mut *queues;
-        if let Some(control) = queues.control.pop_front() {
-            queues.control_bytes -= control.frame.bytes.len();
+        if let Some(control) = queues.pop_control() {
             return Some(Outgoing::Control(control));
         }
         queues.wake_up_later(now);
@@ -295,11 +317,12 @@ impl Outbox {
                 continue;
             };
             queue.scheduled = false;
-            let before = queue.bytes;
+            let before = (queue.bytes, queue.big);
             let Some(sample) = queue.pop(now) else {
                 continue;
             };
-            queues.bytes -= before - queue.bytes;
+            queues.bytes -= before.0 - queue.bytes;
+            queues.big_bytes -= before.1 - queue.big;
             let Wishes {
                 compression,
                 fragment_size,
@@ -307,6 +330,8 @@ impl Outbox {
             } = queue.wishes;
             let topic = queue.topic.clone();
             queues.schedule(key, now);
+            // Less always fits.
+            let _ = queues.count();
             return Some(Outgoing::Sample {
                 key,
                 sample,
@@ -328,9 +353,7 @@ impl Outbox {
         if !fits(queues.control.front()?) {
             return None;
         }
-        let control = queues.control.pop_front()?;
-        queues.control_bytes -= control.frame.bytes.len();
-        Some(control)
+        queues.pop_control()
     }
 
     /// When a throttle rate lets something through that now waits.
@@ -339,7 +362,63 @@ impl Outbox {
     }
 }
 
+impl Control {
+    /// Its bytes, unless they have a permit of their own.
+    pub(crate) fn small(&self) -> usize {
+        match self.frame.is_big() {
+            true => 0,
+            false => self.frame.bytes.len(),
+        }
+    }
+}
+
 impl Queues {
+    fn new(budget: &Budget) -> Self {
+        Self {
+            control: VecDeque::new(),
+            control_bytes: 0,
+            control_small: 0,
+            small: budget.permit(),
+            big: budget.alone().permit(),
+            topics: HashMap::new(),
+            next_key: 0,
+            ready: VecDeque::new(),
+            later: BTreeSet::new(),
+            bytes: 0,
+            big_bytes: 0,
+            goodbye: None,
+            socket: 0,
+            waker: None,
+        }
+    }
+
+    /// Counts what waits in the client's budget.
+    fn count(&mut self) -> Result<(), Exceeded> {
+        self.big.count(self.big_bytes)?;
+        let small = self.control_small + self.bytes - self.big_bytes;
+        self.small.count(small)
+    }
+
+    /// The same after a control message came, of which none may be dropped.
+    fn count_control(&mut self) {
+        if let Err(full) = self.count() {
+            let waiting = self.control.len();
+            self.goodbye.get_or_insert_with(|| Goodbye {
+                code: 1013,
+                reason: format!("{waiting} answers wait to be read: {full}"),
+            });
+        }
+    }
+
+    fn pop_control(&mut self) -> Option<Control> {
+        let control = self.control.pop_front()?;
+        self.control_bytes -= control.frame.bytes.len();
+        self.control_small -= control.small();
+        // Less always fits.
+        let _ = self.count();
+        Some(control)
+    }
+
     fn wake(&mut self) {
         if let Some(waker) = self.waker.take() {
             waker.wake();
@@ -354,11 +433,16 @@ impl Queues {
         }
         let spare_only =
             self.bytes <= limit.saturating_mul(4) || self.bytes == self.largest_bytes();
-        let candidates = self
-            .topics
-            .values_mut()
-            .filter(|queue| !(spare_only && queue.has_one()));
-        let lost = candidates.max_by_key(|queue| queue.bytes)?.drop_one()?;
+        self.drop_largest(|queue| !(spare_only && queue.has_one()))
+    }
+
+    /// Drops a sample of the topic that holds most, of those that `may` lose one; gives its bytes.
+    fn drop_largest(&mut self, may: impl Fn(&TopicQueue) -> bool) -> Option<usize> {
+        let candidates = self.topics.values_mut().filter(|queue| may(queue));
+        let queue = candidates.max_by_key(|queue| queue.bytes)?;
+        let before = queue.big;
+        let lost = queue.drop_one()?;
+        self.big_bytes -= before - queue.big;
         self.bytes -= lost;
         Some(lost)
     }

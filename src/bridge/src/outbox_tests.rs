@@ -9,7 +9,10 @@ use crate::sample::TopicTypes;
 
 fn outbox(options: BridgeOptions) -> (Outbox, Arc<Metrics>) {
     let metrics = Arc::new(Metrics::default());
-    (Outbox::new(&options, metrics.clone()), metrics)
+    (
+        Outbox::new(&options, metrics.clone(), &Budget::unlimited()),
+        metrics,
+    )
 }
 
 fn sample(size: usize) -> Arc<Sample> {
@@ -24,11 +27,9 @@ fn sample(size: usize) -> Arc<Sample> {
         publisher: "/p".into(),
         latching: false,
     };
-    Arc::new(Sample::new(
-        message,
-        false,
-        Arc::new(TopicTypes::new(Arc::new(Registry::new()))),
-    ))
+    let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
+    let options = BridgeOptions::default();
+    Arc::new(Sample::new(message, false, types, &options).unwrap())
 }
 
 fn control(size: usize) -> Control {

@@ -1,9 +1,11 @@
-//! One message from ROS on its way to any number of clients: decoded at most once per encoding, when first needed.
+//! One message from ROS on its way to any number of clients: decoded once per encoding while it is one of its topic's
+//! latest, when first needed.
 
-use std::sync::Arc;
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Weak};
 
-use budget::Permit;
+use budget::{Exceeded, Permit, UNCOUNTED};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::WireType;
@@ -14,21 +16,50 @@ use rosbridge::{Compression, Format, Publish};
 use crate::{BridgeOptions, Metrics};
 use ws::frame::{BINARY, TEXT};
 
-/// What becomes of a message counts in no budget up to this size: the lengths of queues bound it.
-const UNCOUNTED: usize = 64 * 1024;
-
 /// A message becomes at most about so many times longer (an array of booleans does), and what it always has besides.
 const LONGEST: usize = 8;
 const SHORT: usize = 4 * 1024;
+/// Encodings that a topic keeps, and their bytes. A client that is so far behind that it wants an older one has it encoded
+/// again: what waits for it is the message from ROS alone.
+const WARM: (usize, usize) = (256, 16 << 20);
 
 /// A whole WebSocket message, ready to be sent to anyone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Frame {
     pub(crate) format: Format,
+    /// Above [`UNCOUNTED`] they hold their permit.
     pub(crate) bytes: Bytes,
 }
 
 impl Frame {
+    /// A frame of what was printed, which counts nowhere yet.
+    pub(crate) fn new(format: Format, mut printed: Vec<u8>) -> Self {
+        // What is counted is its length.
+        if printed.capacity() > UNCOUNTED {
+            printed.shrink_to_fit();
+        }
+        Self {
+            format,
+            bytes: printed.into(),
+        }
+    }
+
+    /// Whether it counts by itself.
+    pub(crate) fn is_big(&self) -> bool {
+        self.bytes.len() > UNCOUNTED
+    }
+
+    /// The same, holding `permit`.
+    pub(crate) fn holding(self, permit: Option<Permit>) -> Self {
+        match permit {
+            Some(permit) => Self {
+                bytes: permit.around(self.bytes),
+                ..self
+            },
+            None => self,
+        }
+    }
+
     pub(crate) fn opcode(&self) -> u8 {
         match self.format {
             Format::Json => TEXT,
@@ -49,10 +80,7 @@ impl Frame {
             part: None,
         })
         .print(&mut out, Format::Json);
-        Ok(Frame {
-            format: Format::Json,
-            bytes: out.into(),
-        })
+        Ok(Frame::new(Format::Json, out))
     }
 }
 
@@ -62,6 +90,14 @@ pub(crate) struct TopicTypes {
     found: Mutex<Vec<(Arc<WireType>, FoundType)>>,
     /// Length of the last encoding of each kind, as a hint for the next.
     sizes: [AtomicUsize; 3],
+    warm: Mutex<Warm>,
+}
+
+/// Messages whose encodings are kept, oldest first.
+#[derive(Default)]
+struct Warm {
+    samples: VecDeque<(Weak<Sample>, usize)>,
+    bytes: usize,
 }
 
 type FoundType = Result<Arc<MessageType>, Arc<str>>;
@@ -72,6 +108,28 @@ impl TopicTypes {
             registry,
             found: Mutex::default(),
             sizes: Default::default(),
+            warm: Mutex::default(),
+        }
+    }
+
+    /// Keeps an encoding of `bytes` bytes of this message, and older ones no longer.
+    fn keep_warm(&self, sample: &Arc<Sample>, bytes: usize) {
+        let mut cold = Vec::new();
+        {
+            let mut warm = self.warm.lock();
+            warm.samples.push_back((Arc::downgrade(sample), bytes));
+            warm.bytes += bytes;
+            while warm.samples.len() > 1 && (warm.samples.len() > WARM.0 || warm.bytes > WARM.1) {
+                let Some((oldest, bytes)) = warm.samples.pop_front() else {
+                    break;
+                };
+                warm.bytes -= bytes;
+                cold.push(oldest);
+            }
+        }
+        // Not under the lock: one of them may be being encoded.
+        for sample in cold.iter().filter_map(Weak::upgrade) {
+            *sample.encoded.lock() = Encodings::Cold;
         }
     }
 
@@ -139,19 +197,41 @@ pub(crate) struct Sample {
     pub(crate) local: bool,
     pub(crate) received: Time,
     types: Arc<TopicTypes>,
-    encoded: Mutex<Vec<Encoded>>,
+    encoded: Mutex<Encodings>,
+    /// For its bytes.
+    _permit: Option<Permit>,
+}
+
+enum Encodings {
+    Warm(Vec<Encoded>),
+    /// None is kept any more.
+    Cold,
 }
 
 struct Encoded {
     compression: Compression,
     topic: Arc<str>,
     frame: Result<Frame, Arc<str>>,
+    /// In the servant's budget alone; the frame holds the one above.
     _permit: Permit,
 }
 
 impl Sample {
-    pub(crate) fn new(message: ros::bus::Message, local: bool, types: Arc<TopicTypes>) -> Self {
-        Self {
+    /// A sample whose bytes count in the budgets above the servant's while it waits for clients: a slow one of those must not
+    /// use up what the servant has for the others.
+    pub(crate) fn new(
+        message: ros::bus::Message,
+        local: bool,
+        types: Arc<TopicTypes>,
+        options: &BridgeOptions,
+    ) -> Result<Self, Exceeded> {
+        let length = message.bytes.len();
+        let permit = if length > UNCOUNTED {
+            options.budget.take(length)?.split().1
+        } else {
+            None
+        };
+        Ok(Self {
             bytes: message.bytes,
             wire_type: message.wire_type,
             publisher: message.publisher,
@@ -159,13 +239,22 @@ impl Sample {
             local,
             received: Time::now(),
             types,
-            encoded: Mutex::default(),
+            encoded: Mutex::new(Encodings::Warm(Vec::new())),
+            _permit: permit,
+        })
+    }
+
+    /// Its bytes, where they have a permit of their own.
+    pub(crate) fn big(&self) -> usize {
+        match self.bytes.len() {
+            0..=UNCOUNTED => 0,
+            bytes => bytes,
         }
     }
 
     /// The `publish` frame for clients that call the topic `topic`; the reason where it cannot be made.
     pub(crate) fn frame(
-        &self,
+        self: &Arc<Self>,
         compression: Compression,
         topic: &Arc<str>,
         options: &BridgeOptions,
@@ -174,18 +263,31 @@ impl Sample {
         // Held while encoding: a second subscriber waits for the first one's result instead of making its own.
         let mut encoded = self.encoded.lock();
         let same = |other: &&Encoded| other.compression == compression && other.topic == *topic;
-        if let Some(known) = encoded.iter().find(same) {
+        if let Encodings::Warm(known) = &*encoded
+            && let Some(known) = known.iter().find(same)
+        {
             return known.frame.clone();
         }
         metrics.encoded.add(1);
         let mut permit = options.budget.permit();
-        let frame = self.encode(compression, topic, options, &mut permit);
-        encoded.push(Encoded {
+        let made = self.encode(compression, topic, options, &mut permit);
+        let (own, above) = permit.split();
+        let frame = made.map(|frame| match frame.is_big() {
+            true => frame.holding(above),
+            false => frame,
+        });
+        let Encodings::Warm(known) = &mut *encoded else {
+            return frame;
+        };
+        known.push(Encoded {
             compression,
             topic: topic.clone(),
             frame: frame.clone(),
-            _permit: permit,
+            _permit: own,
         });
+        drop(encoded);
+        let bytes = frame.as_ref().map_or(0, |frame| frame.bytes.len());
+        self.types.keep_warm(self, bytes);
         frame
     }
 
@@ -252,23 +354,22 @@ impl Sample {
                 Publish::print_with(&mut out, Format::Json, topic, write).map_err(failed)?;
             }
         }
-        if out.capacity() > UNCOUNTED {
-            permit.resize(out.capacity()).map_err(full)?;
-        }
         self.types.sizes[slot].store(out.len(), Ordering::Relaxed);
         let format = if slot == 0 {
             Format::Json
         } else {
             Format::Cbor
         };
-        let frame = Frame {
-            format,
-            bytes: out.into(),
-        };
+        let mut frame = Frame::new(format, out);
         if compression == Compression::Png {
-            frame.into_png().map_err(Arc::from)
-        } else {
-            Ok(frame)
+            frame = frame.into_png().map_err(Arc::from)?;
         }
+        let counted = if frame.is_big() { frame.bytes.len() } else { 0 };
+        permit.resize(counted).map_err(full)?;
+        Ok(frame)
     }
 }
+
+#[cfg(test)]
+#[path = "sample_tests.rs"]
+mod tests;

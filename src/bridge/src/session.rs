@@ -1,14 +1,13 @@
 //! One socket: moves frames between it and its client, in one task, so that nothing is handed over between threads
 //! on the way.
 
-use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Instant;
 
-use budget::Budget;
+use budget::{Budget, Exceeded, UNCOUNTED};
 use bytes::Bytes;
 use rosbridge::{Compression, Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -18,6 +17,7 @@ use crate::SessionEnd;
 use crate::acks::Acks;
 use crate::client::{Client, Inbox};
 use crate::cut::Cuts;
+use crate::kept::Kept;
 use crate::outbox::{Control, Goodbye, Outgoing, TopicKey};
 use crate::sample::{Frame, Sample};
 use ws::{Message, WebSocket, WsError, frame};
@@ -42,7 +42,7 @@ pub(crate) struct Session<S> {
     number: u64,
     inbox: Inbox,
     /// What came before there was a servant to take it.
-    kept: VecDeque<Message>,
+    kept: Kept,
     cuts: Cuts,
     heard: Instant,
     /// Bytes received by then.
@@ -75,7 +75,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     /// A session on `socket`, which takes what was `kept` of it first.
     pub(crate) fn new(
         socket: WebSocket<S>,
-        kept: VecDeque<Message>,
+        kept: Kept,
         client: Arc<Client>,
         number: u64,
         budget: &Budget,
@@ -91,7 +91,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             heard: now,
             heard_bytes: 0,
             ping_at: (!options.ping_interval.is_zero()).then(|| now + options.ping_interval),
-            acks: Acks::default(),
+            acks: Acks::new(&client.budget),
             held_back: false,
             moved: 0,
             timer: Box::pin(tokio::time::sleep_until(now.into())),
@@ -101,10 +101,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
     }
 
     /// Moves what waits into the socket. Ready when there is nothing left, pending when the socket takes no more.
-    fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<std::io::Result<()>> {
+    fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), Stop>> {
         loop {
             while self.socket.queued() < SOCKET_FULL && self.moved < MOVED {
-                let Some((opcode, bytes)) = self.next_frame(now) else {
+                let next = self.next_frame(now).map_err(|full| Stop::Close {
+                    code: 1013,
+                    reason: format!("a fragment cannot be sent: {full}"),
+                    readable: true,
+                })?;
+                let Some((opcode, bytes)) = next else {
                     break;
                 };
                 let metrics = &self.client.shared.metrics;
@@ -116,15 +121,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             if self.socket.queued() == 0 {
                 return Poll::Ready(Ok(()));
             }
-            ready!(self.socket.poll_flush(cx))?;
+            ready!(self.socket.poll_flush(cx)).map_err(|error| Stop::Lost {
+                reason: error.to_string(),
+                heard_all: false,
+            })?;
         }
     }
 
-    fn next_frame(&mut self, now: Instant) -> Option<(u8, Bytes)> {
+    fn next_frame(&mut self, now: Instant) -> Result<Option<(u8, Bytes)>, Exceeded> {
         if self.cuts.is_due()
-            && let Some(fragment) = self.next_fragment()
+            && let Some(fragment) = self.next_fragment()?
         {
-            return Some(fragment);
+            return Ok(Some(fragment));
         }
         loop {
             let next = if self.cuts.is_full() {
@@ -162,29 +170,47 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             };
             if let Some(frame) = frame {
                 self.cuts.make_due();
-                return Some((frame.opcode(), frame.bytes));
+                return Ok(Some((frame.opcode(), frame.bytes)));
             }
         }
     }
 
-    fn next_fragment(&mut self) -> Option<(u8, Bytes)> {
-        let (bytes, done) = self.cuts.next()?;
+    fn next_fragment(&mut self) -> Result<Option<(u8, Bytes)>, Exceeded> {
+        let Some((mut bytes, done)) = self.cuts.next() else {
+            return Ok(None);
+        };
         if let Some(key) = done {
             self.client.outbox.fragments_sent(key);
         }
-        Some((frame::TEXT, bytes))
+        // A copy of a part of the message.
+        if bytes.len() > UNCOUNTED {
+            bytes = self.client.budget.take(bytes.len())?.around(bytes);
+        }
+        Ok(Some((frame::TEXT, bytes)))
     }
 
     fn encode(
         &self,
         key: TopicKey,
-        sample: &Sample,
+        sample: &Arc<Sample>,
         topic: &Arc<str>,
         compression: Compression,
         now: Instant,
     ) -> Option<Frame> {
         let shared = &self.client.shared;
-        match sample.frame(compression, topic, &shared.options, &shared.metrics) {
+        let made = sample.frame(compression, topic, &shared.options, &shared.metrics);
+        let held = made.and_then(|frame| {
+            // Its bytes are shared with other clients; as long as this one does not read them it is this one that holds them.
+            let held = match frame.is_big() {
+                true => self.client.budget.alone().take(frame.bytes.len()).map(Some),
+                false => Ok(None),
+            };
+            match held {
+                Ok(permit) => Ok(frame.holding(permit)),
+                Err(full) => Err(Arc::from(format!("a message is left out: {full}"))),
+            }
+        });
+        match held {
             Ok(frame) => Some(frame),
             Err(reason) => {
                 if self.client.outbox.may_complain(key, now) {
@@ -220,7 +246,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 self.held_back = true;
                 return Poll::Pending;
             }
-            let next = match self.kept.pop_front() {
+            let next = match self.kept.pop() {
                 Some(message) => Poll::Ready(Ok(message)),
                 None => self.socket.poll_next(cx),
             };
@@ -375,12 +401,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                 return Poll::Ready(stop);
             }
             let written = match self.write(cx, now) {
-                Poll::Ready(Err(error)) => {
-                    return Poll::Ready(Stop::Lost {
-                        reason: error.to_string(),
-                        heard_all: false,
-                    });
-                }
+                Poll::Ready(Err(stop)) => return Poll::Ready(stop),
                 written => written,
             };
             let more =

@@ -40,7 +40,7 @@ async fn session(options: SessionOptions) -> (Session<DuplexStream>, DuplexStrea
     (
         Session::new(
             socket,
-            VecDeque::new(),
+            Kept::within(&budget::Budget::unlimited()),
             client,
             number,
             &budget::Budget::unlimited(),
@@ -67,7 +67,7 @@ fn sample() -> Arc<Sample> {
         latching: false,
     };
     let types = TopicTypes::new(Arc::new(Registry::new()));
-    Arc::new(Sample::new(message, false, Arc::new(types)))
+    Arc::new(Sample::new(message, false, Arc::new(types), &BridgeOptions::default()).unwrap())
 }
 
 #[tokio::test]

@@ -72,6 +72,8 @@ pub(crate) struct TopicQueue {
     /// Latching publishers whose first message has been queued.
     met: HashSet<Arc<str>>,
     pub(crate) bytes: usize,
+    /// Of those, bytes of samples that count for the daemon by themselves.
+    pub(crate) big: usize,
     /// When the throttle rate lets the next one through.
     next_at: Option<Instant>,
     /// When something was last said about messages that cannot be sent.
@@ -91,6 +93,7 @@ impl TopicQueue {
             samples: VecDeque::new(),
             met: HashSet::new(),
             bytes: 0,
+            big: 0,
             next_at: None,
             complained: None,
             scheduled: false,
@@ -116,6 +119,7 @@ impl TopicQueue {
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
         self.bytes += sample.bytes.len();
+        self.big += sample.big();
         if first {
             let at = self
                 .samples
@@ -172,6 +176,7 @@ impl TopicQueue {
         });
         let lost = self.samples.remove(spare.unwrap_or(0))?.sample;
         self.bytes -= lost.bytes.len();
+        self.big -= lost.big();
         Some(lost.bytes.len())
     }
 
@@ -191,6 +196,7 @@ impl TopicQueue {
     pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<Sample>> {
         let Waiting { sample, first } = self.samples.pop_front()?;
         self.bytes -= sample.bytes.len();
+        self.big -= sample.big();
         if self.wishes.queue_length > 0 && !first {
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }

@@ -2,6 +2,7 @@ use ros::bus::{Message, WireType};
 use ros::schema::Registry;
 
 use super::*;
+use crate::BridgeOptions;
 use crate::sample::TopicTypes;
 
 fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
@@ -16,11 +17,9 @@ fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
         publisher: publisher.into(),
         latching,
     };
-    Arc::new(Sample::new(
-        message,
-        false,
-        Arc::new(TopicTypes::new(Arc::new(Registry::new()))),
-    ))
+    let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
+    let options = BridgeOptions::default();
+    Arc::new(Sample::new(message, false, types, &options).unwrap())
 }
 
 fn wishes(throttle: u64, length: usize) -> Wishes {

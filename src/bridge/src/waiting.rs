@@ -1,7 +1,6 @@
-//! Reads a connection while its servant starts. Pings and close frames are answered at once; other messages are kept and
-//! handled in order when the servant is ready.
+//! Reads a connection while its servant starts. Pings and close frames are answered at once; other messages are kept, up to
+//! a limit, and handled in order when the servant is ready.
 
-use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
 use std::pin::{Pin, pin};
 use std::task::{Context, Poll};
@@ -14,20 +13,18 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Sleep, timeout};
 use ws::{Message, WebSocket, WsError, frame};
 
+use crate::kept::{Kept, Taken};
 use crate::{BridgeOptions, SessionEnd};
 
-/// Most messages that are kept, and most bytes of them. At either limit the socket is not read, so the client has to wait
-/// as it does for a busy servant.
-const KEPT_MESSAGES: usize = 1000;
-const KEPT_BYTES: usize = 1 << 20;
+/// Messages taken before other tasks have their turn.
+const READ_BATCH: usize = 64;
 /// Bytes of answers to pings that may wait to be sent.
 const ANSWERS: usize = 64 * 1024;
 
 /// A connection behind its WebSocket upgrade, before a bridge serves it.
 pub struct Waiting<S> {
     socket: WebSocket<S>,
-    kept: VecDeque<Message>,
-    kept_bytes: usize,
+    kept: Kept,
     unfinished: Duration,
     ping_interval: Duration,
     idle_timeout: Duration,
@@ -54,8 +51,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         let interval = options.ping_interval;
         Self {
             socket: WebSocket::new(io, read_ahead, options.max_frame, options.max_message),
-            kept: VecDeque::new(),
-            kept_bytes: 0,
+            kept: Kept::within(&Budget::unlimited()),
             unfinished: options.unfinished,
             ping_interval: interval,
             idle_timeout: options.idle_timeout,
@@ -70,6 +66,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
     /// Counts the client's messages in `budget`, now and in the session.
     pub fn within(mut self, budget: &Budget) -> Self {
         self.socket = self.socket.within(budget, self.unfinished);
+        self.kept = Kept::within(budget);
         self
     }
 
@@ -99,7 +96,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         self.say_goodbye(code, reason, true).await;
     }
 
-    pub(crate) fn into_parts(self) -> (WebSocket<S>, VecDeque<Message>) {
+    pub(crate) fn into_parts(self) -> (WebSocket<S>, Kept) {
         (self.socket, self.kept)
     }
 
@@ -128,15 +125,19 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         }
     }
 
-    async fn say_goodbye(&mut self, code: u16, reason: &str, readable: bool) {
+    fn tell(&mut self, level: Level, text: &str) {
         let mut out = Vec::new();
         let status = Status {
             id: None,
-            level: Level::Error,
-            msg: reason.into(),
+            level,
+            msg: text.into(),
         };
         Op::from(status).print(&mut out, Format::Json);
         self.socket.queue(frame::TEXT, Bytes::from(out));
+    }
+
+    async fn say_goodbye(&mut self, code: u16, reason: &str, readable: bool) {
+        self.tell(Level::Error, reason);
         self.socket.queue_close(code, reason);
         // A client that does not take its leave in time, or is gone already, is left alone.
         let _ = timeout(self.close_timeout, self.socket.leave(readable)).await;
@@ -144,15 +145,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
 
     fn step(&mut self, cx: &mut Context<'_>) -> Poll<Left> {
         loop {
-            if let Poll::Ready(Err(left)) = self.read(cx) {
-                return Poll::Ready(left);
-            }
+            let read = match self.read(cx) {
+                Poll::Ready(Err(left)) => return Poll::Ready(left),
+                read => read,
+            };
             let now = Instant::now();
             if let Err(left) = self.mind_the_clock(now) {
                 return Poll::Ready(left);
             }
             if let Poll::Ready(Err(error)) = self.socket.poll_flush(cx) {
                 return Poll::Ready(Left::Lost(error.to_string()));
+            }
+            if read.is_ready() {
+                cx.waker().wake_by_ref();
+                return Poll::Pending;
             }
             let silent_at = self.silent_at();
             let Some(at) = self.ping_at.into_iter().chain(silent_at).min() else {
@@ -165,13 +171,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         }
     }
 
-    fn is_full(&self) -> bool {
-        self.kept.len() >= KEPT_MESSAGES || self.kept_bytes >= KEPT_BYTES
-    }
-
-    /// When the connection counts as silent; never while this side does not read.
+    /// When the connection counts as silent.
     fn silent_at(&self) -> Option<Instant> {
-        let counts = !self.idle_timeout.is_zero() && !self.is_full();
+        let counts = !self.idle_timeout.is_zero();
         counts.then(|| self.heard + self.idle_timeout)
     }
 
@@ -188,9 +190,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         Ok(())
     }
 
-    /// Takes what the client has sent. Pending when there is no more, or no room for it.
+    /// Takes what the client has sent. Pending when there is no more; ready without an error when other tasks are to have
+    /// their turn.
     fn read(&mut self, cx: &mut Context<'_>) -> Poll<Result<(), Left>> {
-        while !self.is_full() {
+        for _ in 0..READ_BATCH {
             let next = self.socket.poll_next(cx);
             if self.heard_bytes != self.socket.received() {
                 self.heard_bytes = self.socket.received();
@@ -207,10 +210,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
                 }
             };
             match message {
-                Message::Text(ref bytes) | Message::Binary(ref bytes) => {
-                    self.kept_bytes += bytes.len();
-                    self.kept.push_back(message);
-                }
+                Message::Text(_) | Message::Binary(_) => match self.kept.take(message) {
+                    Taken::Kept | Taken::LeftOut { first: false } => {}
+                    Taken::LeftOut { first: true } => self.tell(
+                        Level::Error,
+                        "publish: too much waits for the servant to start; further messages are left out until it has",
+                    ),
+                    Taken::Refused(reason) => {
+                        return Poll::Ready(Err(Left::Refused { code: 1013, reason }));
+                    }
+                },
                 Message::Ping(payload) if self.socket.queued() < ANSWERS => {
                     self.socket.queue(frame::PONG, payload);
                 }
@@ -220,6 +229,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
                 }
             }
         }
-        Poll::Pending
+        Poll::Ready(Ok(()))
     }
 }

@@ -267,10 +267,7 @@ impl Client {
             writer.raw("values", None, response);
             writer.boolean("result", true);
             writer.end();
-            return Ok(Frame {
-                format,
-                bytes: out.into(),
-            });
+            return Ok(Frame::new(format, out));
         };
         answer_frame(call, format, |out| {
             self.print_payload(&def.response, response, format, out)
@@ -311,14 +308,7 @@ impl Client {
         writer.text("values", reason);
         writer.boolean("result", false);
         writer.end();
-        self.send_frame(
-            Frame {
-                format,
-                bytes: out.into(),
-            },
-            call.fragment_size,
-            true,
-        );
+        self.send_frame(Frame::new(format, out), call.fragment_size, true);
     }
 }
 
@@ -333,8 +323,5 @@ fn answer_frame<E>(
     writer.value("values", values)?;
     writer.boolean("result", true);
     writer.end();
-    Ok(Frame {
-        format,
-        bytes: out.into(),
-    })
+    Ok(Frame::new(format, out))
 }

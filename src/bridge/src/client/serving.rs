@@ -116,10 +116,7 @@ impl Handler {
             })?;
         }
         writer.end();
-        Ok(Frame {
-            format,
-            bytes: out.into(),
-        })
+        Ok(Frame::new(format, out))
     }
 }
 

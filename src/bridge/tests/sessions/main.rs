@@ -6,6 +6,7 @@ mod support;
 mod actions;
 mod bad_input;
 mod manners;
+mod memory;
 mod publishing;
 mod resuming;
 mod rosapi;

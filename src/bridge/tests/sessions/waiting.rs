@@ -93,7 +93,7 @@ async fn what_was_said_meanwhile_is_carried_out_in_order() {
         ))
         .await
         .unwrap();
-    // More than is kept: the client has to wait with the rest, and loses nothing.
+    // More than the socket holds: nothing of it is lost.
     let padding = "x".repeat(40_000);
     let messages = 60;
     let (mut sending, mut receiving) = client.split();
@@ -134,4 +134,77 @@ async fn who_cannot_have_a_servant_is_told_why() {
     assert_eq!(u16::from(close.code), 1013);
     while patiently(client.next()).await.is_some() {}
     patiently(refusing).await.unwrap();
+}
+
+/// Says the same so often.
+async fn say(client: &mut Socket, message: &Value, times: usize) {
+    for _ in 0..times {
+        let message = Message::text(message.to_string());
+        patiently(client.send(message)).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn who_has_said_much_is_heard_all_the_same() {
+    let world = World::new().await;
+    let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
+    let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
+    let (ready, readiness) = oneshot::channel::<()>();
+    let bridge = Arc::clone(&world.bridge);
+    let served = tokio::spawn(async move {
+        waiting.until(readiness).await.unwrap().unwrap();
+        bridge
+            .serve_waiting(waiting, SessionOptions::default())
+            .await
+    });
+    let advertise = json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"});
+    say(&mut client, &advertise, 1).await;
+    let publish = json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}});
+    say(&mut client, &publish, 11_000).await;
+    client.send(Message::Ping("p".into())).await.unwrap();
+    let told = next(&mut client).await.into_text().unwrap();
+    assert!(told.contains("publish: too much waits"), "{told}");
+    assert_eq!(next(&mut client).await, Message::Pong("p".into()));
+    ready.send(()).unwrap();
+    let message = patiently(heard.messages.recv()).await.unwrap();
+    assert_eq!(world.json("std_msgs/String", &message.bytes)["data"], "x");
+    client.close(None).await.unwrap();
+    while patiently(client.next()).await.is_some() {}
+    patiently(served).await.unwrap();
+
+    // And may leave.
+    let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
+    let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+    say(&mut client, &publish, 11_000).await;
+    client.close(None).await.unwrap();
+    let end = patiently(waits).await.unwrap().unwrap_err();
+    assert!(matches!(end, SessionEnd::Client { .. }), "{end:?}");
+}
+
+#[tokio::test]
+async fn who_asks_for_more_than_is_kept_is_refused_with_a_reason() {
+    let budget = budget::Budget::new("client x", 1 << 20);
+    for (length, times, reason) in [
+        (10, 10_001, "10000 messages of "),
+        (400_000, 4, "the memory for client x"),
+    ] {
+        let (waiting, mut client) = connection(&BridgeOptions::default()).await;
+        let mut waiting = waiting.within(&budget);
+        let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+        let call =
+            json!({"op": "call_service", "service": "/s", "args": {"x": "x".repeat(length)}});
+        say(&mut client, &call, times).await;
+        let told = next(&mut client).await.into_text().unwrap();
+        assert!(told.contains(reason), "{told}");
+        let end = patiently(async {
+            while let Some(Ok(_)) = client.next().await {}
+            waits.await.unwrap().unwrap_err()
+        })
+        .await;
+        assert!(
+            matches!(end, SessionEnd::Closed { code: 1013, .. }),
+            "{end:?}"
+        );
+        assert_eq!(budget.used(), 0);
+    }
 }

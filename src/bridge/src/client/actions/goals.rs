@@ -312,10 +312,7 @@ impl Goal {
         }
         rest(&mut writer);
         writer.end();
-        Ok(Frame {
-            format,
-            bytes: out.into(),
-        })
+        Ok(Frame::new(format, out))
     }
 
     fn answer(self, client: &Client, frame: Frame) {
@@ -348,12 +345,6 @@ impl Goal {
         writer.integer("status", GoalStatus::Unknown as i64);
         writer.boolean("result", false);
         writer.end();
-        self.answer(
-            client,
-            Frame {
-                format,
-                bytes: out.into(),
-            },
-        );
+        self.answer(client, Frame::new(format, out));
     }
 }

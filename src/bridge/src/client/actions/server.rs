@@ -234,10 +234,7 @@ impl ActionServer {
         }
         writer.boolean("feedback", true);
         writer.end();
-        Ok(Frame {
-            format,
-            bytes: out.into(),
-        })
+        Ok(Frame::new(format, out))
     }
 
     /// actionlib's policy: an empty id means all goals up to the stamp, a zero stamp with it means all. A cancel may be

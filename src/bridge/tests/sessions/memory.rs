@@ -1,0 +1,212 @@
+//! What waits for clients that do not read counts in budgets until it is written.
+
+use bridge::{BridgeOptions, SessionOptions};
+use budget::Budget;
+use bytes::Bytes;
+use serde_json::{Value, json};
+
+use crate::support::{Client, World, connected, patiently};
+
+const MIB: usize = 1 << 20;
+
+/// The daemon's budget, a servant's and a client's.
+struct Budgets {
+    daemon: Budget,
+    servant: Budget,
+    client: Budget,
+}
+
+impl Budgets {
+    fn new(client: usize) -> Self {
+        let daemon = Budget::new("the daemon", 64 * MIB);
+        Self {
+            servant: daemon.within("servant x", 32 * MIB),
+            client: daemon.within("client x", client),
+            daemon,
+        }
+    }
+
+    async fn world(&self) -> World {
+        World::with(BridgeOptions {
+            budget: self.servant.clone(),
+            ..BridgeOptions::default()
+        })
+        .await
+    }
+
+    async fn client(&self, world: &World) -> Client {
+        let options = SessionOptions {
+            budget: self.client.clone(),
+            ..SessionOptions::default()
+        };
+        world.client_with(options).await
+    }
+
+    async fn are_empty(&self) {
+        until(|| self.daemon.used() == 0).await;
+        assert_eq!((self.client.used(), self.servant.used()), (0, 0));
+    }
+}
+
+/// There is no event for what a budget counts.
+async fn until(condition: impl Fn() -> bool) {
+    patiently(async {
+        while !condition() {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+fn bytes(length: usize) -> Bytes {
+    let mut message = (length as u32).to_le_bytes().to_vec();
+    message.resize(4 + length, 7);
+    message.into()
+}
+
+fn length(message: &Value) -> usize {
+    message["msg"]["data"].as_str().map_or(0, str::len)
+}
+
+async fn subscribed(client: &mut Client, fragment_size: Option<usize>) {
+    let mut subscribe = json!({"op": "subscribe", "topic": "/big"});
+    if let Some(size) = fragment_size {
+        subscribe["fragment_size"] = size.into();
+    }
+    client.send(subscribe).await;
+    client.settled().await;
+}
+
+#[tokio::test]
+async fn a_message_counts_for_its_client_until_it_is_read() {
+    let budgets = Budgets::new(8 * MIB);
+    let world = budgets.world().await;
+    let publisher = world
+        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
+        .await;
+    for fragment_size in [None, Some(10_000), Some(MIB)] {
+        let mut client = budgets.client(&world).await;
+        subscribed(&mut client, fragment_size).await;
+        connected(publisher.as_ref(), 1).await;
+        publisher.publish(bytes(2 * MIB));
+        until(|| budgets.client.used() > 2 * MIB).await;
+        // What the servant's budget counted while it was encoded is not what it lacks for others.
+        until(|| budgets.servant.used() == 0).await;
+        assert!(budgets.daemon.used() > 2 * MIB);
+        match fragment_size {
+            None => assert!(length(&client.json().await) > 2 * MIB),
+            Some(_) => loop {
+                let fragment = client.json().await;
+                assert_eq!(fragment["op"], "fragment");
+                if fragment["num"].as_u64().unwrap() + 1 == fragment["total"] {
+                    break;
+                }
+            },
+        }
+        client.settled().await;
+        budgets.are_empty().await;
+    }
+}
+
+#[tokio::test]
+async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() {
+    let budgets = Budgets::new(8 * MIB);
+    let world = budgets.world().await;
+    let publisher = world
+        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
+        .await;
+    let mut slow = Vec::new();
+    for _ in 0..6 {
+        slow.push(budgets.client(&world).await);
+    }
+    let mut quick = world.client().await;
+    for client in slow.iter_mut().chain([&mut quick]) {
+        subscribed(client, None).await;
+    }
+    connected(publisher.as_ref(), 1).await;
+    publisher.publish(bytes(2 * MIB));
+    assert!(length(&quick.json().await) > 2 * MIB);
+    // Base64 makes 2.7 MiB of it: there is room for two. The others' were dropped from their queue, or left out.
+    until(|| budgets.client.refused() >= 4).await;
+    assert!(budgets.client.used() <= 8 * MIB);
+    // Who has it holds the same bytes.
+    until(|| budgets.daemon.used() < 3 * MIB).await;
+    let mut whole = 0;
+    for client in &mut slow {
+        let call = json!({"op": "call_service", "id": "end", "service": "/rosapi/get_ros_version"});
+        client.send(call).await;
+        loop {
+            let heard = client.json().await;
+            match heard["op"].as_str() {
+                Some("publish") => whole += 1,
+                Some("status") => {
+                    let told = heard["msg"].as_str().unwrap_or_default();
+                    assert!(told.contains("the memory for client x"), "{told}");
+                }
+                _ => break assert_eq!(heard["id"], "end", "{heard}"),
+            }
+        }
+    }
+    assert!((1..=2).contains(&whole), "{whole}");
+    budgets.are_empty().await;
+}
+
+#[tokio::test]
+async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budget() {
+    let budgets = Budgets::new(2 * MIB);
+    let world = budgets.world().await;
+    let publisher = world
+        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
+        .await;
+    let (mut slow, mut quick) = (budgets.client(&world).await, world.client().await);
+    for client in [&mut slow, &mut quick] {
+        client
+            .send(json!({"op": "subscribe", "topic": "/big", "compression": "cbor-raw"}))
+            .await;
+        client.settled().await;
+    }
+    connected(publisher.as_ref(), 1).await;
+    // Some count for the daemon by themselves, some do not.
+    let mut newest = 0;
+    for size in (0..200).map(|number| 10_000 + number + number % 2 * 100_000) {
+        publisher.publish(bytes(size));
+        newest = quick.binary().await.len();
+        assert!(newest > size);
+    }
+    assert!(budgets.client.used() > MIB);
+    assert!(world.bridge.metrics().dropped.get() > 0);
+    assert!(budgets.client.used() <= 2 * MIB);
+    // The newest is among those that stayed.
+    while slow.next().await.into_data().len() < newest {}
+    slow.settled().await;
+    budgets.are_empty().await;
+}
+
+#[tokio::test]
+async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
+    for (size, calls) in [(2 * MIB, 8), (30_000, 250)] {
+        let budgets = Budgets::new(3 * MIB);
+        let world = budgets.world().await;
+        let mut client = budgets.client(&world).await;
+        let value = Value::from("x".repeat(size)).to_string();
+        client
+            .send(json!({
+                "op": "call_service", "service": "/rosapi/set_param",
+                "args": {"name": "/long", "value": value},
+            }))
+            .await;
+        assert_eq!(client.json().await["result"], true);
+        for _ in 0..calls {
+            let call = json!({
+                "op": "call_service", "service": "/rosapi/get_param", "args": {"name": "/long"},
+            });
+            client.send(call).await;
+        }
+        until(|| budgets.client.refused() > 0).await;
+        let (code, reason) = client.closed().await;
+        assert_eq!(code, 1013, "{reason}");
+        assert!(reason.contains("the memory for client x"), "{reason}");
+        patiently(client.session).await.unwrap();
+        budgets.are_empty().await;
+    }
+}
