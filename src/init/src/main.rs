@@ -278,14 +278,6 @@ fn become_program(request: &Start<'_>, streams: &[RawFd]) -> (Stage, c_int) {
         if libc::chdir(directory) != 0 {
             return (Stage::Directory, errno());
         }
-        if let Some((user, group)) = request.identity {
-            if libc::setgroups(0, ptr::null()) != 0
-                || libc::setgid(group) != 0
-                || libc::setuid(user) != 0
-            {
-                return (Stage::Identity, errno());
-            }
-        }
         libc::execve(*arguments, arguments, variables);
         (Stage::Execute, errno())
     }

@@ -44,8 +44,6 @@ pub enum Scope {
 pub struct Start<'a> {
     /// Chosen by the shim, returned in the answer.
     pub id: u32,
-    /// User and group to become, when other than init's own.
-    pub identity: Option<(u32, u32)>,
     /// How many arguments follow the directory.
     pub arguments: u16,
     /// How many `NAME=value` follow the arguments.
@@ -59,8 +57,6 @@ pub struct Start<'a> {
 pub struct StartRequest<'a> {
     /// Returned in the answer.
     pub id: u32,
-    /// User and group to become, when other than init's own.
-    pub identity: Option<(u32, u32)>,
     /// Working directory; `/` when empty.
     pub directory: &'a str,
     /// Path of the program and its arguments.
@@ -140,10 +136,8 @@ pub enum Stage {
     Prepare = 2,
     /// Changing to the working directory.
     Directory = 3,
-    /// Changing user or group.
-    Identity = 4,
     /// `execve`.
-    Execute = 5,
+    Execute = 4,
 }
 
 impl Stage {
@@ -153,8 +147,7 @@ impl Stage {
             1 => Self::Fork,
             2 => Self::Prepare,
             3 => Self::Directory,
-            4 => Self::Identity,
-            5 => Self::Execute,
+            4 => Self::Execute,
             _ => Self::Request,
         }
     }
@@ -173,10 +166,6 @@ impl StartRequest<'_> {
         };
         let mut out = vec![START];
         out.extend(self.id.to_le_bytes());
-        let (user, group) = self.identity.unwrap_or((0, 0));
-        out.push(u8::from(self.identity.is_some()));
-        out.extend(user.to_le_bytes());
-        out.extend(group.to_le_bytes());
         for count in [self.argv.len(), self.environment.len()] {
             out.extend(
                 u16::try_from(count)
@@ -208,16 +197,14 @@ impl<'a> Request<'a> {
         let (&kind, rest) = bytes.split_first()?;
         match kind {
             START => {
-                let (fixed, strings) = rest.split_at_checked(17)?;
-                let identity = (fixed[4] != 0).then_some((word(fixed, 5)?, word(fixed, 9)?));
-                let arguments = u16::from_le_bytes([fixed[13], fixed[14]]);
-                let variables = u16::from_le_bytes([fixed[15], fixed[16]]);
+                let (fixed, strings) = rest.split_at_checked(8)?;
+                let arguments = u16::from_le_bytes([fixed[4], fixed[5]]);
+                let variables = u16::from_le_bytes([fixed[6], fixed[7]]);
                 let ended = strings.iter().filter(|byte| **byte == 0).count();
                 let complete = strings.last() == Some(&0)
                     && ended == 1 + usize::from(arguments) + usize::from(variables);
                 (complete && arguments > 0).then_some(Self::Start(Start {
                     id: word(fixed, 0)?,
-                    identity,
                     arguments,
                     variables,
                     strings,
@@ -313,7 +300,6 @@ mod tests {
         let (argv, environment) = (strings(&["/bin/node", "", "x y"]), strings(&["A=1", "B="]));
         let request = StartRequest {
             id: 7,
-            identity: Some((1000, 1001)),
             directory: "",
             argv: &argv,
             environment: &environment,
@@ -322,10 +308,7 @@ mod tests {
         let Some(Request::Start(start)) = Request::decode(&bytes) else {
             panic!("not a start")
         };
-        assert_eq!(
-            (start.id, start.identity, start.arguments, start.variables),
-            (7, Some((1000, 1001)), 3, 2)
-        );
+        assert_eq!((start.id, start.arguments, start.variables), (7, 3, 2));
         assert_eq!(start.strings, b"/\0/bin/node\0\0x y\0A=1\0B=\0");
     }
 
@@ -334,7 +317,6 @@ mod tests {
         let encode = |argv: &[String]| {
             StartRequest {
                 id: 0,
-                identity: None,
                 directory: "/",
                 argv,
                 environment: &[],
@@ -358,7 +340,6 @@ mod tests {
         let argv = strings(&["/bin/node"]);
         let bytes = StartRequest {
             id: 1,
-            identity: None,
             directory: "/",
             argv: &argv,
             environment: &[],

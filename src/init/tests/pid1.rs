@@ -76,7 +76,6 @@ impl Init {
         let environment = ["GREETING=hello".to_owned()];
         let request = StartRequest {
             id,
-            identity: None,
             directory,
             argv: &argv,
             environment: &environment,

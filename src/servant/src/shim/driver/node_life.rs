@@ -48,7 +48,6 @@ impl Driver {
             .collect();
         let request = StartRequest {
             id: number,
-            identity: None,
             directory: &spec.directory,
             argv: &spec.argv,
             environment: &environment,
@@ -218,7 +217,7 @@ fn describe(errno: i32, stage: Stage) -> String {
         Stage::Execute => format!("its program could not be executed: {error}"),
         Stage::Directory => format!("its working directory could not be entered: {error}"),
         Stage::Fork => format!("fork: {error}"),
-        Stage::Request | Stage::Prepare | Stage::Identity => {
+        Stage::Request | Stage::Prepare => {
             format!("init could not prepare it: {error}")
         }
     }
