@@ -3,8 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use base64_simd::STANDARD;
 use sha1::{Digest, Sha1};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -83,7 +82,7 @@ async fn handshake(
     let mut stream = Stream::over(stream, address, authorities)
         .await
         .map_err(|error| unreachable("no TLS with", error))?;
-    let key = STANDARD.encode(rand::random::<[u8; 16]>());
+    let key = STANDARD.encode_to_string(rand::random::<[u8; 16]>());
     let mut request = format!(
         "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: {}\r\nUser-Agent: cloudroid-stub/{}\r\n",
         link::SUBPROTOCOL,
@@ -133,7 +132,7 @@ async fn handshake(
             _ => Error::Busy(text),
         });
     }
-    let expected = STANDARD.encode(Sha1::digest(format!("{key}{GUID}")));
+    let expected = STANDARD.encode_to_string(Sha1::digest(format!("{key}{GUID}")));
     if header(&head, "sec-websocket-accept") != Some(&expected) {
         return Err(Error::Refused(format!(
             "{authority} is no WebSocket server"

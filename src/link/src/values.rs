@@ -4,8 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use base64_simd::STANDARD;
 use ros::bus::ParamValue;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -50,7 +49,7 @@ impl From<&ParamValue> for Written {
             // Stubs leave it out, and say so.
             ParamValue::Nil => Self::String(String::new()),
             ParamValue::Binary(bytes) => Self::Bytes(Bytes {
-                base64: STANDARD.encode(bytes),
+                base64: STANDARD.encode_to_string(bytes),
             }),
             ParamValue::List(items) => Self::List(items.iter().map(Self::from).collect()),
             ParamValue::Map(members) => {
@@ -73,7 +72,7 @@ impl From<Written> for ParamValue {
             Written::Double(number) => Self::Double(number),
             Written::Spelt(spelt) => Self::Double(spelt.double.parse().unwrap_or(f64::NAN)),
             Written::Bytes(bytes) => {
-                Self::Binary(STANDARD.decode(bytes.base64).unwrap_or_default())
+                Self::Binary(STANDARD.decode_to_vec(bytes.base64).unwrap_or_default())
             }
             Written::String(text) => Self::String(text),
             Written::List(items) => Self::List(items.into_iter().map(Self::from).collect()),

@@ -2,8 +2,7 @@
 
 use axum::extract::Request;
 use axum::http::{HeaderValue, Method, header};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use base64_simd::STANDARD;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::errors::Error;
@@ -36,7 +35,10 @@ pub fn accept(request: &Request) -> Result<HeaderValue, Error> {
     let key = text(header::SEC_WEBSOCKET_KEY)
         .map(str::trim)
         .ok_or_else(|| bad("Sec-WebSocket-Key is missing"))?;
-    if !STANDARD.decode(key).is_ok_and(|bytes| bytes.len() == KEY) {
+    if !STANDARD
+        .decode_to_vec(key)
+        .is_ok_and(|bytes| bytes.len() == KEY)
+    {
         return Err(bad("Sec-WebSocket-Key is not 16 bytes in base64"));
     }
     derive_accept_key(key.as_bytes())

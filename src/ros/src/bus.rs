@@ -159,7 +159,7 @@ pub struct ServiceType {
 /// A service's server, as it told of itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceProvider {
-    /// Its node.
+    /// The node that serves it.
     pub node: String,
     /// What it serves.
     pub service_type: ServiceType,
@@ -210,8 +210,7 @@ pub enum ParamValue {
 }
 
 fn as_base64<S: serde::Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
-    use base64::Engine as _;
-    serializer.serialize_str(&base64::engine::general_purpose::STANDARD.encode(bytes))
+    serializer.serialize_str(&base64_simd::STANDARD.encode_to_string(bytes))
 }
 
 impl PartialEq for ParamValue {
@@ -304,9 +303,9 @@ pub enum BusError {
     /// The peer does not speak the protocol.
     #[error("{what} broke the protocol: {reason}")]
     Protocol {
-        /// Who.
+        /// Topic, service or node that sent it.
         what: String,
-        /// How.
+        /// In which way it breaks the protocol.
         reason: String,
     },
 }

@@ -2,8 +2,7 @@
 
 use std::borrow::Cow;
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use base64_simd::STANDARD;
 
 use crate::cbor;
 use crate::fields::Fields;
@@ -142,7 +141,7 @@ impl<'a> Payload<'a> {
             Format::Json => std::str::from_utf8(value)
                 .ok()
                 .and_then(crate::json::unescape)
-                .and_then(|text| STANDARD.decode(text.as_bytes()).ok())
+                .and_then(|text| STANDARD.decode_to_vec(text.as_bytes()).ok())
                 .map(Cow::Owned),
         };
         match bytes {

@@ -2,9 +2,6 @@
 
 use std::borrow::Cow;
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
-
 use crate::{Format, Id, Payload, cbor, json};
 
 /// What a CBOR head of one byte can count.
@@ -126,12 +123,7 @@ impl<'o> Writer<'o> {
         match self.format {
             Format::Json => {
                 self.out.push(b'"');
-                let start = self.out.len();
-                self.out.resize(start + value.len().div_ceil(3) * 4, 0);
-                let written = STANDARD
-                    .encode_slice(value, &mut self.out[start..])
-                    .unwrap_or(0);
-                self.out.truncate(start + written);
+                base64_simd::STANDARD.encode_append(value, self.out);
                 self.out.push(b'"');
             }
             Format::Cbor => {

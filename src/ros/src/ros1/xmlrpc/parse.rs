@@ -4,8 +4,6 @@
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-use base64::Engine as _;
-
 use super::{Error, Fault, Value};
 
 /// Arrays and structs within each other, at most.
@@ -18,7 +16,7 @@ pub const MAX_ELEMENTS: usize = 500_000;
 pub struct Call {
     /// The method's name.
     pub method: String,
-    /// Its arguments.
+    /// Arguments, in order.
     pub params: Vec<Value>,
 }
 
@@ -370,10 +368,10 @@ fn scalar(name: &str, text: &str) -> Result<Value, String> {
                 .bytes()
                 .filter(|byte| !byte.is_ascii_whitespace())
                 .collect();
-            base64::engine::general_purpose::STANDARD
-                .decode(dense)
+            base64_simd::STANDARD
+                .decode_to_vec(dense)
                 .map(Value::Base64)
-                .map_err(|error| format!("bad base64: {error}"))
+                .map_err(|_| format!("{} is not base64", quoted(text)))
         }
         _ => Err(format!("values of type {} are not known", quoted(name))),
     }

@@ -3,8 +3,6 @@
 
 use std::fmt::Write as _;
 
-use base64::Engine as _;
-
 use super::{Fault, Value};
 
 const PROLOGUE: &str = "<?xml version=\"1.0\"?>\n";
@@ -83,7 +81,7 @@ fn print_value(out: &mut String, value: &Value) {
         }
         Value::Base64(bytes) => {
             out.push_str("<base64>");
-            base64::engine::general_purpose::STANDARD.encode_string(bytes, out);
+            base64_simd::STANDARD.encode_append(bytes, out);
             out.push_str("</base64>");
         }
         Value::DateTime(text) => {
@@ -117,7 +115,7 @@ fn print_value(out: &mut String, value: &Value) {
 /// Shortest text that reads back as the same double; `inf` and `nan` as both `strtod` and Python read them.
 fn print_double(out: &mut String, number: f64) {
     if number.is_finite() {
-        out.push_str(ryu::Buffer::new().format_finite(number));
+        out.push_str(zmij::Buffer::new().format_finite(number));
     } else if number.is_nan() {
         out.push_str("nan");
     } else {
