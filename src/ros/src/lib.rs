@@ -8,5 +8,6 @@ pub mod bag;
 pub mod bus;
 pub mod codec;
 pub mod net;
+pub mod ring;
 pub mod ros1;
 pub mod schema;

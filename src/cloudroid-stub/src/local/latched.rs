@@ -1,27 +1,72 @@
 //! Keeps the messages that the robot's publishers have latched, for the local original. Each publisher gets an advertisement of
 //! its own in the private ROS system, so that a process that starts later gets all of them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
+use parking_lot::Mutex;
 use ros::bus::{AdvertiseOptions, Bus, Message, Publisher};
-use tokio::sync::mpsc;
+use ros::ring::{Bounds, Ring};
+use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
 use super::place::Place;
 
-/// Messages kept for a process that is slow; a newcomer is given the last one of each publisher.
+/// Messages of one publisher kept for a process that is slow, and while its advertisement is made; a newcomer is given the
+/// last one of each publisher.
 const QUEUE: usize = 16;
 
 /// A handle; the advertisements end with it.
 pub struct Latched {
-    orders: mpsc::UnboundedSender<Order>,
+    due: Arc<Due>,
     task: AbortHandle,
 }
 
-enum Order {
-    Keep(Arc<str>, Message),
-    Forget(Arc<str>, Arc<str>),
+/// A topic and one of its publishers.
+type Key = (Arc<str>, Arc<str>);
+
+/// What was not passed on yet: by publisher, in the order in which publishers were first heard.
+#[derive(Default)]
+struct Due {
+    state: Mutex<(HashMap<Key, News>, VecDeque<Key>)>,
+    ready: Notify,
+}
+
+/// What is new about one publisher.
+struct News {
+    /// It has left: what it latched before does not count any more.
+    left: bool,
+    messages: Ring<Message>,
+}
+
+impl Due {
+    fn add(&self, topic: &Arc<str>, publisher: &Arc<str>, news: impl FnOnce(&mut News)) {
+        {
+            let (known, turns) = &mut *self.state.lock();
+            let key = (topic.clone(), publisher.clone());
+            let of = known.entry(key.clone()).or_insert_with(|| {
+                turns.push_back(key);
+                News {
+                    left: false,
+                    messages: Ring::new(Bounds::messages(QUEUE)),
+                }
+            });
+            news(of);
+        }
+        self.ready.notify_one();
+    }
+
+    async fn next(&self) -> (Key, News) {
+        loop {
+            {
+                let (known, turns) = &mut *self.state.lock();
+                if let Some(entry) = turns.pop_front().and_then(|key| known.remove_entry(&key)) {
+                    return entry;
+                }
+            }
+            self.ready.notified().await;
+        }
+    }
 }
 
 impl Drop for Latched {
@@ -32,57 +77,111 @@ impl Drop for Latched {
 
 impl Latched {
     pub fn begin(place: &Arc<Place>) -> Self {
-        let (orders, taken) = mpsc::unbounded_channel();
-        let task = tokio::spawn(serve(place.clone(), taken)).abort_handle();
-        Self { orders, task }
+        let due = Arc::new(Due::default());
+        let task = tokio::spawn(serve(place.clone(), due.clone())).abort_handle();
+        Self { due, task }
     }
 
     /// Keeps a message of a publisher that latches.
     pub fn keep(&self, topic: &Arc<str>, message: &Message) {
-        let order = Order::Keep(topic.clone(), message.clone());
-        let _ = self.orders.send(order);
+        self.due.add(topic, &message.publisher, |news| {
+            let dropped = news.messages.push(message.clone());
+            if dropped > 0 {
+                tracing::debug!(%topic, dropped, "newer latched messages took the place of older ones");
+            }
+        });
     }
 
     /// The publisher has unregistered or ended.
     pub fn forget(&self, topic: &Arc<str>, publisher: &Arc<str>) {
-        let order = Order::Forget(topic.clone(), publisher.clone());
-        let _ = self.orders.send(order);
+        self.due.add(topic, publisher, |news| {
+            news.left = true;
+            news.messages.clear();
+        });
     }
 }
 
-/// By topic and publisher: the MD5 of its type, and who repeats it here.
-type Repeated = HashMap<(Arc<str>, Arc<str>), (String, Box<dyn Publisher>)>;
+/// The MD5 of each publisher's type, and who repeats it here.
+type Repeated = HashMap<Key, (String, Box<dyn Publisher>)>;
 
-/// Handles requests one after the other; only a publisher's first message takes time, for its advertisement.
-async fn serve(place: Arc<Place>, mut orders: mpsc::UnboundedReceiver<Order>) {
+/// Serves one publisher after the other; only its first message takes time, for the advertisement.
+async fn serve(place: Arc<Place>, due: Arc<Due>) {
     let mut all = Repeated::new();
-    while let Some(order) = orders.recv().await {
-        let (topic, message) = match order {
-            Order::Keep(topic, message) => (topic, message),
-            Order::Forget(topic, publisher) => {
-                all.remove(&(topic, publisher));
+    loop {
+        let (key, news) = due.next().await;
+        if news.left {
+            all.remove(&key);
+        }
+        for message in news.messages {
+            let md5 = &message.wire_type.md5;
+            if let Some((_, publisher)) = all.get(&key).filter(|(known, _)| known == md5) {
+                publisher.publish(message.bytes);
                 continue;
             }
-        };
-        let md5 = &message.wire_type.md5;
-        let key = (topic.clone(), message.publisher.clone());
-        if let Some((_, publisher)) = all.get(&key).filter(|(known, _)| known == md5) {
-            publisher.publish(message.bytes);
-            continue;
-        }
-        let options = AdvertiseOptions {
-            wire_type: (*message.wire_type).clone(),
-            latch: true,
-            queue: QUEUE,
-        };
-        match place.bus().advertise(&topic, options).await {
-            Ok(publisher) => {
-                publisher.publish(message.bytes);
-                all.insert(key, (md5.clone(), publisher));
-            }
-            Err(error) => {
-                tracing::warn!(%topic, %error, "the local original is not given what is latched there");
+            let options = AdvertiseOptions {
+                wire_type: (*message.wire_type).clone(),
+                latch: true,
+                queue: QUEUE,
+            };
+            match place.bus().advertise(&key.0, options).await {
+                Ok(publisher) => {
+                    publisher.publish(message.bytes);
+                    all.insert(key.clone(), (md5.clone(), publisher));
+                }
+                Err(error) => {
+                    tracing::warn!(topic = %key.0, %error, "the local original is not given what is latched there");
+                }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use ros::bus::WireType;
+
+    use super::*;
+
+    fn message(publisher: &Arc<str>, number: u8) -> Message {
+        let wire_type = WireType {
+            name: "std_msgs/UInt8".into(),
+            md5: "*".into(),
+            definition: String::new(),
+        };
+        Message {
+            bytes: Bytes::from(vec![number]),
+            wire_type: Arc::new(wire_type),
+            publisher: publisher.clone(),
+            latching: true,
+        }
+    }
+
+    #[tokio::test]
+    async fn what_waits_for_an_advertisement_is_bounded_for_each_publisher() {
+        let due = Arc::new(Due::default());
+        let latched = Latched {
+            due: due.clone(),
+            task: tokio::spawn(std::future::pending::<()>()).abort_handle(),
+        };
+        let topic: Arc<str> = "/map".into();
+        let [quiet, busy, left]: [Arc<str>; 3] = ["/quiet", "/busy", "/left"].map(Into::into);
+        latched.keep(&topic, &message(&quiet, 1));
+        for number in 0..100 {
+            latched.keep(&topic, &message(&busy, number));
+            latched.keep(&topic, &message(&left, number));
+        }
+        latched.forget(&topic, &left);
+        let numbers = |news: News| {
+            news.messages
+                .map(|message| message.bytes[0])
+                .collect::<Vec<_>>()
+        };
+        // Whoever publishes much takes nothing from whoever publishes little.
+        assert_eq!(numbers(due.next().await.1), [1]);
+        assert_eq!(numbers(due.next().await.1), (84..100).collect::<Vec<_>>());
+        let (key, news) = due.next().await;
+        assert_eq!((&key.1, news.left, news.messages.len()), (&left, true, 0));
+        assert!(due.state.lock().0.is_empty());
     }
 }

@@ -11,6 +11,7 @@ use link::record::Data;
 use parking_lot::Mutex;
 use qos::Side;
 use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
+use ros::ring::{Bounds, Ring};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
@@ -51,6 +52,8 @@ struct Latched {
     /// kept would grow old.
     last: [Option<Bytes>; 2],
     advertised: Advertised,
+    /// Messages dropped by advertisements that have ended, and before there was one.
+    dropped: u64,
 }
 
 /// A latching topic has a second advertisement.
@@ -58,11 +61,33 @@ struct Latched {
 enum Advertised {
     #[default]
     Not,
-    Asked(Vec<Bytes>),
+    /// It has been asked for; until it is there, messages wait.
+    Asked(Ring<Bytes>),
     Kept(Box<dyn Publisher>),
 }
 
+impl Latched {
+    fn become_advertised(&mut self, advertised: Advertised) {
+        if let Advertised::Kept(ended) = std::mem::replace(&mut self.advertised, advertised) {
+            self.dropped += ended.dropped();
+        }
+    }
+
+    fn dropped(&self) -> u64 {
+        let now = match &self.advertised {
+            Advertised::Kept(publisher) => publisher.dropped(),
+            _ => 0,
+        };
+        self.dropped + now
+    }
+}
+
 impl Topic {
+    /// Messages that whoever listens was too slow for.
+    fn dropped(&self) -> u64 {
+        self.publisher.dropped() + self.latched.lock().dropped()
+    }
+
     /// A side has published; `heard`: it answers for the node.
     fn take(&self, side: Side, message: Bytes, latching: bool, heard: bool) {
         let mut latched = self.latched.lock();
@@ -78,13 +103,12 @@ impl Topic {
         match &mut latched.advertised {
             Advertised::Kept(publisher) => publisher.publish(message),
             Advertised::Asked(waiting) => {
-                if waiting.len() >= QUEUE {
-                    waiting.remove(0);
-                }
-                waiting.push(message);
+                latched.dropped += waiting.push(message);
             }
             Advertised::Not if latching => {
-                latched.advertised = Advertised::Asked(vec![message]);
+                let mut waiting = Ring::new(Bounds::messages(QUEUE));
+                latched.dropped += waiting.push(message);
+                latched.become_advertised(Advertised::Asked(waiting));
                 self.news.notify_one();
             }
             Advertised::Not => self.publisher.publish(message),
@@ -98,7 +122,7 @@ impl Topic {
             Some(message) => self.publish(&mut latched, message, true),
             // The cloud will be asked when somebody listens; until it has latched something, what was heard last stays.
             None if side == Side::Cloud && self.listeners.load(Ordering::Relaxed) == 0 => {
-                latched.advertised = Advertised::Not;
+                latched.become_advertised(Advertised::Not);
             }
             None => {}
         }
@@ -110,7 +134,7 @@ impl Topic {
         latched.last[Side::Cloud.index()] = None;
         let kept = local_speaks && latched.last[Side::Local.index()].is_some();
         if !kept {
-            latched.advertised = Advertised::Not;
+            latched.become_advertised(Advertised::Not);
         }
     }
 }
@@ -242,11 +266,10 @@ impl Outputs {
                     news: Notify::new(),
                     counting: Mutex::default(),
                 });
-                let counted = Arc::downgrade(&topic.publisher);
+                let counted = Arc::downgrade(&topic);
                 mirror.drops.ask(&output.topic, Cause::Slow, move || {
-                    let publisher = counted.upgrade();
-                    let count = publisher.as_ref().map_or(0, |it| it.dropped());
-                    (count, publisher.is_none())
+                    let topic = counted.upgrade();
+                    (topic.as_ref().map_or(0, |it| it.dropped()), topic.is_none())
                 });
                 self.topics
                     .lock()
@@ -341,7 +364,7 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     let Advertised::Asked(waiting) = &mut latched.advertised else {
         return;
     };
-    let waiting = std::mem::take(waiting);
+    let waiting: Vec<Bytes> = waiting.collect();
     // Without one they are heard all the same; the next latched message asks again.
     let publisher: &dyn Publisher = match &advertised {
         Some(publisher) => publisher.as_ref(),
@@ -350,8 +373,8 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     for message in waiting {
         publisher.publish(message);
     }
-    latched.advertised = match advertised {
+    latched.become_advertised(match advertised {
         Some(publisher) => Advertised::Kept(publisher),
         None => Advertised::Not,
-    };
+    });
 }

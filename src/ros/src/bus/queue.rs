@@ -1,6 +1,5 @@
 //! The queue of one subscription: bounded, newest wins, never blocks its sender.
 
-use std::collections::VecDeque;
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,17 +8,18 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::Message;
-
-/// However long a queue is, it holds no more bytes than this (but always one message).
-const MAX_BYTES: usize = 64 << 20;
+use crate::ring::{Bounds, Ring};
 
 /// Makes the two ends of a queue for at most `capacity` messages (0 counts as 1).
 ///
 /// Beyond that, or beyond 64 MiB, the oldest messages are dropped and counted.
 pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
     let shared = Arc::new(Shared {
-        ring: Mutex::new(Ring::default()),
-        capacity: capacity.max(1),
+        state: Mutex::new(State {
+            ring: Ring::new(Bounds::messages(capacity)),
+            sender_gone: false,
+            receiver_gone: false,
+        }),
         ready: Notify::new(),
         dropped: Arc::new(AtomicU64::new(0)),
     });
@@ -31,17 +31,14 @@ pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
     )
 }
 
-#[derive(Default)]
-struct Ring {
-    messages: VecDeque<Message>,
-    bytes: usize,
-    senders_gone: bool,
+struct State {
+    ring: Ring<Message>,
+    sender_gone: bool,
     receiver_gone: bool,
 }
 
 struct Shared {
-    ring: Mutex<Ring>,
-    capacity: usize,
+    state: Mutex<State>,
     ready: Notify,
     dropped: Arc<AtomicU64>,
 }
@@ -54,25 +51,13 @@ pub struct MessageSender {
 impl MessageSender {
     /// Queues a message, dropping the oldest ones if there is no room.
     pub fn send(&self, message: Message) {
-        let mut lost = 0;
-        {
-            let mut ring = self.shared.ring.lock();
-            if ring.receiver_gone {
+        let lost = {
+            let mut state = self.shared.state.lock();
+            if state.receiver_gone {
                 return;
             }
-            let size = message.bytes.len();
-            while ring.messages.len() >= self.shared.capacity
-                || (ring.bytes + size > MAX_BYTES && !ring.messages.is_empty())
-            {
-                let Some(oldest) = ring.messages.pop_front() else {
-                    break;
-                };
-                ring.bytes -= oldest.bytes.len();
-                lost += 1;
-            }
-            ring.bytes += size;
-            ring.messages.push_back(message);
-        }
+            state.ring.push(message)
+        };
         if lost > 0 {
             self.shared.dropped.fetch_add(lost, Ordering::Relaxed);
         }
@@ -81,13 +66,13 @@ impl MessageSender {
 
     /// Whether nobody will ever receive from this queue again.
     pub fn is_closed(&self) -> bool {
-        self.shared.ring.lock().receiver_gone
+        self.shared.state.lock().receiver_gone
     }
 }
 
 impl Drop for MessageSender {
     fn drop(&mut self) {
-        self.shared.ring.lock().senders_gone = true;
+        self.shared.state.lock().sender_gone = true;
         self.shared.ready.notify_one();
     }
 }
@@ -104,12 +89,11 @@ impl MessageReceiver {
             // A queue that never runs empty must not starve the task's neighbours.
             tokio::task::consume_budget().await;
             {
-                let mut ring = self.shared.ring.lock();
-                if let Some(message) = ring.messages.pop_front() {
-                    ring.bytes -= message.bytes.len();
+                let mut state = self.shared.state.lock();
+                if let Some(message) = state.ring.pop() {
                     return Some(message);
                 }
-                if ring.senders_gone {
+                if state.sender_gone {
                     return None;
                 }
             }
@@ -119,15 +103,12 @@ impl MessageReceiver {
 
     /// The next message if one is already there.
     pub fn try_recv(&mut self) -> Option<Message> {
-        let mut ring = self.shared.ring.lock();
-        let message = ring.messages.pop_front()?;
-        ring.bytes -= message.bytes.len();
-        Some(message)
+        self.shared.state.lock().ring.pop()
     }
 
     /// How many messages are waiting.
     pub fn len(&self) -> usize {
-        self.shared.ring.lock().messages.len()
+        self.shared.state.lock().ring.len()
     }
 
     /// Whether none is waiting.
@@ -143,10 +124,9 @@ impl MessageReceiver {
 
 impl Drop for MessageReceiver {
     fn drop(&mut self) {
-        let mut ring = self.shared.ring.lock();
-        ring.receiver_gone = true;
-        ring.messages.clear();
-        ring.bytes = 0;
+        let mut state = self.shared.state.lock();
+        state.receiver_gone = true;
+        state.ring.clear();
     }
 }
 
@@ -199,18 +179,6 @@ mod tests {
         assert_eq!(receiver.recv().await.unwrap().bytes[0], 3);
         assert_eq!(receiver.try_recv().unwrap().bytes[0], 4);
         assert!(receiver.try_recv().is_none());
-    }
-
-    #[tokio::test]
-    async fn bytes_are_bounded_but_one_message_always_fits() {
-        let (sender, mut receiver) = message_queue(1000);
-        let big = Bytes::from(vec![0; MAX_BYTES / 2 + 1]);
-        sender.send(message(big.clone()));
-        sender.send(message(big));
-        assert_eq!(receiver.len(), 1);
-        sender.send(message(Bytes::from(vec![0; MAX_BYTES + 1])));
-        assert_eq!(receiver.len(), 1);
-        assert_eq!(receiver.try_recv().unwrap().bytes.len(), MAX_BYTES + 1);
     }
 
     #[tokio::test]

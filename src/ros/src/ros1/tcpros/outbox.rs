@@ -1,6 +1,5 @@
 //! What waits to be sent to one subscriber: bounded, newest wins, several messages to one system call.
 
-use std::collections::VecDeque;
 use std::io::{self, IoSlice};
 
 use bytes::Bytes;
@@ -8,8 +7,8 @@ use parking_lot::Mutex;
 use tokio::io::{AsyncWrite, AsyncWriteExt as _};
 use tokio::sync::Notify;
 
-/// However long the queue is, it holds no more bytes than this (but always one message).
-const MAX_BYTES: usize = 64 << 20;
+use crate::ring::{Bounds, Ring};
+
 /// Messages and bytes taken from the queue for one round of writing.
 const BATCH: usize = 256;
 const BATCH_BYTES: usize = 1 << 20;
@@ -18,53 +17,39 @@ const BATCH_BYTES: usize = 1 << 20;
 #[derive(Debug)]
 pub struct Outbox {
     state: Mutex<State>,
-    capacity: usize,
     ready: Notify,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct State {
-    queue: VecDeque<Bytes>,
-    bytes: usize,
+    /// What a newcomer is given, however much: no newer message takes its place.
+    first: Vec<Bytes>,
+    ring: Ring<Bytes>,
     closed: bool,
 }
 
 impl Outbox {
-    /// A queue for at most `capacity` messages (0 counts as 1), which begins with `first`, however many.
+    /// A queue for at most `capacity` messages (0 counts as 1) and 64 MiB, after `first`, however many those are.
     pub fn new(capacity: usize, first: impl IntoIterator<Item = Bytes>) -> Self {
-        let queue: VecDeque<Bytes> = first.into_iter().collect();
-        let bytes = queue.iter().map(Bytes::len).sum();
         Self {
-            capacity: capacity.max(1).max(queue.len()),
             state: Mutex::new(State {
-                queue,
-                bytes,
+                first: first.into_iter().collect(),
+                ring: Ring::new(Bounds::messages(capacity)),
                 closed: false,
             }),
             ready: Notify::new(),
         }
     }
 
-    /// Queues a message; how many older ones had to go for it.
+    /// Queues a message; returns how many older ones were dropped for it.
     pub fn push(&self, message: Bytes) -> u64 {
-        let mut lost = 0;
-        {
+        let lost = {
             let mut state = self.state.lock();
             if state.closed {
                 return 0;
             }
-            while state.queue.len() >= self.capacity
-                || (state.bytes + message.len() > MAX_BYTES && !state.queue.is_empty())
-            {
-                let Some(oldest) = state.queue.pop_front() else {
-                    break;
-                };
-                state.bytes -= oldest.len();
-                lost += 1;
-            }
-            state.bytes += message.len();
-            state.queue.push_back(message);
-        }
+            state.ring.push(message)
+        };
         self.ready.notify_one();
         lost
     }
@@ -94,15 +79,15 @@ impl Outbox {
 
     fn take(&self, batch: &mut Vec<Bytes>) -> bool {
         let mut state = self.state.lock();
+        batch.append(&mut state.first);
         let mut bytes = 0;
         while batch.len() < BATCH && bytes < BATCH_BYTES {
-            let Some(message) = state.queue.pop_front() else {
+            let Some(message) = state.ring.pop() else {
                 break;
             };
             bytes += message.len();
             batch.push(message);
         }
-        state.bytes -= bytes;
         !batch.is_empty()
     }
 }
@@ -149,7 +134,7 @@ mod tests {
         let (mut ours, mut theirs) = tokio::io::duplex(1000);
         outbox.close();
         let reading = tokio::spawn(async move {
-            let mut frames = FrameReader::new(BytesMut::new(), MAX_BYTES * 2);
+            let mut frames = FrameReader::new(BytesMut::new(), 1 << 20);
             let mut messages = Vec::new();
             while let Some(message) = frames.next(&mut theirs).await.unwrap() {
                 messages.push(message);
@@ -177,15 +162,6 @@ mod tests {
             assert_eq!(outbox.push(one.clone()), 0);
         }
         assert_eq!(sent(&outbox).await, [all.clone(), all].concat());
-    }
-
-    #[tokio::test]
-    async fn bytes_are_bounded_but_one_message_always_fits() {
-        let outbox = Outbox::new(1000, []);
-        assert_eq!(outbox.push(message(1, MAX_BYTES / 2 + 1)), 0);
-        assert_eq!(outbox.push(message(2, MAX_BYTES / 2 + 1)), 1);
-        assert_eq!(outbox.push(message(3, MAX_BYTES + 1)), 1);
-        assert_eq!(outbox.state.lock().bytes, MAX_BYTES + 1);
     }
 
     #[tokio::test]
