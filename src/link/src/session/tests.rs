@@ -1,10 +1,12 @@
+use std::future::poll_fn;
 use std::sync::Arc;
 
 use tokio::io::duplex;
 use tokio::sync::mpsc;
-use ws::WebSocket;
+use ws::{Message, WebSocket};
 
 use super::*;
+use crate::frame::Frame;
 use crate::{MAX_FRAME, MAX_RECORD};
 
 struct To(mpsc::UnboundedSender<Record>);
@@ -158,25 +160,45 @@ async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
     assert!(robot.position().2 > 1 << 32, "the numbers have passed 2^32");
 }
 
+/// A peer whose clock is `ahead` nanoseconds ahead of this machine's: it answers three pings, and then stays connected
+/// without a word.
+async fn answers_ahead(socket: &mut WebSocket<tokio::io::DuplexStream>, ahead: i64) {
+    let mut pongs = 0;
+    while pongs < 3 {
+        let message = poll_fn(|cx| socket.poll_next(cx)).await.unwrap();
+        let Message::Binary(bytes) = message else {
+            panic!("{message:?}")
+        };
+        let arrived = now() + ahead;
+        let Frame::Ping { sent, received } = Frame::decode(bytes).unwrap() else {
+            continue;
+        };
+        let pong = Frame::Pong {
+            sent,
+            arrived,
+            left: now() + ahead,
+            received,
+        };
+        socket.queue(ws::frame::BINARY, pong.encode());
+        poll_fn(|cx| socket.poll_flush(cx)).await.unwrap();
+        pongs += 1;
+    }
+}
+
 #[tokio::test]
-async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
+async fn a_clock_an_hour_ahead_is_measured_and_a_silent_peer_is_noticed() {
+    const HOUR: i64 = 3600 * 1_000_000_000;
     let (robot, cloud) = (session(), session());
     let (sender, _records) = mpsc::unbounded_channel();
     open(&robot, &cloud);
     let (mut at_robot, mut at_cloud) = sockets();
     let mut up = robot.up();
-    let (to_robot, to_cloud) = (To(sender.clone()), To(sender));
-    let peer = {
-        let cloud = cloud.clone();
-        tokio::spawn(async move {
-            tokio::select! {
-                lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
-                () = async { loop { tokio::time::sleep(Duration::from_millis(10)).await; if cloud.clock().is_some() { break } } } => {}
-            }
-            // Still connected, but it says nothing more.
-            at_cloud
-        })
-    };
+    let to_robot = To(sender);
+    let peer = tokio::spawn(async move {
+        answers_ahead(&mut at_cloud, HOUR).await;
+        // Still connected, but it says nothing more.
+        at_cloud
+    });
     let running = robot.run(&mut at_robot, &to_robot);
     tokio::select! {
         lost = running => panic!("{lost}"),
@@ -184,16 +206,16 @@ async fn the_clock_is_measured_and_a_silent_peer_is_noticed() {
     }
     let sample = robot.clock().unwrap();
     assert!(
-        sample.offset.abs() <= sample.delay.max(1_000_000),
+        (sample.offset - HOUR).abs() <= sample.delay / 2 + 1,
         "{sample:?}"
     );
     drop(peer.await.unwrap());
 }
 
-/// A link that carries nothing any more and does not say so, with the robot's habits for this T_max: how long it takes
-/// until that is noticed, and until the connection is given up.
-async fn noticed(max: Duration) -> (Duration, Duration) {
-    let options = SessionOptions::for_silence(max, None);
+/// A link that carries nothing any more and does not say so: how long it takes until that is noticed, and until the
+/// connection is given up.
+async fn noticed(options: SessionOptions) -> (Duration, Duration) {
+    let max = options.silent;
     let (robot, cloud) = (Session::new(options), session());
     let (sender, _records) = mpsc::unbounded_channel();
     let (to_robot, to_cloud) = (To(sender.clone()), To(sender));
@@ -221,9 +243,15 @@ async fn noticed(max: Duration) -> (Duration, Duration) {
 async fn a_silent_link_is_noticed_within_t_max() {
     for milliseconds in [50, 100, 300, 500, 1000, 2000, 10_000] {
         let max = Duration::from_millis(milliseconds);
-        let (noticed, given_up) = noticed(max).await;
+        let options = SessionOptions::for_silence(max, None);
+        let (ping, lost) = (options.ping, options.lost);
+        let (noticed, given_up) = noticed(options).await;
         assert!(noticed <= max, "{noticed:?} for {max:?}");
-        assert!(given_up > max * 2 || given_up > Duration::from_secs(2));
+        // Silence is counted from the last word, which was a ping before the cut at most.
+        assert!(
+            given_up <= lost && given_up + ping >= lost,
+            "{given_up:?} for {max:?}: {ping:?}, {lost:?}"
+        );
     }
 }
 

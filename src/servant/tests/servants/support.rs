@@ -121,6 +121,22 @@ impl World {
         LocalEngine::new(self.config.clone()).expect("an engine")
     }
 
+    /// Whether this host has a cgroup controller.
+    pub fn has(&self, controller: &str) -> bool {
+        let controllers = self.engine.cgroups().controllers();
+        controllers.iter().any(|known| known == controller)
+    }
+
+    /// Fails where this host lacks a controller: there a test of limits could not fail for any other reason.
+    pub fn needs(&self, controllers: &[&str]) {
+        for controller in controllers {
+            assert!(
+                self.has(controller),
+                "this host has no cgroup controller {controller}: run these tests where it has, or leave out `limits::`"
+            );
+        }
+    }
+
     pub fn path(&self, name: &str) -> PathBuf {
         self.home.path().join(name)
     }
