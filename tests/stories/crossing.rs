@@ -470,25 +470,25 @@ pub fn explain_names_a_clock_and_a_queue() -> Told {
         let last = point(*sent.last().context("some")?);
         while with_log(site.next(&mut worked), &stub)?.bytes[4..] != last[4..] {}
     }
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let explained = daemon.deployer().asks(&["explain", robot])?;
+    let path = format!("/api/v1/robots/{robot}/explain");
+    let explained = daemon.awaits(&path, "a queue and a clock among the causes", |explained| {
         let causes = explained["causes"].to_string();
         let named = |words: &str| causes.contains(words);
-        if named("requests queue before /crossing: ") && named("the robot's clock is 3600") {
-            ensure!(named("ms ahead of the server's"), "{causes}");
-            let phases = &explained["servants"][0]["links"][0]["phases"];
-            let median = |name: &str| -> Option<f64> {
-                let all = phases.as_array()?.iter();
-                let mut parts = all.filter(|part| part["name"] == name);
-                parts.next()?["p50"].as_f64()
-            };
-            let (queue, compute) = (median("queue"), median("compute"));
-            ensure!(queue > compute && compute > Some(0.0), "{phases:#}");
-            return Ok(());
-        }
-        ensure!(Instant::now() < deadline, "{explained:#}\n{}", stub.said());
-    }
+        let both = named("requests queue before /crossing: ") && named("the robot's clock is 3600");
+        both.then(|| explained.clone())
+    });
+    let explained = with_log(explained, &stub)?;
+    let causes = explained["causes"].to_string();
+    ensure!(causes.contains("ms ahead of the server's"), "{causes}");
+    let phases = &explained["servants"][0]["links"][0]["phases"];
+    let median = |name: &str| -> Option<f64> {
+        let all = phases.as_array()?.iter();
+        let mut parts = all.filter(|part| part["name"] == name);
+        parts.next()?["p50"].as_f64()
+    };
+    let (queue, compute) = (median("queue"), median("compute"));
+    ensure!(queue > compute && compute > Some(0.0), "{phases:#}");
+    Ok(())
 }
 
 pub fn settings_are_changed_through_dynamic_reconfigure() -> Told {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
@@ -96,16 +96,7 @@ impl Scene {
 
     /// Waits until the stub has said this so many times.
     fn says(&self, words: &str, times: usize) -> Told {
-        let deadline = Instant::now() + PATIENCE;
-        while self.count(words) < times {
-            ensure!(
-                Instant::now() < deadline,
-                "it should say {words:?}:\n{}",
-                self.stub.said()
-            );
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        Ok(())
+        self.stub.says_times(words, times)
     }
 
     fn count(&self, words: &str) -> usize {
@@ -143,23 +134,20 @@ impl Scene {
 
     /// Waits until the last events of this robot about its local original are of these kinds.
     fn happened(&self, kinds: &[&str]) -> Told {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let events = self.daemon.deployer().asks(&["events", "-n", "10000"])?;
+        support::until(&format!("events that end with {kinds:?}"), || {
+            let events = self.daemon.api("/api/v1/events?limit=10000")?;
             let mine = events.as_array().context("a list")?.iter();
             let mine = mine.filter(|event| event["robot"] == *self.robot);
             let told: Vec<&str> = mine
                 .filter_map(|event| event["kind"].as_str())
                 .filter(|kind| kind.starts_with("local-") || kind.starts_with("cloud-"))
                 .collect();
-            if told.ends_with(kinds) {
-                return Ok(());
-            }
-            ensure!(
-                Instant::now() < deadline,
-                "events should end with {kinds:?}: {told:?}"
-            );
-        }
+            Ok(if told.ends_with(kinds) {
+                Ok(())
+            } else {
+                Err(format!("{told:?}"))
+            })
+        })
     }
 
     /// Waits until the robot's diagnostics say this.
@@ -180,18 +168,11 @@ impl Scene {
 
     /// Waits until `explain` has this of the link.
     fn explains_link(&self, key: &str, value: f64) -> Told {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let explained = self.explained()?;
-            let link = &explained["servants"][0]["links"][0];
-            if link[key] == value {
-                return Ok(());
-            }
-            ensure!(
-                Instant::now() < deadline,
-                "{key} should be {value}: {explained:#}"
-            );
-        }
+        let path = format!("/api/v1/robots/{}/explain", self.robot);
+        let what = format!("a link whose {key} is {value}");
+        self.daemon.awaits(&path, &what, |explained| {
+            (explained["servants"][0]["links"][0][key] == value).then_some(())
+        })
     }
 
     fn explained(&self) -> anyhow::Result<serde_json::Value> {
@@ -387,21 +368,13 @@ pub fn explain_says_why() -> Told {
         scene.hears(number)?;
     }
     // Where the time went has been told.
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let explained = scene.explained()?;
+    let path = format!("/api/v1/robots/{}/explain", scene.robot);
+    let link = scene.daemon.awaits(&path, "three requests", |explained| {
         let link = &explained["servants"][0]["links"][0];
         let phases = link["phases"].as_array().map_or(0, Vec::len);
-        if link["requests"] == 3 && phases == 6 {
-            ensure!(link["max"] == T_MAX * 1e3, "the SLA is known: {link:#}");
-            break;
-        }
-        ensure!(
-            Instant::now() < deadline,
-            "{explained:#}\n{}",
-            scene.stub.said()
-        );
-    }
+        (link["requests"] == 3 && phases == 6).then(|| link.clone())
+    })?;
+    ensure!(link["max"] == T_MAX * 1e3, "the SLA is known: {link:#}");
     let (_, metrics) = scene.daemon.request("GET", "/metrics", &[])?;
     for family in [
         "cloudroid_request_seconds",

@@ -202,16 +202,7 @@ impl Robot {
 
 /// Waits until the stub has said this so many times.
 fn says(stub: &Running, words: &str, times: usize) -> Told {
-    let deadline = Instant::now() + PATIENCE;
-    while stub.said().matches(words).count() < times {
-        ensure!(
-            Instant::now() < deadline,
-            "it should say {words:?}:\n{}",
-            stub.said()
-        );
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    Ok(())
+    stub.says_times(words, times)
 }
 
 /// Waits until a topic's message has these words.

@@ -6,13 +6,11 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
 
 use anyhow::ensure;
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
-use support::robot::PATIENCE;
 use support::world::{PEOPLE, world};
 use support::{Told, binaries, leftovers};
 
@@ -194,13 +192,14 @@ pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Told 
         .unwrap_or_default()
         .to_owned();
     robot.leaves()?;
-    let deadline = Instant::now() + PATIENCE;
-    while !daemon.servants_of("adder_py")?.is_empty() {
-        ensure!(
-            Instant::now() < deadline,
-            "the servant is still there after {PATIENCE:?}"
-        );
-    }
+    support::until("the servant's end", || {
+        let left = daemon.servants_of("adder_py")?;
+        Ok(if left.is_empty() {
+            Ok(())
+        } else {
+            Err(format!("{left:#?}"))
+        })
+    })?;
     ensure!(
         leftovers::cgroups(std::slice::from_ref(&id)).is_empty(),
         "{id} left a cgroup"

@@ -66,19 +66,11 @@ pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Told {
     let closed = robot.frame(PATIENCE)?;
     ensure!(closed == Message::Close(None), "{closed:?}");
     // Nobody can come back to its servant: it is not started to its end.
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let events = daemon.deployer().asks(&["events"])?;
-        let told = |event: &serde_json::Value| {
-            event["message"]
-                .as_str()
-                .is_some_and(|text| text.contains("its robot left before it was ready"))
-        };
-        if events.as_array().context("events")?.iter().any(told) {
-            break;
-        }
-        ensure!(Instant::now() < deadline, "{events:#}");
-    }
+    daemon.awaits_event("a servant's end before it was ready", |event| {
+        event["message"]
+            .as_str()
+            .is_some_and(|text| text.contains("its robot left before it was ready"))
+    })?;
 
     // Who stays may say what it wants in the meantime, and gets it in order.
     let mut robot = daemon.robot("slow_py?robot=eager")?;

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::time::Instant;
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::{Signal, kill};
@@ -10,7 +9,6 @@ use nix::unistd::Pid;
 use serde_json::{Value, json};
 use support::Told;
 use support::daemon::Daemon;
-use support::robot::PATIENCE;
 use support::world::world;
 
 pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Told {
@@ -71,18 +69,14 @@ pub fn a_killed_daemons_spares_end_without_a_word() -> Told {
 
 /// Waits for a spare besides those known; its id.
 fn spare(daemon: &Daemon, known: &BTreeSet<String>) -> anyhow::Result<String> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let there = daemon.deployer().asks(&["status"])?["spares"] == 1;
+    support::until("a spare", || {
+        let there = daemon.api("/api/v1/status")?["spares"] == 1;
         let new: Vec<String> = directories(daemon)?.difference(known).cloned().collect();
-        if let (true, [only]) = (there, new.as_slice()) {
-            return Ok(only.clone());
-        }
-        ensure!(
-            Instant::now() < deadline,
-            "no spare within {PATIENCE:?}: {new:?}"
-        );
-    }
+        Ok(match new.as_slice() {
+            [only] if there => Ok(only.clone()),
+            _ => Err(format!("{new:?}")),
+        })
+    })
 }
 
 fn directories(daemon: &Daemon) -> anyhow::Result<BTreeSet<String>> {

@@ -180,9 +180,14 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Told {
             .map(|line| Ok(line.rsplit(' ').next().context("a value")?.parse::<u64>()?))
             .sum()
     };
-    while answered()? < 3 {
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
+    support::until("three answers in the queue", || {
+        let count = answered()?;
+        Ok(if count < 3 {
+            Err(count.to_string())
+        } else {
+            Ok(())
+        })
+    })?;
     let mut ahead = 0;
     loop {
         match slow.frame(PATIENCE)? {

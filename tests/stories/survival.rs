@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Instant, SystemTime};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
@@ -37,22 +37,12 @@ fn nothing_is_left(daemon: Daemon) -> Told {
 
 /// Waits for an event of this kind whose message has all of these words.
 pub(crate) fn event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<Value> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let events = daemon.deployer().asks(&["events"])?;
-        let matches = |event: &&Value| {
-            event["kind"] == kind
-                && event["message"]
-                    .as_str()
-                    .is_some_and(|text| words.iter().all(|word| text.contains(word)))
-        };
-        if let Some(found) = events.as_array().context("events")?.iter().find(matches) {
-            return Ok(found.clone());
-        }
-        if Instant::now() > deadline {
-            bail!("there was no event {kind} with {words:?}: {events:#}");
-        }
-    }
+    daemon.awaits_event(&format!("an event {kind} with {words:?}"), |event| {
+        event["kind"] == kind
+            && event["message"]
+                .as_str()
+                .is_some_and(|text| words.iter().all(|word| text.contains(word)))
+    })
 }
 
 fn greet(robot: &mut Robot, name: &str) -> anyhow::Result<Value> {
@@ -226,10 +216,14 @@ pub fn a_killed_init_and_a_killed_shim_are_told() -> Told {
             "servant-failed",
             &[servant["id"].as_str().context("an id")?, words],
         )?;
-        let deadline = Instant::now() + PATIENCE;
-        while Path::new(&format!("/proc/{node}")).exists() {
-            ensure!(Instant::now() < deadline, "the node outlived its {which}");
-        }
+        support::until(&format!("the end of a node after its {which}'s"), || {
+            let runs = Path::new(&format!("/proc/{node}")).exists();
+            Ok(if runs {
+                Err("it runs".to_owned())
+            } else {
+                Ok(())
+            })
+        })?;
         // The robot comes again, and is given another.
         let mut robot = daemon.robot(&path)?;
         ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["values"]["count"] == 0);
@@ -279,20 +273,18 @@ pub fn nodes_end_as_ros_users_know_it() -> Told {
 
 /// Waits until phoenix is told to have come again for the `time`th time, and why.
 fn respawned(daemon: &Daemon, time: usize, how: &str) -> Told {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
+    let event = support::until(&format!("a {time}th event"), || {
         let told = respawns(daemon)?;
-        if let Some(event) = told.get(time - 1) {
-            let words = format!("/phoenix {how} and is started again after 1 s");
-            ensure!(event["message"].to_string().contains(&words), "{event:#}");
-            return Ok(());
-        }
-        ensure!(Instant::now() < deadline, "no {time}th event: {told:#?}");
-    }
+        let event = told.get(time - 1).cloned();
+        Ok(event.ok_or_else(|| format!("{told:#?}")))
+    })?;
+    let words = format!("/phoenix {how} and is started again after 1 s");
+    ensure!(event["message"].to_string().contains(&words), "{event:#}");
+    Ok(())
 }
 
 fn respawns(daemon: &Daemon) -> anyhow::Result<Vec<Value>> {
-    let events = daemon.deployer().asks(&["events"])?;
+    let events = daemon.api("/api/v1/events")?;
     let events = events.as_array().context("events")?.iter();
     let of = |event: &&Value| event["kind"] == "node-respawned";
     Ok(events.filter(of).cloned().collect())

@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -254,8 +255,47 @@ impl Daemon {
         path: &str,
         headers: &[(&str, &str)],
     ) -> anyhow::Result<(u16, String)> {
-        let mut stream = TcpStream::connect(&self.address)?;
+        let stream = TcpStream::connect(&self.address)?;
         stream.set_read_timeout(Some(PATIENCE))?;
+        self.exchange(stream, method, path, headers)
+    }
+
+    /// What the API answers to `GET PATH` over the daemon's own socket, where the caller is its operator.
+    pub fn api(&self, path: &str) -> anyhow::Result<Value> {
+        let stream = UnixStream::connect(self.home.join("run/daemon.sock"))?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        let (status, body) = self.exchange(stream, "GET", path, &[])?;
+        ensure!(status == 200, "GET {path}: {status} {body}");
+        Ok(serde_json::from_str(&body)?)
+    }
+
+    /// Waits until there is something in what the API answers.
+    pub fn awaits<T>(
+        &self,
+        path: &str,
+        what: &str,
+        mut find: impl FnMut(&Value) -> Option<T>,
+    ) -> anyhow::Result<T> {
+        crate::until(what, || {
+            let answer = self.api(path)?;
+            Ok(find(&answer).ok_or_else(|| format!("{answer:#}")))
+        })
+    }
+
+    /// Waits for an event among the last 10000.
+    pub fn awaits_event(&self, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+        self.awaits("/api/v1/events?limit=10000", what, |events| {
+            events.as_array()?.iter().find(|event| is(event)).cloned()
+        })
+    }
+
+    fn exchange(
+        &self,
+        mut stream: impl Read + Write,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+    ) -> anyhow::Result<(u16, String)> {
         let mut text = format!("{method} {path} HTTP/1.1\r\n");
         for (usual, value) in [("Connection", "close"), ("Host", &self.address)] {
             let given = |(name, _): &(&str, &str)| name.eq_ignore_ascii_case(usual);
@@ -286,7 +326,7 @@ impl Daemon {
 
     /// The servants of a service, as the API tells.
     pub fn servants_of(&self, service: &str) -> anyhow::Result<Vec<Value>> {
-        let all = self.deployer().asks(&["servants"])?;
+        let all = self.api("/api/v1/servants")?;
         let list = all.as_array().context("servants is a list")?;
         Ok(list
             .iter()

@@ -20,5 +20,33 @@ pub mod site;
 pub mod tls;
 pub mod world;
 
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+
+/// Between two looks at what no event tells of.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
 /// What a story ends with: an error is told with all its causes.
 pub type Told = anyhow::Result<()>;
+
+/// Looks again and again, with a pause, until there is a value. What is found instead becomes the story's failure after
+/// [`robot::PATIENCE`].
+///
+/// # Errors
+/// When looking fails, and when time is up.
+pub fn until<T>(
+    what: &str,
+    mut look: impl FnMut() -> anyhow::Result<Result<T, String>>,
+) -> anyhow::Result<T> {
+    let deadline = Instant::now() + robot::PATIENCE;
+    loop {
+        match look()? {
+            Ok(found) => return Ok(found),
+            Err(instead) if Instant::now() > deadline => {
+                bail!("{what} did not come about; instead: {instead}")
+            }
+            Err(_) => std::thread::sleep(LOOK_EVERY),
+        }
+    }
+}

@@ -6,7 +6,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
@@ -411,16 +410,16 @@ impl Running {
 
     /// Waits until it has printed these words.
     pub fn says(&self, words: &str) -> anyhow::Result<()> {
-        let deadline = Instant::now() + PATIENCE;
-        while !self.said().contains(words) {
-            ensure!(
-                Instant::now() < deadline,
-                "it should have said {words:?}, and said:\n{}",
-                self.said()
-            );
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        Ok(())
+        self.says_times(words, 1)
+    }
+
+    /// Waits until it has printed these words so many times.
+    pub fn says_times(&self, words: &str, times: usize) -> anyhow::Result<()> {
+        crate::until(&format!("{words:?}, {times} times"), || {
+            let said = self.said();
+            let enough = said.matches(words).count() >= times;
+            Ok(if enough { Ok(()) } else { Err(said) })
+        })
     }
 
     /// Sends it a signal.
@@ -433,18 +432,10 @@ impl Running {
 
     /// Waits for its end.
     pub fn ends(&mut self) -> anyhow::Result<ExitStatus> {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            if let Some(status) = self.child.try_wait()? {
-                return Ok(status);
-            }
-            ensure!(
-                Instant::now() < deadline,
-                "it should have ended:\n{}",
-                self.said()
-            );
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        crate::until("its end", || {
+            let ended = self.child.try_wait()?;
+            Ok(ended.ok_or_else(|| self.said()))
+        })
     }
 }
 
