@@ -2,7 +2,6 @@
 //! that another daemon's store imports it instead of making it again.
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -132,11 +131,5 @@ impl Layers {
 
 /// Writes a file that appears whole or not at all.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let directory = path.parent().unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(directory).at("making a file in", directory)?;
-    file.write_all(bytes).at("writing", path)?;
-    file.as_file().sync_data().at("writing", path)?;
-    file.persist(path)
-        .map(drop)
-        .map_err(|error| Error::io("writing", path, error.error))
+    Ok(image::write_whole(path, bytes)?)
 }

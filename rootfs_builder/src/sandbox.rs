@@ -229,15 +229,9 @@ async fn to_its_end(
 /// What a container of a build gets where nothing else was configured: half of the machine's memory, and cores when
 /// servants leave some.
 pub(crate) fn default_limits() -> Limits {
-    let memory = fs::read_to_string("/proc/meminfo").ok().and_then(|text| {
-        let line = text
-            .lines()
-            .find_map(|line| line.strip_prefix("MemTotal:"))?;
-        line.trim().split(' ').next()?.parse::<u64>().ok()
-    });
     Limits {
         cpu_weight: Some(20),
-        memory: memory.map(|kib| kib * 1024 / 2),
+        memory: servant::host::memory().map(|bytes| bytes / 2),
         pids: Some(4096),
         ..Limits::default()
     }

@@ -90,13 +90,8 @@ impl Outcome {
 
     /// Of those that were answered, seconds.
     pub fn median(&self) -> f64 {
-        let mut times: Vec<f64> = self
-            .answers
-            .iter()
-            .filter_map(|answer| answer.after)
-            .collect();
-        times.sort_by(f64::total_cmp);
-        times.get(times.len() / 2).copied().unwrap_or(f64::NAN)
+        let times = self.answers.iter().filter_map(|answer| answer.after);
+        bench_report::quantile(&times.collect::<Vec<f64>>(), 0.5).unwrap_or(f64::NAN)
     }
 }
 

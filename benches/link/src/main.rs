@@ -43,10 +43,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// The middle one.
-fn median(times: &mut [std::time::Duration]) -> f64 {
-    times.sort_unstable();
-    times
-        .get(times.len() / 2)
-        .map_or(f64::NAN, std::time::Duration::as_secs_f64)
+/// In seconds.
+fn median(times: &[std::time::Duration]) -> f64 {
+    bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64())
 }

@@ -136,8 +136,8 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
     }
     let [native_way, linked_way] = &mut ways;
     let (alone, linked) = (
-        crate::median(&mut native_way.times) * 1e3,
-        crate::median(&mut linked_way.times) * 1e3,
+        crate::median(&native_way.times) * 1e3,
+        crate::median(&linked_way.times) * 1e3,
     );
     report
         .figure("people_detect, picture in, found out: median", "ms", linked)

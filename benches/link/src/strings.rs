@@ -13,7 +13,7 @@ use support::site::{Site, string};
 const TRIPS: usize = 1000;
 
 fn counted(times: &mut [Duration]) -> f64 {
-    crate::median(&mut times[TRIPS / 10..]) * 1e6
+    crate::median(&times[TRIPS / 10..]) * 1e6
 }
 
 /// The best median of each one's turns.

@@ -99,6 +99,9 @@ fn under_load(course: &Course<'_>, credit: &Credit, time: Duration) -> Result<[f
         std::thread::sleep(Duration::from_millis(3));
     }
     course.close(open)?;
-    times.sort_unstable();
-    Ok([50, 99].map(|part| times[times.len() * part / 100].as_secs_f64() * 1e6))
+    let part = |fraction| bench_report::quantile(&times, fraction);
+    Ok(
+        [0.5, 0.99]
+            .map(|fraction| part(fraction).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)),
+    )
 }

@@ -26,7 +26,7 @@ mod race;
 mod table;
 
 pub use machine::Machine;
-pub use race::{Race, Times, children_time, thread_time};
+pub use race::{Race, Times, children_time, quantile, thread_time};
 
 use serde::Serialize;
 use std::io;

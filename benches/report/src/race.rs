@@ -12,6 +12,20 @@ pub struct Times {
     pub sorted: Vec<Duration>,
 }
 
+/// The value that a fraction `0.0..=1.0` of `values` stays below; none of none.
+pub fn quantile<T: Copy + PartialOrd>(values: &[T], fraction: f64) -> Option<T> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(|one, other| one.partial_cmp(other).unwrap_or(std::cmp::Ordering::Equal));
+    of_sorted(&sorted, fraction)
+}
+
+fn of_sorted<T: Copy>(sorted: &[T], fraction: f64) -> Option<T> {
+    let last = sorted.len().checked_sub(1)?;
+    sorted
+        .get((fraction * last as f64).round() as usize)
+        .copied()
+}
+
 impl Times {
     /// The shortest: what the code takes when nothing disturbs it.
     pub fn best(&self) -> Duration {
@@ -25,11 +39,7 @@ impl Times {
 
     /// The time that a fraction `0.0..=1.0` of the runs stays below.
     pub fn quantile(&self, fraction: f64) -> Duration {
-        let last = self.sorted.len().saturating_sub(1);
-        self.sorted
-            .get((fraction * last as f64).round() as usize)
-            .copied()
-            .unwrap_or_default()
+        of_sorted(&self.sorted, fraction).unwrap_or_default()
     }
 
     /// [`Times::best`] in microseconds.

@@ -2,7 +2,6 @@
 //! `/api/v1/doctor`. Nothing is changed by looking.
 
 mod cgroups;
-mod idmap;
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -220,7 +219,7 @@ fn idmapped_mounts(home: &Path) -> Check {
     if !nix::unistd::geteuid().is_root() {
         return warning(NAME, "can only be tested as root", "sudo cloudroidd doctor");
     }
-    match idmap::try_on(existing) {
+    match servant::idmap::try_on(existing) {
         Ok(()) => ok(
             NAME,
             format!("work on the file system of {}", existing.display()),

@@ -59,10 +59,5 @@ fn tell(state: &[NotifyState<'_>]) {
 
 /// Nine tenths of the machine's memory.
 pub fn machine_memory() -> u64 {
-    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
-    let kilobytes = text
-        .lines()
-        .find_map(|line| line.strip_prefix("MemTotal:"))
-        .and_then(|rest| rest.trim().trim_end_matches(" kB").parse::<u64>().ok());
-    kilobytes.map_or(1 << 30, |kilobytes| kilobytes * 1024 / 10 * 9)
+    servant::host::memory().map_or(1 << 30, |bytes| bytes / 10 * 9)
 }

@@ -176,8 +176,11 @@ pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
         .map_err(|error| Error::file("flush", directory, error))
 }
 
-/// Writes a small file whole.
-pub(crate) fn write_whole(target: &Path, bytes: &[u8]) -> Result<(), Error> {
+/// Writes a small file of mode 0600 that appears whole or not at all, and survives a power cut: content and name are flushed.
+///
+/// # Errors
+/// When the file cannot be written, with the bytes needed and free where the disk is full.
+pub fn write_whole(target: &Path, bytes: &[u8]) -> Result<(), Error> {
     let new = NewFile::create(directory_of(target))?;
     (&new)
         .write_all(bytes)

@@ -40,6 +40,7 @@ mod unpack;
 
 pub use digest::Digest;
 pub use error::Error;
+pub use files::write_whole;
 pub use gc::{Damage, Swept};
 pub use images::{Image, ImageSpec, Manifest};
 pub use layer::{LayerInfo, Mtime, TreeOptions};

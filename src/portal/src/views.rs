@@ -177,15 +177,9 @@ async fn used(servants: &[Arc<Handle>]) -> api::Usage {
 
 /// How much the whole machine waits; none where its kernel does not tell (PSI).
 fn machine_pressure() -> Option<api::Pressure> {
-    let some = |name: &str| {
-        let text = std::fs::read_to_string(format!("/proc/pressure/{name}")).ok()?;
-        let line = text.lines().find_map(|line| line.strip_prefix("some "))?;
-        line.split(' ')
-            .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
-    };
-    Some(api::Pressure {
-        cpu: some("cpu")?,
-        memory: some("memory")?,
-        io: some("io")?,
+    servant::host::pressure().map(|some| api::Pressure {
+        cpu: some.cpu,
+        memory: some.memory,
+        io: some.io,
     })
 }

@@ -15,6 +15,8 @@ pub mod cgroup;
 pub mod endpoint;
 pub mod engine;
 mod error;
+pub mod host;
+pub mod idmap;
 pub mod launch;
 pub mod local;
 pub mod logs;

@@ -1,4 +1,5 @@
-//! What nodes print: `log.jsonl` in the servant's directory, one JSON object a line, rotated once to `log.jsonl.1`.
+//! What nodes print: `log.jsonl` in the servant's directory, one JSON object a line ([`LogLine`] with its number), rotated
+//! once to `log.jsonl.1`.
 //!
 //! The shim writes ([`Writer`]), whoever wants reads ([`follow`]): neither waits for the other. Lines are numbered, so that
 //! a reader who was too slow for the rotation is told how many it missed instead of missing them silently.
@@ -8,7 +9,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use serde::{Deserialize, Serialize};
+use crate::engine::LogLine;
 
 mod follow;
 
@@ -22,16 +23,6 @@ pub const LONGEST_LINE: usize = 16 * 1024;
 
 /// Bytes after which the file is rotated.
 pub const ROTATE_AT: u64 = 16 << 20;
-
-/// A line as it stands in the file: a [`LogLine`](crate::engine::LogLine) with its number.
-#[derive(Serialize, Deserialize)]
-struct Record<'a> {
-    number: u64,
-    time: SystemTime,
-    node: std::borrow::Cow<'a, str>,
-    stream: std::borrow::Cow<'a, str>,
-    line: std::borrow::Cow<'a, str>,
-}
 
 /// Appends lines.
 #[derive(Debug)]
@@ -61,8 +52,8 @@ impl Writer {
     /// Appends one line. A full disk must not end a servant: what cannot be written is dropped, counted by the gap in
     /// the numbers, and said once on standard error.
     pub fn append(&mut self, node: &str, stream: &str, line: &str) {
-        let record = Record {
-            number: self.number,
+        let record = LogLine {
+            number: Some(self.number),
             time: SystemTime::now(),
             node: node.into(),
             stream: stream.into(),
@@ -82,7 +73,7 @@ impl Writer {
         }
     }
 
-    fn write(&mut self, record: &Record<'_>) -> io::Result<()> {
+    fn write(&mut self, record: &LogLine) -> io::Result<()> {
         let mut text = serde_json::to_vec(record)?;
         text.push(b'\n');
         if self.written > 0 && self.written + text.len() as u64 > self.rotate_at {

@@ -3,8 +3,6 @@
 use std::fs;
 use std::path::Path;
 
-use crate::engine::Pressure;
-
 /// The number that a file holds; none for `max` or when it cannot be read.
 pub(super) fn read_number(file: &Path) -> Option<u64> {
     fs::read_to_string(file).ok()?.trim().parse().ok()
@@ -30,25 +28,6 @@ pub(super) fn read_of_device(file: &Path, device: &str, key: &str) -> Option<u64
         .find_map(|line| line.strip_prefix(device)?.strip_prefix(' '))?;
     line.split(' ')
         .find_map(|pair| pair.strip_prefix(key)?.strip_prefix('=')?.parse().ok())
-}
-
-/// Pressure in a directory of a v2 hierarchy, where it is there without any controller; none where the kernel was built or
-/// booted without.
-pub(super) fn read_pressures(directory: &Path) -> Option<Pressure> {
-    let of = |name| read_pressure(&directory.join(name));
-    Some(Pressure {
-        cpu: of("cpu.pressure")?,
-        memory: of("memory.pressure").unwrap_or(0.0),
-        io: of("io.pressure").unwrap_or(0.0),
-    })
-}
-
-/// `some avg10` of a pressure file, in percent.
-fn read_pressure(file: &Path) -> Option<f64> {
-    let text = fs::read_to_string(file).ok()?;
-    let some = text.lines().find_map(|line| line.strip_prefix("some "))?;
-    some.split(' ')
-        .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
 }
 
 /// The processes of a cgroup directory. Those of another pid namespace read as 0, which `kill` takes for our own process

@@ -4,9 +4,10 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use super::files::{read_field, read_number, read_pressures};
+use super::files::{read_field, read_number};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
+use crate::host::pressure_of_cgroup;
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
@@ -120,7 +121,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         cpu_usec: cpu.or_else(beside).unwrap_or(0),
         throttled_usec: throttled.unwrap_or(0) / 1000,
         memory: memory.unwrap_or(0),
-        pressure: unified.and_then(|leaf| read_pressures(&leaf.directory)),
+        pressure: unified.and_then(|leaf| pressure_of_cgroup(&leaf.directory)),
         ..Usage::default()
     }
 }

@@ -2,9 +2,10 @@
 
 use std::fs;
 
-use super::files::{read_field, read_number, read_of_device, read_pressures};
+use super::files::{read_field, read_number, read_of_device};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
+use crate::host::pressure_of_cgroup;
 use crate::spec::Limits;
 
 /// Microseconds; the kernel's default.
@@ -92,7 +93,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         pressure: cgroup
             .leaves
             .first()
-            .and_then(|leaf| read_pressures(&leaf.directory)),
+            .and_then(|leaf| pressure_of_cgroup(&leaf.directory)),
         ..Usage::default()
     }
 }

@@ -16,7 +16,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::mpsc::error::TryRecvError;
 use tokio::sync::{mpsc, watch};
 
-use super::{Record, rotated};
+use super::rotated;
 use crate::engine::LogLine;
 
 /// Lines that may wait for the receiver.
@@ -225,25 +225,22 @@ impl Cutter {
             let mut lines = Vec::new();
             for text in whole.split(|byte| *byte == b'\n') {
                 // A line that is not ours was written by hand; it is passed over.
-                let Ok(record) = serde_json::from_slice::<Record<'_>>(text) else {
+                let Ok(line) = serde_json::from_slice::<LogLine>(text) else {
+                    continue;
+                };
+                let Some(number) = line.number else {
                     continue;
                 };
                 let missed = self
                     .expected
-                    .map_or(0, |expected| record.number.saturating_sub(expected));
-                self.expected = Some(record.number + 1);
+                    .map_or(0, |expected| number.saturating_sub(expected));
+                self.expected = Some(number + 1);
                 if missed > 0 {
                     lines.push(note(format!(
                         "{missed} lines were lost here: the log was rotated before they were read"
                     )));
                 }
-                lines.push(LogLine {
-                    number: Some(record.number),
-                    time: record.time,
-                    node: record.node.into_owned(),
-                    stream: record.stream.into_owned(),
-                    line: record.line.into_owned(),
-                });
+                lines.push(line);
             }
             if !lines.is_empty() {
                 return Ok(lines);

@@ -12,7 +12,7 @@ use nix::unistd::ForkResult;
 
 use super::make_directory;
 use crate::spec::Mount;
-use crate::{Error, sys};
+use crate::{Error, idmap, sys};
 
 /// A directory that every host has and every user can reach, and that must be covered anyway.
 const STAGE: &str = "/sys/fs/cgroup";
@@ -141,7 +141,7 @@ fn filesystem_of(path: &Path) -> String {
 }
 
 /// A user namespace whose root is the first uid of the range. The kernel gives its map to mounts; nobody lives in it.
-pub(super) fn user_namespace((first, count): (u32, u32)) -> Result<OwnedFd, Error> {
+pub(super) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
     let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
     let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
     // SAFETY: the calling process has one thread (see Rootfs::mount); the child makes system calls only.
@@ -159,7 +159,7 @@ pub(super) fn user_namespace((first, count): (u32, u32)) -> Result<OwnedFd, Erro
             let mut done = [0];
             let read = nix::unistd::read(&unshared, &mut done);
             let opened = if read == Ok(1) && done == [1] {
-                map_ids(child.as_raw(), first, count)
+                idmap::map(child.as_raw(), range)
             } else {
                 Err(Error::call("unshare of a user namespace")(io::Error::from(
                     io::ErrorKind::PermissionDenied,
@@ -170,17 +170,6 @@ pub(super) fn user_namespace((first, count): (u32, u32)) -> Result<OwnedFd, Erro
             opened
         }
     }
-}
-
-fn map_ids(pid: i32, first: u32, count: u32) -> Result<OwnedFd, Error> {
-    for file in ["uid_map", "gid_map"] {
-        let path = format!("/proc/{pid}/{file}");
-        fs::write(&path, format!("0 {first} {count}\n")).map_err(Error::file("write", &path))?;
-    }
-    let path = format!("/proc/{pid}/ns/user");
-    Ok(fs::File::open(&path)
-        .map_err(Error::file("open", &path))?
-        .into())
 }
 
 #[cfg(test)]

@@ -1,0 +1,64 @@
+//! What the host has, and how much it waits: `/proc/meminfo` and pressure stall information (PSI).
+
+use std::fs;
+use std::path::Path;
+
+use crate::engine::Pressure;
+
+/// Bytes of memory that the host has; none where `/proc/meminfo` cannot be read.
+pub fn memory() -> Option<u64> {
+    memory_of(&fs::read_to_string("/proc/meminfo").ok()?)
+}
+
+fn memory_of(meminfo: &str) -> Option<u64> {
+    let line = meminfo
+        .lines()
+        .find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim_end().parse().ok()?;
+    Some(kib * 1024)
+}
+
+/// How much the whole host waits; none where its kernel does not tell.
+pub fn pressure() -> Option<Pressure> {
+    pressure_in(Path::new("/proc/pressure"), "")
+}
+
+/// Pressure in a directory of a v2 cgroup hierarchy, where it is there without any controller; none where the kernel was
+/// built or booted without.
+pub(crate) fn pressure_of_cgroup(directory: &Path) -> Option<Pressure> {
+    pressure_in(directory, ".pressure")
+}
+
+fn pressure_in(directory: &Path, suffix: &str) -> Option<Pressure> {
+    let of = |name: &str| {
+        let text = fs::read_to_string(directory.join(format!("{name}{suffix}"))).ok()?;
+        some_avg10(&text)
+    };
+    Some(Pressure {
+        cpu: of("cpu")?,
+        memory: of("memory").unwrap_or(0.0),
+        io: of("io").unwrap_or(0.0),
+    })
+}
+
+/// `some avg10` of a pressure file, in percent.
+fn some_avg10(text: &str) -> Option<f64> {
+    let some = text.lines().find_map(|line| line.strip_prefix("some "))?;
+    some.split(' ')
+        .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernels_texts_are_read() {
+        let meminfo = "MemTotal:       16316412 kB\nMemFree:         1204 kB\n";
+        assert_eq!(memory_of(meminfo), Some(16_316_412 * 1024));
+        assert_eq!(memory_of("MemFree: 1204 kB\n"), None);
+        let pressure = "some avg10=1.53 avg60=0.87 avg300=0.20 total=1\nfull avg10=0.00 avg60=0.00 avg300=0.00 total=0\n";
+        assert_eq!(some_avg10(pressure), Some(1.53));
+        assert_eq!(some_avg10(""), None);
+    }
+}
