@@ -21,7 +21,7 @@ pub enum Level {
 pub struct Event {
     /// Grows with every event.
     pub id: i64,
-    /// When.
+    /// When it happened.
     pub time: Millis,
     /// How much it matters.
     pub level: Level,

@@ -12,7 +12,7 @@ pub struct Explanation {
     pub robot: String,
     /// What follows, the weightiest first; empty when nothing is wrong.
     pub causes: Vec<Cause>,
-    /// Its servants.
+    /// Servants that the robot has.
     pub servants: Vec<Served>,
     /// What happened to it last, oldest first.
     pub events: Vec<Event>,

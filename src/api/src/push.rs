@@ -87,7 +87,7 @@ pub enum PushEvent {
     },
     /// Something to know that is no failure.
     Warning {
-        /// What.
+        /// Text of the warning.
         message: String,
     },
     /// Published.

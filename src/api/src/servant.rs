@@ -96,7 +96,7 @@ pub struct Stopped {
 /// One line that a node printed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogLine {
-    /// When.
+    /// When the line was printed.
     pub time: Millis,
     /// Which node.
     pub node: String,

@@ -36,7 +36,7 @@ pub struct Fed {
 /// An output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Heard {
-    /// Its topic.
+    /// Topic on which the answer came.
     pub topic: String,
     /// `package/Type`.
     #[serde(rename = "type")]

@@ -42,7 +42,7 @@ pub struct Node {
 #[derive(Debug, Args)]
 pub struct Run {
     #[command(flatten)]
-    /// Which.
+    /// The node to stand in for.
     pub node: Node,
     /// As roslaunch or rosrun gave it: arguments, remaps, __name:=, __log:=.
     #[arg(last = true, allow_hyphen_values = true)]
@@ -53,7 +53,7 @@ pub struct Run {
 #[derive(Debug, Args)]
 pub struct ExecOriginal {
     #[command(flatten)]
-    /// Which.
+    /// The node whose original is executed.
     pub node: Node,
     /// Passed on as it is.
     #[arg(last = true, allow_hyphen_values = true)]

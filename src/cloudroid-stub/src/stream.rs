@@ -16,7 +16,7 @@ use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
 
 use crate::address::Address;
 
-/// Either.
+/// A TCP connection, with or without TLS.
 pub enum Stream {
     /// As it is.
     Plain(TcpStream),

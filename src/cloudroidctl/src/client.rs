@@ -32,7 +32,7 @@ pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
 pub enum Server {
     /// `HOST:PORT`.
     Tcp(String),
-    /// Its socket.
+    /// Unix socket of the daemon on this machine.
     Unix(PathBuf),
 }
 

@@ -82,7 +82,7 @@ impl Table {
         self.rows.len() <= 1
     }
 
-    /// Prints it.
+    /// Prints the table, its columns aligned.
     pub fn print(&self) -> anyhow::Result<()> {
         for text in self.lines() {
             line(&text)?;

@@ -10,7 +10,7 @@ use crate::output::{self, Format};
 /// Change limits of a servant while it works. Those that are not named stay; what it is promised changes too.
 #[derive(Debug, clap::Args)]
 pub struct Set {
-    /// Its id.
+    /// Id of the servant.
     servant: String,
     #[command(flatten)]
     limits: LimitFlags,

@@ -61,7 +61,7 @@ pub enum Reason {
 pub struct Choice {
     /// The codec in use.
     pub codec: Codec,
-    /// Why.
+    /// Why this codec is in use.
     pub reason: Reason,
     /// How often it was changed.
     pub switches: u64,

@@ -10,7 +10,7 @@ use crate::{Digest, Refusal};
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The disk (or the quota) is full. Nothing half-made remains.
-    #[error("no room to write {}: {}; free some space there or use a home directory on a larger disk", .path.display(), Room { needed: *.needed, free: *.free })]
+    #[error("no room to write {}: {}; free some space there or use a home directory on a larger disk", .path.display(), FreeSpace { needed: *.needed, free: *.free })]
     NoRoom {
         /// The file or tree that was being written.
         path: PathBuf,
@@ -26,7 +26,7 @@ pub enum Error {
         action: &'static str,
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the system call.
         source: io::Error,
     },
     /// A directory that is no store, or one of a later version.
@@ -42,7 +42,7 @@ pub enum Error {
     Json {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the JSON parser.
         source: serde_json::Error,
     },
     /// Not the text of a digest.
@@ -90,7 +90,7 @@ pub enum Error {
     Tree {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// In which way it is invalid.
         problem: String,
     },
     /// An archive that is not accepted; nothing of it remains.
@@ -105,12 +105,12 @@ pub enum Error {
 }
 
 /// "N bytes are needed, M are free", as far as known.
-struct Room {
+struct FreeSpace {
     needed: Option<u64>,
     free: Option<u64>,
 }
 
-impl std::fmt::Display for Room {
+impl std::fmt::Display for FreeSpace {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match (self.needed, self.free) {
             (Some(needed), Some(free)) => {

@@ -38,7 +38,7 @@ pub struct Image {
 /// A manifest as it is served.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Manifest {
-    /// Its name.
+    /// Digest of the manifest.
     pub digest: Digest,
     /// For `Content-Type`.
     pub media_type: String,

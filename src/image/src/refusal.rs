@@ -9,7 +9,7 @@ pub enum Refusal {
     /// A name with `..`.
     #[error("entry {entry:?} goes up with '..'; pack the directory so that every name is below it")]
     ParentDirectory {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
     },
     /// A name that begins with `/`.
@@ -17,13 +17,13 @@ pub enum Refusal {
         "entry {entry:?} has an absolute path; pack the directory so that every name is relative to it"
     )]
     AbsolutePath {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
     },
     /// A device, fifo or socket.
     #[error("entry {entry:?} is a {kind}; only files, directories and links are accepted")]
     Special {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
         /// Such as "block device".
         kind: String,
@@ -33,7 +33,7 @@ pub enum Refusal {
         "entry {entry:?} is a link to {target:?}, which leaves the archive; replace it with a copy or leave it out"
     )]
     LinkLeaves {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
         /// Where it leads.
         target: String,
@@ -43,7 +43,7 @@ pub enum Refusal {
         "entry {entry:?} is a hard link to {target:?}, which is no earlier file of the archive; pack it as a file"
     )]
     LinkToNothing {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
         /// What it names.
         target: String,
@@ -53,7 +53,7 @@ pub enum Refusal {
         "entry {entry:?} lies behind the symbolic link {link:?}; pack what the link points to under its own name"
     )]
     BehindLink {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
         /// The earlier entry.
         link: String,
@@ -63,7 +63,7 @@ pub enum Refusal {
         "entry {entry:?} is there twice, or is a file in one place and a directory in another; pack it once"
     )]
     Duplicate {
-        /// Its name.
+        /// The entry's path in the archive.
         entry: String,
     },
     /// A name that cannot be a file's.
@@ -71,7 +71,7 @@ pub enum Refusal {
     BadName {
         /// Its name, shortened.
         entry: String,
-        /// Why.
+        /// In which way it is invalid.
         problem: String,
     },
     /// More entries than allowed.
@@ -81,7 +81,7 @@ pub enum Refusal {
     TooManyEntries {
         /// The first beyond the limit.
         entry: String,
-        /// The limit.
+        /// Most that is accepted.
         limit: u64,
     },
     /// More bytes than allowed.

@@ -43,7 +43,7 @@ pub struct Hold {
 pub struct Blob {
     /// The content.
     pub file: File,
-    /// Its bytes.
+    /// Size in bytes.
     pub size: u64,
 }
 

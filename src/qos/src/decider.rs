@@ -25,7 +25,7 @@ pub enum LocalState {
 pub enum Why {
     /// Q fell below the threshold, or rose above it.
     Satisfaction {
-        /// Q.
+        /// Satisfaction when it was decided.
         q: f64,
     },
     /// Stateful, or no time promised: the link is down, the local original takes over.

@@ -10,7 +10,7 @@ use crate::request::{RequestId, Side, Stamp};
 /// becomes known: an answer that came after T_max.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Which.
+    /// The request that was completed.
     pub request: RequestId,
     /// What was asked.
     pub channel: Channel,

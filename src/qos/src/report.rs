@@ -13,7 +13,7 @@ pub struct Report {
     pub t_desire: f64,
     /// T_max.
     pub t_max: f64,
-    /// Q.
+    /// Satisfaction now.
     pub q: f64,
     /// Q_t.
     pub threshold: f64,

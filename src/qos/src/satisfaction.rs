@@ -54,7 +54,7 @@ impl Satisfaction {
         step
     }
 
-    /// Q.
+    /// Satisfaction now.
     pub fn q(&self) -> f64 {
         self.q
     }

@@ -34,7 +34,7 @@ pub enum BagError {
 /// One recorded message.
 #[derive(Debug, Clone)]
 pub struct Recorded {
-    /// Its topic.
+    /// The topic it was recorded on.
     pub topic: Arc<str>,
     /// Its type, with the full definition.
     pub wire_type: Arc<WireType>,

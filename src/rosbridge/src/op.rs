@@ -27,7 +27,7 @@ pub(crate) trait Message<'a>: Sized {
     const FIELDS: &'static [&'static str];
     /// Reads the fields.
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem>;
-    /// Its id.
+    /// The message's `id` field.
     fn id(&self) -> Option<&Id<'a>>;
     /// Writes the fields, apart from `op` and `id`.
     fn write(&self, writer: &mut Writer<'_>);

@@ -49,7 +49,7 @@ pub enum NodeEvent {
     ExecFailed {
         /// The node's name.
         node: String,
-        /// Why.
+        /// Why it could not be executed.
         reason: String,
     },
     /// It ended.

@@ -14,7 +14,7 @@ pub enum Error {
         action: &'static str,
         /// With what.
         path: PathBuf,
-        /// Why not.
+        /// Error of the system call.
         source: io::Error,
     },
     /// The kernel refused a call that names no file.
@@ -22,7 +22,7 @@ pub enum Error {
     Call {
         /// The system call, and for what.
         call: &'static str,
-        /// Why.
+        /// Error of the system call.
         source: io::Error,
     },
     /// The spec cannot be run as it is.
@@ -60,7 +60,7 @@ pub enum Error {
     Refused {
         /// The id.
         id: String,
-        /// Why.
+        /// Why it was refused.
         reason: String,
     },
     /// There is no node of that name.
@@ -74,7 +74,7 @@ pub enum Error {
     /// Something stands among the servants' directories that is none.
     #[error("{} is no servant's directory and was left alone; move it away", path.display())]
     Stray {
-        /// Where.
+        /// Path of the entry that is none of ours.
         path: PathBuf,
     },
     /// Something of a servant is left after its end.
@@ -103,7 +103,7 @@ pub enum Error {
     IdmapUnsupported {
         /// The layer.
         path: PathBuf,
-        /// Its filesystem.
+        /// Type of the file system.
         filesystem: String,
         /// What the kernel said.
         source: io::Error,
@@ -121,9 +121,9 @@ pub enum Error {
     /// Something that was written by another process is not what it should be.
     #[error("{path} holds something unexpected: {reason}")]
     Malformed {
-        /// Where.
+        /// The file.
         path: PathBuf,
-        /// What.
+        /// In which way it is malformed.
         reason: String,
     },
 }

@@ -121,7 +121,7 @@ impl LocalEngineConfig {
 /// A servant that ended while no daemon watched.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// Its id.
+    /// The servant's id.
     pub id: String,
     /// How it and its nodes ended; none when its shim was killed before it could say.
     pub exit: Option<Exit>,

@@ -12,7 +12,7 @@ use crate::sys;
 /// A process that is named in a file: its number alone may be somebody else's by the time it is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Identity {
-    /// Its number.
+    /// Process id on the host.
     pub pid: i32,
     /// Clock ticks from boot to its start (proc(5), /proc/PID/stat, field 22).
     pub start: u64,

@@ -50,7 +50,7 @@ pub enum FromShim {
     },
     /// Something happened to a node.
     Node {
-        /// What.
+        /// What became of the node.
         event: NodeEvent,
         /// How the node is now.
         status: NodeStatus,
@@ -62,7 +62,7 @@ pub enum FromShim {
     },
     /// An answer to a [`Request`].
     Reply {
-        /// Which.
+        /// Id of the request that is answered.
         id: u64,
         /// None: done. Some: why not.
         error: Option<String>,
@@ -98,7 +98,7 @@ pub enum Command {
     StartNode(NodeSpec),
     /// Send a signal to a node's process group.
     SignalNode {
-        /// Which.
+        /// Name of the node.
         node: String,
         /// Signal number.
         signal: i32,

@@ -21,7 +21,7 @@ const LONGEST: u64 = 16 << 20;
 pub struct Answer {
     /// HTTP status.
     pub status: u16,
-    /// Its body.
+    /// Body of the answer.
     pub body: Vec<u8>,
     /// From the request to the first byte of the answer.
     pub waited: Duration,
@@ -29,11 +29,11 @@ pub struct Answer {
     pub mtu: Option<i32>,
 }
 
-/// Whom to ask.
+/// A server to be asked over HTTP.
 pub struct Server {
-    /// As written.
+    /// Address as it was configured.
     pub address: Address,
-    /// As found.
+    /// The address to which its name was resolved.
     pub ip: IpAddr,
     /// Whom to trust, where that is not the system's to say.
     pub authorities: Option<PathBuf>,

@@ -21,7 +21,7 @@ const ESCALATION: [(Signal, Duration); 2] = [
 pub struct Program {
     /// The executable.
     pub path: PathBuf,
-    /// Its arguments.
+    /// Arguments of the executable.
     pub argv: Vec<String>,
     /// Variables that differ from the stub's own.
     pub environment: Vec<(&'static str, OsString)>,

@@ -51,7 +51,7 @@ impl Stop {
         })
     }
 
-    /// Publishes it.
+    /// Publishes the safe message.
     pub fn publish(&self) {
         self.publisher.publish(self.bytes.clone());
     }

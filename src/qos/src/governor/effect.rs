@@ -20,7 +20,7 @@ pub enum Channel {
 pub enum Effect<P> {
     /// Hand this to one side.
     Give {
-        /// Whom.
+        /// The side that is asked.
         side: Side,
         /// The request it belongs to; none for messages that await no answer.
         request: Option<RequestId>,
@@ -31,11 +31,11 @@ pub enum Effect<P> {
     },
     /// Tell the application that there will be no answer.
     Fail {
-        /// Which.
+        /// The request that failed.
         request: RequestId,
         /// Where it was asked.
         channel: Channel,
-        /// Why not.
+        /// Error text for the caller.
         reason: String,
     },
     /// Publish the SLA's safe-stop message: nobody has answered in time.

@@ -50,13 +50,13 @@ pub enum CodecErrorKind {
     /// The serialized message goes on after its last field.
     #[error("{0} bytes follow the end of the message")]
     Trailing(
-        /// How many.
+        /// Bytes after the last field.
         usize,
     ),
     /// A string's or an array's length cannot be true.
     #[error("a length of {count} cannot be true with {left} bytes to follow")]
     LengthBeyondEnd {
-        /// As declared.
+        /// The length that the input declares.
         count: u64,
         /// Bytes after the length.
         left: usize,
@@ -77,7 +77,7 @@ pub enum CodecErrorKind {
     OutOfRange {
         /// The field's type.
         expected: &'static str,
-        /// The number.
+        /// The number that does not fit.
         found: String,
     },
     /// The path names a field that the type does not have.
@@ -86,7 +86,7 @@ pub enum CodecErrorKind {
     /// A fixed array with another number of elements.
     #[error("takes exactly {expected} elements, got {found}")]
     WrongLength {
-        /// As defined.
+        /// The length that the definition fixes.
         expected: usize,
         /// As given; at least, where counting stopped there.
         found: usize,
@@ -113,13 +113,13 @@ pub enum CodecErrorKind {
     /// The input nests too deeply.
     #[error("nested deeper than {0} levels")]
     TooDeep(
-        /// The limit.
+        /// Levels of nesting that are accepted.
         usize,
     ),
     /// The output would grow beyond what was allowed.
     #[error("the converted message is larger than the limit of {0} bytes")]
     TooLarge(
-        /// The limit.
+        /// Most bytes that may be written.
         usize,
     ),
 }

@@ -33,7 +33,7 @@ pub enum Error {
     TooLarge {
         /// What its prefix says.
         size: usize,
-        /// The limit.
+        /// Most bytes that are accepted.
         max: usize,
     },
     /// A message that does not fit into the memory for its servant.
@@ -44,7 +44,7 @@ pub enum Error {
     Unfinished {
         /// What its prefix says.
         size: usize,
-        /// What came.
+        /// Bytes of the message that came.
         read: usize,
         /// How long was waited.
         after: Duration,

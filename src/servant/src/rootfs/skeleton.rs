@@ -9,7 +9,7 @@ use super::{make_directory, normal};
 use crate::Error;
 use crate::spec::Mount;
 
-/// Fills it.
+/// Makes the directories, files and links in an empty root.
 pub fn make_skeleton(
     skeleton: &Path,
     id: &str,

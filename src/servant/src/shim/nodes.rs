@@ -16,7 +16,7 @@ struct Node {
     inside: Option<i32>,
 }
 
-/// All of them.
+/// All nodes of the servant, by name.
 #[derive(Debug, Default)]
 pub(super) struct Nodes {
     known: BTreeMap<String, Node>,

@@ -23,16 +23,16 @@ const MAX_IDLE: usize = 8;
 /// Idle connections, by service.
 #[derive(Default)]
 pub(super) struct CallPool {
-    idle: Mutex<HashMap<String, Vec<Kept>>>,
+    idle: Mutex<HashMap<String, Vec<IdleConnection>>>,
 }
 
 /// A connection, and the address of its server's node when it was made, where the graph showed that.
-struct Kept {
+struct IdleConnection {
     connection: ServiceConnection,
     address: Option<String>,
 }
 
-impl Kept {
+impl IdleConnection {
     /// Whether whom it leads to still serves.
     fn is_current(&self, service: &str, graph: &Graph) -> bool {
         let Some(server) = graph.services.get(service) else {
@@ -53,7 +53,7 @@ impl Kept {
 
 impl CallPool {
     /// A connection that the server has not closed, to whom serves now.
-    fn take(&self, service: &str, graph: &watch::Sender<Arc<Graph>>) -> Option<Kept> {
+    fn take(&self, service: &str, graph: &watch::Sender<Arc<Graph>>) -> Option<IdleConnection> {
         let mut idle = self.idle.lock();
         let connections = idle.get_mut(service)?;
         while let Some(kept) = connections.pop() {
@@ -65,7 +65,7 @@ impl CallPool {
     }
 
     /// Keeps a connection for the next call, unless somebody else has come to serve during this one.
-    fn put(&self, service: &str, kept: Kept, graph: &watch::Sender<Arc<Graph>>) {
+    fn put(&self, service: &str, kept: IdleConnection, graph: &watch::Sender<Arc<Graph>>) {
         let mut idle = self.idle.lock();
         if !kept.is_current(service, &graph.borrow()) {
             return;
@@ -111,7 +111,7 @@ pub(super) async fn call(
                     let connection = open(bus, service, ("persistent", "1")).await?;
                     let said = connection.header().get("callerid");
                     let address = said.and_then(|node| bus.graph.borrow().nodes.get(node).cloned());
-                    Kept {
+                    IdleConnection {
                         connection,
                         address,
                     }
@@ -273,7 +273,7 @@ mod tests {
         let _served = server.serve("/who", service_type, Arc::new(Echo)).await;
         let connection = || async {
             let opened = open(&caller.inner, "/who", ("persistent", "1")).await;
-            Kept {
+            IdleConnection {
                 connection: opened.unwrap(),
                 address: Some("http://a/".to_owned()),
             }

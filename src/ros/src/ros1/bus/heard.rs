@@ -14,15 +14,15 @@ use crate::ros1::reply::Reply;
 use crate::ros1::xmlrpc::{Client, Value};
 
 /// How long the connection to a publisher is kept after it was asked: whoever waits to be heard asks often.
-const KEPT: Duration = Duration::from_secs(1);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Publishers that were asked a moment ago.
 #[derive(Default)]
-pub(super) struct Asked {
+pub(super) struct PublisherClients {
     clients: Mutex<HashMap<String, (Arc<Client>, Instant)>>,
 }
 
-impl Asked {
+impl PublisherClients {
     /// A client of the publisher at `uri`, connected already where it was asked before.
     fn client(&self, bus: &Arc<Inner>, uri: &str) -> Result<Arc<Client>, BusError> {
         let mut clients = self.clients.lock();
@@ -42,9 +42,9 @@ impl Asked {
 /// Closes the connections to those that are asked no more, until there is none left.
 async fn forget(bus: Arc<Inner>) {
     loop {
-        tokio::time::sleep(KEPT).await;
-        let mut clients = bus.asked.clients.lock();
-        clients.retain(|_, (_, asked)| asked.elapsed() < KEPT);
+        tokio::time::sleep(IDLE_TIMEOUT).await;
+        let mut clients = bus.publisher_clients.clients.lock();
+        clients.retain(|_, (_, asked)| asked.elapsed() < IDLE_TIMEOUT);
         if clients.is_empty() {
             return;
         }
@@ -64,7 +64,7 @@ pub(super) async fn connections(
         let Some(uri) = graph.nodes.get(&node).filter(|_| node != bus.node) else {
             continue;
         };
-        let client = bus.asked.client(bus, uri)?;
+        let client = bus.publisher_clients.client(bus, uri)?;
         let caller = [bus.node.as_str().into()];
         let asked = client.call("getBusInfo", &caller, HANDSHAKE);
         let answer = asked.await.map_err(to_bus_error)?;

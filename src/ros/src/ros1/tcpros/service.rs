@@ -32,7 +32,7 @@ pub enum CallError {
     /// The server closed after it may have taken the request.
     #[error("the server closed the connection during the call")]
     Abandoned,
-    /// Anything else.
+    /// The connection failed, or the server broke the protocol.
     #[error(transparent)]
     Broken(#[from] Error),
 }

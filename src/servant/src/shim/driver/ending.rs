@@ -12,7 +12,7 @@ use crate::shim::nodes;
 use crate::{Error, sys};
 
 /// How long a killed pid namespace may take to be gone.
-const KILLED: Duration = Duration::from_secs(5);
+const KILL_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long the rest of the log may take once nobody can write to it.
 const DRAIN: Duration = Duration::from_secs(2);
 /// How long a cgroup may take to become empty.
@@ -24,8 +24,8 @@ pub(in crate::shim) enum StopStage {
     Interrupt,
     Terminate,
     Kill,
-    /// Killed, and yet not gone.
-    Insist,
+    /// The kill timeout has passed, and something still runs: SIGKILL again.
+    KillAgain,
 }
 
 impl Driver {
@@ -49,7 +49,7 @@ impl Driver {
         let next = match self.stopping {
             None | Some(StopStage::Interrupt) => StopStage::Terminate,
             Some(StopStage::Terminate) => StopStage::Kill,
-            Some(StopStage::Kill | StopStage::Insist) => StopStage::Insist,
+            Some(StopStage::Kill | StopStage::KillAgain) => StopStage::KillAgain,
         };
         self.enter_stage(next).await;
     }
@@ -57,7 +57,7 @@ impl Driver {
     pub(super) async fn enter_stage(&mut self, stage: StopStage) {
         if self
             .stopping
-            .is_some_and(|now| now >= stage && now != StopStage::Insist)
+            .is_some_and(|now| now >= stage && now != StopStage::KillAgain)
         {
             return;
         }
@@ -73,9 +73,9 @@ impl Driver {
                 let _ = self.link.signal(0, libc::SIGTERM, Scope::All).await;
                 self.begun.launch.grace.terminate
             }
-            StopStage::Kill | StopStage::Insist => {
+            StopStage::Kill | StopStage::KillAgain => {
                 self.kill();
-                KILLED
+                KILL_TIMEOUT
             }
         };
         let inputs = self.inputs.clone();
