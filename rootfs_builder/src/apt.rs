@@ -18,6 +18,7 @@ use crate::candidates::Candidates;
 use crate::error::{Error, IoAt};
 use crate::event::Progress;
 use crate::process::{self, Stream};
+use crate::unused;
 
 /// Where packages come from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -367,10 +368,14 @@ impl Apt {
                 fs::rename(&from, archives.join(deb.file_name())).at("keeping", &from)?;
             }
         }
-        Ok(debs
+        let files: Vec<PathBuf> = debs
             .iter()
             .map(|deb| archives.join(deb.file_name()))
-            .collect())
+            .collect();
+        for file in &files {
+            unused::used(file);
+        }
+        Ok(files)
     }
 
     /// Whether the lists need not be fetched again yet.

@@ -24,7 +24,7 @@ use crate::removal::Removals;
 use crate::request::{BuildOutcome, PushRequest, Source};
 use crate::sandbox::{self, Site};
 use crate::workshop::{Turns, Workshop};
-use crate::{blocking, keys, packaged, prebuilt, pushed, seal, source, sources};
+use crate::{blocking, keys, packaged, prebuilt, pushed, seal, source, sources, unused};
 
 /// The base taken when none is named.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -158,6 +158,8 @@ impl Builder {
             log,
         };
         sweep_logs(&self.config.logs_dir);
+        let cache = self.config.cache_dir.clone();
+        blocking::spawn(move || unused::sweep(&cache)).await?;
         let work = async {
             let made = match what {
                 What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,

@@ -10,6 +10,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, IoAt};
+use crate::unused;
 
 /// The cache and the store that it fills.
 #[derive(Clone)]
@@ -84,6 +85,8 @@ impl Layers {
         let Some(layer) = entry.layer else {
             return Ok(Some(entry));
         };
+        unused::used(&about);
+        unused::used(&archive);
         if self.store.layer(&layer.diff_id)?.is_some() {
             return Ok(Some(entry));
         }
@@ -105,7 +108,10 @@ impl Layers {
 
     /// A small result that took long to find.
     pub(crate) fn note<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
-        serde_json::from_slice(&fs::read(self.notes.join(key)).ok()?).ok()
+        let path = self.notes.join(key);
+        let value = serde_json::from_slice(&fs::read(&path).ok()?).ok()?;
+        unused::used(&path);
+        Some(value)
     }
 
     /// Keeps one.

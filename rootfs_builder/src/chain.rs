@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use crate::cache::write_whole;
 use crate::error::{Error, IoAt};
 use crate::key::Key;
+use crate::unused;
 
 /// The most links that are put on each other: what an image has besides its base and package layers. Registries and
 /// the kernel allow more, but each costs every lookup of a file a little.
@@ -78,6 +79,13 @@ impl Chains {
         fs::create_dir_all(&self.directory).at("making", &self.directory)?;
         let text = serde_json::to_vec(link).unwrap_or_default();
         write_whole(&self.directory.join(format!("{key}.json")), &text)
+    }
+
+    /// Notes that these links are in use.
+    pub(crate) fn used(&self, keys: &[String]) {
+        for key in keys {
+            unused::used(&self.directory.join(format!("{key}.json")));
+        }
     }
 
     /// All links there are, by key. Records that are damaged or do not fit their name count as absent.

@@ -8,6 +8,7 @@ use std::process::{Command, Stdio};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, IoAt};
+use crate::unused;
 
 /// A file or link of a Debian package.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,6 +44,7 @@ pub(crate) fn at_run_time(deb: &Path, cache: &Path) -> Result<Vec<Member>, Error
     if let Ok(file) = File::open(&path)
         && let Ok(found) = of_archive(BufReader::new(file), &path, |_| true)
     {
+        unused::used(&path);
         return Ok(found);
     }
     let mut found = members(deb, wanted_of_development)?;

@@ -112,6 +112,7 @@ pub(crate) async fn layers(
     if let Some(keys) = shop.layers.note::<Vec<String>>(&memo)
         && let Some(layers) = at_hand(shop, &keys).await?
     {
+        chains.used(&keys);
         return Ok(Made { layers });
     }
     let (asked, wanted) = (chains.clone(), items.clone());
@@ -129,6 +130,7 @@ pub(crate) async fn layers(
         }
     }
     let mut keys = found.keys;
+    chains.used(&keys);
     let parts = rest(archive, shop, whole, &found.items, MOST_LINKS - keys.len()).await?;
     for part in parts {
         let link = Link {

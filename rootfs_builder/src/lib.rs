@@ -60,6 +60,7 @@ mod source;
 mod sources;
 mod split;
 mod units;
+mod unused;
 mod workshop;
 
 pub use apt::Sources;
