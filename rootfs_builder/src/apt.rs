@@ -48,6 +48,8 @@ pub struct Relations {
     pub source: String,
     /// Every package that its Depends and Pre-Depends name, alternatives too.
     pub needs: BTreeSet<String>,
+    /// Every package that its Pre-Depends name, alternatives too.
+    pub before: BTreeSet<String>,
     /// What it can stand for.
     pub provides: BTreeSet<String>,
 }
@@ -492,6 +494,7 @@ fn parse_relations(stanza: &str) -> Option<(String, Relations)> {
             .into_iter()
             .chain(names("Pre-Depends"))
             .collect(),
+        before: names("Pre-Depends"),
         provides: names("Provides"),
     };
     Some((name, about))

@@ -21,6 +21,7 @@ use crate::event::Progress;
 use crate::key::{Key, sha256};
 use crate::sandbox::Run;
 use crate::split;
+use crate::steps;
 use crate::workshop::{Layer, Packing, Workshop};
 
 /// What is put on top of some layers.
@@ -209,11 +210,7 @@ async fn rest(
     let mut parts = Vec::new();
     if most > 1 && split::may_cut(left.debs.len()) {
         let of_ros = ros_sources(archive, shop).await?;
-        let names = left
-            .debs
-            .iter()
-            .map(|deb| format!("{}={}", deb.name, deb.version));
-        let relations = archive.apt.relations(names).await?;
+        let relations = archive.apt.relations(versions(&left.debs)).await?;
         let (first, last) = split::split(&left.debs, &relations, |source| of_ros.contains(source));
         if !first.is_empty() {
             parts.push(Part {
@@ -225,6 +222,12 @@ async fn rest(
     }
     parts.push(left);
     Ok(parts)
+}
+
+/// Names of packages as apt takes them.
+fn versions(debs: &[Deb]) -> impl Iterator<Item = String> + '_ {
+    debs.iter()
+        .map(|deb| format!("{}={}", deb.name, deb.version))
 }
 
 /// Source packages that hold ROS packages. Remembered: it asks about a thousand packages.
@@ -270,20 +273,25 @@ async fn install(
     fs::create_dir(&debs).at("making", &debs)?;
     fs::create_dir(&upper).at("making", &upper)?;
     set_mode(&debs, 0o755)?;
-    let mut order = String::new();
+    let mut inside = Vec::new();
     for file in &files {
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         link_or_copy(file, &debs.join(name.as_ref()))?;
-        order.push_str(&format!("/cloudroid/debs/{name}\n"));
+        inside.push(format!("/cloudroid/debs/{name}"));
     }
+    let relations = archive.apt.relations(versions(&part.debs)).await?;
+    let steps = steps::written(&steps::steps(&part.debs, &relations), &inside);
     let mut given = BTreeMap::from([
         (
             PathBuf::from("cloudroid/install.sh"),
             INSTALL.as_bytes().to_vec(),
         ),
-        (PathBuf::from("cloudroid/order"), order.into_bytes()),
         (PathBuf::from("cloudroid/debs/.keep"), Vec::new()),
     ]);
+    given.extend(steps.into_iter().map(|(name, text)| {
+        let path = Path::new("cloudroid/steps").join(name);
+        (path, text.into_bytes())
+    }));
     if !part.extras.is_empty() {
         let path = room.join("extras.tar");
         deb::write_tar(&part.extras, &path)?;

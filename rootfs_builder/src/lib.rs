@@ -59,6 +59,7 @@ mod seal;
 mod source;
 mod sources;
 mod split;
+mod steps;
 mod units;
 mod unused;
 mod workshop;

@@ -97,6 +97,7 @@ mod tests {
                     source,
                     needs: words.collect(),
                     provides: provides.split_whitespace().map(str::to_owned).collect(),
+                    ..Relations::default()
                 },
             );
         }

@@ -118,6 +118,7 @@ fn what_a_package_says_of_others_is_understood() {
         names,
         ["a", "b", "init-system-helpers", "libc6", "python3", "x"]
     );
+    assert_eq!(about.before, ["init-system-helpers".to_owned()].into());
     assert_eq!(
         about.provides,
         ["cv-plugin".to_owned(), "other".to_owned()].into()
