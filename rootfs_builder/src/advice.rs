@@ -96,7 +96,7 @@ fn told(what: &str, with: Option<&str>) -> String {
 }
 
 /// The Debian package whose name is nearest to what is looked for.
-fn nearest<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a str> {
+pub(crate) fn nearest<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a str> {
     let plain = name.to_lowercase().replace('_', "-");
     debs.iter()
         .min_by_key(|deb| (!deb.contains(&plain), deb.len(), **deb))

@@ -60,7 +60,7 @@ pub(crate) fn at_run_time(deb: &Path, cache: &Path) -> Result<Vec<Member>, Error
 }
 
 /// Members that `keep` accepts. Blocking.
-fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
+pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
     let mut unpack = Command::new("dpkg-deb");
     unpack
         .arg("--fsys-tarfile")

@@ -10,6 +10,7 @@
 //! 2. Every ROS package that a `package.xml` so found names as an exec dependency is wanted, too, the less of it the
 //!    further away it is (see [`Depth`]).
 //! 3. Every library that a plugin list so found names is wanted, too.
+//! 4. Every Python module that programs to be run, and modules of the ROS packages asked for, import is wanted, too.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -23,6 +24,7 @@ use crate::contents::Part;
 use crate::deb::{self, Content, Member};
 use crate::error::Error;
 use crate::event::Progress;
+use crate::imports::{self, Programs};
 use crate::manifest::{self, PluginLibrary};
 
 /// Packages that are unpacked at the same time, each by processes of its own.
@@ -41,17 +43,20 @@ pub(crate) struct Wanted {
     pub(crate) unknown: BTreeSet<String>,
 }
 
-/// Walks from `roots` (ROS packages). `python`: whether the roots' Python modules are wanted.
+/// Walks from `roots` (ROS packages). `python`: whether the roots' Python modules are wanted. `programs`: which of the
+/// roots' programs may be run.
 pub(crate) async fn gather(
     archive: &Archive,
     base: &Base,
     roots: &BTreeSet<String>,
     python: bool,
+    programs: &Programs,
     progress: &Progress,
 ) -> Result<Wanted, Error> {
     let mut wanted = Wanted::default();
     let (mut seen, mut looked_into) = (BTreeSet::new(), BTreeSet::new());
     let mut next = roots.clone();
+    let mut importing = BTreeSet::new();
     let mut depth = Depth::Itself { python };
     while !next.is_empty() {
         // All of one depth in one go: one call of apt, not one for each.
@@ -62,6 +67,15 @@ pub(crate) async fn gather(
                 continue;
             }
             let carried = archive.to_run(&name, depth);
+            if let Depth::Itself { python } = depth {
+                let carriers = archive.contents.ros_package(&name);
+                let imports = |deb: &&String| {
+                    carriers.get(*deb).is_some_and(|parts| {
+                        parts.contains(&Part::Programs) || python && parts.contains(&Part::Python)
+                    })
+                };
+                importing.extend(carried.install.iter().filter(imports).cloned());
+            }
             wanted.install.extend(carried.install);
             if depth != Depth::Beyond {
                 let tells = archive.contents.ros_package(&name).into_iter();
@@ -117,6 +131,9 @@ pub(crate) async fn gather(
             Depth::Needed | Depth::Beyond => Depth::Beyond,
         };
     }
+    wanted
+        .install
+        .extend(imported(archive, &importing, programs, progress).await?);
     wanted.extras.sort_by(|a, b| a.path.cmp(&b.path));
     wanted
         .extras
@@ -131,6 +148,34 @@ pub(crate) async fn gather(
             .is_some_and(|deb| plugin_targets.contains(deb)),
     });
     Ok(wanted)
+}
+
+/// Debian packages with what Python files of these Debian packages import.
+async fn imported(
+    archive: &Archive,
+    importing: &BTreeSet<String>,
+    programs: &Programs,
+    progress: &Progress,
+) -> Result<BTreeSet<String>, Error> {
+    let debs: Vec<Deb> = importing
+        .iter()
+        .filter_map(|name| archive.candidates.get(name))
+        .collect();
+    let files = archive.apt.download(&debs, progress).await?;
+    let kept = archive.apt.root().to_owned();
+    let looked = stream::iter(files).map(|file| {
+        let kept = kept.clone();
+        crate::blocking::spawn(move || imports::of_package(&file, &kept))
+    });
+    let mut looked = looked.buffered(AT_ONCE);
+    let mut modules = BTreeSet::new();
+    while let Some(found) = looked.next().await {
+        modules.extend(found??.of(programs));
+    }
+    let debs = modules
+        .iter()
+        .filter_map(|module| imports::provider(archive, module));
+    Ok(debs.map(str::to_owned).collect())
 }
 
 /// Where the name in an exec dependency leads.
@@ -330,6 +375,85 @@ mod tests {
                 Vec::new()
             };
             assert_eq!(links, expected);
+        }
+    }
+
+    /// The file of a Debian package, where apt would put it.
+    fn package(archive: &Archive, name: &str, files: &[(&str, &str)]) {
+        let place = tempfile::tempdir().expect("a directory");
+        let control = format!(
+            "Package: {name}\nVersion: 1\nArchitecture: all\nMaintainer: a <a@b.invalid>\nDescription: d\n"
+        );
+        let tree = place.path().join("tree");
+        for (path, text) in files.iter().copied().chain([("DEBIAN/control", &*control)]) {
+            let path = tree.join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        let deb = archive
+            .apt
+            .root()
+            .join(format!("archives/{name}_1_all.deb"));
+        let mut build = std::process::Command::new("dpkg-deb");
+        build.args(["--root-owner-group", "--build"]);
+        let said = build.arg(&tree).arg(&deb).output().expect("run");
+        assert!(said.status.success(), "{said:?}");
+    }
+
+    #[tokio::test]
+    async fn what_a_packaged_python_program_imports_comes_with_it() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let modules = "usr/lib/python3/dist-packages";
+        let text = format!(
+            "usr/share/monitor/package.xml python/python3-monitor\n\
+             usr/lib/monitor/cpu_monitor python/python3-monitor\n\
+             usr/share/updater/package.xml libdevel/libupdater-dev\n\
+             usr/share/updater/cmake/updaterConfig.cmake libdevel/libupdater-dev\n\
+             {modules}/updater/__init__.py python/python3-updater\n\
+             {modules}/numpy/__init__.py python/python3-numpy\n\
+             {modules}/unused/__init__.py python/python3-unused\n"
+        );
+        let names = [
+            "python3-monitor",
+            "python3-updater",
+            "python3-numpy",
+            "python3-unused",
+            "libupdater-dev",
+        ];
+        let archive = archive(directory.path(), &text, &names);
+        let manifest = |name: &str, needs: &str| {
+            format!(
+                "<package><name>{name}</name><version>1.0.0</version><description>d</description>\
+                 <maintainer email=\"a@b.invalid\">m</maintainer><license>l</license>{needs}</package>"
+            )
+        };
+        let about = manifest("monitor", "<run_depend>updater</run_depend>");
+        let program = "#!/usr/bin/python3\nimport os, numpy\nfrom updater import Updater\n";
+        let files = [
+            ("usr/share/monitor/package.xml", about.as_str()),
+            ("usr/lib/monitor/cpu_monitor", program),
+        ];
+        package(&archive, "python3-monitor", &files);
+        let about = manifest("updater", "");
+        let files = [("usr/share/updater/package.xml", about.as_str())];
+        package(&archive, "libupdater-dev", &files);
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        let progress = Progress::new(tokio::sync::mpsc::channel(1).0);
+        let roots = ["monitor".to_owned()].into();
+        let all = vec!["python3-monitor", "python3-numpy", "python3-updater"];
+        let named = |name: &str| Programs::Named([name.to_owned()].into());
+        for (programs, expected) in [
+            (named("cpu_monitor"), all.clone()),
+            // Now as it was kept.
+            (Programs::All, all),
+            (named("other"), vec!["python3-monitor"]),
+        ] {
+            let wanted = gather(&archive, &base, &roots, true, &programs, &progress)
+                .await
+                .expect("gathered");
+            let install: Vec<&str> = wanted.install.iter().map(String::as_str).collect();
+            assert_eq!(install, expected, "{programs:?}");
         }
     }
 

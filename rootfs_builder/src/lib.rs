@@ -39,6 +39,7 @@ mod elf;
 mod error;
 mod event;
 mod gather;
+mod imports;
 mod install;
 mod key;
 mod keys;

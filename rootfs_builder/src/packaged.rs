@@ -8,8 +8,10 @@ use crate::build::{Build, Parts};
 use crate::deb::Member;
 use crate::error::Error;
 use crate::gather::{self, Wanted};
+use crate::imports::Programs;
 use crate::install::Made;
 use crate::key::Key;
+use crate::request::{PushRequest, Source};
 
 /// `name`: a ROS package, or a Debian package that holds some.
 pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
@@ -94,18 +96,27 @@ pub(crate) async fn wanted(
         return Ok(Wanted::default());
     }
     let keys = serde_json::to_string(&build.base.keys).unwrap_or_default();
-    let key = Key::new("gathered with keys")
+    let programs = programs(build.request);
+    let key = Key::new("gathered with imports")
         .with("archive", &build.archive.stamp)
         .with("keys", keys)
         .with_all("ignore", &build.base.ros_packages.ignore)
         .with("python", [u8::from(python)])
+        .with("programs", format!("{programs:?}"))
         .with_all("root", roots)
         .finish();
     let note: Note = match build.shop.layers.note(&key) {
         Some(note) => note,
         None => {
-            let found =
-                gather::gather(&build.archive, &build.base, roots, python, build.progress).await?;
+            let found = gather::gather(
+                &build.archive,
+                &build.base,
+                roots,
+                python,
+                &programs,
+                build.progress,
+            )
+            .await?;
             let note = Note {
                 install: found.install,
                 extras: found.extras,
@@ -133,6 +144,19 @@ pub(crate) async fn wanted(
         warnings: note.warnings,
         unknown: note.unknown,
     })
+}
+
+/// Programs of packages of the archive that a push runs, as far as it is known before.
+fn programs(request: &PushRequest) -> Programs {
+    if let (Source::Packaged(_), Some(_)) = (&request.source, &request.launch) {
+        return Programs::All;
+    }
+    // `PACKAGE/PROGRAM ARGUMENTS`
+    let names = request.nodes.iter().filter_map(|node| {
+        let path = node.split_whitespace().next()?;
+        Some(path.rsplit('/').next().unwrap_or(path).to_owned())
+    });
+    Programs::Named(names.collect())
 }
 
 /// The archive's version of the Debian package that holds a ROS package's programs, or its package.xml.
