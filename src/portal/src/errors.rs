@@ -107,6 +107,7 @@ const INTERNAL: Kind = (
     "the daemon failed",
 );
 const ENDING: Kind = (StatusCode::SERVICE_UNAVAILABLE, "ending", "daemon ending");
+const NEXT_OF_ENDING: &str = "ask again when the daemon has started again";
 
 impl Error {
     /// The problem that a client is told.
@@ -212,6 +213,10 @@ impl Error {
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
+            Error::BodyTooLarge { .. } => "send less in one request".into(),
+            Error::Unfinished { .. } => {
+                "send it over a faster connection, or raise unfinished in [memory] of the configuration".into()
+            }
             Error::TrialTooLarge { .. } => {
                 "send a shorter one, or raise client and daemon in [memory] of the configuration; 512M is the most".into()
             }
@@ -254,6 +259,7 @@ fn next_of_push(error: &push::Error) -> Option<String> {
         }
         P::Choreographer(error) => return next_of_choreographer(error),
         P::Catalogue(error) => return next_of_catalogue(error),
+        P::Ending => NEXT_OF_ENDING.into(),
         _ => return None,
     };
     Some(text)
@@ -285,6 +291,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
             format!("see cloudroidctl events, and push {service} again when its package is mended")
         }
         C::Catalogue(error) => return next_of_catalogue(error),
+        C::Ending => NEXT_OF_ENDING.into(),
         _ => return None,
     };
     Some(text)
@@ -427,6 +434,24 @@ mod tests {
             problem.detail.contains("reserved") && problem.detail.contains("api"),
             "{problem:?}"
         );
+    }
+
+    #[test]
+    fn who_sends_too_much_or_at_the_wrong_time_is_told_what_to_do() {
+        let after = std::time::Duration::from_secs(300);
+        let limit = api::Size(1 << 20);
+        for (error, word) in [
+            (Error::BodyTooLarge { limit }, "send less"),
+            (Error::Unfinished { after }, "raise unfinished"),
+            (
+                Error::Choreographer(choreographer::Error::Ending),
+                "started again",
+            ),
+        ] {
+            let problem = error.problem();
+            let next = problem.next.as_deref().unwrap_or_default();
+            assert!(next.contains(word), "{problem:?}");
+        }
     }
 
     #[test]
