@@ -171,6 +171,8 @@ pub struct Push {
     pub probe: Time,
     /// How long the archive may pause while it is sent.
     pub stall: Time,
+    /// Bytes of the archive that must come in a second, on the average over times of `stall`; 0 for any.
+    pub min_rate: Size,
     /// Pushes that are built at once; others wait.
     pub at_once: usize,
     /// Pushes that may wait.
@@ -284,6 +286,7 @@ impl Default for Push {
             entries: 500_000,
             probe: Time::seconds(30),
             stall: Time::seconds(60),
+            min_rate: Size(1 << 10),
             at_once: 2,
             queue: 16,
             time: Time::seconds(2 * 3600),
@@ -466,6 +469,7 @@ impl Config {
             entries: push.entries,
             probe: push.probe.0,
             stall: push.stall.0,
+            min_rate: push.min_rate,
             at_once: push.at_once,
             queue: push.queue,
             time: push.time.0,

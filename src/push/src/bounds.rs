@@ -4,7 +4,8 @@
 //! systems are mounted without quotas, so the directory of the build is measured, often enough that a build which
 //! writes without end is ended long before the disk is full.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
+use std::future::Future;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -14,7 +15,8 @@ use api::Size;
 use foreign::Visit;
 use nix::sys::statvfs::statvfs;
 use package::interface::Interface;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use parking_lot::Mutex;
+use tokio::sync::{OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use super::request::Tell;
@@ -33,29 +35,112 @@ const LONGEST_NAME: usize = 1024;
 /// Of those together.
 const MOST_NAMES: usize = 20_000;
 
-/// Limits the number of pushes that are built at a time and that wait.
+/// Limits the number of pushes that are built at a time and that wait, and lets those of one service follow one
+/// another.
+///
+/// Whoever has a place never waits for a turn, so that a place is always given back: a push that learns only from what
+/// it has built which service it is of gives its place back while it waits.
 pub(super) struct Places {
     free: Arc<Semaphore>,
+    turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
     waiting: AtomicUsize,
     at_once: usize,
     queue: usize,
+}
+
+/// The right to change a service, until it is dropped.
+pub(super) type Turn = OwnedMutexGuard<()>;
+
+/// A push's place, and its turn once its service is known. Both are given back when this is dropped.
+pub(super) struct Admitted<'a> {
+    places: &'a Places,
+    turn: Option<(String, Turn)>,
+    place: Option<OwnedSemaphorePermit>,
 }
 
 impl Places {
     pub(super) fn new(options: &Options) -> Places {
         Places {
             free: Arc::new(Semaphore::new(options.at_once)),
+            turns: Mutex::default(),
             waiting: AtomicUsize::new(0),
             at_once: options.at_once,
             queue: options.queue,
         }
     }
 
-    /// Waits for a place; it is given back when what this gives is dropped.
-    pub(super) async fn take(&self, tell: &Tell) -> Result<OwnedSemaphorePermit, Error> {
-        if let Ok(place) = Arc::clone(&self.free).try_acquire_owned() {
-            return Ok(place);
-        }
+    /// Waits for the turn of a service, where it is known, and then for a place.
+    pub(super) async fn enter(
+        &self,
+        service: Option<&str>,
+        tell: &Tell,
+    ) -> Result<Admitted<'_>, Error> {
+        let mut waiting = None;
+        let turn = match service {
+            None => None,
+            Some(name) => {
+                let turn = match self.turn_of(name).try_lock_owned() {
+                    Ok(turn) => turn,
+                    Err(_) => {
+                        waiting = Some(self.wait()?);
+                        self.turn_told(name, tell).await
+                    }
+                };
+                Some((name.to_owned(), turn))
+            }
+        };
+        let place = match Arc::clone(&self.free).try_acquire_owned() {
+            Ok(place) => place,
+            Err(_) => {
+                let waiting = match waiting {
+                    Some(waiting) => waiting,
+                    None => self.wait()?,
+                };
+                self.place_told(&waiting, tell).await?
+            }
+        };
+        Ok(Admitted {
+            places: self,
+            turn,
+            place: Some(place),
+        })
+    }
+
+    /// Waits for the turn of a service, without a place.
+    pub(super) async fn turn(&self, service: &str) -> Turn {
+        self.turn_of(service).lock_owned().await
+    }
+
+    fn turn_of(&self, service: &str) -> Arc<tokio::sync::Mutex<()>> {
+        let mut turns = self.turns.lock();
+        turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+        Arc::clone(turns.entry(service.to_owned()).or_default())
+    }
+
+    async fn turn_told(&self, service: &str, tell: &Tell) -> Turn {
+        tell.step(&format!(
+            "waiting: {service} is being pushed or changed already"
+        ))
+        .await;
+        self.turn(service).await
+    }
+
+    async fn place_told(
+        &self,
+        waiting: &Waiting<'_>,
+        tell: &Tell,
+    ) -> Result<OwnedSemaphorePermit, Error> {
+        tell.step(&format!(
+            "waiting: {} pushes are being built, and {} wait before this one",
+            self.at_once, waiting.before
+        ))
+        .await;
+        let place = Arc::clone(&self.free).acquire_owned().await;
+        place.map_err(|_| Error::Ending)
+    }
+
+    /// Counts as waiting, if another may.
+    fn wait(&self) -> Result<Waiting<'_>, Error> {
         let waiting = Waiting::among(&self.waiting);
         if waiting.before >= self.queue {
             return Err(Error::Failed {
@@ -64,19 +149,37 @@ impl Places {
                     self.at_once, waiting.before
                 ),
                 next: Some(
-                    "push again later, or raise at_once or queue in [push] of the configuration"
+                    "push again later, or raise at_once or queue in [push] of the optionsuration"
                         .to_owned(),
                 ),
                 log: Vec::new(),
             });
         }
-        tell.step(&format!(
-            "waiting: {} pushes are being built, and {} wait before this one",
-            self.at_once, waiting.before
-        ))
-        .await;
-        let place = Arc::clone(&self.free).acquire_owned().await;
-        place.map_err(|_| Error::Ending)
+        Ok(waiting)
+    }
+}
+
+impl Admitted<'_> {
+    /// Takes the turn of the service, which may be known only now: then the place is given back while another push of
+    /// it is built, and taken again. That is never refused, since the work is done.
+    pub(super) async fn named(&mut self, service: &str, tell: &Tell) -> Result<(), Error> {
+        if self.turn.as_ref().is_some_and(|(name, _)| name == service) {
+            return Ok(());
+        }
+        // Of another name that the package goes by.
+        self.turn = None;
+        let turn = match self.places.turn_of(service).try_lock_owned() {
+            Ok(turn) => turn,
+            Err(_) => {
+                let waiting = Waiting::among(&self.places.waiting);
+                self.place = None;
+                let turn = self.places.turn_told(service, tell).await;
+                self.place = Some(self.places.place_told(&waiting, tell).await?);
+                turn
+            }
+        };
+        self.turn = Some((service.to_owned(), turn));
+        Ok(())
     }
 }
 
@@ -99,16 +202,49 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// Returns when the push that works in `directory` has exceeded a limit, with the error for its client.
-pub(super) async fn exceeded(options: &Options, directory: &Path) -> Error {
+/// What a push may still use. Waiting does not count.
+pub(super) struct Left<'a> {
+    options: &'a Options,
+    directory: PathBuf,
+    time: Duration,
+}
+
+impl Left<'_> {
+    /// Of a push that works in `directory`.
+    pub(super) fn new(options: &Options, directory: PathBuf) -> Left<'_> {
+        Left {
+            options,
+            directory,
+            time: options.time,
+        }
+    }
+
+    /// Does a part of the push, within what is left; ended where that is exceeded.
+    pub(super) async fn during<T>(
+        &mut self,
+        work: impl Future<Output = Result<T, Error>>,
+    ) -> Result<T, Error> {
+        let began = Instant::now();
+        let outcome = tokio::select! {
+            outcome = work => outcome,
+            error = exceeded(self.options, self.time, &self.directory) => Err(error),
+        };
+        self.time = self.time.saturating_sub(began.elapsed());
+        outcome
+    }
+}
+
+/// Returns when the push that works in `directory` has exceeded a limit, with the error for its client. `time`: what is
+/// left of the limit.
+async fn exceeded(options: &Options, time: Duration, directory: &Path) -> Error {
     let (what, next) = tokio::select! {
-        () = tokio::time::sleep(options.time) => (
+        () = tokio::time::sleep(time) => (
             format!("it took longer than {} s", options.time.as_secs()),
-            "push only what is needed, or raise time in [push] of the configuration",
+            "push only what is needed, or raise time in [push] of the optionsuration",
         ),
         what = overfull(options.disk, directory) => (
             what,
-            "push only what is needed, or raise disk in [push] of the configuration",
+            "push only what is needed, or raise disk in [push] of the optionsuration",
         ),
     };
     Error::Failed {
@@ -238,22 +374,60 @@ mod tests {
         let places = Arc::new(Places::new(&options()));
         let (sender, mut told) = mpsc::channel(16);
         let tell = Tell(sender);
-        let first = places.take(&tell).await.expect("free");
+        let first = places.enter(None, &tell).await.expect("free");
         let (again, tell_again) = (Arc::clone(&places), tell.clone());
-        let second = tokio::spawn(async move { again.take(&tell_again).await });
+        let second = tokio::spawn(async move { again.enter(None, &tell_again).await.map(drop) });
         let Some(api::PushEvent::Step { title }) = told.recv().await else {
             panic!("nothing was told");
         };
         assert!(title.contains("1 pushes are being built"), "{title}");
-        let refused = words(places.take(&tell).await.expect_err("the queue is full"));
+        let refused = places.enter(None, &tell).await.map(drop);
+        let refused = words(refused.expect_err("the queue is full"));
         assert!(
             refused.contains("1 wait already") && refused.contains("at_once"),
             "{refused}"
         );
         drop(first);
-        let second = second.await.expect("no panic").expect("its turn");
-        drop(second);
-        drop(places.take(&tell).await.expect("free again"));
+        second.await.expect("no panic").expect("its turn");
+        drop(places.enter(None, &tell).await.expect("free again"));
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_a_service_holds_no_place() {
+        let options = Options {
+            at_once: 2,
+            queue: 2,
+            ..options()
+        };
+        let places = Arc::new(Places::new(&options));
+        let (sender, mut told) = mpsc::channel(16);
+        let tell = Tell(sender);
+        let first = places.enter(Some("a"), &tell).await.expect("free");
+        let (again, tell_again) = (Arc::clone(&places), tell.clone());
+        let named = tokio::spawn(async move {
+            let second = again.enter(Some("a"), &tell_again).await;
+            second.map(drop)
+        });
+        let waits = |event| match event {
+            Some(api::PushEvent::Step { title }) => {
+                assert!(title.contains("a is being pushed"), "{title}");
+            }
+            other => panic!("{other:?}"),
+        };
+        waits(told.recv().await);
+        // One that is told its service when it is built.
+        let (again, tell_again) = (Arc::clone(&places), tell.clone());
+        let unnamed = tokio::spawn(async move {
+            let mut second = again.enter(None, &tell_again).await?;
+            second.named("a", &tell_again).await
+        });
+        waits(told.recv().await);
+        // Two wait, and there is a place for a third.
+        let other = places.enter(Some("b"), &tell).await.expect("a place");
+        drop((first, other));
+        for waiting in [named, unnamed] {
+            waiting.await.expect("no panic").expect("its turn");
+        }
     }
 
     #[tokio::test]
@@ -261,7 +435,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let directory = place.path().join("push-1");
         let options = options();
-        let exceeded = exceeded(&options, &directory);
+        let exceeded = exceeded(&options, options.time, &directory);
         let written = directory.clone();
         tokio::task::spawn_blocking(move || {
             std::fs::create_dir_all(written.join("upper")).expect("made");
@@ -284,14 +458,14 @@ mod tests {
             disk: Size(1 << 30),
             ..options()
         };
-        let told = words(exceeded(&options, &directory).await);
+        let told = words(exceeded(&options, options.time, &directory).await);
         assert!(told.contains("directories deep"), "{told}");
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_push_that_takes_too_long_is_told_so() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = words(exceeded(&options(), &place.path().join("none")).await);
+        let told = words(exceeded(&options(), options().time, &place.path().join("none")).await);
         assert!(
             told.contains("longer than 7200 s") && told.contains("raise time"),
             "{told}"

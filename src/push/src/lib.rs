@@ -22,7 +22,6 @@ mod receive;
 mod request;
 mod supplement;
 
-use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -31,14 +30,13 @@ use std::time::{Duration, Instant};
 use api::{PushEvent, PushOptions};
 use catalogue::{Catalogue, names};
 use choreographer::Choreographer;
-use parking_lot::Mutex;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
-use tokio::sync::{OwnedMutexGuard, mpsc};
+use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use bounds::Places;
+use bounds::{Left, Places};
 use request::Tell;
 use store::{Journal, NewEvent, Plan, RevisionRecord, State};
 
@@ -65,7 +63,6 @@ pub struct Pusher {
     builder: Builder,
     journal: Journal,
     places: Places,
-    turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
     published: AtomicU64,
     failed: AtomicU64,
     cancel: CancellationToken,
@@ -92,7 +89,6 @@ impl Pusher {
             engine,
             choreographer,
             builder,
-            turns: Mutex::default(),
             published: AtomicU64::new(0),
             failed: AtomicU64::new(0),
             cancel: CancellationToken::new(),
@@ -121,6 +117,7 @@ impl Pusher {
         }
     }
 
+    /// Pushes when it is its turn, within what a push may use.
     async fn push(
         &self,
         id: &str,
@@ -129,11 +126,32 @@ impl Pusher {
         tell: &Tell,
     ) -> Result<Published, Error> {
         let began = Instant::now();
-        let known = options.name.clone().or_else(|| options.apt.clone());
-        let early = match &known {
-            Some(name) => Some(self.turn(name).await),
-            None => None,
-        };
+        let known = options.name.as_deref().or(options.apt.as_deref());
+        let mut admitted = self.places.enter(known, tell).await?;
+        let mut left = Left::new(&self.options, self.home.join("build").join(id));
+        let built = left.during(self.made(id, options, archive, tell)).await?;
+        let name = options
+            .name
+            .clone()
+            .unwrap_or_else(|| built.package.clone());
+        names::service(&name).map_err(catalogue::Error::from)?;
+        admitted.named(&name, tell).await?;
+        let shown = self.shown(id, options, built, name.clone(), tell);
+        Ok(Published {
+            layers: left.during(shown).await?,
+            service: name,
+            took: began.elapsed(),
+        })
+    }
+
+    /// The image of what is pushed.
+    async fn made(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        archive: Archive,
+        tell: &Tell,
+    ) -> Result<BuildOutcome, Error> {
         let source = match &options.apt {
             Some(package) => {
                 // Names of Debian packages have hyphens, those of ROS packages do not.
@@ -152,16 +170,18 @@ impl Pusher {
                 Source::Tree(tree)
             }
         };
-        let built = self.build(id, options, source, tell).await?;
-        let name = options
-            .name
-            .clone()
-            .unwrap_or_else(|| built.package.clone());
-        names::service(&name).map_err(catalogue::Error::from)?;
-        let _turn = match early {
-            Some(turn) if known.as_ref() == Some(&name) => turn,
-            _ => self.turn(&name).await,
-        };
+        self.build(id, options, source, tell).await
+    }
+
+    /// Finds the interface of an image, and publishes both; gives the image's layers.
+    async fn shown(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        built: BuildOutcome,
+        name: String,
+        tell: &Tell,
+    ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         tell.step("starting it once to find its interface").await;
         let mut plan = plan_of(&built, options);
@@ -207,11 +227,7 @@ impl Pusher {
             size: layer.info.size,
             cached: layer.cached,
         };
-        Ok(Published {
-            service: name,
-            layers: built.layers.iter().map(layer).collect(),
-            took: began.elapsed(),
-        })
+        Ok(built.layers.iter().map(layer).collect())
     }
 
     /// A service belongs to the package that it was first made of.
@@ -253,15 +269,6 @@ impl Pusher {
         };
         let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);
         built.map_err(|error| push_error(&error, &self.home, &options.source))
-    }
-
-    async fn turn(&self, service: &str) -> OwnedMutexGuard<()> {
-        let turn = {
-            let mut turns = self.turns.lock();
-            turns.retain(|_, turn| Arc::strong_count(turn) > 1);
-            Arc::clone(turns.entry(service.to_owned()).or_default())
-        };
-        turn.lock_owned().await
     }
 }
 

@@ -15,6 +15,8 @@ pub struct Options {
     pub probe: Duration,
     /// How long the archive may pause while it is sent.
     pub stall: Duration,
+    /// Bytes of the archive that must come in a second, on the average over times of `stall`; 0 for any.
+    pub min_rate: Size,
     /// Pushes that are built at once; others wait.
     pub at_once: usize,
     /// Pushes that may wait.
@@ -35,6 +37,7 @@ impl Options {
             entries: 500_000,
             probe: Duration::from_secs(30),
             stall: Duration::from_secs(60),
+            min_rate: Size(1 << 10),
             at_once: 2,
             queue: 16,
             time: Duration::from_secs(7200),

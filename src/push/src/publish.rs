@@ -16,7 +16,7 @@ impl Pusher {
 
     /// Makes an earlier revision the current one.
     pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<u64, Error> {
-        let _turn = self.turn(name).await;
+        let _turn = self.places.turn(name).await;
         let RolledBack { from, to } = self.catalogue.rollback(name, wanted).await?;
         self.choreographer.look_at_spares();
         let about = NewEvent {
@@ -30,7 +30,7 @@ impl Pusher {
 
     /// Removes a service, its servants and its images; gives the servants' ids.
     pub async fn remove(&self, name: &str) -> Result<Vec<String>, Error> {
-        let _turn = self.turn(name).await;
+        let _turn = self.places.turn(name).await;
         let withdrawn = self.catalogue.withdraw(name)?;
         let stopped = self
             .choreographer

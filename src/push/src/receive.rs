@@ -15,7 +15,7 @@ use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
-use super::patience::{self, Stalled};
+use super::patience::{self, Patience, Stalled, TooSlow};
 use super::request::Tell;
 use crate::Error;
 use crate::Options;
@@ -44,7 +44,11 @@ pub(super) async fn unpack(
     let ended = CancellationToken::new();
     let _ended = ended.clone().drop_guard();
     let stalled = Stalled::default();
-    let chunks = patience::chunks(archive, limits.stall, stalled.clone(), ended);
+    let patience = Patience {
+        pause: limits.stall,
+        rate: limits.min_rate.0,
+    };
+    let chunks = patience::chunks(archive, patience, stalled.clone(), ended);
     let stream = StreamReader::new(chunks.boxed());
     let mut counted = Counted {
         inner: SyncIoBridge::new(stream),
@@ -57,7 +61,7 @@ pub(super) async fn unpack(
         bytes: limits.unpacked.0,
         ..image::Limits::default()
     };
-    let (limit, patience) = (limits.archive, limits.stall);
+    let (limit, slowest) = (limits.archive, limits.min_rate);
     let destination = tree.to_owned();
     let work = blocking::spawn(move || {
         let parent = destination.parent().unwrap_or(&destination);
@@ -70,15 +74,8 @@ pub(super) async fn unpack(
         if counted.exceeded {
             return Err(Error::TooLarge { limit });
         }
-        if stalled.is() {
-            return Err(Error::Failed {
-                message: format!("nothing of the archive came for {} s", patience.as_secs()),
-                next: Some(
-                    "look at the connection and push again, or raise stall in [push] of the configuration"
-                        .to_owned(),
-                ),
-                log: Vec::new(),
-            });
+        if let Some(why) = stalled.why() {
+            return Err(too_slow(why, patience.pause, slowest));
         }
         outcome.map(|_| ()).map_err(refused)
     });
@@ -100,6 +97,24 @@ pub(super) async fn unpack(
     tokio::select! {
         outcome = work => outcome.map_err(|_| Error::Internal("unpacking the archive"))?,
         () = told => Ok(()),
+    }
+}
+
+fn too_slow(why: TooSlow, pause: Duration, rate: Size) -> Error {
+    let (message, next) = match why {
+        TooSlow::Paused => (
+            format!("nothing of the archive came for {} s", pause.as_secs()),
+            "look at the connection and push again, or raise stall in [push] of the configuration",
+        ),
+        TooSlow::Trickled => (
+            format!("the archive came at less than {rate} a second"),
+            "push over a faster connection, or lower min_rate in [push] of the configuration",
+        ),
+    };
+    Error::Failed {
+        message,
+        next: Some(next.to_owned()),
+        log: Vec::new(),
     }
 }
 

@@ -3,7 +3,7 @@
 use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use api::{PushEvent, PushOptions};
 use catalogue::names;
@@ -12,7 +12,7 @@ use store::NewEvent;
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::{Archive, Error, Pusher, bounds, receive};
+use super::{Archive, Error, Pusher, receive};
 
 /// Tells the client what is being done. It may have gone away: that cancels the push by itself.
 #[derive(Clone)]
@@ -42,7 +42,7 @@ pub struct Published {
     pub service: String,
     /// Layers of its image.
     pub layers: Vec<api::push::Layer>,
-    /// How long it took, waiting aside.
+    /// How long it took, with what it waited for others.
     pub took: Duration,
 }
 
@@ -95,22 +95,6 @@ impl Pusher {
         Ok(self.choreographer.check_limits(&options.limits)?)
     }
 
-    /// Pushes when it is its turn, within what a push may use.
-    async fn bounded(
-        &self,
-        id: &str,
-        options: &PushOptions,
-        archive: Archive,
-        tell: &Tell,
-    ) -> Result<Published, Error> {
-        let _place = self.places.take(tell).await?;
-        let directory = self.home.join("build").join(id);
-        tokio::select! {
-            outcome = self.push(id, options, archive, tell) => outcome,
-            error = bounds::exceeded(&self.options, &directory) => Err(error),
-        }
-    }
-
     /// Pushes from beginning to end.
     async fn run(
         &self,
@@ -119,10 +103,9 @@ impl Pusher {
         tell: &Tell,
         cancel: CancellationToken,
     ) -> Result<Published, Error> {
-        let began = Instant::now();
         let id = format!("push-{}", names::random(8));
         let outcome = tokio::select! {
-            outcome = blocking::cancellable(self.bounded(&id, options, archive, tell)) => outcome,
+            outcome = blocking::cancellable(self.push(&id, options, archive, tell)) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
         };
         // First what the builder has in there: it goes when its containers have ended.
@@ -135,8 +118,7 @@ impl Pusher {
         match outcome {
             Ok(published) => {
                 self.published.fetch_add(1, Ordering::Relaxed);
-                let took = began.elapsed();
-                Ok(Published { took, ..published })
+                Ok(published)
             }
             Err(error) => {
                 self.failed.fetch_add(1, Ordering::Relaxed);
