@@ -87,14 +87,17 @@ fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     }
     // The table's address is where it is loaded; the segment that covers it tells where it is in the file.
     let address = strings?;
-    let home = segments
-        .iter()
-        .find(|s| s.kind == PT_LOAD && (s.address..s.address + s.size).contains(&address))?;
-    let table = part(file, home.offset + (address - home.address), length)?;
+    let mut loaded = segments.iter().filter(|s| s.kind == PT_LOAD);
+    let place = loaded.find_map(|segment| {
+        let inside = address.checked_sub(segment.address)?;
+        (inside < segment.size).then(|| segment.offset.checked_add(inside))
+    })??;
+    let table = part(file, place, length)?;
     let needed = names.into_iter().filter_map(|at| {
         let rest = table.get(usize::try_from(at).ok()?..)?;
         let end = rest.iter().position(|byte| *byte == 0)?;
-        String::from_utf8(rest[..end].to_vec()).ok()
+        let name = String::from_utf8(rest[..end].to_vec()).ok()?;
+        (!name.is_empty()).then_some(name)
     });
     Some(Dynamic {
         needed: needed.collect(),
@@ -192,6 +195,78 @@ mod tests {
         for bytes in cases {
             std::fs::write(&path, bytes).expect("written");
             assert_eq!(read(&path).expect("read"), None);
+        }
+    }
+
+    /// A 64-bit file with one loaded segment and a dynamic section that names its string table by `address`.
+    fn file_of(segment: Segment, address: u64) -> Vec<u8> {
+        let entries = [
+            (DT_NEEDED, 1),
+            (DT_STRTAB, address),
+            (DT_STRSZ, 9),
+            (DT_NULL, 0),
+        ];
+        let dynamic = Segment {
+            kind: PT_DYNAMIC,
+            offset: 64 + 2 * 56,
+            address: 0,
+            size: 16 * entries.len() as u64,
+        };
+        let mut bytes = b"\x7fELF\x02\x01".to_vec();
+        bytes.resize(64, 0);
+        bytes[32..40].copy_from_slice(&64_u64.to_le_bytes());
+        bytes[54..58].copy_from_slice(&[56, 0, 2, 0]);
+        for segment in [segment, dynamic] {
+            let fields = [
+                segment.kind.into(),
+                segment.offset,
+                segment.address,
+                0,
+                segment.size,
+                0,
+                0,
+            ];
+            bytes.extend(fields.iter().flat_map(|field: &u64| field.to_le_bytes()));
+        }
+        for (tag, value) in entries {
+            bytes.extend([tag, value].iter().flat_map(|word| word.to_le_bytes()));
+        }
+        bytes.extend(b"\0libx.so\0");
+        bytes
+    }
+
+    #[test]
+    fn a_file_whose_numbers_mean_nothing_needs_nothing() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("x");
+        let needs = |offset, address, size, table| {
+            let kind = PT_LOAD;
+            let segment = Segment {
+                kind,
+                offset,
+                address,
+                size,
+            };
+            std::fs::write(&path, file_of(segment, table)).expect("written");
+            let dynamic = read(&path).expect("read")?;
+            dynamic.needed.into_iter().next()
+        };
+        let strings = 64 + 2 * 56 + 4 * 16;
+        assert_eq!(
+            needs(0, 0x1000, 1 << 20, 0x1000 + strings).as_deref(),
+            Some("libx.so")
+        );
+        for (offset, address, size, table) in [
+            (0, u64::MAX - 8, 100, u64::MAX - 1),
+            (u64::MAX - 8, 0, u64::MAX, 100),
+            (u64::MAX, u64::MAX, u64::MAX, u64::MAX),
+            (0, 0x1000, 100, 0),
+        ] {
+            assert_eq!(
+                needs(offset, address, size, table),
+                None,
+                "{offset} {address}"
+            );
         }
     }
 
