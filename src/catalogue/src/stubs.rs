@@ -93,8 +93,11 @@ pub fn is_authority(text: &str) -> bool {
 }
 
 /// Executables of the package that run in the cloud, those that a revision's servants run, by name: where each is, as its
-/// push recorded it. A stub may have these started and no others.
-pub fn programs(revision: &RevisionRecord) -> BTreeMap<String, PathBuf> {
+/// push recorded it. A stub may have these started and no others. `layers`: the image's, extracted, lowest first. Blocking.
+pub fn programs<L: AsRef<Path>>(
+    revision: &RevisionRecord,
+    layers: &[L],
+) -> BTreeMap<String, PathBuf> {
     let package = &revision.package;
     let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
     let of_package = |argument: &String| {
@@ -104,16 +107,21 @@ pub fn programs(revision: &RevisionRecord) -> BTreeMap<String, PathBuf> {
         let name = argument.rsplit('/').next().unwrap_or_default();
         inside.then(|| (name.to_owned(), PathBuf::from(argument)))
     };
+    // Nodes are given files of the package, too. What cannot be found or looked at is taken for a program, as it was
+    // when it was started.
+    let runs = |(_, path): &(String, PathBuf)| {
+        !matches!(package::stub::is_program(layers, path), Ok(Some(false)))
+    };
     let nodes = revision.plan.nodes.iter();
     nodes
-        .filter_map(|node| node.argv.iter().find_map(of_package))
+        .filter_map(|node| node.argv.iter().filter_map(of_package).find(runs))
         .filter(|(name, _)| package::names::is_executable(name))
         .collect()
 }
 
 /// Their names.
-pub fn outsourced(revision: &RevisionRecord) -> BTreeSet<String> {
-    programs(revision).into_keys().collect()
+fn outsourced<L: AsRef<Path>>(revision: &RevisionRecord, layers: &[L]) -> BTreeSet<String> {
+    programs(revision, layers).into_keys().collect()
 }
 
 /// The files of a revision's stub, but for the robot's program.
@@ -136,7 +144,7 @@ pub fn files(
         image: &revision.image,
         server,
         architecture,
-        outsourced: &outsourced(revision),
+        outsourced: &outsourced(revision, &layers),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
     };
@@ -248,6 +256,7 @@ fn header(kind: EntryType, executable: bool, size: u64) -> Header {
 #[cfg(test)]
 mod tests {
     use std::io::Read;
+    use std::os::unix::fs::PermissionsExt;
 
     use store::Plan;
 
@@ -293,15 +302,43 @@ mod tests {
             &["/opt/mine/share/p/scripts/tool.py", "x:=/lib/p/y"],
             &["/usr/lib/q/other"],
         ]);
-        let names: Vec<String> = super::outsourced(&revision).into_iter().collect();
+        let none: [PathBuf; 0] = [];
+        let names: Vec<String> = super::outsourced(&revision, &none).into_iter().collect();
         assert_eq!(names, ["node", "tool.py"]);
-        let programs = programs(&revision);
+        let programs = programs(&revision, &none);
         assert_eq!(
             programs.get("tool.py").map(PathBuf::as_path),
             Some(Path::new("/opt/mine/share/p/scripts/tool.py"))
         );
         assert!(!programs.contains_key("nice") && !programs.contains_key("other"));
         assert_eq!(prefixes(&revision), ["opt/mine", "usr", "opt/other"]);
+    }
+
+    #[test]
+    fn data_that_a_node_is_given_is_not_outsourced() {
+        let layer = tempfile::tempdir().expect("a directory");
+        let files = [
+            ("usr/share/p/maps/map.yaml", 0o644),
+            ("usr/lib/p/model", 0o644),
+            ("usr/lib/p/node", 0o755),
+        ];
+        for (path, mode) in files {
+            let path = layer.path().join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(&path, "").expect("written");
+            std::fs::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
+        }
+        let revision = revision(&[
+            &[
+                "/usr/lib/map_server/map_server",
+                "/usr/share/p/maps/map.yaml",
+            ],
+            &["/usr/bin/nice", "/usr/lib/p/model", "/usr/lib/p/node"],
+        ]);
+        let names: Vec<String> = super::outsourced(&revision, &[layer.path()])
+            .into_iter()
+            .collect();
+        assert_eq!(names, ["node"]);
     }
 
     #[test]

@@ -55,7 +55,7 @@ async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         parameters: plan.parameters.clone(),
-        programs: stubs::programs(revision),
+        programs: stubs::programs(revision, &layers),
         prefixes: catalogue::prefixes(revision, &layers),
         layers,
         registry,

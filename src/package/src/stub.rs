@@ -15,7 +15,7 @@ mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-pub use contents::{Content, Contents};
+pub use contents::{Content, Contents, is_program};
 
 use crate::Error;
 use crate::interface::Interface;

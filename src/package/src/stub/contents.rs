@@ -11,6 +11,8 @@ const MAX_BYTES: u64 = 64 << 20;
 /// All files together.
 const MAX_TOTAL: usize = 256 << 20;
 const MAX_FILES: usize = 20_000;
+/// Links that are followed from one to the next.
+const MAX_LINKS: usize = 8;
 /// Directories below a package's.
 const MAX_DEPTH: usize = 16;
 
@@ -72,6 +74,31 @@ impl Contents {
         }
         Ok(contents)
     }
+}
+
+/// Whether the file at an absolute path of an image, given as in [`Contents::read`], may be executed; none where there is
+/// none. Links are followed as a process in the image would.
+pub fn is_program<L: AsRef<Path>>(layers: &[L], path: &Path) -> Result<Option<bool>, Error> {
+    let stack = merged::open(layers)?;
+    let mut path = path.to_owned();
+    for _ in 0..MAX_LINKS {
+        let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
+            return Ok(None);
+        };
+        let Some(directory) = parent.to_str() else {
+            return Ok(None);
+        };
+        let directory = Merged::at(&stack, directory)?;
+        let names = directory.names()?;
+        let Some((name, level)) = names.get_key_value(name.as_encoded_bytes()) else {
+            return Ok(None);
+        };
+        match level.link(name) {
+            Some(target) => path = parent.join(target),
+            None => return Ok(Some(level.is_executable(name))),
+        }
+    }
+    Ok(None)
 }
 
 /// Of programs only the names are wanted, and a link to one is one.
@@ -223,6 +250,40 @@ mod tests {
         assert_eq!(contents.share.len(), 1);
         assert_eq!(layers.read("q"), Contents::default());
         assert_eq!(layers.read("../p"), Contents::default());
+    }
+
+    #[test]
+    fn programs_are_told_from_data() {
+        let layers = layers();
+        layers
+            .file("low/usr/share/p/map.yaml", "", 0o644)
+            .file("high/usr/lib/p/hidden", "", 0o644)
+            .file("low/usr/lib/p/hidden", "", 0o755);
+        for (name, target) in [
+            ("high/usr/lib/p/alias", "../../share/p/scripts/tool.py"),
+            ("high/usr/lib/p/data", "/usr/share/p/map.yaml"),
+            ("high/usr/lib/p/lost", "nowhere"),
+            ("high/usr/lib/p/round", "round"),
+        ] {
+            symlink(target, layers.place(name)).expect("linked");
+        }
+        let stack = [layers.0.path().join("low"), layers.0.path().join("high")];
+        for (path, expected) in [
+            ("/usr/lib/p/node", Some(true)),
+            ("/usr/share/p/scripts/tool.py", Some(true)),
+            ("/usr/lib/p/alias", Some(true)),
+            ("/usr/share/p/map.yaml", Some(false)),
+            ("/usr/share/p/launch", Some(false)),
+            ("/usr/lib/p/data", Some(false)),
+            ("/usr/lib/p/hidden", Some(false)),
+            ("/usr/lib/p/lost", None),
+            ("/usr/lib/p/round", None),
+            ("/usr/lib/p/none", None),
+            ("/", None),
+        ] {
+            let told = is_program(&stack, Path::new(path)).expect("read");
+            assert_eq!(told, expected, "{path}");
+        }
     }
 
     #[test]
