@@ -16,7 +16,7 @@ use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rootfs_builder::probe::{ProbeOptions, Work, probe};
+use rootfs_builder::probe::{ProbeOptions, Work, Worked, probe};
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, Config, PushRequest, Source, Sources};
 use ros::bus::ParamValue;
 use ros::net::{LoopbackSockets, Sockets};
@@ -409,11 +409,11 @@ async fn watch(
     let work = Work::new(move || {
         let servant = asked.clone();
         async move {
-            servant
-                .usage()
-                .await
-                .ok()
-                .map(|usage| Duration::from_micros(usage.cpu_usec))
+            let usage = servant.usage().await.ok()?;
+            Some(Worked {
+                ran: Duration::from_micros(usage.cpu_usec),
+                ..Worked::default()
+            })
         }
     });
     let options = ProbeOptions {

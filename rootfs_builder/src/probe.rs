@@ -104,24 +104,34 @@ pub struct ProbeOptions {
     pub patience: Duration,
     /// The graph is still when nothing changed for so long.
     pub settle: Duration,
-    /// At most so long for it to become still, each time.
+    /// At most so long for it to become still, each time; time that the nodes waited for a core does not count, up to
+    /// `patience`.
     pub restless: Duration,
     /// Types of topics as the deployer states them, for inputs that take any.
     pub types: BTreeMap<String, String>,
-    /// Tells how much the nodes have worked: those that work have not settled (they load models, say). None: not
-    /// known.
+    /// Tells how much the nodes have worked: those that work have not settled (they load models, say), and those that
+    /// wait for a core could not. None: not known.
     pub work: Option<Work>,
 }
 
-/// Asks for the CPU time that the nodes have used so far; none where it cannot be told.
+/// What nodes have had of the processors so far.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Worked {
+    /// Time on a core, of all threads together.
+    pub ran: Duration,
+    /// Time in which a thread could have run and others had the cores, of all threads together.
+    pub waited: Duration,
+}
+
+/// Asks what the nodes have had of the processors; none where it cannot be told.
 #[derive(Clone)]
-pub struct Work(Arc<dyn Fn() -> BoxFuture<'static, Option<Duration>> + Send + Sync>);
+pub struct Work(Arc<dyn Fn() -> BoxFuture<'static, Option<Worked>> + Send + Sync>);
 
 impl Work {
     /// Asked several times a second at most.
     pub fn new<F>(ask: impl Fn() -> F + Send + Sync + 'static) -> Self
     where
-        F: Future<Output = Option<Duration>> + Send + 'static,
+        F: Future<Output = Option<Worked>> + Send + 'static,
     {
         Self(Arc::new(move || Box::pin(ask())))
     }
@@ -147,7 +157,7 @@ impl ProbeOptions {
         }
     }
 
-    async fn worked(&self) -> Option<Duration> {
+    async fn worked(&self) -> Option<Worked> {
         match &self.work {
             Some(work) => (work.0)().await,
             None => None,

@@ -2,12 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros::bus::{Graph, TopicNodes};
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
-use super::{ProbeError, ProbeOptions, describe, is_plumbing};
+use super::{ProbeError, ProbeOptions, Worked, describe, is_plumbing};
 
 async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeError> {
     watch.changed().await.map_err(|_| ProbeError::MasterGone)
@@ -48,50 +49,111 @@ pub(super) async fn registered(
     }
 }
 
+/// Time as nodes have it: while they wait for a core it stands still, nearly.
+struct Clock {
+    /// When it was read last.
+    at: Instant,
+    worked: Option<Worked>,
+}
+
+/// What happened between two readings of a [`Clock`].
+struct Past {
+    /// As nodes have it.
+    time: Duration,
+    /// Of that on a core, of all threads together.
+    ran: Duration,
+}
+
+/// Threads that wait together may wait longer than time passes: a part of it counts always.
+const LEAST: u32 = 20;
+
+impl Clock {
+    async fn begin(options: &ProbeOptions) -> Self {
+        Self {
+            at: Instant::now(),
+            worked: options.worked().await,
+        }
+    }
+
+    async fn read(&mut self, options: &ProbeOptions) -> Past {
+        let (at, worked) = (Instant::now(), options.worked().await);
+        let elapsed = at - self.at;
+        let (ran, waited) = match (self.worked, worked) {
+            (Some(before), Some(after)) => (
+                after.ran.saturating_sub(before.ran),
+                // Threads that have ended are not counted any more.
+                after.waited.saturating_sub(before.waited),
+            ),
+            _ => Default::default(),
+        };
+        *self = Self { at, worked };
+        let time = elapsed.saturating_sub(waited).max(elapsed / LEAST);
+        Past { time, ran }
+    }
+}
+
 /// Waits until nothing changes any more; false when it did not come to rest in time.
 ///
-/// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to.
+/// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to. A node
+/// that waits for a core is, too: all times are the nodes' own, but for `patience`.
 pub(super) async fn still(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
 ) -> Result<bool, ProbeError> {
-    let begun = Instant::now();
-    let limit = begun + options.restless;
+    let latest = Instant::now() + options.patience.max(options.restless);
     // Some nodes work all the time; that alone is not worth the whole wait.
-    let working_limit = begun + options.restless / 3;
+    let working_limit = options.restless / 3;
+    let mut clock = Clock::begin(options).await;
     let mut shape = shape(&watch.borrow_and_update());
-    let mut since = Instant::now();
-    let mut worked = options.worked().await;
+    let mut total = Duration::ZERO;
+    // Since the last change.
+    let (mut silent, mut ran) = (Duration::ZERO, Duration::ZERO);
     loop {
-        match timeout_at((since + options.settle).min(limit), changed(watch)).await {
-            Ok(result) => {
-                result?;
-                // Parameters that a node reads again and again change the graph's generation and nothing here.
-                let now = self::shape(&watch.borrow_and_update());
-                if now == shape {
-                    continue;
-                }
-                shape = now;
-            }
-            Err(_) => {
-                let now = Instant::now();
-                let work = options.worked().await;
-                let busy = match (worked, work) {
-                    (Some(before), Some(after)) => after.saturating_sub(before) * 3 > now - since,
-                    _ => false,
-                };
-                worked = work;
-                let bare = shows_nothing(&watch.borrow(), options);
-                if now >= limit {
-                    return Ok(bare || !busy);
-                }
-                if !bare && (!busy || now >= working_limit) {
-                    return Ok(true);
-                }
-            }
+        let pause = options.settle.saturating_sub(silent);
+        let until = Instant::now() + pause.max(options.settle / LEAST);
+        let changed = differs(watch, &mut shape, until.min(latest)).await?;
+        let past = clock.read(options).await;
+        total += past.time;
+        if changed {
+            (silent, ran) = (Duration::ZERO, Duration::ZERO);
+        } else {
+            silent += past.time;
+            ran += past.ran;
         }
-        since = Instant::now();
+        let busy = ran * 3 > silent;
+        let bare = shows_nothing(&watch.borrow(), options);
+        if total >= options.restless || Instant::now() >= latest {
+            return Ok(!changed && (bare || !busy));
+        }
+        if silent < options.settle {
+            continue;
+        }
+        if !bare && (!busy || total >= working_limit) {
+            return Ok(true);
+        }
+        (silent, ran) = (Duration::ZERO, Duration::ZERO);
     }
+}
+
+/// Waits until the graph differs from `shape`, which then is the new one; false if it does not until then.
+async fn differs(
+    watch: &mut watch::Receiver<Arc<Graph>>,
+    shape: &mut Shape,
+    until: Instant,
+) -> Result<bool, ProbeError> {
+    while let Ok(changed) = timeout_at(until, changed(watch)).await {
+        changed?;
+        // Parameters that a node reads again and again change the graph's generation and nothing here.
+        let now = self::shape(&watch.borrow_and_update());
+        if now != *shape {
+            *shape = now;
+            return Ok(true);
+        }
+        if Instant::now() >= until {
+            break;
+        }
+    }
+    Ok(false)
 }
 
 /// Whether nobody has registered anything yet but what every node has. (Of several nodes some may never show

@@ -218,6 +218,67 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
     lab.ends().await;
 }
 
+#[tokio::test(start_paused = true)]
+async fn a_node_that_waits_for_a_core_is_waited_for() {
+    let shows = |topics: &[&str]| {
+        let nodes = || TopicNodes {
+            publishers: vec!["/package".into()],
+            ..TopicNodes::default()
+        };
+        Arc::new(Graph {
+            topics: topics
+                .iter()
+                .map(|&name| (name.to_owned(), nodes()))
+                .collect(),
+            ..Graph::default()
+        })
+    };
+    let (graph, mut watch) = tokio::sync::watch::channel(shows(&["/first"]));
+    // Of five seconds it has a fortieth. Then it shows the rest of itself, and rests.
+    let begun = Instant::now();
+    let crowded = Duration::from_secs(5);
+    let work = Work::new(move || async move {
+        let elapsed = begun.elapsed().min(crowded);
+        Some(Worked {
+            ran: elapsed / 40,
+            waited: elapsed - elapsed / 40,
+        })
+    });
+    let options = ProbeOptions {
+        work: Some(work),
+        ..ProbeOptions::new(vec!["/package".into()], "/looker")
+    };
+    let (all, shown) = (shows(&["/first", "/last"]), graph.clone());
+    tokio::spawn(async move {
+        tokio::time::sleep_until(begun + crowded).await;
+        let _ = shown.send(all);
+    });
+    assert!(settle::still(&mut watch, &options).await.expect("watched"));
+    assert!(watch.borrow().topics.contains_key("/last"));
+    let took = begun.elapsed() - crowded;
+    assert!(took < 2 * options.settle, "{took:?}");
+    // For ever is too long, as [push] says.
+    let work = Work::new(move || async move {
+        Some(Worked {
+            ran: Duration::ZERO,
+            waited: begun.elapsed(),
+        })
+    });
+    let options = ProbeOptions {
+        patience: Duration::from_secs(30),
+        settle: Duration::from_secs(5),
+        work: Some(work),
+        ..options
+    };
+    let began = Instant::now();
+    settle::still(&mut watch, &options).await.expect("watched");
+    let took = began.elapsed();
+    assert!(
+        took >= 5 * options.settle && took < 7 * options.settle,
+        "{took:?}"
+    );
+}
+
 #[tokio::test]
 async fn a_node_that_still_works_is_waited_for() {
     let lab = Lab::new().await;
@@ -245,7 +306,10 @@ async fn a_node_that_still_works_is_waited_for() {
                 *late.lock().await =
                     Some(node.subscribe("/late", options).await.expect("subscribed"));
             }
-            Some(Duration::from_secs(times.min(2).into()))
+            Some(Worked {
+                ran: Duration::from_secs(times.min(2).into()),
+                ..Worked::default()
+            })
         }
     });
     let options = ProbeOptions {

@@ -8,7 +8,7 @@ use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use reach::egress::Relays;
 use reach::{ServantSockets, how_it_ended, master};
-use rootfs_builder::probe::{Found, ProbeOptions, Work};
+use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
 use rootfs_builder::{BuildOutcome, blocking};
 use ros::bus::Bus;
 use ros::ros1::Ros1Bus;
@@ -125,7 +125,7 @@ async fn look(
             .as_deref()
             .map(supplement::topic_types)
             .unwrap_or_default(),
-        work: Some(Work::new(move || cpu_time(Arc::clone(&working)))),
+        work: Some(Work::new(move || worked(Arc::clone(&working)))),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),
             NODE,
@@ -173,9 +173,29 @@ async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
     }
 }
 
-async fn cpu_time(servant: Arc<dyn Servant>) -> Option<Duration> {
+async fn worked(servant: Arc<dyn Servant>) -> Option<Worked> {
     let usage = servant.usage().await.ok()?;
-    Some(Duration::from_micros(usage.cpu_usec))
+    let processes = servant.processes().await.unwrap_or_default();
+    let waited = tokio::task::spawn_blocking(move || processes.into_iter().map(waited).sum());
+    Some(Worked {
+        ran: Duration::from_micros(usage.cpu_usec),
+        waited: waited.await.unwrap_or_default(),
+    })
+}
+
+/// How long the threads of a process could have run and others had the cores; nothing where the kernel does not count it
+/// (Documentation/scheduler/sched-stats.rst: nanoseconds on a core, nanoseconds waiting, slices).
+fn waited(pid: i32) -> Duration {
+    let threads = std::fs::read_dir(format!("/proc/{pid}/task"));
+    let waited = threads
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|thread| {
+            let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+            text.split_whitespace().nth(1)?.parse::<u64>().ok()
+        });
+    Duration::from_nanos(waited.sum())
 }
 
 /// Comes back when a node ends that should not, or the container does, with what is to be said about it.
