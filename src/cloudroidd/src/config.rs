@@ -1,6 +1,8 @@
 //! The configuration file: TOML, every key optional, unknown keys refused by name.
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
+mod options;
+
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -8,14 +10,10 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use api::{Limits, Size};
-use bridge::BridgeOptions;
-use choreographer::MemoryOptions;
 use choreographer::grants::Allow;
 use choreographer::limits::check as check_limits;
 use portal::Tokens;
 use serde::{Deserialize, Deserializer};
-
-use crate::supervision::machine_memory;
 
 /// Everything that can be configured.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -189,11 +187,6 @@ pub struct Push {
     pub pids: u64,
 }
 
-/// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
-/// `MOST` bytes.
-const PART: u64 = 4;
-const MOST: u64 = 1 << 30;
-
 /// A duration: `"500ms"`, `"30s"`, `"5m"`, `"1h"`, or a number of seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Time(pub Duration);
@@ -299,16 +292,6 @@ impl Default for Push {
 }
 
 impl Push {
-    /// Limits of each container of a build.
-    pub fn limits(&self) -> servant::spec::Limits {
-        servant::spec::Limits {
-            cpus: self.cpus,
-            memory: self.memory.map(|memory| memory.0),
-            pids: Some(self.pids),
-            ..servant::spec::Limits::default()
-        }
-    }
-
     fn check(&self) -> anyhow::Result<()> {
         if self.at_once == 0 {
             bail!("at_once = 0 would let no push be built; write at least 1");
@@ -436,59 +419,6 @@ impl Config {
         Ok(())
     }
 
-    /// What of it is the choreographer's.
-    pub fn choreographer(&self) -> choreographer::Options {
-        let (servant, memory) = (&self.servant, &self.memory);
-        let daemon = memory.daemon.map(|size| size.0);
-        choreographer::Options {
-            limits: self.limits,
-            reserve_cpus: servant.reserve_cpus,
-            reserve_memory: servant.reserve_memory.0,
-            deadline: self.room.deadline.0,
-            start: servant.start.0,
-            grace: servant.grace.0,
-            anonymous_grace: servant.anonymous_grace.0,
-            spares: servant.spares,
-            allow: self.allow.clone(),
-            bridge: bridge_options(self),
-            memory: MemoryOptions {
-                daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),
-                client: memory.client.0,
-                servant: memory.servant.0,
-                unfinished: memory.unfinished.0,
-            },
-        }
-    }
-
-    /// What of it is for pushes.
-    pub fn push(&self) -> push::Options {
-        let push = &self.push;
-        push::Options {
-            archive: push.archive,
-            unpacked: push.unpacked,
-            entries: push.entries,
-            probe: push.probe.0,
-            stall: push.stall.0,
-            min_rate: push.min_rate,
-            at_once: push.at_once,
-            queue: push.queue,
-            time: push.time.0,
-            disk: push.disk,
-        }
-    }
-
-    /// What of it is the portal's.
-    pub fn portal(&self) -> portal::Options {
-        portal::Options {
-            origins: self.origins.clone(),
-            default_service: self.default_service.clone(),
-            default_robot: self.default_robot.clone(),
-            handshake: self.portal.handshake.0,
-            drain: self.portal.drain.0,
-            isolation: self.isolation.to_string(),
-        }
-    }
-
     /// Whether servants outlive this daemon when it is ended.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
@@ -523,26 +453,6 @@ impl Memory {
             bail!("shim_cpus = {} is not between 0.1 and 64", self.shim_cpus);
         }
         Ok(())
-    }
-}
-
-/// What the configuration says of bridges.
-fn bridge_options(config: &Config) -> BridgeOptions {
-    let bytes = |size: Size| usize::try_from(size.0).unwrap_or(usize::MAX);
-    BridgeOptions {
-        max_frame: bytes(config.portal.max_frame),
-        max_message: bytes(config.portal.max_message),
-        max_encoded: bytes(config.portal.max_encoded),
-        unfinished: config.memory.unfinished.0,
-        ping_interval: config.portal.ping.0,
-        idle_timeout: config.portal.idle.0,
-        non_finite: match config.portal.non_finite {
-            NonFinite::Null => ros::codec::NonFinite::Null,
-            NonFinite::Text => ros::codec::NonFinite::String,
-            NonFinite::Bare => ros::codec::NonFinite::Bare,
-        },
-        resume_grace: config.servant.grace.0,
-        ..BridgeOptions::default()
     }
 }
 

@@ -15,6 +15,7 @@ mod doctor;
 mod home;
 mod shim;
 mod supervision;
+mod wiring;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;
@@ -25,22 +26,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use catalogue::Catalogue;
-use choreographer::{Admission, Amount, Choreographer};
 use clap::{Parser, Subcommand};
-use portal::{App, Machine, Tokens};
-use push::Pusher;
-use rootfs_builder::Builder;
-use servant::engine::Engine;
-use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
+use portal::Machine;
 use tokio::net::TcpListener;
-use tokio_util::sync::CancellationToken;
-use tokio_util::task::TaskTracker;
 use tracing_subscriber::EnvFilter;
 
 use config::{Config, IsolationMode};
 use home::Home;
-use store::State;
 
 /// Robot packages as services, on this machine.
 #[derive(Debug, Parser)]
@@ -201,7 +193,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     })?;
     let listener = listen(config.listen).await?;
     let socket = home.listen()?;
-    let app = build(&config, &home, machine, listener.local_addr()?)?;
+    let app = wiring::build(&config, &home, machine, listener.local_addr()?)?;
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
     }
@@ -233,108 +225,11 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     app.choreographer.keep_spares();
     asked.cancelled().await;
     supervision::stopping();
-    drain(&app, config.keeps_servants()).await;
+    wiring::drain(&app, config.keeps_servants()).await;
     app.ending.cancel();
     let _ = tokio::join!(tcp, unix);
     let _ = std::fs::remove_file(home.socket());
     Ok(())
-}
-
-fn build(
-    config: &Config,
-    home: &Home,
-    machine: Machine,
-    listen: SocketAddr,
-) -> anyhow::Result<Arc<App>> {
-    let tokens = Tokens::new(&config.tokens)?;
-    let state = Arc::new(State::open(&home.database())?);
-    tokio::spawn(store::watch(Arc::clone(&state)));
-    // Names bound to a token that is not known any more would be nobody's for ever.
-    state.release_robots(tokens.hashes())?;
-    let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
-    let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
-    let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(config, home)?)?);
-    let room = &config.room;
-    let memory = room
-        .memory
-        .map_or_else(supervision::machine_memory, |size| size.0);
-    let capacity = Amount::new(room.cpus.unwrap_or_else(config::machine_cores), memory);
-    let choreographer = Choreographer::new(
-        config.choreographer(),
-        Arc::clone(&catalogue),
-        Arc::clone(&engine),
-        Admission::new(capacity, room.queue),
-    );
-    let definitions = bases::directory(config, home)?;
-    let builder = builder(config, home, definitions, catalogue.images(), &engine)?;
-    let pusher = Pusher::new(
-        config.push(),
-        home.path().to_owned(),
-        builder,
-        Arc::clone(&catalogue),
-        engine,
-        choreographer.clone(),
-    );
-    let examined = home.path().to_owned();
-    Ok(Arc::new(App {
-        tokens,
-        listen,
-        home: home.path().to_owned(),
-        state,
-        catalogue,
-        choreographer,
-        pusher: Arc::new(pusher),
-        machine,
-        started: store::now(),
-        sessions: TaskTracker::new(),
-        ending: CancellationToken::new(),
-        options: config.portal(),
-        examine: Box::new(move || doctor::examine(&examined, Some(listen))),
-    }))
-}
-
-/// What makes images of pushes.
-fn builder(
-    config: &Config,
-    home: &Home,
-    bases_dir: PathBuf,
-    images: &Arc<image::Store>,
-    engine: &Arc<dyn Engine>,
-) -> anyhow::Result<Builder> {
-    let cache = home.cache();
-    // What was compiled lies there, too.
-    store::private::make_directory(&cache)
-        .and_then(|()| store::private::close(&cache))
-        .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
-    Builder::new(rootfs_builder::Config {
-        cache_dir: cache,
-        bases_dir,
-        build_dir: home.path().join("build"),
-        logs_dir: home.path().join("logs"),
-        sources: rootfs_builder::Sources::default(),
-        store: Arc::clone(images),
-        engine: Arc::clone(engine),
-        limits: config.push.limits(),
-    })
-    .context("cannot prepare for building images")
-}
-
-fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConfig> {
-    let program = std::env::current_exe().context("cannot find this very program")?;
-    let init = doctor::find_init().context("cloudroid-init is not beside cloudroidd")?;
-    let servants = home.path().join("servants");
-    let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
-    engine.default_limits = choreographer::engine_limits(&config.limits);
-    engine.shim_limits = servant::spec::Limits {
-        cpus: Some(config.memory.shim_cpus),
-        memory: Some(config.memory.shim.0),
-        ..servant::spec::Limits::default()
-    };
-    engine.isolation = match config.isolation {
-        IsolationMode::Require => Isolation::Require,
-        IsolationMode::BestEffort => Isolation::BestEffort,
-    };
-    Ok(engine)
 }
 
 async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
@@ -352,34 +247,6 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
                 "cannot listen on {address}; choose another with --listen"
             )),
         })
-}
-
-/// Lets pushes, sessions and, unless they are to be kept, servants end.
-async fn drain(app: &App, keep_servants: bool) {
-    app.choreographer.close();
-    app.pusher.cancel_all(app.options.drain).await;
-    app.choreographer.end_spares().await;
-    if keep_servants {
-        tracing::info!(
-            "ending; {} servants go on",
-            app.choreographer.servants().len()
-        );
-        for handle in app.choreographer.servants() {
-            if let Some(reach) = handle.reach() {
-                reach
-                    .bridge
-                    .close("the daemon is being restarted; connect again");
-            }
-        }
-    } else {
-        let ended = app
-            .choreographer
-            .stop("the daemon is ending", |_| true)
-            .await;
-        tracing::info!("ending; {} servants ended", ended.len());
-    }
-    app.sessions.close();
-    let _ = tokio::time::timeout(app.options.drain, app.sessions.wait()).await;
 }
 
 #[cfg(test)]

@@ -1,0 +1,100 @@
+//! The table in ARCHITECTURE.md says which crate uses which. It is compared with the manifests.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// The repository.
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../..")
+        .canonicalize()
+        .expect("two levels up")
+}
+
+fn read(path: &Path) -> toml::Table {
+    let text = std::fs::read_to_string(path).expect("a manifest");
+    toml::from_str(&text).expect("TOML")
+}
+
+/// Directories of all crates, as the workspace lists them, with the name of each.
+fn members() -> BTreeMap<String, String> {
+    let workspace = read(&root().join("Cargo.toml"));
+    let members = workspace["workspace"]["members"]
+        .as_array()
+        .expect("a list");
+    let directories = members.iter().filter_map(|member| member.as_str());
+    directories
+        .map(|directory| {
+            let manifest = read(&root().join(directory).join("Cargo.toml"));
+            let name = manifest["package"]["name"].as_str().expect("a name");
+            (directory.to_owned(), name.to_owned())
+        })
+        .collect()
+}
+
+/// Crates of `known` that the crate in `directory` depends on, tests aside.
+fn dependencies(directory: &str, known: &BTreeSet<&str>) -> BTreeSet<String> {
+    let manifest = read(&root().join(directory).join("Cargo.toml"));
+    let Some(dependencies) = manifest.get("dependencies").and_then(|all| all.as_table()) else {
+        return BTreeSet::new();
+    };
+    let ours = dependencies
+        .keys()
+        .filter(|name| known.contains(name.as_str()));
+    ours.cloned().collect()
+}
+
+/// Rows of the map: what stands at the left, and what it uses.
+fn rows() -> Vec<(String, BTreeSet<String>)> {
+    let text = std::fs::read_to_string(root().join("ARCHITECTURE.md")).expect("it is there");
+    let (_, map) = text
+        .split_once("\n| where | what it is | uses |")
+        .expect("the map");
+    let (map, _) = map.split_once("\n\n").expect("its end");
+    let rows = map.lines().filter(|line| line.starts_with("| `"));
+    rows.map(|line| {
+        let cells: Vec<&str> = line.trim_matches('|').split(" | ").collect();
+        let place = cells[0].trim().trim_matches('`').trim_end_matches('/');
+        let uses = cells.get(2).copied().unwrap_or_default();
+        let uses = uses.split([',', '|']).map(str::trim);
+        let uses = uses.filter(|name| !name.is_empty());
+        (place.to_owned(), uses.map(str::to_owned).collect())
+    })
+    .collect()
+}
+
+#[test]
+fn the_map_says_what_the_manifests_say() {
+    let members = members();
+    // Measurements and stories are told with one another's help; that is no part of the system.
+    let part = |name: &&str| *name != "stories" && !name.starts_with("bench-");
+    let known: BTreeSet<&str> = members.values().map(String::as_str).filter(part).collect();
+    let rows = rows();
+    let mut above = BTreeSet::new();
+    for (place, told) in &rows {
+        let inside = |directory: &&String| {
+            *directory == place || directory.starts_with(&format!("{place}/"))
+        };
+        let crates: Vec<&String> = members.keys().filter(inside).collect();
+        let found: BTreeSet<String> = crates
+            .iter()
+            .flat_map(|directory| dependencies(directory, &known))
+            .collect();
+        assert_eq!(
+            *told, found,
+            "what {place} uses, in the map and in its manifest"
+        );
+        for used in &found {
+            assert!(
+                above.contains(used.as_str()),
+                "{place} uses {used}, which stands below it: imports run one way"
+            );
+        }
+        above.extend(crates.iter().map(|directory| members[*directory].as_str()));
+    }
+    let untold: Vec<&&str> = known
+        .iter()
+        .filter(|name| !above.contains(**name))
+        .collect();
+    assert!(untold.is_empty(), "the map has no row for {untold:?}");
+}
