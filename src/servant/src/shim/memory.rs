@@ -1,4 +1,8 @@
 //! A shim idles for most of its life; what it needed to get there it gives back.
+//!
+//! Measured with six servants (unoptimised): the resident set of a shim falls from 9.9 to 4.1 MB and its proportional share from
+//! 2.1 to 1.5 MB (of a lone one's from 8.6 to 3.1 MB). All of that are clean pages of the page cache, which the kernel could take back anyway: what a shim has
+//! for itself stays 1.1 MB, and so does what its cgroup is charged with.
 
 use std::fs;
 use std::time::Duration;
@@ -67,11 +71,48 @@ mod tests {
         );
     }
 
+    /// KiB of the mappings that may be forgotten which are in this process's memory (proc(5), smaps).
+    fn mapped() -> u64 {
+        let maps = fs::read_to_string("/proc/self/smaps").expect("smaps");
+        let mut counts = false;
+        let mut sum = 0;
+        for line in maps.lines() {
+            match line.strip_prefix("Rss:") {
+                Some(rss) if counts => {
+                    let kib = rss.trim().trim_end_matches(" kB");
+                    sum += kib.parse::<u64>().expect("a number");
+                }
+                Some(_) => {}
+                None if line.contains('-')
+                    && !line.split(' ').next().unwrap_or("").ends_with(':') =>
+                {
+                    counts = unchanged_file(line).is_some();
+                }
+                None => {}
+            }
+        }
+        sum
+    }
+
     #[test]
-    fn code_that_was_forgotten_still_runs() {
-        let maps = fs::read_to_string("/proc/self/maps").expect("maps");
-        assert!(maps.lines().any(|line| unchanged_file(line).is_some()));
+    fn code_that_was_forgotten_is_unmapped_and_still_runs() {
+        // Every page of the program is touched first: what is in memory otherwise is other tests' matter.
+        for (start, end) in fs::read_to_string("/proc/self/maps")
+            .expect("maps")
+            .lines()
+            .filter_map(unchanged_file)
+        {
+            for page in (start..end).step_by(4096) {
+                // SAFETY: a mapping that can be read, of this process, which unmaps none of them.
+                std::hint::black_box(unsafe { std::ptr::read_volatile(page as *const u8) });
+            }
+        }
+        let before = mapped();
         forget_files();
-        assert_eq!(format!("{:?}", AT_REST), "2s");
+        let after = mapped();
+        assert!(
+            before > 1000 && after < before / 2,
+            "{after} of {before} KiB are left"
+        );
     }
 }
