@@ -49,10 +49,11 @@ async fn a_required_node_out_of_memory_is_a_failure_that_names_the_limit() {
     let world = World::new();
     let mut greedy = node("/greedy", &["eat"]);
     greedy.required = true;
-    let mut spec = spec(vec![greedy]);
+    let mut spec = spec(vec![]);
     spec.limits.memory = Some(48 << 20);
     world.needs(&["memory"]);
     let servant = world.start(spec).await;
+    servant.start_node(greedy).await.unwrap();
     let ContainerState::Failed { reason } = ended(&*servant).await else {
         panic!("it did not fail")
     };
