@@ -315,6 +315,7 @@ impl Apt {
             let there = all.entry(name).or_default();
             there.source = about.source;
             there.needs.extend(about.needs);
+            there.before.extend(about.before);
             there.provides.extend(about.provides);
         }
         Ok(all)

@@ -91,6 +91,26 @@ async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
 }
 
 #[tokio::test]
+async fn relations_are_those_of_the_lists() {
+    let root = tempfile::tempdir().expect("a directory");
+    let apt = listed(root.path(), LAB);
+    let asked = ["robot=1:2.0-1", "arm=1.5"].map(str::to_owned);
+    let relations = apt.relations(asked).await.expect("told");
+    let names = |names: &BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(" ");
+    let told: Vec<_> = relations
+        .iter()
+        .map(|(name, about)| (name.as_str(), names(&about.needs), names(&about.before)))
+        .collect();
+    assert_eq!(
+        told,
+        [
+            ("arm", "bolt".to_owned(), "bolt".to_owned()),
+            ("robot", "arm leg wheel".to_owned(), String::new()),
+        ]
+    );
+}
+
+#[tokio::test]
 async fn candidates_are_those_that_apt_would_take() {
     let root = tempfile::tempdir().expect("a directory");
     let apt = listed(root.path(), LAB);
