@@ -76,6 +76,8 @@ async fn look(
         next: None,
         log: Vec::new(),
     };
+    // A container is a host of that name.
+    let host = servant.id();
     let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
     let bus = Ros1Bus::connect(sockets, master::ADDRESS, NODE)
         .await
@@ -83,16 +85,16 @@ async fn look(
     let mut graph = bus.graph();
     let seen = graph.clone();
     let patience = pusher.options.probe;
-    let all_there = |graph: &Arc<Graph>| names(graph, unnamed).len() == unnamed.len();
+    let all_there = |graph: &Arc<Graph>| names(graph, unnamed, host).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
         // What it says of itself is told when it is started again, with its parameters.
-        _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed)),
+        _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed, host)),
         there = timeout(patience, graph.wait_for(all_there)) => match there {
-            Ok(Ok(graph)) => Ok(names(&graph, unnamed)),
+            Ok(Ok(graph)) => Ok(names(&graph, unnamed, host)),
             Ok(Err(_)) => Err(failed(ProbeError::MasterGone.to_string())),
             // Here it cannot reach what it was granted; it can when it is looked at.
-            Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed)),
+            Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed, host)),
             Err(_) => Err(never_registered(alone, patience)),
         },
     };
@@ -114,8 +116,8 @@ fn never_registered(alone: &Plan, after: Duration) -> Error {
     }
 }
 
-/// Which node of the graph is which.
-fn names(graph: &Graph, unnamed: &[usize]) -> Vec<(usize, String)> {
+/// Which node of the graph is which. `host`: the name of the machine that they think they run on.
+fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Vec<(usize, String)> {
     let mut names = Vec::new();
     for index in unnamed {
         let below = format!("{}/", namespace(*index));
@@ -130,10 +132,10 @@ fn names(graph: &Graph, unnamed: &[usize]) -> Vec<(usize, String)> {
         let said = own.or(only.map(|name| name.trim_start_matches('/')));
         // Whatever a program registers is what a stranger says.
         let said = said
-            .map(without_random_end)
+            .map(|name| without_host(without_random_end(name), host))
             .filter(|name| is_graph_name(&format!("/{name}")));
         if let Some(name) = said {
-            names.push((*index, name.to_owned()));
+            names.push((*index, name));
         }
     }
     names
@@ -154,6 +156,21 @@ fn without_random_end(name: &str) -> &str {
     match cut(shorter, 1).filter(|at| *at > 0 && !nanoseconds) {
         Some(at) => &shorter[..at],
         None => shorter,
+    }
+}
+
+/// The name of a node that has the machine's in it (`cpu_monitor_HOST`) without that: here it is a container's, another one
+/// each time. Nothing is left of one that has no other name.
+fn without_host(name: &str, host: &str) -> String {
+    // A hyphen is not allowed in a node's name.
+    let host = host.replace('-', "_");
+    match name.split_once(host.as_str()) {
+        Some((before, after)) if !host.is_empty() => {
+            let parts = [before.trim_end_matches('_'), after.trim_start_matches('_')];
+            let parts: Vec<&str> = parts.into_iter().filter(|part| !part.is_empty()).collect();
+            parts.join("_")
+        }
+        _ => name.to_owned(),
     }
 }
 
@@ -293,6 +310,7 @@ mod tests {
                 "/cloudroid_name_0/costmap_2d",
                 "/cloudroid_name_3/talker_71_1700000000123",
                 "/cloudroid_name_4/x'$(cmd)'",
+                "/cloudroid_name_5/cpu_monitor_push_1_names",
                 NODE,
             ]
             .map(|name| (name.to_owned(), String::new()))
@@ -300,9 +318,23 @@ mod tests {
             ..Graph::default()
         };
         assert_eq!(
-            names(&graph, &[0, 3, 4]),
-            [(0, "costmap_2d".to_owned()), (3, "talker".to_owned())]
+            names(&graph, &[0, 3, 4, 5], "push-1-names"),
+            [(0, "costmap_2d"), (3, "talker"), (5, "cpu_monitor")]
+                .map(|(index, name)| (index, name.to_owned()))
         );
+    }
+
+    #[test]
+    fn the_machine_is_no_part_of_a_name() {
+        for (name, plain) in [
+            ("cpu_monitor_push_1_names", "cpu_monitor"),
+            ("push_1_names_ntp", "ntp"),
+            ("a_push_1_names_b", "a_b"),
+            ("push_1_names", ""),
+            ("push_1", "push_1"),
+        ] {
+            assert_eq!(without_host(name, "push-1-names"), plain);
+        }
     }
 
     #[test]
