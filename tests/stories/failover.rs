@@ -271,7 +271,7 @@ pub fn a_lost_link_hands_over_and_back() -> Told {
     ])?;
     let listed = scene.daemon.deployer().types(&["events"])?.succeeded()?;
     for words in [
-        "robot failover-lost: /people_detect: the local original takes over: the link is down, ",
+        "robot failover-lost: /people_detect: the local original takes over: the link is down",
         "robot failover-lost: /people_detect: the local original hands back: the link is up again",
     ] {
         ensure!(listed.stdout.contains(words), "{words}: {}", listed.stdout);
