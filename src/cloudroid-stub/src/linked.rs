@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use link::control::{Hello, Resume, Welcome};
 use link::session::{receive_open, send_open};
-use link::{Lost, Session};
+use link::{Lost, RobotSession};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use ws::WebSocket;
 
@@ -206,7 +206,7 @@ impl Link<'_> {
                 servant,
             } => {
                 if !resumed && self.session.is_some() {
-                    let fresh = Session::new(session_options(self.config));
+                    let fresh = RobotSession::new(session_options(self.config));
                     fresh.begin_at(self.hello.next);
                     self.mirror.renew(Arc::new(fresh));
                 }
@@ -238,7 +238,7 @@ async fn open(config: &Config) -> Result<WebSocket<Stream>, connect::Error> {
 }
 
 /// A connection beside the one that carries the session, once that has been silent and still is.
-async fn standby(config: &Config, session: &Session) -> WebSocket<Stream> {
+async fn standby(config: &Config, session: &RobotSession) -> WebSocket<Stream> {
     let mut up = session.up();
     loop {
         // The session lives as long as this.

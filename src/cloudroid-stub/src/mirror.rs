@@ -27,10 +27,10 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
-use link::control::{Control, Exit, Graph};
+use link::control::{Exit, FromCloud, Graph};
 use link::drops::{Cause, Drops};
 use link::record::Record;
-use link::{Handler, Session};
+use link::{Handler, RobotSession};
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{Bus, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
@@ -52,7 +52,7 @@ pub struct Mirror {
     bus: Arc<dyn Bus>,
     /// By which stubs of one servant know each other.
     label: String,
-    session: RwLock<Arc<Session>>,
+    session: RwLock<Arc<RobotSession>>,
     inputs: Inputs,
     outputs: Outputs,
     calls: Calls,
@@ -69,7 +69,7 @@ pub struct Mirror {
     types: Mutex<HashMap<(String, String), WireType>>,
     siblings: RwLock<BTreeSet<String>>,
     exit: watch::Sender<Option<Exit>>,
-    orders: mpsc::UnboundedSender<Control>,
+    orders: mpsc::UnboundedSender<FromCloud>,
 }
 
 impl Mirror {
@@ -78,7 +78,7 @@ impl Mirror {
     pub fn start(
         bus: Arc<dyn Bus>,
         label: String,
-        session: Arc<Session>,
+        session: Arc<RobotSession>,
         call_limit: Duration,
     ) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
@@ -118,13 +118,13 @@ impl Mirror {
     }
 
     /// The session in use.
-    pub fn session(&self) -> Arc<Session> {
+    pub fn session(&self) -> Arc<RobotSession> {
         self.session.read().clone()
     }
 
     /// Another session takes the place of the one that was lost: calls under way have failed, and what the node
     /// listens to is opened again.
-    pub fn renew(&self, session: Arc<Session>) {
+    pub fn renew(&self, session: Arc<RobotSession>) {
         self.calls.renew();
         let before = std::mem::replace(&mut *self.session.write(), session);
         for drop in before.drops() {
@@ -189,9 +189,9 @@ impl Handler for Mirror {
                 request,
             } => self.lent.call(self, service, request, (id, arrived)),
             Record::Control(json) => match serde_json::from_slice(&json) {
-                Ok(Control::Line { error: true, text }) => eprintln!("{text}"),
-                Ok(Control::Line { text, .. }) => println!("{text}"),
-                Ok(Control::Lookup { service }) => self.lent.look_up(self, service),
+                Ok(FromCloud::Line { error: true, text }) => eprintln!("{text}"),
+                Ok(FromCloud::Line { text, .. }) => println!("{text}"),
+                Ok(FromCloud::Lookup { service }) => self.lent.look_up(self, service),
                 Ok(control) => drop(self.orders.send(control)),
                 Err(error) => tracing::debug!(%error, "the cloud tells something unknown"),
             },
@@ -203,7 +203,7 @@ impl Handler for Mirror {
 #[derive(Default)]
 struct Applied {
     /// By which session.
-    session: Weak<Session>,
+    session: Weak<RobotSession>,
     /// That has had time to tell all: what it does not list is taken back.
     settled: bool,
     /// Told last; none: never.
@@ -214,7 +214,7 @@ struct Applied {
 
 /// A session's node may have just been started, and registers one thing after the other: for so long what was
 /// registered on the robot before stays, and whoever uses it waits.
-async fn settle(mirror: Weak<Mirror>, session: Weak<Session>) {
+async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
     tokio::time::sleep(SETTLE).await;
     let Some(mirror) = mirror.upgrade() else {
         return;
@@ -227,13 +227,13 @@ async fn settle(mirror: Weak<Mirror>, session: Weak<Session>) {
 }
 
 /// Does what the cloud tells, one thing after the other.
-async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<Control>) {
+async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<FromCloud>) {
     while let Some(order) = orders.recv().await {
         let Some(mirror) = mirror.upgrade() else {
             return;
         };
         match order {
-            Control::Type {
+            FromCloud::Type {
                 name,
                 md5,
                 definition,
@@ -246,16 +246,16 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<Control>
                 };
                 mirror.types.lock().insert(key, wire_type);
             }
-            Control::Graph(graph) => mirror.apply(graph).await,
-            Control::Parameters(changes) => parameters::change(&mirror, changes).await,
-            Control::Exited(exit) => {
+            FromCloud::Graph(graph) => mirror.apply(graph).await,
+            FromCloud::Parameters(changes) => parameters::change(&mirror, changes).await,
+            FromCloud::Exited(exit) => {
                 mirror.exit.send_replace(Some(exit));
             }
-            Control::Notice {
+            FromCloud::Notice {
                 warning: true,
                 text,
             } => tracing::warn!("{text}"),
-            Control::Notice { text, .. } => tracing::info!("{text}"),
+            FromCloud::Notice { text, .. } => tracing::info!("{text}"),
             other => tracing::debug!(?other, "not for the robot"),
         }
     }

@@ -12,8 +12,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use link::control::{Control, Exit, Hello, Sla};
-use link::{Session, SessionOptions};
+use link::control::{Exit, FromRobot, Hello, Sla};
+use link::{RobotSession, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
 use ros::bus::{Bus, BusError, ParamValue};
@@ -86,7 +86,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         );
     }
     let mut shutdown = bus.shutdown_requested();
-    let session = Arc::new(Session::new(session_options(&config)));
+    let session = Arc::new(RobotSession::new(session_options(&config)));
     let label = format!("{} for {}", config.service, config.robot());
     bus.set_label(&label);
     let mirror = Mirror::start(bus.clone(), label, session, config.call_limit());
@@ -129,7 +129,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
                 if let Some(keeper) = mirror.keeper() {
                     keeper.end();
                 }
-                mirror.session().tell(&Control::Signal { signal });
+                mirror.session().tell(&FromRobot::Signal { signal });
                 let up = *mirror.session().up().borrow();
                 let patience = if up { FAREWELL } else { Duration::ZERO };
                 let mut exit = mirror.exit();

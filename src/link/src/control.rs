@@ -131,37 +131,60 @@ pub enum Welcome {
     },
 }
 
-/// Everything told later.
+/// What a robot tells the cloud.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Control {
-    /// Robot: a topic's publisher whose messages come as this channel.
+pub enum FromRobot {
+    /// A topic's publisher whose messages come as this channel.
     Open(Input),
-    /// Robot: that publisher is gone.
+    /// That publisher is gone.
     Close {
         /// Which.
         channel: u32,
     },
-    /// Robot: so many listen to an output now.
+    /// So many listen to an output now.
     Listeners {
         /// Which.
         channel: u32,
         /// How many nodes of the robot, other nodes of this servant not counted.
         count: usize,
     },
-    /// Both: parameters that changed; without a value: was deleted.
+    /// Parameters that changed; without a value: was deleted.
     Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),
-    /// Robot: send the node this signal.
+    /// Send the node this signal.
     Signal {
         /// Its number.
         signal: i32,
     },
-    /// Both: a frame of a channel was lost that later ones refer to.
-    Keyframe {
-        /// Which.
-        channel: u32,
+    /// How a request went, for the cloud's statistics.
+    Requests(Vec<Request>),
+    /// What it has under that name. Told as an answer, and when what was there is gone.
+    Lent {
+        /// The name.
+        service: String,
+        /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
+        of: Option<Served>,
     },
-    /// Cloud: a type that later names refer to.
+    /// All messages that were dropped on its side so far.
+    Dropped(Vec<Drop>),
+    /// Messages of this session that it has not sent, so far.
+    Unsent {
+        /// A newer one took their place.
+        replaced: u64,
+        /// They were too old.
+        stale: u64,
+    },
+    /// What was decided about the local original, for the cloud's events, oldest first.
+    Decided(Vec<Decision>),
+}
+
+/// What the cloud tells a robot.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FromCloud {
+    /// Parameters that changed; without a value: was deleted.
+    Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),
+    /// A type that later names refer to.
     Type {
         /// `package/Type`.
         name: String,
@@ -170,50 +193,47 @@ pub enum Control {
         /// With all it contains.
         definition: String,
     },
-    /// Cloud: all that the node has registered now.
+    /// All that the node has registered now.
     Graph(Graph),
-    /// Cloud: the node has ended.
+    /// The node has ended.
     Exited(Exit),
-    /// Cloud: something that belongs into the robot's log.
+    /// Something that belongs into the robot's log.
     Notice {
         /// It needs attention.
         warning: bool,
         /// In words.
         text: String,
     },
-    /// Cloud: a line that the node printed.
+    /// A line that the node printed.
     Line {
         /// On standard error.
         error: bool,
         /// Without its end.
         text: String,
     },
-    /// Robot: how a request went, for the cloud's statistics.
-    Requests(Vec<Request>),
-    /// Cloud: a node looks for a service that nobody in the servant serves.
+    /// A node looks for a service that nobody in the servant serves.
     Lookup {
         /// Its name.
         service: String,
     },
-    /// Robot: what it has under that name. Told as an answer, and when what was there is gone.
-    Lent {
-        /// The name.
-        service: String,
-        /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
-        of: Option<Served>,
-    },
-    /// Robot: all messages that were dropped on its side so far.
-    Dropped(Vec<Drop>),
-    /// Robot: messages of this session that it has not sent, so far.
-    Unsent {
-        /// A newer one took their place.
-        replaced: u64,
-        /// They were too old.
-        stale: u64,
-    },
-    /// Robot: what was decided about the local original, for the cloud's events, oldest first.
-    Decided(Vec<Decision>),
 }
+
+/// What the sessions of both ends tell each other.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Between {
+    /// A frame of a channel was lost that later ones refer to.
+    Keyframe {
+        /// Which.
+        channel: u32,
+    },
+}
+
+/// The end of a link that a session is of: which orders it gives.
+pub trait Order: Serialize + Send + Sync + 'static {}
+
+impl Order for FromRobot {}
+impl Order for FromCloud {}
 
 /// A decision about the local original.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -374,7 +394,14 @@ mod tests {
             r#"{"listeners":{"channel":1,"count":2}}"#,
             r#"{"parameters":[["/a",1],["/b",null]]}"#,
             r#"{"signal":{"signal":2}}"#,
-            r#"{"keyframe":{"channel":1}}"#,
+            r#"{"requests":[{"id":1,"name":"/s","total":null,"serialise":0,"up":1,"queue":2,"compute":3,"down":4,
+                "local":true,"satisfaction":2.5}]}"#,
+            r#"{"dropped":[{"topic":"/t","cause":"cut_off","count":3}]}"#,
+        ] {
+            says_the_same::<FromRobot>(told);
+        }
+        for told in [
+            r#"{"parameters":[["/a",1],["/b",null]]}"#,
             r#"{"type":{"name":"p/T","md5":"0","definition":"d"}}"#,
             r#"{"graph":{"outputs":[{"channel":1,"topic":"/t","type":"p/T","md5":"0"}],
                 "inputs":[{"topic":"/t","type":"*","md5":"*","feed":true}],
@@ -382,16 +409,26 @@ mod tests {
             r#"{"exited":{"code":0,"signal":null,"text":"t"}}"#,
             r#"{"notice":{"warning":true,"text":"t"}}"#,
             r#"{"line":{"error":false,"text":"t"}}"#,
-            r#"{"requests":[{"id":1,"name":"/s","total":null,"serialise":0,"up":1,"queue":2,"compute":3,"down":4,
-                "local":true,"satisfaction":2.5}]}"#,
-            r#"{"dropped":[{"topic":"/t","cause":"cut_off","count":3}]}"#,
         ] {
-            let control: Control = serde_json::from_str(told).expect(told);
-            // Written again it says the same: nothing was left out for want of understanding.
-            let again = serde_json::to_value(&control).unwrap();
-            let told: serde_json::Value = serde_json::from_str(told).unwrap();
-            assert_eq!(covers(&again, &told), None, "{again} {told}");
+            says_the_same::<FromCloud>(told);
         }
+        says_the_same::<Between>(r#"{"keyframe":{"channel":1}}"#);
+    }
+
+    /// An order that is read and written again says the same: nothing was left out for want of understanding.
+    fn says_the_same<O: Serialize + serde::de::DeserializeOwned>(told: &str) {
+        let order: O = serde_json::from_str(told).expect(told);
+        let again = serde_json::to_value(&order).unwrap();
+        let told: serde_json::Value = serde_json::from_str(told).unwrap();
+        assert_eq!(covers(&again, &told), None, "{again} {told}");
+    }
+
+    #[test]
+    fn an_order_of_the_wrong_way_is_none() {
+        let order = serde_json::to_string(&FromRobot::Signal { signal: 9 }).unwrap();
+        assert!(serde_json::from_str::<FromCloud>(&order).is_err());
+        let order = r#"{"line":{"error":false,"text":"t"}}"#;
+        assert!(serde_json::from_str::<FromRobot>(order).is_err());
     }
 
     /// Where `whole` lacks something of `part`.

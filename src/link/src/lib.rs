@@ -34,7 +34,7 @@ mod values;
 
 pub use drops::Dropped;
 pub use outgoing::Quality;
-pub use session::{Handler, Lost, Session, SessionOptions};
+pub use session::{CloudSession, Handler, Lost, RobotSession, Session, SessionOptions};
 
 /// The WebSocket subprotocol of this version. Both ends list those they speak, newest first.
 ///

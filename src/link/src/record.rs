@@ -2,7 +2,7 @@
 //!
 //! | first byte | then |
 //! |---|---|
-//! | 0 control | JSON, a [`Control`](crate::control::Control) |
+//! | 0 control | JSON, an order [`FromRobot`](crate::control::FromRobot) or [`FromCloud`](crate::control::FromCloud) |
 //! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · [answered: born i64 · serialise u32 · left i64 · taken i64 · given i64] · message |
 //! | 2 call | id u32 · service u32 · request |
 //! | 3 answer | id u32 · ok u8 · taken i64 · given i64 · response, or why not |

@@ -6,18 +6,20 @@ mod opening;
 mod throughput;
 
 use std::collections::BTreeMap;
+use std::marker::PhantomData;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
+use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
 use crate::Error;
 use crate::clock::{Clock, Sample, now};
-use crate::control::Control;
+use crate::control::{Between, FromCloud, FromRobot, Order};
 use crate::drops::{Cause, Drop, Dropped};
 use crate::frame::Received;
 use crate::incoming::Incoming;
@@ -102,13 +104,19 @@ pub trait Handler: Sync {
     }
 }
 
-/// What two ends know of each other, whichever connection carries it.
-pub struct Session {
+/// The robot's end of a session.
+pub type RobotSession = Session<FromRobot>;
+/// The cloud's end of a session.
+pub type CloudSession = Session<FromCloud>;
+
+/// What two ends know of each other, whichever connection carries it. This one gives orders `O`.
+pub struct Session<O> {
     options: SessionOptions,
     state: Mutex<State>,
     wake: Notify,
     up: watch::Sender<bool>,
     next_call: AtomicU32,
+    orders: PhantomData<fn(O)>,
 }
 
 struct State {
@@ -143,7 +151,7 @@ impl State {
     }
 }
 
-impl Session {
+impl<O: Order> Session<O> {
     /// A session without a connection.
     pub fn new(options: SessionOptions) -> Self {
         let age = options
@@ -165,6 +173,7 @@ impl Session {
             wake: Notify::new(),
             up: watch::Sender::new(false),
             next_call: AtomicU32::new(1),
+            orders: PhantomData,
         }
     }
 
@@ -241,8 +250,17 @@ impl Session {
     }
 
     /// Tells the peer something; it will come, in order, over however many connections.
-    pub fn tell(&self, control: &Control) {
-        let json = serde_json::to_vec(control).unwrap_or_default();
+    pub fn tell(&self, order: &O) {
+        self.control(order);
+    }
+
+    /// Has the peer's session send a frame that refers to none before it.
+    fn ask_for_keyframe(&self, channel: u32) {
+        self.control(&Between::Keyframe { channel });
+    }
+
+    fn control(&self, told: &impl Serialize) {
+        let json = serde_json::to_vec(told).unwrap_or_default();
         self.push(&Record::Control(json.into()), Quality::Each);
     }
 
@@ -298,15 +316,6 @@ impl Session {
 
     fn push(&self, record: &Record, quality: Quality) {
         self.state.lock().out.push(record, quality);
-        self.wake.notify_one();
-    }
-
-    /// Closes a channel for sending; the peer is told after all messages that wait on it.
-    pub fn closes(&self, channel: u32) {
-        let json = serde_json::to_vec(&Control::Close { channel }).unwrap_or_default();
-        let mut state = self.state.lock();
-        state.out.close(channel, &Record::Control(json.into()));
-        drop(state);
         self.wake.notify_one();
     }
 
@@ -366,6 +375,17 @@ impl Session {
             let pays = state.packing.pays(Some(rate));
             state.out.set_packs(pays);
         }
+    }
+}
+
+impl Session<FromRobot> {
+    /// Closes a channel for sending; the peer is told after all messages that wait on it.
+    pub fn closes(&self, channel: u32) {
+        let json = serde_json::to_vec(&FromRobot::Close { channel }).unwrap_or_default();
+        let mut state = self.state.lock();
+        state.out.close(channel, &Record::Control(json.into()));
+        drop(state);
+        self.wake.notify_one();
     }
 }
 

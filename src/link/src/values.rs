@@ -131,7 +131,7 @@ pub(crate) mod changes {
 
 #[cfg(test)]
 mod tests {
-    use crate::control::{Control, Hello};
+    use crate::control::{FromRobot, Hello};
 
     use super::*;
 
@@ -159,10 +159,10 @@ mod tests {
             "{text}"
         );
         let changed =
-            Control::Parameters(vec![("/scan".into(), Some(map)), ("/gone".into(), None)]);
+            FromRobot::Parameters(vec![("/scan".into(), Some(map)), ("/gone".into(), None)]);
         let text = serde_json::to_string(&changed).unwrap();
         assert_eq!(
-            serde_json::from_str::<Control>(&text).unwrap(),
+            serde_json::from_str::<FromRobot>(&text).unwrap(),
             changed,
             "{text}"
         );

@@ -38,7 +38,7 @@ use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use link::control::{Control, Decision, Exit, Hello, Node, Request, Sla, Welcome};
+use link::control::{Decision, Exit, FromCloud, Hello, Node, Request, Sla, Welcome};
 use link::drops::Drop;
 use link::packing::decoded_here;
 use link::session::{Lost, SessionOptions, receive_open, send_open};
@@ -375,14 +375,14 @@ impl Hub {
         }
         let untold = self.parameters.untold();
         if !untold.is_empty() {
-            link.session.tell(&Control::Parameters(untold));
+            link.session.tell(&FromCloud::Parameters(untold));
         }
         // What the node has set before there was a link to tell.
         if let Ok(ParamValue::Map(set)) = self.bus.get_param(node).await {
             let set = set
                 .into_iter()
                 .map(|(key, value)| (format!("{node}/{key}"), Some(value)));
-            link.session.tell(&Control::Parameters(set.collect()));
+            link.session.tell(&FromCloud::Parameters(set.collect()));
         }
         self.changed();
         let turn = *link.kick.borrow();

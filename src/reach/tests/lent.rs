@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::clock::now;
-use link::control::{Control, Exit, Hello, Node, Served, Sla, Welcome};
+use link::control::{Exit, FromCloud, FromRobot, Hello, Node, Served, Sla, Welcome};
 use link::record::Record;
 use link::session::{receive_open, send_open};
-use link::{Handler, MAX_FRAME, MAX_RECORD, Session, SessionOptions};
+use link::{Handler, MAX_FRAME, MAX_RECORD, RobotSession, SessionOptions};
 use reach::links::{Hub, HubOptions, Nodes};
 use ros::bus::{Bus, BusError, ParamValue};
 use ros::net::HostSockets;
@@ -95,7 +95,7 @@ impl Handler for Ear {
                 request,
             } => Told::Call(id, service, request),
             Record::Control(json) => match serde_json::from_slice(&json) {
-                Ok(Control::Lookup { service }) => Told::Lookup(service),
+                Ok(FromCloud::Lookup { service }) => Told::Lookup(service),
                 _ => return,
             },
             _ => return,
@@ -106,7 +106,7 @@ impl Handler for Ear {
 
 /// The robot's end of a link.
 struct Robot {
-    session: Arc<Session>,
+    session: Arc<RobotSession>,
     hello: Hello,
     ear: mpsc::UnboundedSender<Told>,
     told: mpsc::UnboundedReceiver<Told>,
@@ -123,7 +123,7 @@ impl Robot {
         };
         let (ear, told) = mpsc::unbounded_channel();
         Self {
-            session: Arc::new(Session::new(options)),
+            session: Arc::new(RobotSession::new(options)),
             hello: Hello {
                 run: "run".to_owned(),
                 node: Node {
@@ -207,7 +207,7 @@ impl Robot {
             md5: "abcd".to_owned(),
         });
         let service = "/map".to_owned();
-        self.session.tell(&Control::Lent { service, of });
+        self.session.tell(&FromRobot::Lent { service, of });
     }
 }
 

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use link::control::Control;
+use link::control::FromRobot;
 use link::drops::{Drop, Teller};
 
 use super::Mirror;
@@ -46,7 +46,7 @@ pub async fn tell(mirror: Weak<Mirror>) {
         // Another session's cloud was told nothing yet.
         let other = !std::ptr::eq(Weak::as_ptr(&told.0), Arc::as_ptr(&session));
         if !all.is_empty() && (other || told.1 != all) {
-            session.tell(&Control::Dropped(all.clone()));
+            session.tell(&FromRobot::Dropped(all.clone()));
             told = (Arc::downgrade(&session), all);
         }
     }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use link::Quality;
 use link::clock::now;
-use link::control::{Control, Input, Wanted};
+use link::control::{FromRobot, Input, Wanted};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
@@ -258,7 +258,7 @@ impl Channels {
         let key = (publisher, message.wire_type.md5.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
-            mirror.session().tell(&Control::Open(Input {
+            mirror.session().tell(&FromRobot::Open(Input {
                 channel,
                 topic: topic.to_owned(),
                 type_name: message.wire_type.name.clone(),

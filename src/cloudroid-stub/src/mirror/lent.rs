@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Weak};
 
 use bytes::Bytes;
-use link::Session;
-use link::control::{Control, Served};
+use link::RobotSession;
+use link::control::{FromRobot, Served};
 use parking_lot::Mutex;
 use ros::bus::{BusError, Graph, ServiceProvider};
 
@@ -56,7 +56,7 @@ impl Lent {
     fn tell(
         &self,
         mirror: &Mirror,
-        session: &Arc<Session>,
+        session: &Arc<RobotSession>,
         service: String,
         provider: Option<ServiceProvider>,
     ) {
@@ -87,7 +87,7 @@ impl Lent {
         if of.is_none() {
             services.remove(&service);
         }
-        session.tell(&Control::Lent { service, of });
+        session.tell(&FromRobot::Lent { service, of });
     }
 
     /// Calls on behalf of the cloud; `id` and `arrived` are the call's.
@@ -130,7 +130,7 @@ impl Lent {
         services.retain(|name, service| {
             let gone = gone(service);
             if gone {
-                mirror.session().tell(&Control::Lent {
+                mirror.session().tell(&FromRobot::Lent {
                     service: name.clone(),
                     of: None,
                 });
@@ -239,7 +239,7 @@ mod tests {
             lost: Duration::from_secs(3),
             max_age: None,
         };
-        let session = Arc::new(Session::new(options));
+        let session = Arc::new(RobotSession::new(options));
         let label = "maps for rover".to_owned();
         let mirror = Mirror::start(own.clone(), label, session, Duration::from_secs(60));
         mirror.siblings.write().insert("/unlabelled".to_owned());

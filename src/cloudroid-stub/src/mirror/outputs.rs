@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use bytes::Bytes;
-use link::control::{Control, Output};
+use link::control::{FromRobot, Output};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
@@ -315,7 +315,7 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
                     if channel != NOWHERE {
                         mirror
                             .session()
-                            .tell(&Control::Listeners { channel, count });
+                            .tell(&FromRobot::Listeners { channel, count });
                     }
                 }
                 keep_latched(&mirror, &topic).await;

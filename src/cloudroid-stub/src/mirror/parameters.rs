@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use link::control::Control;
+use link::control::FromRobot;
 use parking_lot::Mutex;
 use ros::bus::{ParamChange, ParamValue};
 
@@ -47,7 +47,7 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                         && parameters::can_be_carried(key.trim_end_matches('/'), &mut value)
                     {
                         let changes = vec![(key, value)];
-                        mirror.session().tell(&Control::Parameters(changes));
+                        mirror.session().tell(&FromRobot::Parameters(changes));
                     }
                 }
             });

@@ -5,7 +5,7 @@ use std::sync::{Arc, Weak};
 
 use anyhow::{Context, bail};
 use bytes::Bytes;
-use link::Session;
+use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
@@ -254,7 +254,7 @@ fn topics(known: &BTreeMap<String, WireType>) -> Vec<Topic> {
 /// Tells the keeper whether the link is up, over all sessions.
 async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
     // The session that was up last: what it carried is answered yet when it is up again.
-    let mut before: Weak<Session> = Weak::new();
+    let mut before: Weak<RobotSession> = Weak::new();
     loop {
         let Some(session) = mirror.upgrade().map(|mirror| mirror.session()) else {
             return;

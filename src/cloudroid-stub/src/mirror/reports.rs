@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use link::control::{Control, Decision, Request};
+use link::control::{Decision, FromRobot, Request};
 use link::record::Data;
 use parking_lot::Mutex;
 use qos::{Channel, Event, Outcome, Phases, Side, Why};
@@ -150,7 +150,7 @@ pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
         if *session.up().borrow() {
             let requests = std::mem::take(&mut *promise.reports.waiting.lock());
             if !requests.is_empty() {
-                session.tell(&Control::Requests(requests));
+                session.tell(&FromRobot::Requests(requests));
             }
             let (of, dropped) = (Arc::downgrade(&session), session.dropped());
             if !Weak::ptr_eq(&told.0, &of) {
@@ -158,14 +158,14 @@ pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             }
             if told.1 != dropped {
                 told.1 = dropped;
-                session.tell(&Control::Unsent {
+                session.tell(&FromRobot::Unsent {
                     replaced: dropped.replaced,
                     stale: dropped.stale,
                 });
             }
             let decisions = promise.reports.take_decisions();
             if !decisions.is_empty() {
-                session.tell(&Control::Decided(decisions));
+                session.tell(&FromRobot::Decided(decisions));
             }
         }
         diagnostics.publish(&promise.keeper().report());

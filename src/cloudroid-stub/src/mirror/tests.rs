@@ -127,7 +127,7 @@ impl Scene {
             lost: Duration::from_secs(20),
             max_age: None,
         };
-        let session = Arc::new(Session::new(session));
+        let session = Arc::new(RobotSession::new(session));
         Self {
             robot,
             mirror: Mirror::start(node(robot, name).await, "label".to_owned(), session, SOON),

@@ -14,6 +14,7 @@ use ws::{Message, WebSocket, WsError, frame as opcode};
 use super::{Handler, Lost, Session, SessionOptions};
 use crate::Error;
 use crate::clock::{Sample, now};
+use crate::control::Order;
 use crate::frame::{Frame, Received};
 use crate::packing::Packed;
 use crate::record::Record;
@@ -27,7 +28,7 @@ const IN_A_ROW: u32 = 32;
 /// Exchanges made at once on a new connection, to know the peer's clock.
 const FIRST_PINGS: u32 = 6;
 
-impl Session {
+impl<O: Order> Session<O> {
     /// Carries the session over a connection that was opened, until that ends.
     pub async fn run<S, H>(&self, socket: &mut WebSocket<S>, handler: &H) -> Lost
     where
@@ -329,7 +330,7 @@ impl Connection {
 
     fn ping<S: AsyncRead + AsyncWrite + Unpin>(
         &mut self,
-        session: &Session,
+        session: &Session<impl Order>,
         socket: &mut WebSocket<S>,
     ) {
         self.pinged = Instant::now();

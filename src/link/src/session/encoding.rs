@@ -4,12 +4,12 @@ use codec::Answer;
 use tokio::task::JoinHandle;
 
 use super::{Session, State};
-use crate::control::Control;
+use crate::control::{Between, Order};
 use crate::frame::Frame;
 use crate::packing::Packed;
 use crate::record::Data;
 
-impl Session {
+impl<O: Order> Session<O> {
     /// Begins to encode the next message that is to be, on another thread.
     pub(super) fn pack(&self) -> Option<JoinHandle<Packed>> {
         let mut state = self.state.lock();
@@ -55,7 +55,7 @@ impl Session {
         match answer {
             Some(Answer::Keyframe) => {
                 tracing::debug!(channel, %error, "a message cannot be decoded");
-                self.tell(&Control::Keyframe { channel });
+                self.ask_for_keyframe(channel);
                 Err(None)
             }
             Some(Answer::Damaged) => {
@@ -86,7 +86,7 @@ impl Session {
         if !json.starts_with(b"{\"keyframe\"") {
             return false;
         }
-        let Ok(Control::Keyframe { channel }) = serde_json::from_slice(json) else {
+        let Ok(Between::Keyframe { channel }) = serde_json::from_slice(json) else {
             return false;
         };
         let packing = &mut self.state.lock().packing;

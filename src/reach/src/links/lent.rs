@@ -23,7 +23,7 @@ use tokio::time::{Instant as Moment, timeout_at};
 
 use super::Hub;
 use super::node_link::NodeLink;
-use link::control::{Control, Served};
+use link::control::{FromCloud, Served};
 use link::skew::Way;
 use link::stamps::Stamps;
 
@@ -221,7 +221,7 @@ impl NodeLink {
 
     fn tell_lookup(&self, service: &str) {
         let service = service.to_owned();
-        self.session.tell(&Control::Lookup { service });
+        self.session.tell(&FromCloud::Lookup { service });
     }
 
     /// Calls a service of the robot. Over a cut the call waits; it fails with the link.
@@ -263,7 +263,7 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     let known = hub.registry.service(&served.type_name).ok();
     let known = known.filter(|known| known.md5 == served.md5);
     if known.is_none() && hub.skew.difference() != 0 {
-        link.session.tell(&Control::Notice {
+        link.session.tell(&FromCloud::Notice {
             warning: true,
             text: format!(
                 "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with md5sum {}; push the package with the Debian package that holds it (--with DEB)",

@@ -8,7 +8,7 @@ use ros::schema::MessageType;
 
 use super::Hub;
 use super::node_link::{NodeLink, Service};
-use link::control::{Control, Graph, Output, Served, Wanted};
+use link::control::{FromCloud, Graph, Output, Served, Wanted};
 use link::stamps::Stamps;
 
 /// What was told so far.
@@ -88,7 +88,7 @@ impl Told {
         }
         self.let_go(link, &graph);
         if self.graph.as_ref() != Some(&graph) {
-            link.session.tell(&Control::Graph(graph.clone()));
+            link.session.tell(&FromCloud::Graph(graph.clone()));
             self.graph = Some(graph);
         }
     }
@@ -112,7 +112,7 @@ impl Told {
         };
         let key = (wire_type.name.clone(), wire_type.md5.clone());
         if self.types.insert(key) {
-            link.session.tell(&Control::Type {
+            link.session.tell(&FromCloud::Type {
                 name: wire_type.name.clone(),
                 md5: wire_type.md5.clone(),
                 definition: wire_type.definition.clone(),

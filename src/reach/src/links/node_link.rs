@@ -17,10 +17,10 @@ use super::twins::Machine;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
 use link::clock::Sample;
-use link::control::{Control, Hello, Request, Sla};
+use link::control::{FromCloud, FromRobot, Hello, Request, Sla};
 use link::drops::{Drop, Drops, Teller};
 use link::record::Record;
-use link::session::{Handler, Session, SessionOptions};
+use link::session::{CloudSession, Handler, SessionOptions};
 use link::skew::Way;
 use link::stamps::Stamps;
 
@@ -36,7 +36,7 @@ pub(super) struct NodeLink {
     pub(super) machine: Machine,
     /// Names the session.
     pub(super) id: String,
-    pub(super) session: Session,
+    pub(super) session: CloudSession,
     /// Held by the connection that carries the session.
     pub(super) seat: tokio::sync::Mutex<()>,
     /// Grows when another connection, or nobody, is to carry it.
@@ -56,7 +56,7 @@ pub(super) struct NodeLink {
     dropped: Mutex<Vec<Drop>>,
     /// What must wait for an output to be subscribed to.
     pub(super) held: Held,
-    orders: mpsc::UnboundedSender<(Control, Option<Hold>)>,
+    orders: mpsc::UnboundedSender<(FromRobot, Option<Hold>)>,
     /// They wait for no order: a node that answers nobody is the one to be ended.
     signals: mpsc::UnboundedSender<i32>,
     tasks: Mutex<Vec<AbortHandle>>,
@@ -84,7 +84,7 @@ impl NodeLink {
             run: hello.run.clone(),
             machine: Machine::of(hello),
             id,
-            session: Session::new(options).within(&hub.options.budget),
+            session: CloudSession::new(options).within(&hub.options.budget),
             seat: tokio::sync::Mutex::default(),
             kick: watch::Sender::new(0),
             hub: Arc::downgrade(hub),
@@ -112,7 +112,7 @@ impl NodeLink {
         tasks.push(
             tokio::spawn(async move {
                 let exit = nodes.ended(&watching.node).await;
-                watching.session.tell(&Control::Exited(exit));
+                watching.session.tell(&FromCloud::Exited(exit));
             })
             .abort_handle(),
         );
@@ -120,7 +120,7 @@ impl NodeLink {
         tasks.push(
             tokio::spawn(async move {
                 while let Some((error, text)) = lines.recv().await {
-                    printing.session.tell(&Control::Line { error, text });
+                    printing.session.tell(&FromCloud::Line { error, text });
                 }
             })
             .abort_handle(),
@@ -288,23 +288,24 @@ impl NodeLink {
             Record::Answer { id, response, .. } => self.lent.answered(id, response),
             Record::Control(json) => match serde_json::from_slice(&json) {
                 // A call that waits for it must not wait for other orders.
-                Ok(Control::Lent { service, of }) => this.lends(service, of),
-                Ok(Control::Signal { signal }) => {
+                Ok(FromRobot::Lent { service, of }) => this.lends(service, of),
+                Ok(FromRobot::Signal { signal }) => {
                     let _ = self.signals.send(signal);
                 }
                 // After the messages before it.
-                Ok(Control::Close { .. }) => match self.held.take(Record::Control(json), arrived) {
+                Ok(FromRobot::Close { .. }) => match self.held.take(Record::Control(json), arrived)
+                {
                     Some((record, arrived)) => this.give(record, arrived),
                     None => this.pass_held(),
                 },
                 Ok(control) => {
                     // Data may follow in the same breath.
                     let hold = match &control {
-                        Control::Open(input) => {
+                        FromRobot::Open(input) => {
                             self.inputs.expect(input);
                             None
                         }
-                        Control::Listeners { channel, count } => {
+                        FromRobot::Listeners { channel, count } => {
                             let begin = self.outputs.expect(*channel, *count);
                             begin.then(|| Hold::new(this))
                         }
@@ -358,21 +359,21 @@ impl NodeLink {
 async fn obey(
     link: Arc<NodeLink>,
     hub: Arc<Hub>,
-    mut orders: mpsc::UnboundedReceiver<(Control, Option<Hold>)>,
+    mut orders: mpsc::UnboundedReceiver<(FromRobot, Option<Hold>)>,
 ) {
     while let Some((order, hold)) = orders.recv().await {
         match order {
-            Control::Open(input) => link.inputs.open(&hub, &link.drops, input).await,
-            Control::Close { channel } => {
+            FromRobot::Open(input) => link.inputs.open(&hub, &link.drops, input).await,
+            FromRobot::Close { channel } => {
                 link.inputs.close(channel);
                 link.session.peer_closed(channel);
             }
-            Control::Listeners { channel, count } => {
+            FromRobot::Listeners { channel, count } => {
                 let outputs = &link.outputs;
                 outputs.listeners(&link, &hub, (channel, count), hold).await;
             }
-            Control::Parameters(changes) => hub.parameters.change(&hub, changes).await,
-            Control::Requests(requests) => {
+            FromRobot::Parameters(changes) => hub.parameters.change(&hub, changes).await,
+            FromRobot::Requests(requests) => {
                 let mut kept = link.requests.lock();
                 for request in requests {
                     // What was late is told again when its answer has come after all.
@@ -389,15 +390,15 @@ async fn obey(
                 let surplus = kept.len().saturating_sub(REQUESTS);
                 kept.drain(..surplus);
             }
-            Control::Unsent { replaced, stale } => {
+            FromRobot::Unsent { replaced, stale } => {
                 link.unsent.note(replaced.saturating_add(stale));
             }
-            Control::Decided(decisions) => {
+            FromRobot::Decided(decisions) => {
                 for decision in &decisions {
                     hub.nodes.decided(&link.node, decision);
                 }
             }
-            Control::Dropped(dropped) => *link.dropped.lock() = dropped,
+            FromRobot::Dropped(dropped) => *link.dropped.lock() = dropped,
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
         }
     }
@@ -419,7 +420,7 @@ async fn tell_drops(link: Arc<NodeLink>) {
         tokio::time::sleep(DROPS).await;
         for drop in teller.news(&link.drops_here()) {
             tracing::info!(node = link.node, "{drop}");
-            link.session.tell(&Control::Notice {
+            link.session.tell(&FromCloud::Notice {
                 warning: !drop.cause.is_meant(),
                 text: format!("in the cloud {drop}"),
             });

@@ -9,7 +9,7 @@ use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
 use super::{Hub, RUNS};
-use link::control::{Control, Hello, Node};
+use link::control::{FromCloud, Hello, Node};
 
 /// Those of a Master itself.
 const OWN: [&str; 5] = [
@@ -111,7 +111,9 @@ impl Known {
         let links = hub.links.lock();
         let owner = links.values().find(|link| key.starts_with(&link.node));
         match owner.or_else(|| links.values().next()) {
-            Some(link) => link.session.tell(&Control::Parameters(vec![(key, value)])),
+            Some(link) => link
+                .session
+                .tell(&FromCloud::Parameters(vec![(key, value)])),
             None => drop(self.untold.lock().insert(key, value)),
         }
     }

@@ -5,7 +5,7 @@ use tokio::io::{DuplexStream, duplex};
 use tokio::net::TcpListener;
 
 use super::*;
-use link::control::{Input, Resume};
+use link::control::{FromRobot, Input, Resume};
 use link::record::Record;
 
 /// A servant whose nodes run from when they are started, and say nothing.
@@ -266,11 +266,11 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     .await;
     let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let tell = |control: &Control| {
-        let json = serde_json::to_vec(control).unwrap();
+    let tell = |order: &FromRobot| {
+        let json = serde_json::to_vec(order).unwrap();
         link::Handler::record(&*link, Record::Control(json.into()), 0);
     };
-    tell(&Control::Open(Input {
+    tell(&FromRobot::Open(Input {
         channel: 1,
         topic: "/image".into(),
         type_name: "std_msgs/Empty".into(),
@@ -278,7 +278,7 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
         ..Input::default()
     }));
     for signal in [2, 15] {
-        tell(&Control::Signal { signal });
+        tell(&FromRobot::Signal { signal });
     }
     let mut signals = nodes.signals.subscribe();
     let both = signals.wait_for(|signals| signals.len() == 2);

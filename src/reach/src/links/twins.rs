@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::Hub;
 use super::node_link::NodeLink;
-use link::control::{Control, Hello};
+use link::control::{FromCloud, Hello};
 
 /// What to do about it.
 pub(super) const NEXT: &str =
@@ -80,7 +80,7 @@ impl Hub {
             );
             self.nodes.warn("robot-twins", &text);
             for side in [link, &other] {
-                side.session.tell(&Control::Notice {
+                side.session.tell(&FromCloud::Notice {
                     warning: true,
                     text: text.clone(),
                 });
