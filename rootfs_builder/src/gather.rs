@@ -91,17 +91,7 @@ pub(crate) async fn gather(
             .iter()
             .filter_map(|name| archive.candidates.get(name))
             .collect();
-        let files = archive.apt.download(&debs, progress).await?;
-        let kept = archive.apt.root().to_owned();
-        let looked = stream::iter(files).map(|file| {
-            let kept = kept.clone();
-            crate::blocking::spawn(move || deb::at_run_time(&file, &kept))
-        });
-        let mut looked = looked.buffered(AT_ONCE);
-        let mut of_round = Vec::new();
-        while let Some(members) = looked.next().await {
-            of_round.push(members??);
-        }
+        let of_round = looked_into_each(archive, &debs, progress, deb::at_run_time).await?;
         for (deb, members) in debs.iter().zip(of_round) {
             let told = tell(&members, base);
             let itself = matches!(depth, Depth::Itself { .. });
@@ -150,6 +140,28 @@ pub(crate) async fn gather(
     Ok(wanted)
 }
 
+/// Downloads packages and has each looked into, some at the same time; `look` is given the package's file and the
+/// directory in which it may keep what it finds.
+async fn looked_into_each<T: Send + 'static>(
+    archive: &Archive,
+    debs: &[Deb],
+    progress: &Progress,
+    look: fn(&Path, &Path) -> Result<T, Error>,
+) -> Result<Vec<T>, Error> {
+    let files = archive.apt.download(debs, progress).await?;
+    let kept = archive.apt.root().to_owned();
+    let looked = stream::iter(files).map(|file| {
+        let kept = kept.clone();
+        crate::blocking::spawn(move || look(&file, &kept))
+    });
+    let mut looked = looked.buffered(AT_ONCE);
+    let mut found = Vec::with_capacity(debs.len());
+    while let Some(of_one) = looked.next().await {
+        found.push(of_one??);
+    }
+    Ok(found)
+}
+
 /// Debian packages with what Python files of these Debian packages import.
 async fn imported(
     archive: &Archive,
@@ -161,17 +173,11 @@ async fn imported(
         .iter()
         .filter_map(|name| archive.candidates.get(name))
         .collect();
-    let files = archive.apt.download(&debs, progress).await?;
-    let kept = archive.apt.root().to_owned();
-    let looked = stream::iter(files).map(|file| {
-        let kept = kept.clone();
-        crate::blocking::spawn(move || imports::of_package(&file, &kept))
-    });
-    let mut looked = looked.buffered(AT_ONCE);
-    let mut modules = BTreeSet::new();
-    while let Some(found) = looked.next().await {
-        modules.extend(found??.of(programs));
-    }
+    let found = looked_into_each(archive, &debs, progress, imports::of_package).await?;
+    let modules: BTreeSet<String> = found
+        .into_iter()
+        .flat_map(|imports| imports.of(programs))
+        .collect();
     let debs = modules
         .iter()
         .filter_map(|module| imports::provider(archive, module));
