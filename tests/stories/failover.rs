@@ -213,8 +213,8 @@ pub fn a_slow_network_costs_few_requests() -> Told {
             scene.stub.said()
         );
     }
-    scene.explains("requests of /people_detect passed T_max (5000 ms); most of the time")?;
-    scene.explains("look at the robot's network")?;
+    // In which part the time went is known of late answers that came: of a picture that gave way to a newer one none does.
+    scene.explains("requests of /people_detect passed T_max (5000 ms)")?;
     scene.happened(&["local-answers-too", "cloud-answers-alone"])?;
     // The cloud alone: what it still owed has come before this.
     let last = scene.asks();

@@ -508,6 +508,17 @@ mod tests {
                 .contains("; of these none was answered; see"),
             "{unanswered:?}"
         );
+        let upward = Link {
+            late_in: part("up", vec![400.0]),
+            ..late.clone()
+        };
+        let network = texts(served(upward));
+        assert!(
+            network[0]
+                .1
+                .contains("goes into up (400 ms); look at the robot's network"),
+            "{network:?}"
+        );
         let causes = texts(served(Link { late_in, ..late }));
         assert_eq!(causes.len(), 1);
         assert!(

@@ -205,6 +205,10 @@ impl Driver {
 
     pub(super) fn memory_limit(&self) -> String {
         match self.begun.enforced.limits.memory {
+            // As `api::Size` writes it, so that it reads as in the configuration and in the event.
+            Some(bytes) if bytes % (1 << 20) == 0 => {
+                format!("out of memory, the limit is {}M", bytes >> 20)
+            }
             Some(bytes) => format!("out of memory, the limit is {bytes} bytes"),
             None => "out of memory".into(),
         }
