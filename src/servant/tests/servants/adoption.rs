@@ -13,7 +13,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let first = world.start(spec).await;
     let (uids, network) = (first.uid_range(), first.endpoint().netns);
     let enforced = first.enforced();
-    let processes = processes(&*first, 2).await;
+    let of_first = processes(&*first, 2).await;
     drop(first);
     let engine = world.restarted();
     let mut adopted = within(engine.adopt()).await.unwrap();
@@ -26,7 +26,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     ));
     assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
     assert_eq!(second.endpoint().netns, network);
-    assert_eq!(second.processes().await.unwrap(), processes, "the same");
+    assert_eq!(processes(&*second, 2).await, of_first, "the same");
     assert!(hear(&*second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
     assert_eq!(

@@ -310,11 +310,17 @@ pub async fn lines_until(
     }
 }
 
-/// The processes of a servant, once there are so many.
+/// The processes in a servant's PID namespace, once there are so many. What has made the container may still be in its cgroup.
 pub async fn processes(servant: &dyn Servant, count: usize) -> Vec<i32> {
+    let inside = |pid: &i32| {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+        let numbers = status.lines().find_map(|line| line.strip_prefix("NSpid:"));
+        numbers.is_some_and(|numbers| numbers.split_whitespace().count() > 1)
+    };
     within(async {
         loop {
-            let processes = servant.processes().await.unwrap();
+            let mut processes = servant.processes().await.unwrap();
+            processes.retain(inside);
             if processes.len() >= count {
                 return processes;
             }
