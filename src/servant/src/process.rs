@@ -65,10 +65,15 @@ impl Identity {
         match Self::of(self.pid) {
             Ok(found) if self.is(&found) && !has_ended(&pidfd) => Ok(Some(pidfd)),
             Ok(_) => Ok(None),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) if is_of_nobody(&error) => Ok(None),
             Err(error) => Err(error),
         }
     }
+}
+
+/// Whether reading below `/proc/PID` failed because the process is gone: its directory is not there, or was opened before it went.
+fn is_of_nobody(error: &io::Error) -> bool {
+    error.kind() == io::ErrorKind::NotFound || error.raw_os_error() == Some(libc::ESRCH)
 }
 
 /// Whether a process has ended, reaped or not: its pidfd is readable then.
