@@ -442,6 +442,7 @@ mod tests {
         let limit = api::Size(1 << 20);
         for (error, word) in [
             (Error::BodyTooLarge { limit }, "send less"),
+            (Error::TrialTooLarge { limit }, "[memory]"),
             (Error::Unfinished { after }, "raise unfinished"),
             (
                 Error::Choreographer(choreographer::Error::Ending),

@@ -198,9 +198,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn rosauth_messages_are_verified() {
-        let known = tokens(&["open-sesame"]);
+    /// A message of 1000 s, good until 2000 s.
+    fn signed(secret: &str) -> AuthMessage {
         let mut message = AuthMessage {
             mac: String::new(),
             client: "10.0.0.2".into(),
@@ -210,7 +209,14 @@ mod tests {
             level: "user".into(),
             end: 2000.0,
         };
-        message.mac = message.signature("open-sesame");
+        message.mac = message.signature(secret);
+        message
+    }
+
+    #[test]
+    fn rosauth_messages_are_verified() {
+        let known = tokens(&["open-sesame"]);
+        let message = signed("open-sesame");
         assert_eq!(
             known.recognise_auth(&message, 1010.0),
             Err(AuthRefusal::Unknown),
@@ -241,16 +247,7 @@ mod tests {
     #[test]
     fn a_signed_message_counts_once() {
         let known = tokens(&["open-sesame"]);
-        let mut message = AuthMessage {
-            mac: String::new(),
-            client: "10.0.0.2".into(),
-            dest: "10.0.0.1".into(),
-            rand: "abc".into(),
-            t: 1000.0,
-            level: "user".into(),
-            end: 2000.0,
-        };
-        message.mac = message.signature("open-sesame");
+        let message = signed("open-sesame");
         let later = tokens(&["open-sesame"]);
         known.recognise_auth(&message, 996.0).expect("the first");
         let upper = AuthMessage {
