@@ -121,7 +121,7 @@ pub fn without_the_original_the_stub_stands_alone() -> Told {
     let said = doctor.succeeded()?.stdout;
     ensure!(
         said.contains("people_detect is not installed on this robot: it runs in the cloud only")
-            && said.contains("mend it:  install the package opencv_apps"),
+            && said.contains("fix it:  install the package opencv_apps"),
         "{said}"
     );
     Ok(())
@@ -183,7 +183,7 @@ pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Told {
             "sh",
             &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"),
         )?
-        .failed_saying(&["FAIL  shadowing", "mend it:  . /opt/cloudroid/setup.sh"])?;
+        .failed_saying(&["FAIL  shadowing", "fix it:  . /opt/cloudroid/setup.sh"])?;
     Ok(())
 }
 

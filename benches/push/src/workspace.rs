@@ -27,8 +27,8 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
         "a push that cannot be compiled fails"
     );
     fs::write(&app, &good)?;
-    eprintln!("pushing it mended");
-    let mended = push(daemon, &workspace)?;
+    eprintln!("pushing it fixed");
+    let fixed = push(daemon, &workspace)?;
     eprintln!("pushing it unchanged");
     let unchanged = push(daemon, &workspace)?;
     eprintln!("pushing it with all packages changed");
@@ -42,7 +42,7 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
         Ok((pushed.total - probe).as_secs_f64())
     };
     for (name, pushed, bound) in [
-        ("the last one mended after it failed", &mended, BOUND),
+        ("the last one fixed after it failed", &fixed, BOUND),
         ("nothing changed", &unchanged, BOUND),
     ] {
         report

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// The result of all checks.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Doctor {
-    /// Every check, in the order in which a person would mend them.
+    /// Every check, in the order in which a person would fix them.
     pub checks: Vec<Check>,
 }
 
@@ -27,9 +27,9 @@ pub struct Check {
     pub status: CheckStatus,
     /// What was found.
     pub found: String,
-    /// The command or the setting that mends it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub mend: Option<String>,
+    /// The command or the setting that fixes it.
+    #[serde(default, skip_serializing_if = "Option::is_none", alias = "mend")]
+    pub fix: Option<String>,
 }
 
 /// Whether a need is met.

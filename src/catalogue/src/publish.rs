@@ -31,7 +31,7 @@ impl Catalogue {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("publishing", move || {
             let number = state.publish(&record)?;
-            // A crash before these is mended at the next start.
+            // A crash before these is repaired at the next start.
             tag(&store, &record.service, number, &record.image)?;
             tag_current(&store, &record.service, &record.image)?;
             Ok(number)
@@ -101,9 +101,9 @@ impl Catalogue {
     }
 
     /// Makes the tags say what the database says: a crash may have come between.
-    pub async fn mend(&self) -> Result<(), Error> {
+    pub async fn repair(&self) -> Result<(), Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
-        blocking("mending the image store", move || {
+        blocking("repairing the image store", move || {
             let mut wanted = BTreeSet::new();
             for revision in state.all_revisions()? {
                 tag(&store, &revision.service, revision.number, &revision.image)?;

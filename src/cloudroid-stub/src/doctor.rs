@@ -1,4 +1,4 @@
-//! `cloudroid-stub doctor`: each thing that a stub needs, whether it is there, and the command that mends it.
+//! `cloudroid-stub doctor`: each thing that a stub needs, whether it is there, and the command that fixes it.
 
 mod http;
 mod overlay;
@@ -24,8 +24,8 @@ struct Check {
     verdict: Verdict,
     /// What was found.
     found: String,
-    /// The command that mends it.
-    mend: Option<String>,
+    /// The command that fixes it.
+    fix: Option<String>,
 }
 
 impl Check {
@@ -34,23 +34,23 @@ impl Check {
             name,
             verdict: Verdict::Good,
             found: found.into(),
-            mend: None,
+            fix: None,
         }
     }
 
-    fn bad(name: &'static str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+    fn bad(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
         Check {
             name,
             verdict: Verdict::Bad,
             found: found.into(),
-            mend: Some(mend.into()),
+            fix: Some(fix.into()),
         }
     }
 
-    fn warning(name: &'static str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+    fn warning(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
         Check {
             verdict: Verdict::Warning,
-            ..Check::bad(name, found, mend)
+            ..Check::bad(name, found, fix)
         }
     }
 
@@ -61,15 +61,15 @@ impl Check {
             Verdict::Warning => "warn",
             Verdict::Bad => "FAIL",
         };
-        let mend = self
-            .mend
+        let fix = self
+            .fix
             .iter()
-            .map(|mend| format!("\n                 mend it:  {mend}"));
+            .map(|fix| format!("\n                 fix it:  {fix}"));
         format!(
             "{mark}  {:<10} {}{}",
             self.name,
             self.found,
-            mend.collect::<String>()
+            fix.collect::<String>()
         )
     }
 }
@@ -110,7 +110,7 @@ mod tests {
         );
         assert_eq!(
             check.lines(),
-            "FAIL  token      the server wants one\n                 mend it:  sh install.sh --token TOKEN"
+            "FAIL  token      the server wants one\n                 fix it:  sh install.sh --token TOKEN"
         );
         assert_eq!(
             Check::good("clock", "in step").lines(),

@@ -9,7 +9,7 @@ use api::{Check, CheckStatus};
 use crate::client::{Client, Unreachable};
 use crate::output::{self, Format, Table};
 
-/// Check what this machine needs to run servants, and say how to mend what is missing.
+/// Check what this machine needs to run servants, and say how to fix what is missing.
 #[derive(Debug, clap::Args)]
 pub struct Doctor {}
 
@@ -62,7 +62,7 @@ async fn without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doct
         name: "daemon".to_owned(),
         status: CheckStatus::Warning,
         found: "not running".to_owned(),
-        mend: Some(format!("sudo {}", program.display())),
+        fix: Some(format!("sudo {}", program.display())),
     });
     Ok(doctor)
 }
@@ -83,8 +83,8 @@ fn show(doctor: &api::Doctor) -> anyhow::Result<()> {
         .iter()
         .filter(|check| check.status != CheckStatus::Ok);
     for check in mendable {
-        if let Some(mend) = &check.mend {
-            output::line(&format!("\nto mend {}:\n    {mend}", check.name))?;
+        if let Some(fix) = &check.fix {
+            output::line(&format!("\nto fix {}:\n    {fix}", check.name))?;
         }
     }
     Ok(())

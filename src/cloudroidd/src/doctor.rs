@@ -93,8 +93,8 @@ pub fn find_init() -> Option<PathBuf> {
 
 /// A list for people, for the daemon that cannot start.
 pub fn list(checks: &[Check]) -> String {
-    let lines = checks.iter().map(|check| match &check.mend {
-        Some(mend) => format!("  {}: {}\n    {mend}", check.name, check.found),
+    let lines = checks.iter().map(|check| match &check.fix {
+        Some(fix) => format!("  {}: {}\n    {fix}", check.name, check.found),
         None => format!("  {}: {}", check.name, check.found),
     });
     lines.collect::<Vec<_>>().join("\n")
@@ -105,25 +105,25 @@ fn ok(name: &str, found: impl Into<String>) -> Check {
         name: name.to_owned(),
         status: CheckStatus::Ok,
         found: found.into(),
-        mend: None,
+        fix: None,
     }
 }
 
-fn missing(name: &str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+fn missing(name: &str, found: impl Into<String>, fix: impl Into<String>) -> Check {
     Check {
         name: name.to_owned(),
         status: CheckStatus::Missing,
         found: found.into(),
-        mend: Some(mend.into()),
+        fix: Some(fix.into()),
     }
 }
 
-fn warning(name: &str, found: impl Into<String>, mend: impl Into<String>) -> Check {
+fn warning(name: &str, found: impl Into<String>, fix: impl Into<String>) -> Check {
     Check {
         name: name.to_owned(),
         status: CheckStatus::Warning,
         found: found.into(),
-        mend: Some(mend.into()),
+        fix: Some(fix.into()),
     }
 }
 
@@ -285,14 +285,14 @@ fn room(home: &Path) -> Check {
     };
     let free = found.blocks_available() * found.fragment_size();
     let text = format!("{} free at {}", Size(free), existing.display());
-    let mend = "make room, or choose another state directory with --home; cloudroidctl rm removes services";
+    let fix = "make room, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {
         _ if free < ROOM_NEEDED => missing(
             NAME,
             format!("{text}; a first push needs {}", Size(ROOM_NEEDED)),
-            mend,
+            fix,
         ),
-        _ if free < ROOM_WANTED => warning(NAME, text, mend),
+        _ if free < ROOM_WANTED => warning(NAME, text, fix),
         _ => ok(NAME, text),
     }
 }
@@ -345,7 +345,7 @@ mod tests {
         let doctor = examine(Path::new("/nonexistent/home"), None);
         for check in doctor.checks {
             assert!(
-                check.status == CheckStatus::Ok || check.mend.is_some(),
+                check.status == CheckStatus::Ok || check.fix.is_some(),
                 "{check:?}"
             );
         }
@@ -355,6 +355,6 @@ mod tests {
     fn a_missing_program_names_its_package() {
         let check = program("no-such-program", "its-package", "does things");
         assert_eq!(check.status, CheckStatus::Missing);
-        assert_eq!(check.mend.as_deref(), Some("apt-get install its-package"));
+        assert_eq!(check.fix.as_deref(), Some("apt-get install its-package"));
     }
 }

@@ -122,8 +122,8 @@ fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
             api::CheckStatus::Missing => "MISSING",
         };
         println!("{mark} {}: {}", check.name, check.found);
-        if let Some(mend) = &check.mend {
-            println!("    {mend}");
+        if let Some(fix) = &check.fix {
+            println!("    {fix}");
         }
     }
     if doctor.well() {
@@ -198,9 +198,9 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         tracing::warn!("{warning}");
     }
     app.pusher
-        .mend()
+        .repair()
         .await
-        .context("cannot mend the image store")?;
+        .context("cannot repair the image store")?;
     let adopted = app
         .choreographer
         .adopt()

@@ -288,7 +288,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
         C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
         C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [room] in the configuration".into(),
         C::Servant { service, .. } => {
-            format!("see cloudroidctl events, and push {service} again when its package is mended")
+            format!("see cloudroidctl events, and push {service} again when its package is fixed")
         }
         C::Catalogue(error) => return next_of_catalogue(error),
         C::Ending => NEXT_OF_ENDING.into(),
@@ -334,7 +334,7 @@ fn next_of_catalogue(error: &catalogue::Error) -> Option<String> {
         C::UnknownRevision { service, .. } => {
             format!("see those that exist with: cloudroidctl services {service}")
         }
-        C::NoStub { service, .. } => format!("mend the package and push {service} again"),
+        C::NoStub { service, .. } => format!("fix the package and push {service} again"),
         C::UnknownArchitecture { .. } => {
             "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".to_owned()
         }

@@ -339,19 +339,19 @@ fn push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error
 fn as_the_pusher_knows_it(text: &str, home: &Path, source: &str) -> String {
     let builds = format!("{}/", home.join("build").display());
     let mut parts = text.split(builds.as_str());
-    let mut mended = parts.next().unwrap_or_default().to_owned();
+    let mut named = parts.next().unwrap_or_default().to_owned();
     for part in parts {
         let inside = part.split_once('/').map_or(part, |(_, inside)| inside);
         match inside.strip_prefix(PUSHED) {
-            Some(below) if source.is_empty() => mended.push_str(below.trim_start_matches('/')),
+            Some(below) if source.is_empty() => named.push_str(below.trim_start_matches('/')),
             Some(below) => {
-                mended.push_str(source.trim_end_matches('/'));
-                mended.push_str(below);
+                named.push_str(source.trim_end_matches('/'));
+                named.push_str(below);
             }
-            None => mended.push_str(inside),
+            None => named.push_str(inside),
         }
     }
-    mended
+    named
 }
 
 #[cfg(test)]
@@ -371,7 +371,7 @@ mod tests {
             told("there is no package.xml in /home/build/push-1/pushed", "."),
             "there is no package.xml in ."
         );
-        assert_eq!(told("nothing to mend", "x"), "nothing to mend");
+        assert_eq!(told("nothing to fix", "x"), "nothing to fix");
     }
 
     #[test]

@@ -49,8 +49,8 @@ impl Pusher {
     }
 
     /// Makes image store and database say the same, then removes what nothing needs.
-    pub async fn mend(&self) -> Result<(), Error> {
-        self.catalogue.mend().await?;
+    pub async fn repair(&self) -> Result<(), Error> {
+        self.catalogue.repair().await?;
         self.collect_garbage().await;
         Ok(())
     }

@@ -1,4 +1,4 @@
-//! What is wrong with a frame, said so that the client's author can mend it.
+//! What is wrong with a frame, said so that the client's author can fix it.
 
 use crate::Id;
 

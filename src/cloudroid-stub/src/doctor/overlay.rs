@@ -77,7 +77,7 @@ fn shadowing(place: &Place, variable: &dyn Fn(&str) -> Option<String>) -> Check 
     let overlay = original::overlay(&place.share);
     let overlay = overlay.canonicalize().unwrap_or(overlay);
     let package = &place.package;
-    let mend = format!(
+    let fix = format!(
         ". {}, after every other setup file",
         overlay.join("setup.sh").display()
     );
@@ -106,7 +106,7 @@ fn shadowing(place: &Place, variable: &dyn Fn(&str) -> Option<String>) -> Check 
                 Some(other) => format!("{name} names {} before this stub", other.display()),
                 None => format!("{name} does not name this stub"),
             };
-            return Check::bad("shadowing", found, mend);
+            return Check::bad("shadowing", found, fix);
         }
     }
     Check::good(
@@ -207,7 +207,7 @@ mod tests {
             let bad = robot.examined(prefixes, packages);
             assert_eq!(bad.verdict, Verdict::Bad);
             assert!(bad.found.contains(words), "{bad:?}");
-            assert!(bad.mend.is_some_and(|mend| mend.contains("stub/setup.sh")));
+            assert!(bad.fix.is_some_and(|fix| fix.contains("stub/setup.sh")));
         }
     }
 

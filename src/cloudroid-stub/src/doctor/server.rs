@@ -12,7 +12,7 @@ use crate::resolver;
 
 /// The clock is asked so often; the quickest answer counts.
 const SAMPLES: usize = 5;
-/// A difference that is worth mending. Stamps are set right on the link, but people read logs of both sides.
+/// A difference that is worth fixing. Stamps are set right on the link, but people read logs of both sides.
 const IN_STEP: f64 = 0.1;
 
 /// All checks of the server. When it is not reached there is but one.
@@ -54,15 +54,15 @@ struct Portal {
 impl Portal {
     async fn find(config: &Config, place: &Place) -> Result<Portal, Box<Check>> {
         let installer = place.installer();
-        let mend = format!("{installer} --server ws://HOST:9090");
-        let bad = |found: String, mend: String| Box::new(Check::bad("server", found, mend));
+        let fix = format!("{installer} --server ws://HOST:9090");
+        let bad = |found: String, fix: String| Box::new(Check::bad("server", found, fix));
         let address = match config.address() {
             Ok(address) => address,
-            Err(words) => return Err(bad(words, mend)),
+            Err(words) => return Err(bad(words, fix)),
         };
         let token = config.token().map_err(|error| {
-            let mend = format!("{installer} --token TOKEN");
-            Box::new(Check::bad("token", format!("{error:#}"), mend))
+            let fix = format!("{installer} --token TOKEN");
+            Box::new(Check::bad("token", format!("{error:#}"), fix))
         })?;
         let token = token.filter(|token| !token.is_empty());
         match resolver::resolve(&address.host).await {
@@ -75,7 +75,7 @@ impl Portal {
                 token,
                 installer,
             }),
-            Err(error) => Err(bad(format!("{} is not found: {error}", address.host), mend)),
+            Err(error) => Err(bad(format!("{} is not found: {error}", address.host), fix)),
         }
     }
 
@@ -113,13 +113,13 @@ impl Portal {
                     Some(_) => "the token is refused",
                     None => "the server wants a token",
                 };
-                let mend = format!("{} --token TOKEN", self.installer);
-                return Check::bad("token", format!("{given}: {words}"), mend);
+                let fix = format!("{} --token TOKEN", self.installer);
+                return Check::bad("token", format!("{given}: {words}"), fix);
             }
             404 => {
-                let mend =
+                let fix =
                     "have it pushed there (cloudroidctl push), or correct service in stub.toml";
-                return Check::bad("service", words, mend);
+                return Check::bad("service", words, fix);
             }
             status => {
                 let found = format!("status {status}: {words}");

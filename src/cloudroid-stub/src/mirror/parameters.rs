@@ -53,7 +53,7 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
             });
         }
         Err(error) => tracing::warn!(
-            "parameters that change later do not reach the cloud: {error}; mend those that are named next, then start this node again"
+            "parameters that change later do not reach the cloud: {error}; fix those that are named next, then start this node again"
         ),
     }
     all(mirror).await

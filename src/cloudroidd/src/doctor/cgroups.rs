@@ -37,14 +37,14 @@ pub fn check() -> Check {
             found.why
         ),
     };
-    let mend = (status != CheckStatus::Ok).then(|| {
+    let fix = (status != CheckStatus::Ok).then(|| {
         "boot with systemd.unified_cgroup_hierarchy=1, and give the daemon its controllers (Delegate=yes)".to_owned()
     });
     Check {
         name: NAME.to_owned(),
         status,
         found: text,
-        mend,
+        fix,
     }
 }
 

@@ -135,7 +135,7 @@ if [ -n "$ca" ]; then
   export CLOUDROID_CA_FILE
 fi
 if ! "$stub" doctor --share "$trial" --package "$package" --only server; then
-  $force || complain "nothing was installed: mend this, or install all the same with --force"
+  $force || complain "nothing was installed: fix this, or install all the same with --force"
 fi
 
 mkdir -p "$prefix/lib" "$prefix/share"
