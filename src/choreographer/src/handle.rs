@@ -86,7 +86,7 @@ impl Asked {
 
 /// Whoever is promised cores gets them before those who are not: a thousand of weight for each, where others have a
 /// hundred, unless a weight was asked for.
-pub(super) fn with_weight(asked: Limits) -> Limits {
+pub(crate) fn with_weight(asked: Limits) -> Limits {
     let promised = |cpus: f64| ((cpus * 1000.0).round() as u64).clamp(100, 10_000);
     Limits {
         cpu_weight: asked.cpu_weight.or(asked.cpus.map(promised)),
@@ -170,21 +170,21 @@ impl Handle {
         self.asked.lock().promised
     }
 
-    pub(super) fn set_asked(&self, limits: Limits) {
+    pub(crate) fn set_asked(&self, limits: Limits) {
         self.asked.lock().promised = limits;
     }
 
     /// Whoever changes its limits holds this.
-    pub(super) async fn limits_turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
+    pub(crate) async fn limits_turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
         self.limits_turn.lock().await
     }
 
     /// What it is promised, once it was admitted.
-    pub(super) fn promise(&self) -> Option<&Promise> {
+    pub(crate) fn promise(&self) -> Option<&Promise> {
         self.promise.get()
     }
 
-    pub(super) fn set_promise(&self, promise: Promise) {
+    pub(crate) fn set_promise(&self, promise: Promise) {
         let _ = self.promise.set(promise);
     }
 
@@ -249,7 +249,7 @@ impl Handle {
     }
 
     /// Comes back when its end is asked for, with the reason.
-    pub(super) async fn end_asked(&self) -> String {
+    pub(crate) async fn end_asked(&self) -> String {
         self.end.cancelled().await;
         self.end_reason.get().cloned().unwrap_or_default()
     }
@@ -262,11 +262,11 @@ impl Handle {
             .await;
     }
 
-    pub(super) fn set_phase(&self, phase: Phase) {
+    pub(crate) fn set_phase(&self, phase: Phase) {
         self.life.send_modify(|life| life.phase = phase);
     }
 
-    pub(super) fn set_over(&self, outcome: &Result<String, Failure>) {
+    pub(crate) fn set_over(&self, outcome: &Result<String, Failure>) {
         self.life.send_modify(|life| {
             life.phase = Phase::Draining;
             match outcome {
@@ -276,25 +276,25 @@ impl Handle {
         });
     }
 
-    pub(super) fn set_container(&self, container: Arc<dyn servant::engine::Servant>) {
+    pub(crate) fn set_container(&self, container: Arc<dyn servant::engine::Servant>) {
         let _ = self.container.set(container);
     }
 
-    pub(super) fn set_reach(&self, reach: Arc<Reach>) {
+    pub(crate) fn set_reach(&self, reach: Arc<Reach>) {
         *self.reach.lock() = Some(reach);
     }
 
     /// Nobody reaches its ROS from here on; gives what was there.
-    pub(super) fn take_reach(&self) -> Option<Arc<Reach>> {
+    pub(crate) fn take_reach(&self) -> Option<Arc<Reach>> {
         self.reach.lock().take()
     }
 
-    pub(super) fn set_idle_until(&self, until: Option<Millis>) {
+    pub(crate) fn set_idle_until(&self, until: Option<Millis>) {
         self.idle_until.store(until.unwrap_or(0), Ordering::Relaxed);
     }
 
     /// The number of connections now and later.
-    pub(super) fn watch_connections(&self) -> watch::Receiver<usize> {
+    pub(crate) fn watch_connections(&self) -> watch::Receiver<usize> {
         self.connections.subscribe()
     }
 
@@ -341,7 +341,7 @@ pub struct Lease {
 
 impl Lease {
     /// Counts one more connection in. Only under the choreographer's lock.
-    pub(super) fn new(handle: Arc<Handle>) -> Lease {
+    pub(crate) fn new(handle: Arc<Handle>) -> Lease {
         handle.connections.send_modify(|count| *count += 1);
         Lease { handle }
     }

@@ -11,29 +11,23 @@
 //!                                    └── adopted: an earlier daemon started it
 //! ```
 //!
-//! Each servant has one task ([`driver`]) that alone changes its state; everybody else asks for its end, counts
+//! Each servant has one task ([`lives::driver`]) that alone changes its state; everybody else asks for its end, counts
 //! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided under one
 //! short lock: a servant that is being ended is never given to anyone.
 
 #![forbid(unsafe_code)]
 
 mod admission;
-mod adoption;
-mod driver;
 mod error;
 pub mod grants;
 mod handle;
 pub mod limits;
+mod lives;
 mod memory;
-mod nodes;
 mod options;
-mod reaching;
 mod restart;
-mod room;
-mod spares;
 mod tail;
 
-use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -45,7 +39,7 @@ use parking_lot::Mutex;
 use reach::RequestTimes;
 use reach::egress::Way;
 use servant::engine::Engine;
-use store::{Journal, State};
+use store::Journal;
 
 pub use admission::{Admission, Amount, Permit, Refused};
 pub use error::{Error, with_last_words};
@@ -55,40 +49,15 @@ pub use memory::{Memory, MemoryOptions};
 pub use options::Options;
 pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
-use driver::Beginning;
 use grants::Granted;
-use memory::SharedMemory;
-use spares::Spares;
+use lives::driver::{self, Beginning};
+use lives::spares::{self, Spares};
+use lives::Inner;
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]
 pub struct Choreographer {
     inner: Arc<Inner>,
-}
-
-/// What the choreographer and its drivers share.
-pub(crate) struct Inner {
-    pub(crate) options: Options,
-    pub(crate) state: Arc<State>,
-    pub(crate) journal: Journal,
-    pub(crate) catalogue: Arc<Catalogue>,
-    pub(crate) engine: Arc<dyn Engine>,
-    pub(crate) admission: Admission,
-    pub(crate) request_times: Arc<RequestTimes>,
-    pub(crate) memory: SharedMemory,
-    servants: Mutex<Servants>,
-    spares: Spares,
-    /// Images whose nodes did not show all of their interface although they had all the time of a start.
-    incomplete: Mutex<BTreeSet<String>>,
-    ending: AtomicBool,
-}
-
-#[derive(Default)]
-struct Servants {
-    /// All that live, by id.
-    all: HashMap<String, Arc<Handle>>,
-    /// Those that a robot may be given, by service and robot.
-    given: HashMap<(String, String), Arc<Handle>>,
 }
 
 impl Choreographer {
@@ -329,60 +298,6 @@ impl Choreographer {
                 .map(|handle| handle.revision.image.clone()),
         );
         images
-    }
-}
-
-impl Inner {
-    fn promised(&self, handle: &Handle) -> Amount {
-        self.promised_for(&handle.asked())
-    }
-
-    fn is_ending(&self) -> bool {
-        self.ending.load(Ordering::SeqCst)
-    }
-
-    /// Limits asked for at push are a promise; else the configured reserve is.
-    fn promised_for(&self, asked: &api::Limits) -> Amount {
-        let options = &self.options;
-        let memory = asked.memory.map(|memory| memory.0);
-        Amount::new(
-            asked.cpus.unwrap_or(options.reserve_cpus),
-            memory.unwrap_or(options.reserve_memory),
-        )
-    }
-
-    /// Takes the servant out of reach if nobody is connected; true when so.
-    fn retire_if_idle(&self, handle: &Arc<Handle>) -> bool {
-        let mut servants = self.servants.lock();
-        let idle = handle.connections() == 0;
-        if idle {
-            servants.take_back(handle);
-        }
-        idle
-    }
-
-    /// Takes the servant out of reach.
-    fn retire(&self, handle: &Arc<Handle>) {
-        self.servants.lock().take_back(handle);
-    }
-
-    fn forget(&self, handle: &Arc<Handle>) {
-        let mut servants = self.servants.lock();
-        servants.take_back(handle);
-        servants.all.remove(&handle.id);
-    }
-}
-
-impl Servants {
-    fn take_back(&mut self, handle: &Arc<Handle>) {
-        let key = (handle.service().to_owned(), handle.robot.clone());
-        if self
-            .given
-            .get(&key)
-            .is_some_and(|given| Arc::ptr_eq(given, handle))
-        {
-            self.given.remove(&key);
-        }
     }
 }
 

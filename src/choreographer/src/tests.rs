@@ -5,7 +5,7 @@ use servant::engine::{Adopted, Servant};
 use servant::spec::Spec;
 
 use super::*;
-use store::{Plan, RevisionRecord};
+use store::{Plan, RevisionRecord, State};
 
 /// No servant is started here.
 struct NoEngine;

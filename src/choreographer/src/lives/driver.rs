@@ -13,13 +13,13 @@ use servant::engine::{ContainerState, Servant};
 use servant::spec::{NodeSpec, Profile, Spec};
 use tokio::time::{Instant, timeout_at};
 
-use super::handle::{Failure, Handle};
 use super::nodes::Nodes;
 use super::spares::{self, Spare};
-use super::{Inner, engine_limits, reaching, tail};
+use super::{Inner, reaching};
 use crate::admission::Permit;
 use crate::grants;
-use crate::{Error, with_last_words};
+use crate::handle::{Failure, Handle};
+use crate::{Error, engine_limits, tail, with_last_words};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 /// Lines of the log that explain a failure.
@@ -29,7 +29,7 @@ const LOG_LINES: usize = 20;
 const SETTLED: Duration = Duration::from_secs(5);
 
 /// How a servant begins.
-pub(super) enum Beginning {
+pub(crate) enum Beginning {
     /// A robot asked for it; it may have been made but for its nodes.
     Asked(Option<Spare>),
     /// An earlier daemon started it.
@@ -37,7 +37,7 @@ pub(super) enum Beginning {
 }
 
 /// Runs the servant's life to its end and cleans up after it.
-pub(super) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning: Beginning) {
+pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning: Beginning) {
     let mut permit = None;
     let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
@@ -327,7 +327,7 @@ async fn reach(
 }
 
 /// What the engine is to make: a servant of this revision, with these nodes.
-pub(super) async fn spec(
+pub(crate) async fn spec(
     inner: &Arc<Inner>,
     id: &str,
     revision: &RevisionRecord,

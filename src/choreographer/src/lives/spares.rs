@@ -15,22 +15,22 @@ use reach::Reach;
 use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 
-use super::{Asked, Inner, driver, reaching};
-use crate::Error;
+use super::{Inner, driver, reaching};
+use crate::{Asked, Error};
 use store::RevisionRecord;
 
 /// A servant without nodes.
-pub(super) struct Spare {
+pub(crate) struct Spare {
     /// Its container.
-    pub(super) container: Arc<dyn Servant>,
+    pub(crate) container: Arc<dyn Servant>,
     /// Its ROS and its bridge.
-    pub(super) reach: Arc<Reach>,
+    pub(crate) reach: Arc<Reach>,
     revision: Arc<RevisionRecord>,
 }
 
 /// All of them.
 #[derive(Default)]
-pub(super) struct Spares {
+pub(crate) struct Spares {
     kept: Mutex<Kept>,
     /// Something may be missing or too many.
     look: Notify,
@@ -59,7 +59,7 @@ impl Spare {
     }
 
     /// Ends it; nothing is left.
-    pub(super) async fn end(self) {
+    pub(crate) async fn end(self) {
         self.reach.bridge.close("the spare is not needed");
         if let Err(error) = self.container.stop().await {
             let id = self.container.id();
@@ -70,7 +70,7 @@ impl Spare {
 
 impl Spares {
     /// Gives the one of this revision, if there is one that lives, and remembers that the service was asked for.
-    pub(super) fn take(&self, revision: &RevisionRecord) -> Option<Spare> {
+    pub(crate) fn take(&self, revision: &RevisionRecord) -> Option<Spare> {
         let mut kept = self.kept.lock();
         kept.asked_for
             .retain(|service| *service != revision.service);
@@ -95,17 +95,17 @@ impl Spares {
     }
 
     /// Has a look taken, soon, at what is missing.
-    pub(super) fn look(&self) {
+    pub(crate) fn look(&self) {
         self.look.notify_one();
     }
 
     /// How many there are.
-    pub(super) fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         self.kept.lock().by_service.len()
     }
 
     /// Images that they were made from.
-    pub(super) fn images(&self) -> Vec<String> {
+    pub(crate) fn images(&self) -> Vec<String> {
         let kept = self.kept.lock();
         kept.by_service
             .values()
@@ -148,7 +148,7 @@ impl Spares {
 }
 
 /// Makes and ends spares as they are needed, for ever.
-pub(super) async fn keep(inner: Arc<Inner>) {
+pub(crate) async fn keep(inner: Arc<Inner>) {
     loop {
         inner.spares.look.notified().await;
         if let Err(error) = tidy(&inner, true).await {
@@ -158,7 +158,7 @@ pub(super) async fn keep(inner: Arc<Inner>) {
 }
 
 /// Ends those that are not wanted any more and makes, if so told, those that are missing.
-pub(super) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), Error> {
+pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), Error> {
     let _turn = inner.spares.turn.lock().await;
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
@@ -208,14 +208,14 @@ async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare
 }
 
 /// Takes a spare back that its robot left unused, or ends it.
-pub(super) async fn give_back(inner: &Inner, spare: Spare) {
+pub(crate) async fn give_back(inner: &Inner, spare: Spare) {
     if let Some(unwanted) = inner.spares.put_back(spare) {
         unwanted.end().await;
     }
 }
 
 /// Ends all of them and makes no more.
-pub(super) async fn end_all(inner: &Inner) {
+pub(crate) async fn end_all(inner: &Inner) {
     let all = {
         let mut kept = inner.spares.kept.lock();
         kept.closed = true;

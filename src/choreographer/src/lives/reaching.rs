@@ -14,7 +14,7 @@ use super::Inner;
 use crate::grants;
 
 /// Connects to the ROS of a container that was started from `revision`.
-pub(super) async fn open(
+pub(crate) async fn open(
     inner: &Inner,
     revision: &Arc<RevisionRecord>,
     container: &Arc<dyn Servant>,

@@ -13,9 +13,10 @@ use servant::spec::NodeSpec;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::time::Instant;
 
-use super::handle::{Failure, Handle};
-use super::restart::Backoff;
-use super::{Inner, tail};
+use super::Inner;
+use crate::handle::{Failure, Handle};
+use crate::restart::Backoff;
+use crate::tail;
 
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
@@ -23,7 +24,7 @@ const LOG_LINES: usize = 20;
 type Ended<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
 
 /// The servant's nodes: who ended, and who is started again. A node that asked for `respawn` is the engine's.
-pub(super) struct Nodes<'a> {
+pub(crate) struct Nodes<'a> {
     inner: &'a Inner,
     handle: &'a Handle,
     container: &'a Arc<dyn Servant>,
@@ -38,7 +39,7 @@ pub(super) struct Nodes<'a> {
 }
 
 impl<'a> Nodes<'a> {
-    pub(super) fn new(
+    pub(crate) fn new(
         inner: &'a Inner,
         handle: &'a Handle,
         container: &'a Arc<dyn Servant>,
@@ -79,7 +80,7 @@ impl<'a> Nodes<'a> {
     }
 
     /// Comes back when the servant has lost a node that it cannot do without.
-    pub(super) async fn supervise(&mut self) -> Failure {
+    pub(crate) async fn supervise(&mut self) -> Failure {
         loop {
             tokio::select! {
                 Some((node, began, exit)) = self.running.next() => {

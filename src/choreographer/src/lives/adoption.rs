@@ -4,8 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::driver::{self, Beginning};
-use super::{Asked, Choreographer, Handle};
 use crate::Error;
+use crate::{Asked, Choreographer, Handle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 impl Choreographer {

@@ -5,7 +5,7 @@ use crate::admission::Amount;
 
 impl Inner {
     /// Ends idle servants, those first that have been idle longest, until there will be room for everybody who waits.
-    pub(super) fn make_room(&self) {
+    pub(crate) fn make_room(&self) {
         let servants = self.servants.lock();
         let mut lacking = self.admission.lacking();
         if lacking == Amount::default() {

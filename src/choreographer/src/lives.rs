@@ -1,0 +1,104 @@
+//! The tasks that carry out what was decided: one for each servant ([`driver`]), which alone changes its state, and one that
+//! keeps the warm pool ([`spares`]). Servants of an earlier daemon are taken over here ([`adoption`]).
+
+mod adoption;
+pub(crate) mod driver;
+mod nodes;
+mod reaching;
+mod room;
+pub(crate) mod spares;
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use catalogue::Catalogue;
+use parking_lot::Mutex;
+use reach::RequestTimes;
+use servant::engine::Engine;
+use store::{Journal, State};
+
+use crate::admission::{Admission, Amount};
+use crate::handle::Handle;
+use crate::memory::SharedMemory;
+use crate::options::Options;
+use spares::Spares;
+
+/// What the choreographer and its tasks share.
+pub(crate) struct Inner {
+    pub(crate) options: Options,
+    pub(crate) state: Arc<State>,
+    pub(crate) journal: Journal,
+    pub(crate) catalogue: Arc<Catalogue>,
+    pub(crate) engine: Arc<dyn Engine>,
+    pub(crate) admission: Admission,
+    pub(crate) request_times: Arc<RequestTimes>,
+    pub(crate) memory: SharedMemory,
+    pub(crate) servants: Mutex<Servants>,
+    pub(crate) spares: Spares,
+    /// Images whose nodes did not show all of their interface although they had all the time of a start.
+    pub(crate) incomplete: Mutex<BTreeSet<String>>,
+    pub(crate) ending: AtomicBool,
+}
+
+#[derive(Default)]
+pub(crate) struct Servants {
+    /// All that live, by id.
+    pub(crate) all: HashMap<String, Arc<Handle>>,
+    /// Those that a robot may be given, by service and robot.
+    pub(crate) given: HashMap<(String, String), Arc<Handle>>,
+}
+
+impl Inner {
+    pub(crate) fn promised(&self, handle: &Handle) -> Amount {
+        self.promised_for(&handle.asked())
+    }
+
+    pub(crate) fn is_ending(&self) -> bool {
+        self.ending.load(Ordering::SeqCst)
+    }
+
+    /// Limits asked for at push are a promise; else the configured reserve is.
+    pub(crate) fn promised_for(&self, asked: &api::Limits) -> Amount {
+        let options = &self.options;
+        let memory = asked.memory.map(|memory| memory.0);
+        Amount::new(
+            asked.cpus.unwrap_or(options.reserve_cpus),
+            memory.unwrap_or(options.reserve_memory),
+        )
+    }
+
+    /// Takes the servant out of reach if nobody is connected; true when so.
+    pub(crate) fn retire_if_idle(&self, handle: &Arc<Handle>) -> bool {
+        let mut servants = self.servants.lock();
+        let idle = handle.connections() == 0;
+        if idle {
+            servants.take_back(handle);
+        }
+        idle
+    }
+
+    /// Takes the servant out of reach.
+    pub(crate) fn retire(&self, handle: &Arc<Handle>) {
+        self.servants.lock().take_back(handle);
+    }
+
+    pub(crate) fn forget(&self, handle: &Arc<Handle>) {
+        let mut servants = self.servants.lock();
+        servants.take_back(handle);
+        servants.all.remove(&handle.id);
+    }
+}
+
+impl Servants {
+    fn take_back(&mut self, handle: &Arc<Handle>) {
+        let key = (handle.service().to_owned(), handle.robot.clone());
+        if self
+            .given
+            .get(&key)
+            .is_some_and(|given| Arc::ptr_eq(given, handle))
+        {
+            self.given.remove(&key);
+        }
+    }
+}
