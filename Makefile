@@ -12,7 +12,6 @@ export CLOUDROID_PYTHON := $(VENV)/bin/python
 # The same for the stories' client in JavaScript.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
-HOST := x86_64-unknown-linux-gnu
 PREFIX ?= /usr/local
 
 .PHONY: help
@@ -33,23 +32,16 @@ test-deps: deps
 	@scripts/python "$(VENV)" demo/requirements.txt
 	@scripts/node "$(NODE)" tests/robots/package.json
 
-# PID 1 of every servant is static: it runs on whatever root file system a service has.
-INIT_FLAGS := --locked -p init --profile init --target $(HOST)
+# PID 1 of every servant and the robot's program are static (scripts/rustc): they run on whatever file system there is. They stand where
+# the daemon looks for them, beside it.
 .PHONY: init
 init:
-	@RUSTFLAGS="-C target-feature=+crt-static" cargo build -q $(INIT_FLAGS)
+	@cargo build -q --locked -p init --profile init
 
-# The robot's program is static, too: it runs on whatever a robot has. It stands where the daemon looks for it.
-STUB := cargo build -q --locked -p cloudroid-stub --target $(HOST)
 .PHONY: stub
 stub:
-	@RUSTFLAGS="-C target-feature=+crt-static" $(STUB) --profile stub
-	@install -D -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/stub/cloudroid-stub" "$(CARGO_TARGET_DIR)/release/stubs/x86_64/cloudroid-stub"
-
-.PHONY: stub-dev
-stub-dev:
-	@RUSTFLAGS="-C target-feature=+crt-static -C strip=debuginfo" $(STUB)
-	@install -D -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/debug/cloudroid-stub" "$(CARGO_TARGET_DIR)/debug/stubs/x86_64/cloudroid-stub"
+	@cargo build -q --locked -p cloudroid-stub --profile stub
+	@install -D -m 755 "$(CARGO_TARGET_DIR)/stub/cloudroid-stub" "$(CARGO_TARGET_DIR)/release/stubs/x86_64/cloudroid-stub"
 
 .PHONY: stub-cross
 stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it under qemu (as root)
@@ -68,21 +60,34 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 	@echo "== building cloudroidd and cloudroidctl (release; the first time takes some minutes)"
 	@$(MAKE) init stub
 	@cargo build --locked --release -p cloudroidd -p cloudroidctl
-	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
+	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
 # One selection of packages for all that is built for tests: Cargo compiles a library once per set of features, and each selection
 # has a set of its own.
 DEV := --locked --workspace
 
+# Puts what the daemon looks for beside a daemon that was built by profile $(1).
+define beside
+	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/$(1)/cloudroid-init"
+	@mkdir -p "$(CARGO_TARGET_DIR)/$(1)/stubs/x86_64"
+	@strip --strip-debug -o "$(CARGO_TARGET_DIR)/$(1)/stubs/x86_64/cloudroid-stub" "$(CARGO_TARGET_DIR)/$(1)/cloudroid-stub"
+endef
+
 .PHONY: build-dev
-build-dev:
-	@$(MAKE) init stub-dev
-	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --test stories
-	@install -m 755 "$(CARGO_TARGET_DIR)/$(HOST)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/debug/cloudroid-init"
+build-dev: init
+	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --test stories
+	$(call beside,debug)
+
+.PHONY: build-demo
+build-demo: init
+	@scripts/deps build
+	@echo "== building cloudroidd and cloudroidctl (not optimised; the first time takes some minutes)"
+	@cargo build --locked --profile demo -p cloudroidd -p cloudroidctl -p cloudroid-stub
+	$(call beside,demo)
 
 .PHONY: demo
-demo: demo-deps build ## push Debian's people_detect and find people in real pictures; CHECK=1 ends by itself
-	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/release" demo/demo
+demo: demo-deps build-demo ## push Debian's people_detect and find people in real pictures; CHECK=1 ends by itself
+	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/demo" demo/demo
 
 .PHONY: test
 test: ## format, lints, unit tests, stories, stories in a virtual machine; says how long each took
