@@ -50,9 +50,9 @@ pub use options::Options;
 pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
 use grants::Granted;
+use lives::Inner;
 use lives::driver::{self, Beginning};
 use lives::spares::{self, Spares};
-use lives::Inner;
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]

@@ -54,3 +54,14 @@ pub enum Error {
     #[error("the daemon failed at {0}; its log says more")]
     Internal(&'static str),
 }
+
+#[cfg(test)]
+impl Error {
+    /// Message and advice of a push that failed.
+    pub(crate) fn words(self) -> String {
+        let Error::Failed { message, next, .. } = self else {
+            panic!("{self} is no failed push");
+        };
+        format!("{message}; {}", next.unwrap_or_default())
+    }
+}

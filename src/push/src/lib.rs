@@ -13,9 +13,11 @@
 
 mod bounds;
 mod error;
+mod interface_limits;
 mod naming;
 mod options;
 mod patience;
+mod places;
 mod probe;
 mod publish;
 mod receive;
@@ -36,7 +38,8 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use bounds::{Left, Places};
+use bounds::Left;
+use places::Places;
 use request::Tell;
 use store::{Journal, NewEvent, Plan, RevisionRecord, State};
 
@@ -198,7 +201,7 @@ impl Pusher {
             supplement::add(&mut interface, text, &built.definitions)
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
-        bounds::check_interface(&interface)?;
+        interface_limits::check_interface(&interface)?;
         let record = RevisionRecord {
             service: name.clone(),
             number: 0,
