@@ -28,7 +28,7 @@ use std::time::Duration;
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, SubscribeOptions, Subscription, TopicNodes};
+use ros::bus::{Bus, Graph, Qos, Subscription, TopicNodes, WireType};
 use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -294,11 +294,11 @@ impl Look<'_> {
             }
             let asked = Instant::now();
             for topic in &new {
-                let any = SubscribeOptions {
-                    wire_type: None,
-                    queue: 1,
-                };
-                match self.bus.subscribe(topic, any).await {
+                match self
+                    .bus
+                    .subscribe(topic, WireType::any(), Qos::keep_last(1))
+                    .await
+                {
                     Ok(subscription) => {
                         self.subscriptions.insert(topic.clone(), subscription);
                     }

@@ -73,10 +73,7 @@ impl ServiceHandler for Secret {
 }
 
 fn trigger() -> ServiceType {
-    ServiceType {
-        name: "std_srvs/Trigger".to_owned(),
-        md5: "937c9679a518e3a18d831e57125ea522".to_owned(),
-    }
+    ServiceType::new("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")
 }
 
 fn serves(
@@ -220,10 +217,7 @@ pub fn a_python_node_calls_the_robot() -> Told {
     let fails = |words: &str| fails_at_last(&site, &app, "/crossing/ask", words, &gone);
     with_log(fails("unavailable"), &stub)?;
     let another = site.node("/another")?;
-    let wrong = ServiceType {
-        name: "std_srvs/Empty".to_owned(),
-        md5: "d41d8cd98f00b204e9800998ecf8427e".to_owned(),
-    };
+    let wrong = ServiceType::new("std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e");
     let serving = serves(&site, &another, "/robot/secret", wrong, Secret::new("?"))?;
     let gone = ["unavailable"];
     let fails = |words: &str| fails_at_last(&site, &app, "/crossing/ask", words, &gone);
@@ -332,10 +326,10 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Told {
         "caller_cpp/srv/Measure",
         "Header header\nuint8[] data\n---\ntime[] moments\nHeader header\nuint8[] data\n",
     )?;
-    let measure = ServiceType {
-        name: "caller_cpp/Measure".to_owned(),
-        md5: registry.service("caller_cpp/Measure")?.md5.clone(),
-    };
+    let measure = ServiceType::new(
+        "caller_cpp/Measure",
+        registry.service("caller_cpp/Measure")?.md5.clone(),
+    );
     let scale = Arc::new(Scale {
         ahead: HOUR * SECOND,
     });

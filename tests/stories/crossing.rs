@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use ros::bus::{AdvertiseOptions, Bus, Message, ParamValue, Publisher, Subscription, WireType};
+use ros::bus::{
+    Bus, GlobalParameters, Message, ParamValue, Publisher, Qos, Subscription, WireType,
+};
 use ros::ros1::Ros1Bus;
 use ros::schema::{MessageType, Registry};
 use support::Told;
@@ -61,16 +63,11 @@ pub fn advertises(
     of: &MessageType,
     latch: bool,
 ) -> anyhow::Result<Box<dyn Publisher>> {
-    let options = AdvertiseOptions {
-        wire_type: WireType {
-            name: of.name().to_owned(),
-            md5: of.md5().to_owned(),
-            definition: of.full_text().to_owned(),
-        },
-        latch,
-        queue: 10,
-    };
-    Ok(site.runtime.block_on(node.advertise(topic, options))?)
+    Ok(site.runtime.block_on(node.advertise(
+        topic,
+        WireType::of(&of),
+        Qos::keep_last(10).latching(latch),
+    ))?)
 }
 
 /// A serialized message, written field by field.
@@ -173,7 +170,7 @@ pub fn answers(
 pub fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
     let mut subscription = site.hears(app, topic)?;
     let connected = site.runtime.block_on(async {
-        let connected = subscription.publishers.wait_for(|count| *count > 0);
+        let connected = subscription.matched.wait_for(|now| now.connected() > 0);
         tokio::time::timeout(PATIENCE, connected).await.is_ok()
     });
     ensure!(connected, "nobody publishes {topic}");
@@ -218,7 +215,7 @@ pub fn simulated_time_is_the_robot_s() -> Told {
     let site = Site::new()?;
     let app = site.node("/app")?;
     site.runtime
-        .block_on(app.set_param("/use_sim_time", ParamValue::Bool(true)))?;
+        .block_on(app.set("/use_sim_time", ParamValue::Bool(true)))?;
     let clock = types.message("rosgraph_msgs/Clock")?;
     let clock = advertises(&site, &app, "/clock", &clock, true)?;
     let simulated = 1234 * 1_000_000_000 + 5;
@@ -521,7 +518,7 @@ pub fn settings_are_changed_through_dynamic_reconfigure() -> Told {
     // The node has written it to the robot's parameter server, too.
     let deadline = Instant::now() + PATIENCE;
     loop {
-        let value = site.runtime.block_on(app.get_param("/people/padding"))?;
+        let value = site.runtime.block_on(app.get("/people/padding"))?;
         if value == ParamValue::Int(16) {
             return Ok(());
         }

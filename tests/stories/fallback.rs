@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use bytes::{BufMut, Bytes, BytesMut};
-use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 use support::Told;
 use support::cable::{Badness, Cable};
@@ -116,26 +116,25 @@ impl Robot {
         let site = Site::new()?;
         let (server, node) = (site.node("/map_server")?, site.node("/laser")?);
         let advertise = |node: &Ros1Bus, topic: &str, latch: bool, wire_type: WireType| {
-            let options = AdvertiseOptions {
+            site.runtime.block_on(node.advertise(
+                topic,
                 wire_type,
-                latch,
-                queue: 10,
-            };
-            site.runtime.block_on(node.advertise(topic, options))
+                Qos::keep_last(10).latching(latch),
+            ))
         };
-        let grid = WireType {
-            name: "nav_msgs/OccupancyGrid".into(),
-            md5: "3381f2d731d4076ec5c71b0759edbe4e".into(),
-            definition: format!("{GRID}{HEADER}"),
-        };
+        let grid = WireType::new(
+            "nav_msgs/OccupancyGrid",
+            "3381f2d731d4076ec5c71b0759edbe4e",
+            format!("{GRID}{HEADER}"),
+        );
         let map_publisher = advertise(&server, "/map", true, grid)?;
         // Once, long before anybody asks.
         map_publisher.publish(map());
-        let laser = WireType {
-            name: "sensor_msgs/LaserScan".into(),
-            md5: "90c7ef2dc6895d81024acba2ac42f369".into(),
-            definition: format!("{SCAN}{HEADER}"),
-        };
+        let laser = WireType::new(
+            "sensor_msgs/LaserScan",
+            "90c7ef2dc6895d81024acba2ac42f369",
+            format!("{SCAN}{HEADER}"),
+        );
         let scan = advertise(&node, "/scan", false, laser)?;
         let poses = site.hears(&node, "/localiser/pose")?;
         Ok(Self {

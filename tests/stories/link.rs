@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
-use ros::bus::{Bus, Graph, ParamValue};
+use ros::bus::{Bus, GlobalParameters, Graph, ParamValue};
 use ros::ros1::Ros1Bus;
 use support::Told;
 use support::freezer::Freezer;
@@ -36,7 +36,7 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Told {
     let site = Site::new()?;
     let app = site.node("/app")?;
     let run = |future| site.runtime.block_on(future);
-    run(app.set_param(
+    run(app.set(
         "/front/hello/style",
         ParamValue::String("{name: robot's}".into()),
     ))?;
@@ -59,7 +59,8 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Told {
     let greeting = with_log(site.next(&mut greetings), &stub)?;
     ensure!(text(&greeting.bytes).contains("hi robot"), "{greeting:?}");
     ensure!(
-        greeting.wire_type.name == "greeter_cpp/Greeting" && &*greeting.publisher == "/front/hello",
+        greeting.wire_type.name == "greeter_cpp/Greeting"
+            && greeting.publisher.node() == "/front/hello",
         "{greeting:?}"
     );
     // A newcomer is given the latched one.
@@ -98,10 +99,10 @@ fn told_of(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String> {
     let services = graph.services.iter().filter(|(_, server)| *server == node);
     for (service, _) in services {
         if let Ok(kind) = site.runtime.block_on(watcher.service_type(service)) {
-            lines.insert(format!("{service} is a {} {}", kind.name, kind.md5));
+            lines.insert(format!("{service} is a {} {}", kind.name, kind.digest));
         }
     }
-    if let Ok(ParamValue::Map(all)) = site.runtime.block_on(watcher.get_param(node)) {
+    if let Ok(ParamValue::Map(all)) = site.runtime.block_on(watcher.get(node)) {
         lines.extend(
             all.iter()
                 .map(|(name, value)| format!("sets {name} to {value:?}")),
@@ -452,7 +453,7 @@ pub fn who_has_just_connected_hears_what_the_node_answers() -> Told {
         // Nobody listens yet: in the cloud the node is subscribed to from now on.
         let app = site.node(&format!("/app{number}"))?;
         let mut sums = site.hears(&app, "/sums")?;
-        let connected = sums.publishers.wait_for(|count| *count == 1);
+        let connected = sums.matched.wait_for(|now| now.connected() == 1);
         site.runtime
             .block_on(async { tokio::time::timeout(PATIENCE, connected).await.map(drop) })
             .context("the stub should be connected to")?;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, ServiceHandler, ServiceType};
+use ros::bus::{Bus, ServiceHandler, ServiceType, reaches};
 use support::Told;
 use support::robot::PATIENCE;
 use support::site::Site;
@@ -65,10 +65,7 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Told {
         "patient.py",
         &["__name:=move_base"],
     )?;
-    let trigger = ServiceType {
-        name: "std_srvs/Trigger".to_owned(),
-        md5: "937c9679a518e3a18d831e57125ea522".to_owned(),
-    };
+    let trigger = ServiceType::new("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522");
     let map = app.serve("/static_map", trigger, Arc::new(Answer(&[1, 0, 0, 0, 0])));
     let _map = site.runtime.block_on(map)?;
     let scans = types.message("sensor_msgs/LaserScan")?;
@@ -103,20 +100,13 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Told {
         transforms.publish(transform.clone());
         scans.publish(scan.clone());
     };
-    let mut connected = goals.subscribers();
     let deadline = Instant::now() + PATIENCE;
-    let there = |connected: &mut tokio::sync::watch::Receiver<usize>| {
-        let wait = async {
-            tokio::time::timeout(
-                Duration::from_millis(200),
-                connected.wait_for(|count| *count > 0),
-            )
-            .await
-            .is_ok()
-        };
-        site.runtime.block_on(wait)
+    let there = || {
+        let connected = reaches(goals.matched(), 1);
+        let wait = async { tokio::time::timeout(Duration::from_millis(200), connected).await };
+        site.runtime.block_on(wait).is_ok()
     };
-    while !there(&mut connected) {
+    while !there() {
         ensure!(Instant::now() < deadline, "no action came: {}", stub.said());
         gives();
     }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bytes::{BufMut, Bytes, BytesMut};
-use ros::bus::{AdvertiseOptions, Bus, Message, Publisher, Subscription, WireType};
+use ros::bus::{Bus, Message, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 
 use crate::cable::Cable;
@@ -78,16 +78,15 @@ impl Camera {
     pub fn new(site: &Site, queue: usize) -> anyhow::Result<Self> {
         let node = site.node("/camera")?;
         let found = site.hears(&node, "/people_detect/found")?;
-        let options = AdvertiseOptions {
-            wire_type: WireType {
-                name: "sensor_msgs/Image".into(),
-                md5: "060021388200f6f0f447d0fcd9c64743".into(),
-                definition: IMAGE.into(),
-            },
-            latch: false,
-            queue,
-        };
-        let image = site.runtime.block_on(node.advertise("/image", options))?;
+        let image = site.runtime.block_on(node.advertise(
+            "/image",
+            WireType::new(
+                "sensor_msgs/Image",
+                "060021388200f6f0f447d0fcd9c64743",
+                IMAGE,
+            ),
+            Qos::keep_last(queue),
+        ))?;
         site.connected(&*image, 1)?;
         Ok(Self { found, image, node })
     }

@@ -11,9 +11,7 @@ use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use ros::bus::{
-    AdvertiseOptions, Bus, Graph, Message, Publisher, SubscribeOptions, Subscription, WireType,
-};
+use ros::bus::{Bus, Graph, Message, Publisher, Qos, Subscription, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -115,25 +113,22 @@ impl Site {
         topic: &str,
         latch: bool,
     ) -> anyhow::Result<Box<dyn Publisher>> {
-        let options = AdvertiseOptions {
-            wire_type: WireType {
-                name: "std_msgs/String".into(),
-                md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
-                definition: "string data\n".into(),
-            },
-            latch,
-            queue: 100,
-        };
-        Ok(self.runtime.block_on(node.advertise(topic, options))?)
+        Ok(self.runtime.block_on(node.advertise(
+            topic,
+            WireType::new(
+                "std_msgs/String",
+                "992ce8a1687cec8c8bd883ec73ca41d1",
+                "string data\n",
+            ),
+            Qos::keep_last(100).latching(latch),
+        ))?)
     }
 
     /// Subscribes to a topic of any type.
     pub fn hears(&self, node: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
-        let options = SubscribeOptions {
-            wire_type: None,
-            queue: 100,
-        };
-        Ok(self.runtime.block_on(node.subscribe(topic, options))?)
+        Ok(self
+            .runtime
+            .block_on(node.subscribe(topic, WireType::any(), Qos::keep_last(100)))?)
     }
 
     /// The next message.
@@ -147,16 +142,16 @@ impl Site {
 
     /// Waits until so many subscribers are connected.
     pub fn connected(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
-        let mut now = publisher.subscribers();
+        let mut now = publisher.matched();
         let reached = self.runtime.block_on(async {
-            tokio::time::timeout(PATIENCE, now.wait_for(|now| *now == count))
+            tokio::time::timeout(PATIENCE, now.wait_for(|now| now.connected() == count))
                 .await
                 .is_ok()
         });
         ensure!(
             reached,
             "{count} subscribers should be connected, not {}",
-            *publisher.subscribers().borrow()
+            publisher.matched().borrow().connected()
         );
         Ok(())
     }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use bench_report::Report;
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
@@ -66,18 +66,15 @@ fn picture(number: u32) -> Bytes {
 }
 
 fn advertises(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
-    let options = AdvertiseOptions {
-        wire_type: WireType {
-            name: "sensor_msgs/Image".into(),
-            md5: "060021388200f6f0f447d0fcd9c64743".into(),
-            definition: crate::people::IMAGE.into(),
-        },
-        latch: false,
-        queue: 1,
-    };
-    Ok(site
-        .runtime
-        .block_on(app.advertise("/meter/image_in", options))?)
+    Ok(site.runtime.block_on(app.advertise(
+        "/meter/image_in",
+        WireType::new(
+            "sensor_msgs/Image",
+            "060021388200f6f0f447d0fcd9c64743",
+            crate::people::IMAGE,
+        ),
+        Qos::keep_last(1),
+    ))?)
 }
 
 /// One small message after the other through the stub.
@@ -115,8 +112,11 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
     site.connected(&*pings, 1).with_context(|| stub.said())?;
     let mut pongs = site.hears(&app, "/meter/pong")?;
     site.runtime.block_on(async {
-        let mut connected = pongs.publishers.clone();
-        connected.wait_for(|count| *count == 1).await.map(drop)
+        let mut connected = pongs.matched.clone();
+        connected
+            .wait_for(|now| now.connected() == 1)
+            .await
+            .map(drop)
     })?;
     let pictures: Arc<dyn Publisher> = advertises(&site, &app)?.into();
     site.connected(&*pictures, 1).with_context(|| stub.said())?;

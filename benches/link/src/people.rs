@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use bench_report::{Report, Target};
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 use support::daemon::Daemon;
 use support::site::Site;
@@ -27,17 +27,16 @@ struct Way {
 impl Way {
     fn new(site: &Site, app: &Ros1Bus, node: &str) -> Result<Self> {
         let found = site.hears(app, &format!("/{node}/found"))?;
-        let image = AdvertiseOptions {
-            wire_type: WireType {
-                name: "sensor_msgs/Image".into(),
-                md5: "060021388200f6f0f447d0fcd9c64743".into(),
-                definition: IMAGE.into(),
-            },
-            latch: false,
-            queue: 10,
-        };
         let topic = format!("/{node}_camera");
-        let pictures = site.runtime.block_on(app.advertise(&topic, image))?;
+        let pictures = site.runtime.block_on(app.advertise(
+            &topic,
+            WireType::new(
+                "sensor_msgs/Image",
+                "060021388200f6f0f447d0fcd9c64743",
+                IMAGE,
+            ),
+            Qos::keep_last(10),
+        ))?;
         site.connected(&*pictures, 1)?;
         Ok(Self {
             pictures,

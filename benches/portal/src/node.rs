@@ -10,7 +10,7 @@ use anyhow::{Context, Result, ensure};
 use async_trait::async_trait;
 use bench_servant::Daemon;
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, SubscribeOptions, WireType};
+use ros::bus::{Bus, Publisher, Qos, WireType};
 use ros::net::Sockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::xmlrpc::{Client, Value};
@@ -143,13 +143,12 @@ impl Node {
 
     /// Credit for one of the node's sources: it publishes as many messages as it is told.
     pub(crate) fn credit(&self, topic: &str) -> Result<Credit> {
-        let options = AdvertiseOptions {
-            wire_type: UINT32.into(),
-            latch: false,
-            queue: 1000,
-        };
         let topic = format!("{topic}_credit");
-        let publisher = self.runtime.block_on(self.bus.advertise(&topic, options))?;
+        let publisher = self.runtime.block_on(self.bus.advertise(
+            &topic,
+            UINT32.into(),
+            Qos::keep_last(1000),
+        ))?;
         self.until_connected(&topic, 1)?;
         Ok(Credit(publisher))
     }
@@ -160,11 +159,11 @@ impl Node {
         let counted = count.clone();
         let asking = std::thread::current();
         let topic = format!("{topic}_count");
-        let options = SubscribeOptions {
-            wire_type: Some(UINT32.into()),
-            queue: 1000,
-        };
-        let mut subscription = self.runtime.block_on(self.bus.subscribe(&topic, options))?;
+        let mut subscription = self.runtime.block_on(self.bus.subscribe(
+            &topic,
+            UINT32.into(),
+            Qos::keep_last(1000),
+        ))?;
         self.runtime.spawn(async move {
             let _subscribed = &subscription.guard;
             while let Some(message) = subscription.messages.recv().await {
@@ -212,11 +211,7 @@ pub(crate) const IMAGE: Type = Type {
 
 impl From<Type> for WireType {
     fn from(from: Type) -> Self {
-        Self {
-            name: from.name.to_owned(),
-            md5: from.md5.to_owned(),
-            definition: from.definition.to_owned(),
-        }
+        Self::new(from.name, from.md5, from.definition)
     }
 }
 

@@ -52,7 +52,7 @@ pub(super) async fn describe(
             match ask(&name, bus.topic_type(&name)).await {
                 Ok(wire) => {
                     let wire = if follows_any(seen, &name, direction, &wire) {
-                        any_type()
+                        WireType::any()
                     } else {
                         wire
                     };
@@ -62,7 +62,7 @@ pub(super) async fn describe(
             }
         }
     }
-    let actions = take_actions(&mut topics, registry, &mut texts)?;
+    let actions = take_actions(&mut topics, seen, registry, &mut texts)?;
     topics.sort_by(|a, b| {
         (&a.name, a.direction == Direction::Output)
             .cmp(&(&b.name, b.direction == Direction::Output))
@@ -88,14 +88,14 @@ pub(super) async fn describe(
                 compare(
                     &format!("service {name}"),
                     &wire.name,
-                    &wire.md5,
+                    wire.digest.as_str(),
                     &service.md5,
                 )?;
                 texts.service(&wire.name, [&service.request, &service.response]);
                 services.push(Service {
                     name: name.clone(),
                     type_name: wire.name,
-                    md5: wire.md5,
+                    md5: wire.digest.to_string(),
                     node: node.clone(),
                 });
             }
@@ -177,14 +177,6 @@ fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireTyp
     }
 }
 
-fn any_type() -> WireType {
-    WireType {
-        name: "*".to_owned(),
-        md5: "*".to_owned(),
-        definition: String::new(),
-    }
-}
-
 async fn ask<T>(
     name: &str,
     answer: impl Future<Output = Result<T, BusError>>,
@@ -205,7 +197,7 @@ fn topic(
     texts: &mut Texts<'_>,
 ) -> Result<Topic, ProbeError> {
     // Some nodes take any type; nothing is to be compared.
-    let any = wire.name == "*" || wire.md5 == "*";
+    let any = wire.name == "*" || wire.digest.is_any();
     if !any {
         let message = match registry.message(&wire.name) {
             Ok(message) => message,
@@ -229,7 +221,7 @@ fn topic(
         compare(
             &format!("topic {name}"),
             &wire.name,
-            &wire.md5,
+            wire.digest.as_str(),
             message.md5(),
         )?;
         texts.message(&message);
@@ -249,7 +241,7 @@ fn topic(
         latched: direction == Direction::Output && seen.latched.contains(&name),
         lazy: direction == Direction::Input && !seen.eager.contains(&name),
         type_name: wire.name,
-        md5: wire.md5,
+        md5: wire.digest.to_string(),
         direction,
         nodes,
         name,
@@ -268,67 +260,42 @@ fn compare(what: &str, type_name: &str, announced: &str, defined: &str) -> Resul
     })
 }
 
-/// Five topics below one name, in the directions of a server, are an action (actionlib).
+/// Actions that the package serves; topics that they are made of are no part of the interface.
 fn take_actions(
     topics: &mut Vec<Topic>,
+    seen: &Seen<'_>,
     registry: &Registry,
     texts: &mut Texts<'_>,
 ) -> Result<Vec<Action>, ProbeError> {
-    use Direction::{Input, Output};
-    const ENDS: [(&str, Direction); 5] = [
-        ("goal", Input),
-        ("cancel", Input),
-        ("status", Output),
-        ("feedback", Output),
-        ("result", Output),
-    ];
-    let has = |topics: &[Topic], name: &str, direction| {
-        topics
-            .iter()
-            .any(|topic| topic.name == name && topic.direction == direction)
-    };
     let mut actions = Vec::new();
-    let goals: Vec<Topic> = topics
-        .iter()
-        .filter(|topic| topic.direction == Input && topic.name.ends_with("/goal"))
-        .cloned()
-        .collect();
-    for goal in goals {
-        let name = goal.name.trim_end_matches("/goal");
-        let Some(type_name) = goal.type_name.strip_suffix("ActionGoal") else {
+    for (name, ends) in &seen.graph.actions {
+        let mut servers = ends.servers.iter().filter(|node| *node != seen.own_name);
+        let Some(node) = servers.next().filter(|_| ends.type_name != "*") else {
             continue;
         };
-        if !ENDS
-            .iter()
-            .all(|(end, direction)| has(topics, &format!("{name}/{end}"), *direction))
-        {
-            continue;
+        if let Ok(action) = registry.action(&ends.type_name) {
+            let goal = &action.action_goal;
+            let of_goals = topics.iter().filter(|topic| {
+                ends.topics.contains(&topic.name) && topic.type_name == goal.name()
+            });
+            for topic in of_goals {
+                compare(
+                    &format!("action {name}"),
+                    &topic.type_name,
+                    &topic.md5,
+                    goal.md5(),
+                )?;
+            }
+            texts.action(&ends.type_name);
         }
-        if let Ok(action) = registry.action(type_name) {
-            compare(
-                &format!("action {name}"),
-                &goal.type_name,
-                &goal.md5,
-                action.action_goal.md5(),
-            )?;
-            texts.action(type_name);
-        }
+        // In either direction: a server may well be its own client (move_base is).
+        topics.retain(|topic| !ends.topics.contains(&topic.name));
         actions.push(Action {
-            name: name.to_owned(),
-            type_name: type_name.to_owned(),
-            node: goal.nodes.first().cloned().unwrap_or_default(),
+            name: name.clone(),
+            type_name: ends.type_name.clone(),
+            node: node.clone(),
         });
     }
-    topics.retain(|topic| {
-        !actions.iter().any(|action| {
-            let end = topic
-                .name
-                .strip_prefix(action.name.as_str())
-                .and_then(|rest| rest.strip_prefix('/'));
-            // In either direction: a server may well be its own client (move_base is).
-            end.is_some_and(|end| ENDS.iter().any(|(name, _)| *name == end))
-        })
-    });
     Ok(actions)
 }
 
@@ -343,7 +310,7 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
         if plumbing || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
-        let value = bus.get_param(name).await.ok().map(|value| json(&value));
+        let value = bus.parameter(name).await.ok().map(|value| json(&value));
         parameters.push(Parameter {
             name: name.clone(),
             value,

@@ -15,9 +15,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
-use ros::bus::{
-    AdvertiseOptions, Bus, Graph, ParamValue, Publisher, SubscribeOptions, Subscription, WireType,
-};
+use ros::bus::{Bus, Graph, ParamValue, Publisher, Qos, Subscription, WireType, reaches};
 use ros::codec::{self, FillOptions, JsonOptions, Time};
 use ros::schema::{MessageType, Registry};
 use tokio::task::JoinHandle;
@@ -84,17 +82,16 @@ impl<'a> Feed<'a> {
         registry: &'a Registry,
         options: &'a ProbeOptions,
     ) -> Self {
-        let listen = SubscribeOptions {
-            wire_type: None,
-            queue: 200,
-        };
         Self {
             bus,
             registry,
             options,
             frames: Arc::default(),
             parameters: BTreeSet::new(),
-            log: bus.subscribe(LOG, listen).await.ok(),
+            log: bus
+                .subscribe(LOG, WireType::any(), Qos::keep_last(200))
+                .await
+                .ok(),
             said: BTreeMap::new(),
             lender: None,
             beats: BTreeMap::new(),
@@ -162,7 +159,8 @@ impl<'a> Feed<'a> {
         });
         if looked_for && self.lender.is_none() {
             let lender = AnyService::new(self.registry, &self.options.own_name);
-            match self.bus.lend(lender.clone()).await {
+            let lent = async { self.bus.lending()?.lend(lender.clone()).await };
+            match lent.await {
                 Ok(()) => new = true,
                 Err(error) => tracing::warn!("services cannot be lent to a package: {error}"),
             }
@@ -202,7 +200,7 @@ impl<'a> Feed<'a> {
             if !self.parameters.insert(key.clone()) {
                 continue;
             }
-            if let Ok(ParamValue::String(name)) = self.bus.get_param(key).await {
+            if let Ok(ParamValue::String(name)) = self.bus.parameter(key).await {
                 new |= self.frames.lock().add(&name);
             }
         }
@@ -268,8 +266,7 @@ impl<'a> Feed<'a> {
                 Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
                     Ok(bytes) => {
                         // Not latched, which would reach whoever is late, too: relays latch what was latched.
-                        let mut connected = publisher.subscribers();
-                        let _ = timeout(ANSWER, connected.wait_for(|count| *count > 0)).await;
+                        let _ = timeout(ANSWER, reaches(publisher.matched(), 1)).await;
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
                         longest = longest.max(Some(began.elapsed()));
@@ -316,16 +313,10 @@ impl<'a> Feed<'a> {
             .registry
             .message(name)
             .map_err(|error| error.to_string())?;
-        let options = AdvertiseOptions {
-            wire_type: WireType {
-                name: message.name().to_owned(),
-                md5: message.md5().to_owned(),
-                definition: message.full_text().to_owned(),
-            },
-            latch: false,
-            queue: 10,
-        };
-        let publisher = self.bus.advertise(topic, options).await;
+        let publisher = self
+            .bus
+            .advertise(topic, WireType::of(&message), Qos::keep_last(10))
+            .await;
         Ok(Some((
             message,
             publisher.map_err(|error| error.to_string())?,

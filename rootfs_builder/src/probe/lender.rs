@@ -6,7 +6,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Lender, Lent, ServiceHandler, ServiceType};
+use ros::bus::{Digest, Lender, Lent, ServiceHandler, ServiceType};
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use tokio::sync::watch;
@@ -15,7 +15,7 @@ use super::plausible;
 
 /// Answers every service that is looked for, and remembers which were.
 pub(super) struct AnyService {
-    by_md5: Arc<BTreeMap<String, Arc<ServiceDef>>>,
+    by_digest: Arc<BTreeMap<Digest, Arc<ServiceDef>>>,
     asked: Mutex<BTreeMap<String, BTreeSet<String>>>,
     own_name: String,
     ending: watch::Sender<bool>,
@@ -24,16 +24,18 @@ pub(super) struct AnyService {
 impl AnyService {
     /// Knows the service types of the image; `own_name` is the looking node, whose questions do not count.
     pub(super) fn new(registry: &Registry, own_name: &str) -> Arc<Self> {
-        let mut by_md5 = BTreeMap::new();
+        let mut by_digest = BTreeMap::new();
         for key in registry.keys() {
             if let Some((package, name)) = key.split_once("/srv/")
                 && let Ok(service) = registry.service(&format!("{package}/{name}"))
             {
-                by_md5.entry(service.md5.clone()).or_insert(service);
+                by_digest
+                    .entry(Digest::from(&service.md5))
+                    .or_insert(service);
             }
         }
         Arc::new(Self {
-            by_md5: Arc::new(by_md5),
+            by_digest: Arc::new(by_digest),
             asked: Mutex::default(),
             own_name: own_name.to_owned(),
             ending: watch::channel(false).0,
@@ -63,12 +65,9 @@ impl Lender for AnyService {
             .or_default()
             .insert(node.to_owned());
         Some(Lent {
-            service_type: ServiceType {
-                name: "*".to_owned(),
-                md5: "*".to_owned(),
-            },
+            service_type: ServiceType::new("*", "*"),
             handler: Arc::new(Answers {
-                by_md5: self.by_md5.clone(),
+                by_digest: self.by_digest.clone(),
                 service: None,
             }),
             gone: self.ending.subscribe(),
@@ -78,7 +77,7 @@ impl Lender for AnyService {
 
 /// Answers calls of one type, or of none yet.
 struct Answers {
-    by_md5: Arc<BTreeMap<String, Arc<ServiceDef>>>,
+    by_digest: Arc<BTreeMap<Digest, Arc<ServiceDef>>>,
     service: Option<Arc<ServiceDef>>,
 }
 
@@ -90,10 +89,10 @@ impl ServiceHandler for Answers {
         plausible::message(&service.response, Time::now()).map_err(|error| error.to_string())
     }
 
-    fn for_md5(&self, md5: &str) -> Option<Arc<dyn ServiceHandler>> {
-        let service = Some(self.by_md5.get(md5)?.clone());
+    fn for_type(&self, digest: &Digest) -> Option<Arc<dyn ServiceHandler>> {
+        let service = Some(self.by_digest.get(digest)?.clone());
         Some(Arc::new(Answers {
-            by_md5: self.by_md5.clone(),
+            by_digest: self.by_digest.clone(),
             service,
         }))
     }
@@ -108,14 +107,17 @@ mod tests {
         let text = "---\nint64 sum\nstring words\n".to_owned();
         let definitions = [("lab/srv/Add".to_owned(), text)].into();
         let registry = Registry::from_definitions(&definitions).expect("valid");
-        let md5 = registry.service("lab/Add").expect("defined").md5.clone();
+        let add = registry.service("lab/Add").expect("defined");
         let any = AnyService::new(&registry, "/looker");
         assert!(
             any.find("/add", "/looker").await.is_none(),
             "its own questions"
         );
         let lent = any.find("/add", "/node").await.expect("lent");
-        let handler = lent.handler.for_md5(&md5).expect("the type is known");
+        let handler = lent
+            .handler
+            .for_type(&Digest::from(&add.md5))
+            .expect("the type is known");
         let answer = handler.call(Bytes::new(), "/node").await.expect("answered");
         assert_eq!(answer.len(), 12);
         assert!(

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use package::interface::Direction;
-use ros::bus::{AdvertiseOptions, Publisher, ServiceHandler, ServiceType, WireType};
+use ros::bus::{Publisher, Qos, ServiceHandler, ServiceType, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -54,11 +54,7 @@ impl Lab {
 
     fn wire(&self, name: &str) -> WireType {
         let message = self.registry.message(name).expect("defined");
-        WireType {
-            name: name.to_owned(),
-            md5: message.md5().to_owned(),
-            definition: message.full_text().to_owned(),
-        }
+        WireType::of(&message)
     }
 
     async fn advertises(
@@ -67,34 +63,22 @@ impl Lab {
         wire_type: WireType,
         latch: bool,
     ) -> Box<dyn Publisher> {
-        let options = AdvertiseOptions {
-            wire_type,
-            latch,
-            queue: 1,
-        };
         self.node
-            .advertise(topic, options)
+            .advertise(topic, wire_type, Qos::keep_last(1).latching(latch))
             .await
             .expect("advertised")
     }
 
     async fn subscribes(&self, topic: &str, wire_type: WireType) -> Subscription {
-        let options = SubscribeOptions {
-            wire_type: Some(wire_type),
-            queue: 1,
-        };
         self.node
-            .subscribe(topic, options)
+            .subscribe(topic, wire_type, Qos::keep_last(1))
             .await
             .expect("subscribed")
     }
 
     async fn serves(&self, service: &str) -> Box<dyn Send + Sync> {
         let add = self.registry.service("lab/Add").expect("defined");
-        let add = ServiceType {
-            name: "lab/Add".into(),
-            md5: add.md5.clone(),
-        };
+        let add = ServiceType::new("lab/Add", add.md5.clone());
         let serving = self.node.serve(service, add, Arc::new(Sum));
         serving.await.expect("served")
     }
@@ -157,19 +141,20 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
     let output = lab.advertises("/out", string.clone(), false).await;
     let _served = lab.serves("/add").await;
     lab.node
-        .set_param("/package/gain", ros::bus::ParamValue::Double(0.5))
+        .parameters()
+        .expect("offered")
+        .set("/package/gain", ros::bus::ParamValue::Double(0.5))
         .await
         .expect("set");
     // Wakes as real nodes do: with the first subscriber of its output.
-    let mut listeners = output.subscribers();
+    let mut listeners = output.matched();
     let node = lab.node.clone();
     let waking = tokio::spawn(async move {
-        listeners.wait_for(|count| *count > 0).await.expect("alive");
-        let options = SubscribeOptions {
-            wire_type: Some(string),
-            queue: 1,
-        };
-        node.subscribe("/sleepy", options)
+        listeners
+            .wait_for(|now| now.connected() > 0)
+            .await
+            .expect("alive");
+        node.subscribe("/sleepy", string, Qos::keep_last(1))
             .await
             .expect("subscribed")
     });
@@ -299,12 +284,11 @@ async fn a_node_that_still_works_is_waited_for() {
         let times = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         async move {
             if times == 2 {
-                let options = SubscribeOptions {
-                    wire_type: Some(wire),
-                    queue: 1,
-                };
-                *late.lock().await =
-                    Some(node.subscribe("/late", options).await.expect("subscribed"));
+                *late.lock().await = Some(
+                    node.subscribe("/late", wire, Qos::keep_last(1))
+                        .await
+                        .expect("subscribed"),
+                );
             }
             Some(Worked {
                 ran: Duration::from_secs(times.min(2).into()),
@@ -345,16 +329,9 @@ async fn a_node_that_shows_nothing_yet_is_waited_for() {
     let showing = tokio::spawn(async move {
         // Slow: long after the graph was still for a while.
         tokio::time::sleep(Duration::from_millis(600)).await;
-        node.advertise(
-            "/late",
-            AdvertiseOptions {
-                wire_type,
-                latch: false,
-                queue: 1,
-            },
-        )
-        .await
-        .expect("advertised")
+        node.advertise("/late", wire_type, Qos::keep_last(1))
+            .await
+            .expect("advertised")
     });
     let found = lab
         .probed(&["/package"], std::future::pending())
@@ -369,11 +346,7 @@ async fn a_node_that_shows_nothing_yet_is_waited_for() {
 async fn five_topics_are_an_action() {
     let lab = Lab::new().await;
     let turn = lab.registry.action("lab/Turn").expect("defined");
-    let wire = |message: &Arc<ros::schema::MessageType>| WireType {
-        name: message.name().to_owned(),
-        md5: message.md5().to_owned(),
-        definition: message.full_text().to_owned(),
-    };
+    let wire = |message: &Arc<ros::schema::MessageType>| WireType::of(message);
     let _goal = lab.subscribes("/turn/goal", wire(&turn.action_goal)).await;
     let _cancel = lab
         .subscribes("/turn/cancel", lab.wire("actionlib_msgs/GoalID"))
@@ -411,7 +384,7 @@ async fn five_topics_are_an_action() {
 async fn a_node_compiled_with_another_definition_is_refused() {
     let lab = Lab::new().await;
     let other = WireType {
-        md5: "0".repeat(32),
+        digest: "0".repeat(32).into(),
         ..lab.wire("std_msgs/String")
     };
     let _input = lab.subscribes("/in", other).await;

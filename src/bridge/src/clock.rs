@@ -34,7 +34,7 @@ impl Listener for Ticks {
 
 /// The time now.
 pub(crate) async fn now(shared: &Arc<Shared>) -> Time {
-    if let Ok(ParamValue::Bool(true)) = shared.bus.get_param("/use_sim_time").await {
+    if let Ok(ParamValue::Bool(true)) = shared.bus.parameter("/use_sim_time").await {
         let (ticks, mut heard) = mpsc::unbounded_channel();
         let listening = shared.hub("/clock", None).listen(Arc::new(Ticks(ticks)));
         let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Message, SubscribeOptions, Subscription, WireType};
+use ros::bus::{Bus, Message, PeerId, Qos, Subscription, WireType};
 use ros::schema::MessageType;
 use tokio::task::AbortHandle;
 
@@ -81,22 +81,16 @@ impl Hub {
             state: Mutex::default(),
             pump: OnceLock::new(),
         });
-        let options = SubscribeOptions {
-            // Any MD5: a publisher with another definition is read by its own, or its listeners are told of it; a
-            // connection refused for it would only be silence.
-            wire_type: message_type.map(|found| WireType {
-                name: found.name().to_owned(),
-                md5: "*".to_owned(),
-                definition: String::new(),
-            }),
-            queue: shared.options.bus_queue,
-        };
+        // Any digest: a publisher with another definition is read by its own, or its listeners are told of it; a
+        // connection refused for it would only be silence.
+        let of = message_type.map_or_else(WireType::any, |found| WireType::named(found.name()));
+        let qos = Qos::keep_last(shared.options.bus_queue).latching(true);
         let pump = tokio::spawn(pump(
             Arc::downgrade(&hub),
             shared.bus.clone(),
             shared.metrics.clone(),
             topic.to_owned(),
-            options,
+            (of, qos),
         ));
         // Set once, here.
         let _ = hub.pump.set(pump.abort_handle());
@@ -160,7 +154,10 @@ impl Hub {
                 .map(|nodes| nodes.publishers.as_slice())
                 .unwrap_or_default();
             state.latched.retain(|sample| {
-                sample.local || publishers.iter().any(|name| **name == *sample.publisher)
+                sample.local
+                    || publishers
+                        .iter()
+                        .any(|name| name == sample.publisher.node())
             });
         }
         for sample in &state.latched {
@@ -196,11 +193,11 @@ impl Hub {
     }
 
     /// A client that latched a message here publishes no longer.
-    pub(crate) fn forget(&self, publisher: &str) {
+    pub(crate) fn forget(&self, publisher: &PeerId) {
         self.state
             .lock()
             .latched
-            .retain(|sample| *sample.publisher != *publisher);
+            .retain(|sample| sample.publisher != *publisher);
     }
 
     fn fail(&self, reason: String) {
@@ -236,9 +233,9 @@ async fn pump(
     bus: Arc<dyn Bus>,
     metrics: Arc<Metrics>,
     topic: String,
-    options: SubscribeOptions,
+    (of, qos): (WireType, Qos),
 ) {
-    let mut subscription: Subscription = match bus.subscribe(&topic, options).await {
+    let mut subscription: Subscription = match bus.subscribe(&topic, of, qos).await {
         Ok(subscription) => subscription,
         Err(error) => {
             if let Some(hub) = hub.upgrade() {

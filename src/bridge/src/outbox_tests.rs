@@ -16,11 +16,7 @@ fn outbox(options: BridgeOptions) -> (Outbox, Arc<Metrics>) {
 }
 
 fn sample(size: usize) -> Arc<Sample> {
-    let wire_type = Arc::new(WireType {
-        name: "a/B".into(),
-        md5: "*".into(),
-        definition: String::new(),
-    });
+    let wire_type = Arc::new(WireType::named("a/B"));
     let message = Message {
         bytes: vec![0; size].into(),
         wire_type,

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
+use ros::bus::{Matched, Message, PeerId, Publisher, Qos, WireType};
 use ros::schema::MessageType;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
@@ -24,7 +24,7 @@ pub(crate) struct Outlet {
     pub(crate) latch: bool,
     wire_type: Arc<WireType>,
     /// Tells this outlet's latched message from others'.
-    pub(crate) name: Arc<str>,
+    pub(crate) id: PeerId,
     shared: Arc<Shared>,
     /// The last message, where it latches.
     last: Mutex<Option<Bytes>>,
@@ -74,17 +74,13 @@ impl Outlet {
         queue: usize,
         failed: impl FnOnce(String) + Send + 'static,
     ) -> Arc<Outlet> {
-        let wire_type = WireType {
-            name: message_type.name().to_owned(),
-            md5: message_type.md5().to_owned(),
-            definition: message_type.full_text().to_owned(),
-        };
+        let wire_type = WireType::of(&message_type);
         let outlet = Arc::new(Outlet {
             topic: topic.to_owned(),
             message_type,
             latch,
             wire_type: Arc::new(wire_type.clone()),
-            name: format!("client#{}", shared.next_number()).into(),
+            id: PeerId::new(format!("client#{}", shared.next_number()), 0),
             shared: shared.clone(),
             last: Mutex::default(),
             given_up: Mutex::default(),
@@ -92,13 +88,9 @@ impl Outlet {
             state: Mutex::new(State::warming(None)),
         });
         shared.add_outlet(&outlet);
-        let options = AdvertiseOptions {
-            wire_type,
-            latch,
-            queue,
-        };
         // Holds the outlet until what was published at once has been sent, even if the client is gone by then.
-        tokio::spawn(warm_up(outlet.clone(), options, failed));
+        let qos = Qos::keep_last(queue).latching(latch);
+        tokio::spawn(warm_up(outlet.clone(), wire_type, qos, failed));
         outlet
     }
 
@@ -114,7 +106,7 @@ impl Outlet {
         if let State::Live { publisher, settled } = &mut *state
             && self.is_incomplete(publisher.as_ref(), settled)
         {
-            let subscribers = publisher.subscribers();
+            let subscribers = publisher.matched();
             if let State::Live { publisher, .. } =
                 std::mem::replace(&mut *state, State::warming(None))
             {
@@ -165,7 +157,7 @@ impl Outlet {
         Message {
             bytes,
             wire_type: self.wire_type.clone(),
-            publisher: self.name.clone(),
+            publisher: self.id.clone(),
             latching: self.latch,
         }
     }
@@ -177,7 +169,7 @@ impl Outlet {
         if generation == *settled {
             return false;
         }
-        let missing = self.missing(&publisher.subscriber_names());
+        let missing = self.missing(&publisher.matched().borrow());
         let mut given_up = self.given_up.lock();
         // Who has gone meanwhile may come back with the right type.
         given_up.retain(|node| missing.contains(node));
@@ -190,7 +182,7 @@ impl Outlet {
 
     /// Nodes that the Master names as subscribers, and that are not connected. The bridge itself may be among those
     /// that are named, but never connects.
-    fn missing(&self, connected: &[String]) -> BTreeSet<Node> {
+    fn missing(&self, matched: &Matched) -> BTreeSet<Node> {
         let bus = &self.shared.bus;
         let graph = bus.graph().borrow().clone();
         let Some(nodes) = graph.topics.get(&self.topic) else {
@@ -199,7 +191,7 @@ impl Outlet {
         nodes
             .subscribers
             .iter()
-            .filter(|name| *name != bus.node() && !connected.contains(name))
+            .filter(|name| *name != bus.node() && !matched.has_node(name))
             .map(|name| {
                 let address = graph.nodes.get(name).cloned();
                 (name.clone(), address.unwrap_or_default())
@@ -207,24 +199,9 @@ impl Outlet {
             .collect()
     }
 
-    fn connected_names(&self) -> Vec<String> {
-        match &*self.state.lock() {
-            State::Live { publisher, .. }
-            | State::Warming {
-                publisher: Some(publisher),
-                ..
-            } => publisher.subscriber_names(),
-            _ => Vec::new(),
-        }
-    }
-
     /// Whether all are connected who should be, at least one.
-    fn is_complete(&self, connected: usize) -> bool {
-        if connected == 0 {
-            return false;
-        }
-        let missing = self.missing(&self.connected_names());
-        missing.is_subset(&self.given_up.lock())
+    fn is_complete(&self, matched: &Matched) -> bool {
+        matched.connected() > 0 && self.missing(matched).is_subset(&self.given_up.lock())
     }
 
     /// Sends what waits, in order, and from now on at once.
@@ -253,21 +230,17 @@ impl Drop for Outlet {
     }
 }
 
-async fn warm_up(
-    outlet: Arc<Outlet>,
-    options: AdvertiseOptions,
-    failed: impl FnOnce(String) + Send,
-) {
+async fn warm_up(outlet: Arc<Outlet>, of: WireType, qos: Qos, failed: impl FnOnce(String) + Send) {
     let shared = outlet.shared.clone();
     let deadline = Instant::now() + shared.options.warm_up;
-    let publisher = match shared.bus.advertise(&outlet.topic, options).await {
+    let publisher = match shared.bus.advertise(&outlet.topic, of, qos).await {
         Ok(publisher) => publisher,
         Err(error) => {
             *outlet.state.lock() = State::Failed;
             return failed(error.to_string());
         }
     };
-    let subscribers = publisher.subscribers();
+    let subscribers = publisher.matched();
     if let State::Warming {
         publisher: held, ..
     } = &mut *outlet.state.lock()
@@ -279,9 +252,13 @@ async fn warm_up(
 }
 
 /// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits.
-async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<usize>, deadline: Instant) {
+async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<Matched>, deadline: Instant) {
     let connected = async {
-        while !outlet.is_complete(*subscribers.borrow_and_update()) {
+        loop {
+            let matched = subscribers.borrow_and_update().clone();
+            if outlet.is_complete(&matched) {
+                return;
+            }
             if subscribers.changed().await.is_err() {
                 return;
             }
@@ -289,22 +266,22 @@ async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<usize>, de
     };
     if timeout_at(deadline.into(), connected).await.is_err() {
         // Not waited for again while they are what they are.
-        *outlet.given_up.lock() = outlet.missing(&outlet.connected_names());
+        *outlet.given_up.lock() = outlet.missing(&subscribers.borrow());
     }
-    outlet.connected.send_replace(*subscribers.borrow());
+    let connected = subscribers.borrow().connected();
+    outlet.connected.send_replace(connected);
     outlet.go_live();
 }
 
 /// Tells those who wait for a first subscriber, for as long as the outlet lives.
-fn follow(outlet: Weak<Outlet>, mut subscribers: watch::Receiver<usize>) {
+fn follow(outlet: Weak<Outlet>, mut subscribers: watch::Receiver<Matched>) {
     tokio::spawn(async move {
         loop {
             let Some(outlet) = outlet.upgrade() else {
                 return;
             };
-            outlet
-                .connected
-                .send_replace(*subscribers.borrow_and_update());
+            let connected = subscribers.borrow_and_update().connected();
+            outlet.connected.send_replace(connected);
             drop(outlet);
             // An error means that the publisher is gone, and the outlet with it.
             if subscribers.changed().await.is_err() {

@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use ros::bus::{Bus, Graph, SubscribeOptions};
+use ros::bus::{Bus, Graph, Qos, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -30,16 +30,10 @@ async fn is_live(outlet: &Outlet) {
 }
 
 async fn subscribe(node: &Ros1Bus, md5: &str) -> ros::bus::Subscription {
-    let wire_type = WireType {
-        name: "std_msgs/Int32".to_owned(),
-        md5: md5.to_owned(),
-        definition: String::new(),
-    };
-    let options = SubscribeOptions {
-        wire_type: Some(wire_type),
-        queue: 100,
-    };
-    node.subscribe("/number", options).await.unwrap()
+    let wire_type = WireType::new("std_msgs/Int32", md5, "");
+    node.subscribe("/number", wire_type, Qos::keep_last(100))
+        .await
+        .unwrap()
 }
 
 #[tokio::test]
@@ -80,12 +74,10 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
     // The graph changes, and what is published goes out at once all the same.
     for number in 0..3 {
         let name = format!("/other{number}");
-        let other = ros::bus::AdvertiseOptions {
-            wire_type: (*outlet.wire_type).clone(),
-            latch: false,
-            queue: 1,
-        };
-        let _other = odd.advertise(&name, other).await.unwrap();
+        let _other = odd
+            .advertise(&name, (*outlet.wire_type).clone(), Qos::keep_last(1))
+            .await
+            .unwrap();
         in_graph(&*bus, |graph| graph.topics.contains_key(&name)).await;
         outlet.publish(vec![0; 4].into());
         let live = matches!(*outlet.state.lock(), State::Live { .. });

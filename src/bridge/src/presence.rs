@@ -86,14 +86,9 @@ impl Presence {
                 bytes.extend_from_slice(&since.nsecs.to_le_bytes());
             }
         }
-        let wire_type = WireType {
-            name: message_type.name().to_owned(),
-            md5: message_type.md5().to_owned(),
-            definition: message_type.full_text().to_owned(),
-        };
         Message {
             bytes: bytes.into(),
-            wire_type: Arc::new(wire_type),
+            wire_type: Arc::new(WireType::of(message_type)),
             publisher: "/rosbridge_websocket".into(),
             latching: true,
         }

@@ -122,7 +122,10 @@ impl Service {
                 let Time { secs, nsecs } = clock::now(shared).await;
                 json!({ "time": { "secs": secs, "nsecs": nsecs } })
             }
-            "get_ros_version" => json!({ "version": 1, "distro": params::distro(shared).await }),
+            "get_ros_version" => json!({
+                "version": shared.bus.version().number(),
+                "distro": shared.bus.distribution().await,
+            }),
             other => return Err(format!("rosapi has no service {other}")),
         })
     }

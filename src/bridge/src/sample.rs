@@ -8,7 +8,7 @@ use std::sync::{Arc, Weak};
 use budget::{Exceeded, Permit, UNCOUNTED};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::WireType;
+use ros::bus::{PeerId, WireType};
 use ros::codec::{self, CborOptions, JsonOptions, Time};
 use ros::schema::{MessageType, Registry};
 use rosbridge::{Compression, Format, Publish};
@@ -152,7 +152,7 @@ impl TopicTypes {
 
 /// The registry's type where its MD5 agrees, else one made from the definition that the publisher sent.
 fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, String> {
-    let agrees = |found: &MessageType| wire.md5 == "*" || wire.md5 == found.md5();
+    let agrees = |found: &MessageType| wire.digest.agrees(&found.md5().into());
     let ours = match registry.message(&wire.name) {
         Ok(found) if agrees(&found) => return Ok(found),
         ours => ours,
@@ -162,7 +162,7 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
             Ok(found) => format!(
                 "its type {} has MD5 {}, ours has {}",
                 wire.name,
-                wire.md5,
+                wire.digest,
                 found.md5()
             ),
             Err(error) => error.to_string(),
@@ -173,7 +173,7 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
             .insert_full_text(&wire.name, &wire.definition)
             .and_then(|()| registry.message(&wire.name))
     } else {
-        MessageType::from_full_text(&wire.name, &wire.definition)
+        wire.schema()
     };
     match theirs {
         Ok(found) if agrees(&found) => Ok(found),
@@ -181,7 +181,7 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
             "the publisher's definition of {} has MD5 {}, not {} as it says",
             wire.name,
             found.md5(),
-            wire.md5
+            wire.digest
         )),
         Err(error) => Err(error.to_string()),
     }
@@ -191,7 +191,7 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
 pub(crate) struct Sample {
     pub(crate) bytes: Bytes,
     pub(crate) wire_type: Arc<WireType>,
-    pub(crate) publisher: Arc<str>,
+    pub(crate) publisher: PeerId,
     pub(crate) latching: bool,
     /// From a client of this bridge rather than from a node.
     pub(crate) local: bool,

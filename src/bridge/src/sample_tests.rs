@@ -12,11 +12,7 @@ fn a_topic_keeps_the_encodings_of_its_latest_messages_only() {
     };
     let metrics = Metrics::default();
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
-    let wire_type = Arc::new(WireType {
-        name: "a/B".into(),
-        md5: "*".into(),
-        definition: String::new(),
-    });
+    let wire_type = Arc::new(WireType::named("a/B"));
     let topic: Arc<str> = "/t".into();
     let frame = |sample: &Arc<Sample>| {
         sample

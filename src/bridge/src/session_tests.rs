@@ -55,11 +55,7 @@ fn step(session: &mut Session<DuplexStream>) {
 }
 
 fn sample() -> Arc<Sample> {
-    let wire_type = WireType {
-        name: "a/B".into(),
-        md5: "*".into(),
-        definition: String::new(),
-    };
+    let wire_type = WireType::named("a/B");
     let message = BusMessage {
         bytes: vec![0; 8].into(),
         wire_type: Arc::new(wire_type),

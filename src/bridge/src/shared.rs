@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::Bus;
+use ros::bus::{Bus, PeerId};
 use ros::schema::{MessageType, Registry};
 use tokio::sync::watch;
 
@@ -177,11 +177,9 @@ impl Shared {
             .collect()
     }
 
-    /// Whether the client that published under this name still does.
-    pub(crate) fn has_outlet(&self, topic: &str, name: &str) -> bool {
-        self.outlets_of(topic)
-            .iter()
-            .any(|outlet| *outlet.name == *name)
+    /// Whether the client that published so still does.
+    pub(crate) fn has_outlet(&self, topic: &str, id: &PeerId) -> bool {
+        self.outlets_of(topic).iter().any(|outlet| outlet.id == *id)
     }
 
     pub(crate) fn add_outlet(&self, outlet: &Arc<Outlet>) {
@@ -205,7 +203,7 @@ impl Shared {
         if outlet.latch
             && let Some(hub) = self.live_hub(&outlet.topic)
         {
-            hub.forget(&outlet.name);
+            hub.forget(&outlet.id);
         }
     }
 

@@ -16,7 +16,9 @@ use ros::codec::Time;
 use ros::schema::Registry;
 
 use buffer::Buffer;
-pub(crate) use republish::{GOAL_TOPIC, Republisher, SERVICE, STATUS_TOPIC, TOPICS, definition};
+pub(crate) use republish::{
+    ACTION, GOAL_TOPIC, Republisher, SERVICE, STATUS_TOPIC, TOPICS, definition,
+};
 use transform::Transform;
 
 const DEFINITIONS: &[(&str, &str)] = &[

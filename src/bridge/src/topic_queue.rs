@@ -4,6 +4,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use ros::bus::PeerId;
 use rosbridge::{Compression, Id};
 
 use crate::sample::Sample;
@@ -70,7 +71,7 @@ pub(crate) struct TopicQueue {
     limits: QueueLimits,
     samples: VecDeque<Waiting>,
     /// Latching publishers whose first message has been queued.
-    met: HashSet<Arc<str>>,
+    met: HashSet<PeerId>,
     pub(crate) bytes: usize,
     /// Of those, bytes of samples that count for the daemon by themselves.
     pub(crate) big: usize,

@@ -6,11 +6,7 @@ use crate::BridgeOptions;
 use crate::sample::TopicTypes;
 
 fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
-    let wire_type = Arc::new(WireType {
-        name: "a/B".into(),
-        md5: "*".into(),
-        definition: String::new(),
-    });
+    let wire_type = Arc::new(WireType::named("a/B"));
     let message = Message {
         bytes: vec![0; size].into(),
         wire_type,

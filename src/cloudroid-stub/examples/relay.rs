@@ -9,9 +9,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{
-    AdvertiseOptions, Bus, ParamValue, ServiceHandler, ServiceType, SubscribeOptions, WireType,
-};
+use ros::bus::{Bus, GlobalParameters, ParamValue, Qos, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::names::{self, PeerUri};
@@ -58,38 +56,30 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         PeerUri::parse(&std::env::var("ROS_MASTER_URI")?, "http").ok_or("ROS_MASTER_URI")?;
     let master = HostSockets.resolve(&master.host, master.port).await?;
     let bus = Ros1Bus::connect(Arc::new(HostSockets), master, &node).await?;
-    let greeting = match bus.get_param(&format!("{node}_sibling/greeting")).await {
+    let greeting = match bus.get(&format!("{node}_sibling/greeting")).await {
         Ok(ParamValue::String(greeting)) => greeting,
         _ => String::new(),
     };
-    bus.set_param(&format!("{node}/seen"), ParamValue::Bool(true))
+    bus.set(&format!("{node}/seen"), ParamValue::Bool(true))
         .await?;
-    let wire_type = WireType {
-        name: "std_msgs/String".into(),
-        md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
-        definition: "string data\n".into(),
-    };
-    let echo_type = ServiceType {
-        name: "tests/Echo".into(),
-        md5: "0123456789abcdef0123456789abcdef".into(),
-    };
+    let wire_type = WireType::new(
+        "std_msgs/String",
+        "992ce8a1687cec8c8bd883ec73ca41d1",
+        "string data\n",
+    );
+    let echo_type = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _echo = bus
         .serve(&format!("{node}/echo"), echo_type, Arc::new(Echo))
         .await?;
-    let out = AdvertiseOptions {
-        wire_type: wire_type.clone(),
-        latch: false,
-        queue: 8,
-    };
-    let out = bus.advertise(&topic("out"), out).await?;
+    let out = bus
+        .advertise(&topic("out"), wire_type.clone(), Qos::keep_last(8))
+        .await?;
     if arguments.iter().any(|argument| argument == "patient") {
-        out.subscribers().wait_for(|count| *count > 0).await?;
+        out.matched().wait_for(|now| now.connected() > 0).await?;
     }
-    let input = SubscribeOptions {
-        wire_type: Some(wire_type),
-        queue: 8,
-    };
-    let mut input = bus.subscribe(&topic("in"), input).await?;
+    let mut input = bus
+        .subscribe(&topic("in"), wire_type, Qos::keep_last(8))
+        .await?;
     let mut end = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::interrupt())?;
     loop {
         tokio::select! {

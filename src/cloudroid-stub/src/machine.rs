@@ -37,7 +37,7 @@ pub fn host() -> String {
 
 /// The id of the Master's life, where it has one: several machines with one Master are one robot.
 pub async fn roscore(bus: &dyn Bus) -> String {
-    match bus.get_param("/run_id").await {
+    match bus.parameter("/run_id").await {
         Ok(ParamValue::String(id)) => id,
         _ => String::new(),
     }

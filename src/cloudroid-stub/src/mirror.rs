@@ -239,11 +239,7 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<FromClou
                 definition,
             } => {
                 let key = (name.clone(), md5.clone());
-                let wire_type = WireType {
-                    name,
-                    md5,
-                    definition,
-                };
+                let wire_type = WireType::new(name, md5, definition);
                 mirror.types.lock().insert(key, wire_type);
             }
             FromCloud::Graph(graph) => mirror.apply(graph).await,

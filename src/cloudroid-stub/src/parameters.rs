@@ -14,7 +14,7 @@ static TOLD: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 /// All parameters as a tree, without the Master's own. Those that cannot be read are left out, and named in the log.
 pub async fn all(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
-    let mut all = match bus.get_param("/").await {
+    let mut all = match bus.parameter("/").await {
         Ok(ParamValue::Map(all)) => all,
         Ok(_) => BTreeMap::new(),
         Err(error) if is_of_values(&error) => one_by_one(bus).await?,
@@ -79,8 +79,8 @@ fn is_of_values(error: &BusError) -> bool {
 
 async fn one_by_one(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
     let mut all = BTreeMap::new();
-    for name in bus.param_names().await? {
-        match bus.get_param(&name).await {
+    for name in bus.parameters()?.names().await? {
+        match bus.parameter(&name).await {
             Ok(value) => insert(&mut all, name.trim_start_matches('/'), value),
             // Deleted meanwhile.
             Err(BusError::NoParam(_)) => {}

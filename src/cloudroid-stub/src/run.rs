@@ -16,9 +16,9 @@ use link::control::{Exit, FromRobot, Hello, Sla};
 use link::{RobotSession, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
-use ros::bus::{Bus, BusError, ParamValue};
+use ros::JoinOptions;
+use ros::bus::{Bus, BusError, ParamValue, RosVersion};
 use ros::net::Sockets;
-use ros::ros1::{Ros1Bus, Ros1Options};
 use tokio::signal::unix::{SignalKind, signal as signals};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
@@ -88,11 +88,13 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     let mut shutdown = bus.shutdown_requested();
     let session = Arc::new(RobotSession::new(session_options(&config)));
     let label = format!("{} for {}", config.service, config.robot());
-    bus.set_label(&label);
+    if let Ok(lending) = bus.lending() {
+        lending.set_label(&label);
+    }
     let mirror = Mirror::start(bus.clone(), label, session, config.call_limit());
     let mut watcher: Option<Arc<dyn Bus>> = None;
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
-        let bus: Arc<dyn Bus> = join(robot, &format!("{}_cloudroid", robot.node)).await?;
+        let bus = join(robot, &format!("{}_cloudroid", robot.node)).await?;
         let diagnostics = Diagnostics::new(&bus, &robot.node, &config.robot()).await?;
         let original = local_original(asked, robot);
         mirror.promise(sla, original, diagnostics, &bus).await?;
@@ -168,16 +170,16 @@ fn node_end(exit: &Result<watch::Ref<'_, Option<Exit>>, watch::error::RecvError>
 }
 
 /// Joins the robot's ROS as a node of this name; waits for its Master as every node does.
-async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<Ros1Bus>> {
+async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
     let mut told = false;
     loop {
         let joined = async {
             let master = RobotSockets
                 .resolve(&robot.master_host, robot.master_port)
                 .await?;
-            let mut options = Ros1Options::new(master, node);
+            let mut options = JoinOptions::new(master, node);
             options.host = robot.host.clone();
-            anyhow::Ok(Ros1Bus::connect_with(Arc::new(RobotSockets), options).await?)
+            anyhow::Ok(ros::connect(RosVersion::One, Arc::new(RobotSockets), options).await?)
         };
         match joined.await {
             Ok(bus) => return Ok(bus),
@@ -195,7 +197,7 @@ async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<Ros1Bus>> {
 async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::Result<Config> {
     let mut given = Vec::new();
     for name in config::groups(node) {
-        match bus.get_param(&name).await {
+        match bus.parameter(&name).await {
             Ok(ParamValue::Map(settings)) => given.push(Group { name, settings }),
             Ok(_) => bail!(
                 "parameter {name} is a single value, and stands where this node's settings are looked for; remove it with: rosparam delete {name}"
@@ -271,17 +273,21 @@ async fn stopped(stopping: &mut Stopping) {
 /// A signal, or XML-RPC's `shutdown`, which means the same as SIGINT.
 async fn asked_to_stop(
     stopping: &mut Stopping,
-    shutdown: &mut watch::Receiver<Option<String>>,
+    shutdown: &mut Option<watch::Receiver<Option<String>>>,
 ) -> i32 {
+    let asked = async {
+        let is_asked = match shutdown {
+            Some(asked) => asked.changed().await.is_ok(),
+            None => false,
+        };
+        if !is_asked {
+            std::future::pending::<()>().await;
+        }
+    };
     tokio::select! {
         _ = stopping.interrupt.recv() => Signal::SIGINT as i32,
         _ = stopping.terminate.recv() => Signal::SIGTERM as i32,
-        asked = shutdown.changed() => {
-            if asked.is_err() {
-                std::future::pending::<()>().await;
-            }
-            Signal::SIGINT as i32
-        }
+        () = asked => Signal::SIGINT as i32,
     }
 }
 

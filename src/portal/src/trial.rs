@@ -12,7 +12,7 @@ use catalogue::{Catalogue, names};
 use choreographer::Choreographer;
 use package::interface::{Direction, Interface, Topic};
 use ros::bag::Recorded;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, SubscribeOptions, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, Subscription, WireType, reaches};
 use ros::codec::{JsonOptions, Time, header_stamp, to_json};
 use ros::schema::Registry;
 use tokio::sync::mpsc;
@@ -71,20 +71,16 @@ async fn attempt(
     let mut ears = Ears::open(bus, interface).await?;
     let mut mouths = Vec::new();
     for (topic, wire_type) in &plan.inputs {
-        let options = AdvertiseOptions {
-            wire_type: wire_type.clone(),
-            latch: false,
-            queue: QUEUE,
-        };
-        let publisher = bus.advertise(topic, options).await.map_err(failed)?;
-        let mut listeners = publisher.subscribers();
-        let listening = listeners.wait_for(|count| *count > 0);
-        if !matches!(timeout(PATIENCE, listening).await, Ok(Ok(_))) {
+        let publisher = bus
+            .advertise(topic, wire_type.clone(), Qos::keep_last(QUEUE))
+            .await
+            .map_err(failed)?;
+        let listening = reaches(publisher.matched(), 1);
+        if timeout(PATIENCE, listening).await.is_err() {
             return Err(Error::BadRequest(format!(
                 "no node of {service} listens to {topic}"
             )));
         }
-        drop(listeners);
         mouths.push(Mouth { publisher, sent: 0 });
     }
     let mut times = Vec::new();
@@ -234,10 +230,10 @@ impl Plan {
             return Ok(Some(known));
         }
         let wire_type = wire_type(registry, input)?;
-        if wire_type.md5 != message.wire_type.md5 {
+        if wire_type.digest != message.wire_type.digest {
             return Err(Error::BadRequest(format!(
                 "{} was recorded with another definition of {} ({}) than the service has ({})",
-                message.topic, wire_type.name, message.wire_type.md5, wire_type.md5
+                message.topic, wire_type.name, message.wire_type.digest, wire_type.digest
             )));
         }
         self.inputs.push((input.name.clone(), wire_type));
@@ -254,11 +250,7 @@ fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
     let known = registry.message(&topic.type_name).map_err(|error| {
         Error::BadRequest(format!("the type of {} is not known: {error}", topic.name))
     })?;
-    Ok(WireType {
-        name: topic.type_name.clone(),
-        md5: known.md5().to_owned(),
-        definition: known.full_text().to_owned(),
-    })
+    Ok(WireType::of(&known))
 }
 
 struct Mouth {
@@ -290,11 +282,10 @@ impl Ears {
             .iter()
             .filter(|topic| topic.direction == Direction::Output && !topic.latched);
         for (number, topic) in outputs.enumerate() {
-            let options = SubscribeOptions {
-                wire_type: None,
-                queue: QUEUE,
-            };
-            let subscription = bus.subscribe(&topic.name, options).await.map_err(failed)?;
+            let subscription = bus
+                .subscribe(&topic.name, WireType::any(), Qos::keep_last(QUEUE))
+                .await
+                .map_err(failed)?;
             let task = tokio::spawn(listen(number, subscription, sender.clone()));
             ears.tasks.push(task.abort_handle());
             ears.topics.push((topic.clone(), 0, Bytes::new()));
@@ -433,11 +424,7 @@ mod tests {
     fn recorded(topic: &str, of_type: &str, md5: &str) -> Recorded {
         Recorded {
             topic: topic.into(),
-            wire_type: Arc::new(WireType {
-                name: of_type.into(),
-                md5: md5.into(),
-                definition: String::new(),
-            }),
+            wire_type: Arc::new(WireType::new(of_type, md5, "")),
             time: 0,
             bytes: Bytes::from_static(b"\0\0\0\0"),
         }

@@ -14,8 +14,8 @@ use package::names::is_graph_name;
 use reach::{ServantSockets, master};
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
-use ros::bus::{Bus, Graph};
-use ros::ros1::Ros1Bus;
+use ros::JoinOptions;
+use ros::bus::{Graph, RosVersion};
 use servant::engine::Servant;
 use tokio::time::timeout;
 
@@ -79,9 +79,13 @@ async fn look(
     // A container is a host of that name.
     let host = servant.id();
     let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-    let bus = Ros1Bus::connect(sockets, master::ADDRESS, NODE)
-        .await
-        .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+    let bus = ros::connect(
+        RosVersion::One,
+        sockets,
+        JoinOptions::new(master::ADDRESS, NODE),
+    )
+    .await
+    .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
     let mut graph = bus.graph();
     let seen = graph.clone();
     let patience = pusher.options.probe;

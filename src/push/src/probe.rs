@@ -10,8 +10,8 @@ use reach::egress::Relays;
 use reach::{ServantSockets, how_it_ended, master};
 use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
 use rootfs_builder::{BuildOutcome, blocking};
-use ros::bus::Bus;
-use ros::ros1::Ros1Bus;
+use ros::JoinOptions;
+use ros::bus::{Bus, RosVersion};
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::{Profile, Spec};
@@ -137,7 +137,7 @@ async fn look(
             // First: of a node that ended, nothing else is worth saying.
             biased;
             words = ended(servant, plan) => return Err(failed(words)),
-            bus = Ros1Bus::connect(sockets, master::ADDRESS, NODE) => {
+            bus = ros::connect(RosVersion::One, sockets, JoinOptions::new(master::ADDRESS, NODE)) => {
                 bus.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
             }
         };

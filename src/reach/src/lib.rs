@@ -29,8 +29,8 @@ use std::time::Duration;
 use bridge::{Bridge, BridgeOptions};
 use budget::Budget;
 use link::control::Request;
-use ros::bus::{Bus, BusError, ParamValue};
-use ros::ros1::{Ros1Bus, Ros1Options};
+use ros::JoinOptions;
+use ros::bus::{Bus, BusError, ParamValue, RosVersion};
 use ros::schema::Registry;
 use servant::spec::NodeSpec;
 
@@ -125,13 +125,14 @@ impl Reach {
         observer: Arc<dyn Observer>,
     ) -> Result<Arc<Reach>, BusError> {
         let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
-        let joining = Ros1Options {
+        let joining = JoinOptions {
             budget: options.budget.clone(),
             unfinished: options.unfinished,
-            ..Ros1Options::new(master::ADDRESS, NODE)
+            ..JoinOptions::new(master::ADDRESS, NODE)
         };
-        let (bus, recorded) = tokio::join!(Ros1Bus::connect_with(sockets, joining), recorded);
-        let bus: Arc<dyn Bus> = bus?;
+        let joined = ros::connect(RosVersion::One, sockets, joining);
+        let (bus, recorded) = tokio::join!(joined, recorded);
+        let bus = bus?;
         let registry = Arc::clone(&recorded.registry);
         let relays = Relays::open(&container.endpoint(), &recorded.ways_out).await;
         let nodes = Arc::new(LinkedNodes::new(recorded, container, observer));

@@ -349,7 +349,7 @@ impl Hub {
         let run_key = format!("{RUNS}/{}", node.trim_start_matches('/').replace('/', "__"));
         let running = self.nodes.is_running(node).await;
         let ours = running
-            && self.bus.get_param(&run_key).await.ok()
+            && self.bus.parameter(&run_key).await.ok()
                 == Some(ParamValue::String(hello.run.clone()));
         if running && !ours {
             self.stop(node).await;
@@ -357,10 +357,10 @@ impl Hub {
         self.parameters.take(self, hello).await;
         let lines = self.nodes.lines(node);
         if !ours {
-            let _ = self
-                .bus
-                .set_param(&run_key, ParamValue::String(hello.run.clone()))
-                .await;
+            if let Ok(parameters) = self.bus.parameters() {
+                let run = ParamValue::String(hello.run.clone());
+                let _ = parameters.set(&run_key, run).await;
+            }
             self.nodes
                 .start(&hello.node, &hello.sla)
                 .await
@@ -378,7 +378,7 @@ impl Hub {
             link.session.tell(&FromCloud::Parameters(untold));
         }
         // What the node has set before there was a link to tell.
-        if let Ok(ParamValue::Map(set)) = self.bus.get_param(node).await {
+        if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {
             let set = set
                 .into_iter()
                 .map(|(key, value)| (format!("{node}/{key}"), Some(value)));

@@ -35,8 +35,8 @@ pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
         }
     }
     for action in &interface.actions {
-        let goal = graph.topics.get(&format!("{}/goal", action.name));
-        if !late(&action.name) && goal.is_none_or(|ends| ends.subscribers.is_empty()) {
+        let ends = graph.actions.get(&action.name);
+        if !late(&action.name) && ends.is_none_or(|ends| ends.servers.is_empty()) {
             missing.push(format!("the action {}", action.name));
         }
     }
@@ -63,7 +63,7 @@ fn covers(there: &[String], expected: &[String]) -> bool {
 #[cfg(test)]
 mod tests {
     use package::interface::{Action, Service, Topic};
-    use ros::bus::TopicNodes;
+    use ros::bus::{ActionNodes, TopicNodes};
 
     use super::*;
 
@@ -127,9 +127,11 @@ mod tests {
         graph
             .topics
             .insert("/in".into(), ends(&["/node"], &["/other"]));
-        graph
-            .topics
-            .insert("/go/goal".into(), ends(&[], &["/node"]));
+        let served = ActionNodes {
+            servers: vec!["/node".into()],
+            ..ActionNodes::default()
+        };
+        graph.actions.insert("/go".into(), served);
         graph.services.insert("/add".into(), "/node".into());
         graph
             .nodes

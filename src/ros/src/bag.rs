@@ -91,11 +91,11 @@ impl Reader {
                 Some(CONNECTION) => {
                     let number = number(&fields, "conn").ok_or(damaged.clone())?;
                     let about = self::fields(&file[data]).ok_or(damaged)?;
-                    let wire_type = WireType {
-                        name: text(&about, "type"),
-                        md5: text(&about, "md5sum"),
-                        definition: text(&about, "message_definition"),
-                    };
+                    let wire_type = WireType::new(
+                        text(&about, "type"),
+                        text(&about, "md5sum"),
+                        text(&about, "message_definition"),
+                    );
                     // As it was subscribed to; the connection's own header may name another before remapping.
                     let topic = text(&fields, "topic").into();
                     self.connections

@@ -7,7 +7,10 @@
 pub mod bag;
 pub mod bus;
 pub mod codec;
+mod connect;
 pub mod net;
 pub mod ring;
 pub mod ros1;
 pub mod schema;
+
+pub use connect::{JoinOptions, connect};

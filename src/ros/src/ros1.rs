@@ -1,5 +1,6 @@
 //! ROS 1: XML-RPC, Master, TCPROS and the bus made of them.
 
+mod actions;
 mod bus;
 pub mod master;
 pub mod names;
@@ -9,4 +10,4 @@ pub mod tcpros;
 mod testing;
 pub mod xmlrpc;
 
-pub use bus::{Ros1Bus, Ros1Options};
+pub use bus::Ros1Bus;

@@ -9,9 +9,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{
-    AdvertiseOptions, Bus, ParamValue, ServiceHandler, ServiceType, SubscribeOptions, WireType,
-};
+use ros::bus::{Bus, ParamValue, Qos, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -65,33 +63,27 @@ async fn every_connection_notices_when_its_peer_is_gone() {
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
     let (one, two) = (join("/one").await.unwrap(), join("/two").await.unwrap());
-    let wire_type = WireType {
-        name: "std_msgs/Empty".into(),
-        md5: "d41d8cd98f00b204e9800998ecf8427e".into(),
-        definition: String::new(),
-    };
-    let options = AdvertiseOptions {
-        wire_type: wire_type.clone(),
-        latch: true,
-        queue: 1,
-    };
-    let publisher = one.advertise("/said", options).await.unwrap();
+    let wire_type = WireType::new("std_msgs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "");
+    let publisher = one
+        .advertise("/said", wire_type.clone(), Qos::keep_last(1).latching(true))
+        .await
+        .unwrap();
     publisher.publish(Bytes::new());
-    let options = SubscribeOptions {
-        wire_type: Some(wire_type),
-        queue: 1,
-    };
-    let mut subscription = two.subscribe("/said", options).await.unwrap();
+    let mut subscription = two
+        .subscribe("/said", wire_type, Qos::keep_last(1))
+        .await
+        .unwrap();
     let heard = timeout(LONG, subscription.messages.recv()).await;
     heard.unwrap().unwrap();
-    let of = ServiceType {
-        name: "tests/Echo".into(),
-        md5: "0123456789abcdef0123456789abcdef".into(),
-    };
+    let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _serving = one.serve("/echo", of, Arc::new(Echo)).await.unwrap();
     let answer = two.call("/echo", Bytes::from_static(b"hi"), LONG).await;
     assert_eq!(answer.unwrap(), "hi");
-    two.set_param("/p", ParamValue::Int(1)).await.unwrap();
+    two.parameters()
+        .unwrap()
+        .set("/p", ParamValue::Int(1))
+        .await
+        .unwrap();
     // A connection on which something is under way has another timer until that is acknowledged.
     let quiet = async {
         loop {

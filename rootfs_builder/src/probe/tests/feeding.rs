@@ -60,32 +60,23 @@ impl Node {
 
     fn wire(&self, name: &str) -> WireType {
         let message = self.registry.message(name).expect("defined");
-        WireType {
-            name: name.to_owned(),
-            md5: message.md5().to_owned(),
-            definition: message.full_text().to_owned(),
-        }
+        WireType::of(&message)
     }
 
     async fn hears(&self, topic: &str, type_name: &str) -> Subscription {
-        let options = SubscribeOptions {
-            wire_type: (type_name != "*").then(|| self.wire(type_name)),
-            queue: 10,
+        let wanted = match type_name {
+            "*" => WireType::any(),
+            name => self.wire(name),
         };
         self.bus
-            .subscribe(topic, options)
+            .subscribe(topic, wanted, Qos::keep_last(10))
             .await
             .expect("subscribed")
     }
 
     async fn tells(&self, topic: &str, wire_type: WireType) -> Box<dyn Publisher> {
-        let options = AdvertiseOptions {
-            wire_type,
-            latch: false,
-            queue: 1,
-        };
         self.bus
-            .advertise(topic, options)
+            .advertise(topic, wire_type, Qos::keep_last(1))
             .await
             .expect("advertised")
     }
@@ -111,7 +102,9 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
     let node = Node::of(&lab);
     let base = ros::bus::ParamValue::String("chassis".into());
     lab.node
-        .set_param("/package/base_frame", base)
+        .parameters()
+        .expect("offered")
+        .set("/package/base_frame", base)
         .await
         .expect("set");
     let mut transforms = node.hears("/tf", "tf2_msgs/TFMessage").await;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, ServiceHandler, ServiceType, SubscribeOptions};
+use ros::bus::{Bus, Qos, ServiceHandler, ServiceType};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -53,32 +53,24 @@ pub async fn relay_round_trip(world: &World) -> Result<[Duration; 2], Failure> {
 /// Through the bridge: a String to a node that sends it back, or a call of a service.
 pub fn round_trip(world: &World, service: bool) -> Result<[Duration; 2], Failure> {
     let wire_type = wire_type(world, "std_msgs/String")?;
-    let options = AdvertiseOptions {
-        wire_type: wire_type.clone(),
-        latch: false,
-        queue: 100,
-    };
-    let publisher = world
-        .theirs
-        .block_on(world.node.advertise("/trip/back", options))?;
-    let subscribe = SubscribeOptions {
-        wire_type: Some(wire_type),
-        queue: 100,
-    };
-    let mut subscription = world
-        .theirs
-        .block_on(world.node.subscribe("/trip/there", subscribe))?;
-    let mut subscribers = publisher.subscribers();
+    let publisher = world.theirs.block_on(world.node.advertise(
+        "/trip/back",
+        wire_type.clone(),
+        Qos::keep_last(100),
+    ))?;
+    let mut subscription = world.theirs.block_on(world.node.subscribe(
+        "/trip/there",
+        wire_type,
+        Qos::keep_last(100),
+    ))?;
+    let mut subscribers = publisher.matched();
     let echo = world.theirs.spawn(async move {
         while let Some(message) = subscription.messages.recv().await {
             publisher.publish(message.bytes);
         }
     });
     let def = world.registry.service("x/Echo")?;
-    let service_type = ServiceType {
-        name: def.name.clone(),
-        md5: def.md5.clone(),
-    };
+    let service_type = ServiceType::of(&def);
     let _served =
         world
             .theirs
@@ -95,7 +87,7 @@ pub fn round_trip(world: &World, service: bool) -> Result<[Duration; 2], Failure
         };
         stream.write_all(&begin).await?;
         if !service {
-            subscribers.wait_for(|count| *count > 0).await?;
+            subscribers.wait_for(|now| now.connected() > 0).await?;
         }
         let ask = if service {
             frame(1, br#"{"op":"call_service","id":"1","service":"/trip/call","args":{"data":"hello there"}}"#)

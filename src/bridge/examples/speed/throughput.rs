@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use ros::bus::{AdvertiseOptions, Bus, SubscribeOptions};
+use ros::bus::{Bus, Qos};
 use ros::codec::{self, CborOptions, JsonOptions};
 use rosbridge::{Format, Publish, Writer};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -107,14 +107,11 @@ pub fn out(
         encoding.replace('-', "_")
     );
     let received = Arc::new(Progress::default());
-    let options = AdvertiseOptions {
-        wire_type: wire_type(world, type_name)?,
-        latch: false,
-        queue: 1000,
-    };
-    let publisher = world
-        .theirs
-        .block_on(world.node.advertise(&topic, options))?;
+    let publisher = world.theirs.block_on(world.node.advertise(
+        &topic,
+        wire_type(world, type_name)?,
+        Qos::keep_last(1000),
+    ))?;
     let subscribe = format!(
         r#"{{"op":"subscribe","topic":"{topic}","type":"{type_name}","compression":"{encoding}"}}"#
     );
@@ -125,7 +122,10 @@ pub fn out(
         count_frames(stream, &count).await
     });
     let found = world.theirs.block_on(async {
-        publisher.subscribers().wait_for(|count| *count > 0).await?;
+        publisher
+            .matched()
+            .wait_for(|now| now.connected() > 0)
+            .await?;
         rate(&received, window, || {
             publisher.publish(message.clone());
             async { Ok(()) }
@@ -210,13 +210,11 @@ pub fn inward(
         }
     };
     let payload = frame(opcode, &payload);
-    let options = SubscribeOptions {
-        wire_type: Some(wire_type(world, type_name)?),
-        queue: 1000,
-    };
-    let mut subscription = world
-        .theirs
-        .block_on(world.node.subscribe(&topic, options))?;
+    let mut subscription = world.theirs.block_on(world.node.subscribe(
+        &topic,
+        wire_type(world, type_name)?,
+        Qos::keep_last(1000),
+    ))?;
     let received = Arc::new(Progress::default());
     let count = received.clone();
     let reader = world.theirs.spawn(async move {

@@ -111,11 +111,7 @@ pub fn message(world: &World, type_name: &str, size: usize) -> Result<Bytes, Fai
 
 pub fn wire_type(world: &World, type_name: &str) -> Result<WireType, Failure> {
     let found = world.registry.message(type_name)?;
-    Ok(WireType {
-        name: type_name.to_owned(),
-        md5: found.md5().to_owned(),
-        definition: found.full_text().to_owned(),
-    })
+    Ok(WireType::of(&found))
 }
 
 /// A masked text or binary frame; the mask is zero, which costs the server the same.

@@ -96,5 +96,5 @@ fn common_type(shared: &Shared, name: &str) -> Result<Arc<MessageType>, String> 
 
 /// Whether what a node sends is what we take it for.
 fn is_type(wire: &WireType, expected: &MessageType) -> bool {
-    wire.md5 == "*" || wire.md5 == expected.md5()
+    wire.digest.agrees(&expected.md5().into())
 }

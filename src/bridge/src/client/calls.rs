@@ -6,6 +6,7 @@ use std::task::{Context, Waker};
 use std::time::Duration;
 
 use bytes::Bytes;
+use ros::bus::Digest;
 use ros::codec::{self, CborOptions, JsonOptions};
 use ros::schema::{MessageType, ServiceDef};
 use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
@@ -130,16 +131,15 @@ impl Client {
             .registry
             .service(&service_type.name)
             .map_err(explain);
-        let def =
-            def.and_then(
-                |def| match def.md5 == service_type.md5 || service_type.md5 == "*" {
-                    true => Ok(def),
-                    false => Err(format!(
-                        "service {} has type {} with MD5 {} there and {} here",
-                        call.service, def.name, service_type.md5, def.md5
-                    )),
-                },
-            );
+        let def = def.and_then(
+            |def| match service_type.digest.agrees(&Digest::from(&def.md5)) {
+                true => Ok(def),
+                false => Err(format!(
+                    "service {} has type {} with MD5 {} there and {} here",
+                    call.service, def.name, service_type.digest, def.md5
+                )),
+            },
+        );
         if let Ok(def) = &def {
             self.tell_surplus(&call.reply(), "call_service", &def.request, call.args());
         }

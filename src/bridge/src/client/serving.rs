@@ -183,10 +183,7 @@ impl Client {
         let (client, reply) = (Arc::downgrade(self), reply.clone());
         let shared = self.shared.clone();
         tokio::spawn(async move {
-            let service_type = ServiceType {
-                name: def.name.clone(),
-                md5: def.md5.clone(),
-            };
+            let service_type = ServiceType::of(&def);
             // An earlier handler of this client lets go at once; another client's does not.
             let patience = std::time::Duration::from_secs(1);
             let entered =

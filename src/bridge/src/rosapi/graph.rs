@@ -47,6 +47,8 @@ pub(super) fn with_own_topics(graph: &Graph) -> Graph {
             };
             end.push(NODE.to_owned());
         }
+        let nodes = graph.actions.entry(tf::ACTION.to_owned()).or_default();
+        nodes.servers.push(NODE.to_owned());
     }
     let (topic, type_name) = ROSOUT;
     let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
@@ -130,26 +132,8 @@ pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
     })
 }
 
-/// A namespace that has all five topics of actionlib.
 pub(super) fn action_servers(graph: &Graph) -> Value {
-    const PARTS: [&str; 5] = ["cancel", "feedback", "goal", "result", "status"];
-    let mut found: BTreeMap<&str, u8> = BTreeMap::new();
-    for topic in graph.topics.keys() {
-        let Some((namespace, part)) = topic
-            .rsplit_once('/')
-            .filter(|(namespace, _)| !namespace.is_empty())
-        else {
-            continue;
-        };
-        if let Some(at) = PARTS.iter().position(|known| *known == part) {
-            *found.entry(namespace).or_default() |= 1 << at;
-        }
-    }
-    let servers = found
-        .into_iter()
-        .filter(|(_, parts)| *parts == 0b11111)
-        .map(|(namespace, _)| namespace);
-    json!({ "action_servers": servers.collect::<Vec<_>>() })
+    json!({ "action_servers": graph.actions.keys().collect::<Vec<_>>() })
 }
 
 fn all_services(graph: &Graph) -> BTreeSet<String> {

@@ -22,7 +22,7 @@ fn failed(error: BusError) -> String {
 }
 
 pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let value = match shared.bus.get_param(&key(args)?).await {
+    let value = match shared.bus.parameter(&key(args)?).await {
         Ok(value) => serde_json::to_string(&value).map_err(|error| error.to_string())?,
         Err(BusError::NoParam(_)) => {
             let default = if args.default.is_empty() {
@@ -58,11 +58,8 @@ pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
             ),
         }
     })?;
-    shared
-        .bus
-        .set_param(&key(args)?, value)
-        .await
-        .map_err(failed)?;
+    let parameters = shared.bus.parameters().map_err(failed)?;
+    parameters.set(&key(args)?, value).await.map_err(failed)?;
     Ok(json!({}))
 }
 
@@ -82,33 +79,26 @@ fn null_in(value: &Value, place: String) -> Option<String> {
 }
 
 pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    Ok(json!({ "exists": shared.bus.has_param(&key(args)?).await.map_err(failed)? }))
+    let parameters = shared.bus.parameters().map_err(failed)?;
+    Ok(json!({ "exists": parameters.has(&key(args)?).await.map_err(failed)? }))
 }
 
 pub(super) async fn search(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let found = shared
-        .bus
-        .search_param("/", args.name.trim_start_matches('/'))
-        .await
-        .map_err(failed)?;
+    let parameters = shared.bus.parameters().map_err(failed)?;
+    let found = parameters.search("/", args.name.trim_start_matches('/'));
+    let found = found.await.map_err(failed)?;
     Ok(json!({ "global_name": found.unwrap_or_default() }))
 }
 
 pub(super) async fn delete(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    match shared.bus.delete_param(&key(args)?).await {
+    let parameters = shared.bus.parameters().map_err(failed)?;
+    match parameters.delete(&key(args)?).await {
         Ok(()) | Err(BusError::NoParam(_)) => Ok(json!({})),
         Err(error) => Err(failed(error)),
     }
 }
 
 pub(super) async fn names(shared: &Arc<Shared>) -> Result<Value, String> {
-    Ok(json!({ "names": shared.bus.param_names().await.map_err(failed)? }))
-}
-
-/// `/rosdistro` as roslaunch sets it.
-pub(super) async fn distro(shared: &Arc<Shared>) -> String {
-    match shared.bus.get_param("/rosdistro").await {
-        Ok(ParamValue::String(distro)) => distro.trim().to_owned(),
-        _ => "noetic".to_owned(),
-    }
+    let parameters = shared.bus.parameters().map_err(failed)?;
+    Ok(json!({ "names": parameters.names().await.map_err(failed)? }))
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Message, WireType};
+use ros::bus::{Message, PeerId, WireType};
 use ros::codec::{self, JsonOptions, Time};
 use ros::schema::{MessageType, Registry, ServiceDef};
 use serde::Deserialize;
@@ -53,8 +53,8 @@ pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
 ];
 /// Beginning of the names of topics made for callers of the service.
 const TOPIC_PREFIX: &str = "/tf_repub_";
-/// The node that seems to publish.
-const NODE: &str = "/tf2_web_republisher";
+/// The action, and the node that seems to publish.
+pub(crate) const ACTION: &str = "/tf2_web_republisher";
 
 /// Requests served at once.
 const MAX_REQUESTS: usize = 1000;
@@ -206,7 +206,7 @@ impl Republisher {
         shared: &Arc<Shared>,
         goal: GoalId,
         body: &[u8],
-        publisher: Arc<str>,
+        publisher: PeerId,
     ) -> Result<(), String> {
         let action = shared
             .registry
@@ -296,15 +296,10 @@ fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
 }
 
 fn message(message_type: &MessageType, bytes: Bytes) -> Message {
-    let wire_type = WireType {
-        name: message_type.name().to_owned(),
-        md5: message_type.md5().to_owned(),
-        definition: message_type.full_text().to_owned(),
-    };
     Message {
         bytes,
-        wire_type: Arc::new(wire_type),
-        publisher: NODE.into(),
+        wire_type: Arc::new(WireType::of(message_type)),
+        publisher: ACTION.into(),
         latching: false,
     }
 }

@@ -94,7 +94,10 @@ async fn ros_bytes_pass_through_untouched_and_are_checked() {
         .node_subscribes("/bytes", "std_msgs/UInt8MultiArray")
         .await;
     let mut client = world.client().await;
-    let md5 = world.wire_type("std_msgs/UInt8MultiArray").md5;
+    let md5 = world
+        .wire_type("std_msgs/UInt8MultiArray")
+        .digest
+        .to_string();
     client
         .send(json!({"op": "advertise", "topic": "/bytes", "type": "std_msgs/UInt8MultiArray", "md5sum": md5}))
         .await;

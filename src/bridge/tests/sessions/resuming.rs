@@ -38,10 +38,7 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     let mut heard = world.node_subscribes("/number", "std_msgs/Int32").await;
     let def = world.registry.service("x_msgs/Nothing").unwrap();
     let gate = Arc::new(Notify::new());
-    let service_type = ServiceType {
-        name: def.name.clone(),
-        md5: def.md5.clone(),
-    };
+    let service_type = ServiceType::of(&def);
     let _served = world
         .node
         .serve("/gated", service_type, Arc::new(Gated(gate.clone())))
@@ -93,7 +90,7 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
         [2, 0, 0, 0]
     );
     client.settled().await;
-    assert_eq!(*publisher.subscribers().borrow(), 1);
+    assert_eq!(publisher.matched().borrow().connected(), 1);
     assert_eq!(world.bridge.metrics().resumed.get(), 1);
 }
 
@@ -141,7 +138,7 @@ async fn who_does_not_come_back_in_time_has_lost_everything() {
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     client.lose().await;
-    patiently(publisher.subscribers().wait_for(|count| *count == 0))
+    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
     let mut client = world.client_with(with_token("secret")).await;
@@ -162,7 +159,7 @@ async fn a_client_without_token_leaves_nothing_behind() {
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     client.lose().await;
-    patiently(publisher.subscribers().wait_for(|count| *count == 0))
+    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
 }

@@ -34,10 +34,7 @@ impl ServiceHandler for Add {
 
 async fn serves(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn Send + Sync> {
     let def = world.registry.service("x_msgs/Add").unwrap();
-    let service_type = ServiceType {
-        name: def.name.clone(),
-        md5: def.md5.clone(),
-    };
+    let service_type = ServiceType::of(&def);
     let guard = world
         .node
         .serve(name, service_type, Arc::new(Add { gate }))
@@ -213,10 +210,7 @@ async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
 #[tokio::test]
 async fn a_service_of_another_definition_is_not_called() {
     let world = World::new().await;
-    let service_type = ServiceType {
-        name: "x_msgs/Add".to_owned(),
-        md5: "0123456789abcdef0123456789abcdef".to_owned(),
-    };
+    let service_type = ServiceType::new("x_msgs/Add", "0123456789abcdef0123456789abcdef");
     let _served = world
         .node
         .serve("/odd", service_type, Arc::new(Add { gate: None }))

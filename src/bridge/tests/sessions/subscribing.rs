@@ -70,8 +70,8 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
             .await;
         client.settled().await;
         client.lose().await;
-        let mut subscribers = publisher.subscribers();
-        crate::support::patiently(subscribers.wait_for(|count| *count == 0))
+        let mut subscribers = publisher.matched();
+        crate::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
             .await
             .unwrap();
     }
@@ -187,8 +187,8 @@ async fn subscriptions_are_ended_one_by_one_or_all_at_once() {
         .send(json!({"op": "unsubscribe", "topic": "/text"}))
         .await;
     client.settled().await;
-    let mut subscribers = publisher.subscribers();
-    crate::support::patiently(subscribers.wait_for(|count| *count == 0))
+    let mut subscribers = publisher.matched();
+    crate::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
     client.settled().await;
@@ -302,24 +302,26 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
     // The same name as one of ours, from a newer version of its package.
     let definition = "string name\nuint8 number\nbool new\n".to_owned();
     let newer = ros::schema::MessageType::from_full_text("x_msgs/Tag", &definition).unwrap();
-    let wire_type = |definition: String| ros::bus::WireType {
-        name: "x_msgs/Tag".into(),
-        md5: newer.md5().into(),
-        definition,
-    };
-    let options = |definition| ros::bus::AdvertiseOptions {
-        wire_type: wire_type(definition),
-        latch: true,
-        queue: 1,
-    };
+    let wire_type =
+        |definition: String| ros::bus::WireType::new("x_msgs/Tag", newer.md5(), definition);
     let bytes = bytes::Bytes::from_static(b"\x01\0\0\0x\x07\x01");
-    let told = ros::bus::Bus::advertise(world.node.as_ref(), "/told", options(definition))
-        .await
-        .unwrap();
+    let told = ros::bus::Bus::advertise(
+        world.node.as_ref(),
+        "/told",
+        wire_type(definition),
+        ros::bus::Qos::keep_last(1).latching(true),
+    )
+    .await
+    .unwrap();
     told.publish(bytes.clone());
-    let mute = ros::bus::Bus::advertise(world.node.as_ref(), "/mute", options(String::new()))
-        .await
-        .unwrap();
+    let mute = ros::bus::Bus::advertise(
+        world.node.as_ref(),
+        "/mute",
+        wire_type(String::new()),
+        ros::bus::Qos::keep_last(1).latching(true),
+    )
+    .await
+    .unwrap();
     mute.publish(bytes);
     world
         .in_graph(|graph| graph.topics.contains_key("/told") && graph.topics.contains_key("/mute"))
@@ -350,19 +352,15 @@ async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
     let world = World::new().await;
     let definition = "int32 a\nstring b\n".to_owned();
     let message_type = ros::schema::MessageType::from_full_text("y_msgs/New", &definition).unwrap();
-    let wire_type = ros::bus::WireType {
-        name: "y_msgs/New".into(),
-        md5: message_type.md5().into(),
-        definition,
-    };
-    let options = ros::bus::AdvertiseOptions {
+    let wire_type = ros::bus::WireType::new("y_msgs/New", message_type.md5(), definition);
+    let publisher = ros::bus::Bus::advertise(
+        world.node.as_ref(),
+        "/new",
         wire_type,
-        latch: true,
-        queue: 1,
-    };
-    let publisher = ros::bus::Bus::advertise(world.node.as_ref(), "/new", options)
-        .await
-        .unwrap();
+        ros::bus::Qos::keep_last(1).latching(true),
+    )
+    .await
+    .unwrap();
     publisher.publish(vec![1, 0, 0, 0, 1, 0, 0, 0, b'x'].into());
     world
         .in_graph(|graph| graph.topics.contains_key("/new"))

@@ -6,7 +6,7 @@ use std::time::Duration;
 use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
-use ros::bus::{AdvertiseOptions, Bus, Publisher, SubscribeOptions, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -131,11 +131,7 @@ impl World {
 
     pub fn wire_type(&self, type_name: &str) -> WireType {
         let message_type = self.registry.message(type_name).unwrap();
-        WireType {
-            name: type_name.to_owned(),
-            md5: message_type.md5().to_owned(),
-            definition: message_type.full_text().to_owned(),
-        }
+        WireType::of(&message_type)
     }
 
     pub async fn node_publishes(
@@ -154,23 +150,24 @@ impl World {
         type_name: &str,
         latch: bool,
     ) -> Box<dyn Publisher> {
-        let options = AdvertiseOptions {
-            wire_type: self.wire_type(type_name),
-            latch,
-            queue: 10_000,
-        };
-        let publisher = node.advertise(topic, options).await.unwrap();
+        let publisher = node
+            .advertise(
+                topic,
+                self.wire_type(type_name),
+                Qos::keep_last(10_000).latching(latch),
+            )
+            .await
+            .unwrap();
         self.in_graph(|graph| graph.topics.contains_key(topic))
             .await;
         publisher
     }
 
     pub async fn node_subscribes(&self, topic: &str, type_name: &str) -> Subscription {
-        let options = SubscribeOptions {
-            wire_type: Some(self.wire_type(type_name)),
-            queue: 10_000,
-        };
-        self.node.subscribe(topic, options).await.unwrap()
+        self.node
+            .subscribe(topic, self.wire_type(type_name), Qos::keep_last(10_000))
+            .await
+            .unwrap()
     }
 
     /// Waits until the node sees the graph so; the bridge sees it then or soon.
@@ -197,13 +194,9 @@ pub async fn patiently<F: Future>(future: F) -> F::Output {
 
 /// Waits until somebody has connected to a publisher.
 pub async fn connected(publisher: &dyn Publisher, count: usize) {
-    patiently(
-        publisher
-            .subscribers()
-            .wait_for(|subscribers| *subscribers >= count),
-    )
-    .await
-    .unwrap();
+    patiently(publisher.matched().wait_for(|now| now.connected() >= count))
+        .await
+        .unwrap();
 }
 
 /// A client of the bridge.

@@ -12,7 +12,7 @@ use qos::{
     Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Pair, Phases,
     RequestId, SafeStop, Side, Sla, Verdict,
 };
-use ros::bus::{BusError, Message};
+use ros::bus::{BusError, Message, PeerId};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
@@ -169,7 +169,7 @@ impl Keeper {
     }
 
     /// A publisher of the robot has gone, and with it what it has latched on this topic.
-    pub fn left(&self, topic: &Arc<str>, publisher: &Arc<str>) {
+    pub fn left(&self, topic: &Arc<str>, publisher: &PeerId) {
         if let Some(original) = &self.original {
             original.unlatch(topic, publisher);
         }

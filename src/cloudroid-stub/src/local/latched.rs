@@ -5,7 +5,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{AdvertiseOptions, Bus, Message, Publisher};
+use ros::bus::{Bus, Digest, Message, PeerId, Publisher, Qos, WireType};
 use ros::ring::{Bounds, Ring};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
@@ -23,7 +23,7 @@ pub struct Latched {
 }
 
 /// A topic and one of its publishers.
-type Key = (Arc<str>, Arc<str>);
+type Key = (Arc<str>, PeerId);
 
 /// What was not passed on yet: by publisher, in the order in which publishers were first heard.
 #[derive(Default)]
@@ -40,7 +40,7 @@ struct News {
 }
 
 impl Due {
-    fn add(&self, topic: &Arc<str>, publisher: &Arc<str>, news: impl FnOnce(&mut News)) {
+    fn add(&self, topic: &Arc<str>, publisher: &PeerId, news: impl FnOnce(&mut News)) {
         {
             let (known, turns) = &mut *self.state.lock();
             let key = (topic.clone(), publisher.clone());
@@ -93,7 +93,7 @@ impl Latched {
     }
 
     /// The publisher has unregistered or ended.
-    pub fn forget(&self, topic: &Arc<str>, publisher: &Arc<str>) {
+    pub fn forget(&self, topic: &Arc<str>, publisher: &PeerId) {
         self.due.add(topic, publisher, |news| {
             news.left = true;
             news.messages.clear();
@@ -101,8 +101,8 @@ impl Latched {
     }
 }
 
-/// The MD5 of each publisher's type, and who repeats it here.
-type Repeated = HashMap<Key, (String, Box<dyn Publisher>)>;
+/// The digest of each publisher's type, and who repeats it here.
+type Repeated = HashMap<Key, (Digest, Box<dyn Publisher>)>;
 
 /// Serves one publisher after the other; only its first message takes time, for the advertisement.
 async fn serve(place: Arc<Place>, due: Arc<Due>) {
@@ -113,20 +113,17 @@ async fn serve(place: Arc<Place>, due: Arc<Due>) {
             all.remove(&key);
         }
         for message in news.messages {
-            let md5 = &message.wire_type.md5;
-            if let Some((_, publisher)) = all.get(&key).filter(|(known, _)| known == md5) {
+            let digest = &message.wire_type.digest;
+            if let Some((_, publisher)) = all.get(&key).filter(|(known, _)| known == digest) {
                 publisher.publish(message.bytes);
                 continue;
             }
-            let options = AdvertiseOptions {
-                wire_type: (*message.wire_type).clone(),
-                latch: true,
-                queue: QUEUE,
-            };
-            match place.bus().advertise(&key.0, options).await {
+            let of = WireType::clone(&message.wire_type);
+            let qos = Qos::keep_last(QUEUE).latching(true);
+            match place.bus().advertise(&key.0, of, qos).await {
                 Ok(publisher) => {
                     publisher.publish(message.bytes);
-                    all.insert(key.clone(), (md5.clone(), publisher));
+                    all.insert(key.clone(), (digest.clone(), publisher));
                 }
                 Err(error) => {
                     tracing::warn!(topic = %key.0, %error, "the local original is not given what is latched there");
@@ -139,16 +136,11 @@ async fn serve(place: Arc<Place>, due: Arc<Due>) {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use ros::bus::WireType;
 
     use super::*;
 
-    fn message(publisher: &Arc<str>, number: u8) -> Message {
-        let wire_type = WireType {
-            name: "std_msgs/UInt8".into(),
-            md5: "*".into(),
-            definition: String::new(),
-        };
+    fn message(publisher: &PeerId, number: u8) -> Message {
+        let wire_type = WireType::named("std_msgs/UInt8");
         Message {
             bytes: Bytes::from(vec![number]),
             wire_type: Arc::new(wire_type),
@@ -165,7 +157,7 @@ mod tests {
             task: tokio::spawn(std::future::pending::<()>()).abort_handle(),
         };
         let topic: Arc<str> = "/map".into();
-        let [quiet, busy, left]: [Arc<str>; 3] = ["/quiet", "/busy", "/left"].map(Into::into);
+        let [quiet, busy, left] = ["/quiet", "/busy", "/left"].map(PeerId::from);
         latched.keep(&topic, &message(&quiet, 1));
         for number in 0..100 {
             latched.keep(&topic, &message(&busy, number));

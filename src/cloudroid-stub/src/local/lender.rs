@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, BusError, Lender, Lent, ServiceHandler};
+use ros::bus::{Bus, BusError, Digest, Lender, Lent, ServiceHandler};
 use tokio::sync::watch;
 
 /// Lends what is served on the robot, but by the node that is stood in for.
@@ -33,7 +33,7 @@ impl Robot {
 #[async_trait]
 impl Lender for Robot {
     async fn find(&self, service: &str, _node: &str) -> Option<Lent> {
-        let provider = self.bus.service_provider(service).await.ok()?;
+        let provider = self.bus.lending().ok()?.provider(service).await.ok()?;
         // Its own would come back to it.
         if provider.node == self.node {
             return None;
@@ -43,7 +43,7 @@ impl Lender for Robot {
                 bus: Arc::clone(&self.bus),
                 service: service.to_owned(),
                 limit: self.limit,
-                md5: provider.service_type.md5.clone(),
+                digest: provider.service_type.digest.clone(),
             }),
             service_type: provider.service_type,
             gone: self.open.subscribe(),
@@ -56,14 +56,14 @@ struct Passing {
     bus: Arc<dyn Bus>,
     service: String,
     limit: Duration,
-    md5: String,
+    digest: Digest,
 }
 
 #[async_trait]
 impl ServiceHandler for Passing {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let (service, md5) = (&self.service, &self.md5);
-        let called = self.bus.call_typed(service, md5, request, self.limit);
+        let (service, digest) = (&self.service, &self.digest);
+        let called = self.bus.call_typed(service, digest, request, self.limit);
         called.await.map_err(|error| match error {
             BusError::CallFailed { reason, .. } => reason,
             error @ BusError::Timeout { .. } => took_too_long(&error),

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::LocalState;
-use ros::bus::{AdvertiseOptions, Bus, BusError, Message, Publisher, SubscribeOptions, WireType};
+use ros::bus::{Bus, BusError, Matched, Message, PeerId, Publisher, Qos, WireType, reaches};
 use tokio::process::Child;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
@@ -84,8 +84,8 @@ pub struct Original {
 
 /// The inputs that it is given.
 type Publishers = Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>;
-/// How many publish each output.
-type Sources = Arc<Mutex<HashMap<String, watch::Receiver<usize>>>>;
+/// Who publishes each output.
+type Sources = Arc<Mutex<HashMap<String, watch::Receiver<Matched>>>>;
 /// What the node is expected to register.
 type Expected = Arc<Mutex<Interface>>;
 
@@ -155,14 +155,18 @@ impl Original {
             if self.sources.lock().contains_key(&output) {
                 continue;
             }
-            let options = SubscribeOptions {
-                wire_type: None,
-                queue: QUEUE,
-            };
-            let subscription = self.place.bus().subscribe(&output, options).await?;
+            let subscription = self
+                .place
+                .bus()
+                .subscribe(
+                    &output,
+                    WireType::any(),
+                    Qos::keep_last(QUEUE).latching(true),
+                )
+                .await?;
             self.sources
                 .lock()
-                .insert(output.clone(), subscription.publishers.clone());
+                .insert(output.clone(), subscription.matched.clone());
             let (topic, news): (Arc<str>, _) = (output.into(), self.news.clone());
             let task = tokio::spawn(async move {
                 // All of it, or the guard would stay behind and end the subscription.
@@ -196,13 +200,13 @@ impl Original {
 
     /// Returns once the process is connected to all inputs, or has had time to be.
     pub async fn connected(&self) {
-        let counts: Vec<_> = {
+        let ends: Vec<_> = {
             let inputs = self.publishers.lock();
-            inputs.values().map(|input| input.subscribers()).collect()
+            inputs.values().map(|input| input.matched()).collect()
         };
         let all = async {
-            for mut count in counts {
-                let _ = count.wait_for(|count| *count > 0).await;
+            for end in ends {
+                reaches(end, 1).await;
             }
         };
         let _ = timeout(SETTLE, all).await;
@@ -214,7 +218,7 @@ impl Original {
     }
 
     /// This publisher of a topic has gone; its latched message is dropped.
-    pub fn unlatch(&self, topic: &Arc<str>, publisher: &Arc<str>) {
+    pub fn unlatch(&self, topic: &Arc<str>, publisher: &PeerId) {
         self.latched.forget(topic, publisher);
     }
 
@@ -264,12 +268,10 @@ async fn advertise(
     topic: &str,
     wire_type: &WireType,
 ) -> Result<Box<dyn Publisher>, BusError> {
-    let options = AdvertiseOptions {
-        wire_type: wire_type.clone(),
-        latch: false,
-        queue: QUEUE,
-    };
-    place.bus().advertise(topic, options).await
+    place
+        .bus()
+        .advertise(topic, wire_type.clone(), Qos::keep_last(QUEUE))
+        .await
 }
 
 struct Runner {
@@ -352,21 +354,21 @@ impl Runner {
             let nodes = published.topics.get(topic).map(|topic| &topic.subscribers);
             nodes.is_some_and(|nodes| nodes.contains(node))
         };
-        let counts: Vec<_> = {
+        let ends: Vec<_> = {
             let inputs = self.publishers.lock();
             let due = inputs
                 .iter()
                 .filter(|(topic, _)| expected.awaited.contains(*topic) || listens(topic));
-            due.map(|(_, input)| input.subscribers()).collect()
+            due.map(|(_, input)| input.matched()).collect()
         };
-        for mut count in counts {
-            let _ = count.wait_for(|count| *count > 0).await;
+        for end in ends {
+            reaches(end, 1).await;
         }
         let sources = self.sources.lock().clone();
-        for (topic, mut source) in sources {
+        for (topic, source) in sources {
             let nodes = published.topics.get(&topic).map(|topic| &topic.publishers);
             if nodes.is_some_and(|nodes| nodes.contains(&self.setting.node)) {
-                let _ = source.wait_for(|count| *count > 0).await;
+                reaches(source, 1).await;
             }
         }
     }

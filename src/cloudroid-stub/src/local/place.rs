@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ros::bus::{Bus, Graph, ServiceType, WireType};
+use ros::bus::{Bus, GlobalParameters, Graph, Lending, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -95,7 +95,7 @@ impl Place {
             .await
             .context("the robot's parameters")?;
         for (name, value) in all {
-            self.bus.set_param(&format!("/{name}"), value).await?;
+            self.bus.set(&format!("/{name}"), value).await?;
         }
         Ok(())
     }
@@ -160,7 +160,7 @@ impl Place {
             let Ok(wire_type) = self.bus.topic_type(topic).await else {
                 continue;
             };
-            if says && wire_type.md5 != "*" {
+            if says && !wire_type.digest.is_any() {
                 registered.outputs.push((topic.clone(), wire_type.clone()));
             }
             if listens {

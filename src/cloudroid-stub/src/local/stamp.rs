@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use qos::{Key, Stamp};
-use ros::bus::{Message, WireType};
+use ros::bus::{Digest, Message, WireType};
 
 /// Knows for each type whether it begins with a header.
 #[derive(Debug, Default)]
 pub struct Stamps {
-    stamped: HashMap<String, bool>,
+    stamped: HashMap<Digest, bool>,
 }
 
 impl Stamps {
@@ -25,13 +25,13 @@ impl Stamps {
     /// The stamp of a message whose type begins with `std_msgs/Header`.
     pub fn of(&mut self, message: &Message) -> Option<Stamp> {
         let wire_type = &message.wire_type;
-        let stamped = match self.stamped.get(&wire_type.md5) {
+        let stamped = match self.stamped.get(&wire_type.digest) {
             Some(stamped) => *stamped,
             None => {
                 let stamped = is_stamped(wire_type);
                 // A type whose definition has not come may be known later.
                 if !wire_type.definition.is_empty() {
-                    self.stamped.insert(wire_type.md5.clone(), stamped);
+                    self.stamped.insert(wire_type.digest.clone(), stamped);
                 }
                 stamped
             }

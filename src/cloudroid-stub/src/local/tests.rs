@@ -9,7 +9,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Event, LocalState, Outcome, RequestId, SafeStop, Sla};
-use ros::bus::{Bus, Message, ParamValue, ServiceHandler, ServiceType, WireType};
+use ros::bus::{Bus, GlobalParameters, Message, ParamValue, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -39,18 +39,18 @@ async fn robot() -> Arc<Ros1Bus> {
         .await
         .unwrap();
     let greeting = ParamValue::String("hello ".into());
-    bus.set_param("/ns/relay_sibling/greeting", greeting)
+    bus.set("/ns/relay_sibling/greeting", greeting)
         .await
         .unwrap();
     bus
 }
 
 pub fn string_type() -> WireType {
-    WireType {
-        name: "std_msgs/String".into(),
-        md5: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
-        definition: "string data\n".into(),
-    }
+    WireType::new(
+        "std_msgs/String",
+        "992ce8a1687cec8c8bd883ec73ca41d1",
+        "string data\n",
+    )
 }
 
 pub fn string(text: &str) -> Message {
@@ -159,7 +159,7 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
             .all(|name| name != "/absolute/out" && name != "/ns/in"),
         "{graph:?}"
     );
-    let parameters = robot.param_names().await.unwrap();
+    let parameters = robot.names().await.unwrap();
     assert!(
         parameters.iter().all(|name| name != "/ns/relay/seen"),
         "what it writes stays with it: {parameters:?}"
@@ -289,10 +289,7 @@ async fn where_nothing_is_promised_a_missing_original_is_told_when_it_is_needed(
 #[tokio::test]
 async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over() {
     let robot = robot().await;
-    let of = ServiceType {
-        name: "tests/Says".into(),
-        md5: "0123456789abcdef0123456789abcdef".into(),
-    };
+    let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
     let _hangs = robot.serve("/hangs", of, Arc::new(Hangs)).await.unwrap();
     let limit = Duration::from_millis(100);
     let original = Original::new(setting(&["patient"]), Interface::default(), robot, limit);
@@ -340,10 +337,7 @@ async fn it_calls_what_the_robot_serves() {
     state(&mut news, LocalState::Ready).await;
     let mut served = Vec::new();
     for (name, says) in [("/secret", Ok("42")), ("/silent", Err("it is a secret"))] {
-        let of = ServiceType {
-            name: "tests/Says".into(),
-            md5: "0123456789abcdef0123456789abcdef".into(),
-        };
+        let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
         let serving = robot.serve(name, of, Arc::new(Says(says))).await;
         served.push(serving.unwrap());
     }

@@ -122,10 +122,7 @@ impl Calls {
                 name: served.name.as_str().into(),
                 channel: channel.clone(),
             });
-            let service_type = ServiceType {
-                name: served.type_name.clone(),
-                md5: served.md5.clone(),
-            };
+            let service_type = ServiceType::new(served.type_name.clone(), served.md5.clone());
             match mirror.bus.serve(&served.name, service_type, handler).await {
                 Ok(serving) => {
                     let service = Service {

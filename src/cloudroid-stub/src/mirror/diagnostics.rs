@@ -7,7 +7,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use qos::{Local, LocalState, Report};
-use ros::bus::{AdvertiseOptions, Bus, BusError, Publisher, WireType};
+use ros::bus::{Bus, BusError, Publisher, Qos, WireType};
 
 const TOPIC: &str = "/diagnostics";
 /// DiagnosticStatus' levels.
@@ -53,13 +53,8 @@ pub struct Diagnostics {
 impl Diagnostics {
     /// Advertises it on `bus`, for the node of this name.
     pub async fn new(bus: &Arc<dyn Bus>, node: &str, robot: &str) -> Result<Self, BusError> {
-        let options = AdvertiseOptions {
-            wire_type: wire_type(),
-            latch: false,
-            queue: 2,
-        };
         Ok(Self {
-            publisher: bus.advertise(TOPIC, options).await?,
+            publisher: bus.advertise(TOPIC, wire_type(), Qos::keep_last(2)).await?,
             name: format!("{}: cloudroid", node.trim_start_matches('/')),
             robot: robot.to_owned(),
             sequence: 0,
@@ -75,11 +70,11 @@ impl Diagnostics {
 }
 
 fn wire_type() -> WireType {
-    WireType {
-        name: "diagnostic_msgs/DiagnosticArray".into(),
-        md5: "60810da900de1dd6ddd437c3503511da".into(),
-        definition: DEFINITION.into(),
-    }
+    WireType::new(
+        "diagnostic_msgs/DiagnosticArray",
+        "60810da900de1dd6ddd437c3503511da",
+        DEFINITION,
+    )
 }
 
 /// How bad it is: nobody answers; somebody does, but not as wished for; the cloud keeps its promise.
@@ -190,7 +185,7 @@ mod tests {
     fn the_array_is_what_its_definition_says() {
         let wire_type = wire_type();
         let known = MessageType::from_full_text(&wire_type.name, DEFINITION).unwrap();
-        assert_eq!(known.md5(), wire_type.md5);
+        assert_eq!(wire_type.digest, known.md5());
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
         let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
         let now = Instant::now();

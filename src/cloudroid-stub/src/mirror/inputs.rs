@@ -10,7 +10,7 @@ use link::control::{FromRobot, Input, Wanted};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
-use ros::bus::{Message, SubscribeOptions, WireType};
+use ros::bus::{Digest, Matched, Message, PeerId, Qos, WireType};
 use tokio::task::AbortHandle;
 
 use super::Mirror;
@@ -127,7 +127,7 @@ impl Inputs {
     }
 
     /// Only these publishers of a topic are left: what the cloud was given of others is taken back.
-    fn left(&self, mirror: &Mirror, topic: &str, present: &BTreeSet<Arc<str>>) {
+    fn left(&self, mirror: &Mirror, topic: &str, present: &Matched) {
         if let Some(channels) = self.channels.lock().get_mut(topic) {
             channels.left(mirror, present);
         }
@@ -155,16 +155,13 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
     let Some(bus) = mirror.upgrade().map(|mirror| mirror.bus.clone()) else {
         return;
     };
-    let known = wanted.type_name != "*";
-    let options = SubscribeOptions {
-        wire_type: known.then(|| WireType {
-            name: wanted.type_name.clone(),
-            md5: wanted.md5.clone(),
-            definition: String::new(),
-        }),
-        queue: QUEUE,
+    let of = match wanted.type_name.as_str() {
+        "*" => WireType::any(),
+        name => WireType::new(name, &wanted.md5, ""),
     };
-    let mut subscription = match bus.subscribe(&wanted.topic, options).await {
+    // Whatever is latched goes to the cloud, too.
+    let qos = Qos::keep_last(QUEUE).latching(true);
+    let mut subscription = match bus.subscribe(&wanted.topic, of, qos).await {
         Ok(subscription) => subscription,
         Err(error) => {
             tracing::warn!(topic = wanted.topic, %error, "cannot be subscribed to");
@@ -176,8 +173,8 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         mirror.drops.watch(&wanted.topic, Cause::Busy, dropped);
     }
     let topic: Arc<str> = wanted.topic.as_str().into();
-    let mut present = subscription.present.clone();
-    let mut latching: BTreeSet<Arc<str>> = BTreeSet::new();
+    let mut present = subscription.matched.clone();
+    let mut latching: BTreeSet<PeerId> = BTreeSet::new();
     loop {
         let message = tokio::select! {
             // Who has left has sent all that it had before.
@@ -206,7 +203,7 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
             latching.insert(message.publisher.clone());
         }
         // Other nodes of the servant hear each other inside. Their originals on the robot do not.
-        let inside = mirror.siblings.read().contains(&*message.publisher);
+        let inside = mirror.siblings.read().contains(message.publisher.node());
         match (mirror.keeper(), !inside && feed.load(Ordering::Relaxed)) {
             (Some(keeper), true) => keeper.input(&topic, message),
             (Some(keeper), false) => keeper.overheard(&topic, message),
@@ -219,17 +216,17 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
 /// A channel for all publishers that do not latch, and one for each that does: what each has latched is kept.
 #[derive(Default)]
 struct Channels {
-    by_publisher: HashMap<(Option<Arc<str>>, String), Channel>,
+    by_publisher: HashMap<(Option<PeerId>, Digest), Channel>,
     /// What each publisher has latched last.
-    latched: HashMap<Arc<str>, Message>,
+    latched: HashMap<PeerId, Message>,
     /// Of that, what a new servant was not given yet.
-    to_send_again: HashMap<Arc<str>, Message>,
+    to_send_again: HashMap<PeerId, Message>,
 }
 
 struct Channel {
     number: u32,
     /// Who has sent by it.
-    publishers: BTreeSet<Arc<str>>,
+    publishers: BTreeSet<PeerId>,
 }
 
 impl Channels {
@@ -241,7 +238,7 @@ impl Channels {
     }
 
     /// Forgets publishers that are not among these.
-    fn left(&mut self, mirror: &Mirror, present: &BTreeSet<Arc<str>>) {
+    fn left(&mut self, mirror: &Mirror, present: &Matched) {
         self.by_publisher.retain(|_, channel| {
             channel.publishers.retain(|name| present.contains(name));
             if channel.publishers.is_empty() {
@@ -255,19 +252,19 @@ impl Channels {
 
     fn of(&mut self, mirror: &Mirror, topic: &str, message: &Message) -> u32 {
         let publisher = message.latching.then(|| message.publisher.clone());
-        let key = (publisher, message.wire_type.md5.clone());
+        let key = (publisher, message.wire_type.digest.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
             mirror.session().tell(&FromRobot::Open(Input {
                 channel,
                 topic: topic.to_owned(),
                 type_name: message.wire_type.name.clone(),
-                md5: message.wire_type.md5.clone(),
+                md5: message.wire_type.digest.to_string(),
                 definition: message.wire_type.definition.clone(),
                 latching: message.latching,
             }));
             let of = &message.wire_type;
-            let schema = codec::Schema::of(&of.name, &of.md5);
+            let schema = codec::Schema::of(&of.name, of.digest.as_str());
             mirror.session().opens(channel, topic, schema);
             Channel {
                 number: channel,

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use link::RobotSession;
 use link::control::{FromRobot, Served};
 use parking_lot::Mutex;
-use ros::bus::{BusError, Graph, ServiceProvider};
+use ros::bus::{BusError, Digest, Graph, ServiceProvider};
 
 use super::Mirror;
 use crate::local;
@@ -25,7 +25,7 @@ struct Service {
     channel: u32,
     /// The node that serves it.
     node: String,
-    md5: String,
+    digest: Digest,
 }
 
 impl Lent {
@@ -39,7 +39,7 @@ impl Lent {
         let (this, session) = (mirror.this.clone(), mirror.session());
         tokio::spawn(async move {
             let Some(mirror) = this.upgrade() else { return };
-            let found = mirror.bus.service_provider(&service).await;
+            let found = async { mirror.bus.lending()?.provider(&service).await }.await;
             let found = found.map_err(|error| error.to_string());
             let found = found.and_then(|provider| mirror.can_lend(&service, provider));
             let provider = match found {
@@ -66,20 +66,20 @@ impl Lent {
             return;
         }
         let of = provider.map(|provider| {
-            let md5 = &provider.service_type.md5;
+            let digest = &provider.service_type.digest;
             let same = services.get(&service);
-            let same = same.filter(|known| known.node == provider.node && known.md5 == *md5);
+            let same = same.filter(|known| known.node == provider.node && known.digest == *digest);
             let channel = same.map(|known| known.channel);
             let served = Served {
                 channel: channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed)),
                 name: service.clone(),
                 type_name: provider.service_type.name,
-                md5: provider.service_type.md5,
+                md5: digest.to_string(),
             };
             let known = Service {
                 channel: served.channel,
                 node: provider.node,
-                md5: served.md5.clone(),
+                digest: provider.service_type.digest,
             };
             services.insert(service.clone(), known);
             served
@@ -98,9 +98,9 @@ impl Lent {
             let mut services = services.iter();
             services
                 .find(|(_, service)| service.channel == channel)
-                .map(|(name, service)| (name.clone(), service.md5.clone()))
+                .map(|(name, service)| (name.clone(), service.digest.clone()))
         };
-        let Some((name, md5)) = known else {
+        let Some((name, digest)) = known else {
             let gone = "nobody on the robot serves this any more".to_owned();
             return session.answer(id, arrived, Err(gone));
         };
@@ -108,7 +108,7 @@ impl Lent {
         tokio::spawn(async move {
             let Some(mirror) = this.upgrade() else { return };
             let limit = mirror.call_limit;
-            let called = mirror.bus.call_typed(&name, &md5, request, limit).await;
+            let called = mirror.bus.call_typed(&name, &digest, request, limit).await;
             if called.as_ref().is_err_and(is_of_the_provider) {
                 mirror
                     .lent
@@ -202,7 +202,7 @@ mod tests {
 
     use async_trait::async_trait;
     use link::SessionOptions;
-    use ros::bus::{Bus, ServiceHandler, ServiceType};
+    use ros::bus::{Bus, Lending, ServiceHandler, ServiceType};
     use ros::net::HostSockets;
     use ros::ros1::Ros1Bus;
     use ros::ros1::master::{Master, MasterOptions};
@@ -250,13 +250,10 @@ mod tests {
             ("/plain", None, true),
         ] {
             let bus = join(node, label).await;
-            let of = ServiceType {
-                name: "pkg/Do".to_owned(),
-                md5: "abcd".to_owned(),
-            };
+            let of = ServiceType::new("pkg/Do", "abcd");
             let name = format!("{node}/do");
             let _serving = bus.serve(&name, of, Arc::new(Echo)).await.unwrap();
-            let provider = own.service_provider(&name).await.unwrap();
+            let provider = own.provider(&name).await.unwrap();
             assert_eq!(provider.node, node);
             let can = mirror.can_lend(&name, provider);
             assert_eq!(can.is_ok(), lent, "{node}: {can:?}");

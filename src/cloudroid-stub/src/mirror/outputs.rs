@@ -10,7 +10,7 @@ use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use qos::Side;
-use ros::bus::{AdvertiseOptions, Message, Publisher, WireType};
+use ros::bus::{Message, PeerId, Publisher, Qos, WireType};
 use ros::ring::{Bounds, Ring};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
@@ -34,7 +34,7 @@ struct Topic {
     md5: String,
     wire_type: Arc<WireType>,
     /// Who publishes what comes from the cloud.
-    cloud: Arc<str>,
+    cloud: PeerId,
     channel: Mutex<u32>,
     publisher: Arc<dyn Publisher>,
     latched: Mutex<Latched>,
@@ -242,22 +242,15 @@ impl Outputs {
 
     async fn advertise(&self, mirror: &Arc<Mirror>, output: &Output) -> Option<Arc<Topic>> {
         let key = (output.type_name.clone(), output.md5.clone());
-        let wire_type = mirror.types.lock().get(&key).cloned().unwrap_or(WireType {
-            name: output.type_name.clone(),
-            md5: output.md5.clone(),
-            definition: String::new(),
-        });
-        let options = AdvertiseOptions {
-            wire_type: wire_type.clone(),
-            latch: false,
-            queue: QUEUE,
-        };
-        match mirror.bus.advertise(&output.topic, options).await {
+        let known = mirror.types.lock().get(&key).cloned();
+        let of = known.unwrap_or_else(|| WireType::new(&output.type_name, &output.md5, ""));
+        let qos = Qos::keep_last(QUEUE);
+        match mirror.bus.advertise(&output.topic, of.clone(), qos).await {
             Ok(publisher) => {
                 let topic = Arc::new(Topic {
                     name: output.topic.clone(),
                     md5: output.md5.clone(),
-                    wire_type: Arc::new(wire_type),
+                    wire_type: Arc::new(of),
                     cloud: "cloud".into(),
                     channel: Mutex::new(output.channel),
                     publisher: publisher.into(),
@@ -287,21 +280,19 @@ impl Outputs {
 /// Tells the cloud how many listen, now and whenever that changes.
 fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     let (mirror, of) = (Arc::downgrade(mirror), Arc::downgrade(topic));
-    let mut subscribers = topic.publisher.subscribers();
+    let mut subscribers = topic.publisher.matched();
     let task = tokio::spawn(async move {
         let mut told = None;
         loop {
-            subscribers.borrow_and_update();
+            let matched = subscribers.borrow_and_update().clone();
             {
                 let (Some(mirror), Some(topic)) = (mirror.upgrade(), of.upgrade()) else {
                     return;
                 };
-                let names = topic.publisher.subscriber_names();
                 let siblings = mirror.siblings.read().clone();
-                let count = names
-                    .iter()
-                    .filter(|name| !siblings.contains(*name))
-                    .count();
+                let others = matched.peers.iter();
+                let others = others.filter(|peer| !siblings.contains(peer.id.node()));
+                let count = others.count();
                 if told != Some(count) {
                     told = Some(count);
                     topic.listeners.store(count, Ordering::Relaxed);
@@ -347,16 +338,12 @@ async fn keep_latched(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
         .types
         .lock()
         .values()
-        .find(|known| known.md5 == topic.md5)
+        .find(|known| known.digest == *topic.md5)
         .cloned();
     let advertised = match (name, wire_type) {
         (Some(name), Some(wire_type)) => {
-            let options = AdvertiseOptions {
-                wire_type,
-                latch: true,
-                queue: QUEUE,
-            };
-            mirror.bus.advertise(&name, options).await.ok()
+            let qos = Qos::keep_last(QUEUE).latching(true);
+            mirror.bus.advertise(&name, wire_type, qos).await.ok()
         }
         _ => None,
     };

@@ -35,7 +35,8 @@ impl Parameters {
 
 /// All parameters now, and from now on their changes go to the cloud.
 pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
-    match mirror.bus.watch_params().await {
+    let watching = async { mirror.bus.parameters()?.watch().await };
+    match watching.await {
         Ok(mut changes) => {
             let mirror = Arc::downgrade(mirror);
             tokio::spawn(async move {
@@ -72,6 +73,9 @@ pub async fn all(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
 
 /// What the real node has set.
 pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
+    let Ok(parameters) = mirror.bus.parameters() else {
+        return;
+    };
     for (key, value) in changes {
         let done = match value {
             Some(value) => {
@@ -80,9 +84,9 @@ pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
                     .set
                     .lock()
                     .insert(key.clone(), value.clone());
-                mirror.bus.set_param(&key, value).await
+                parameters.set(&key, value).await
             }
-            None => mirror.bus.delete_param(&key).await,
+            None => parameters.delete(&key).await,
         };
         if let Err(error) = done {
             tracing::debug!(key, %error, "a parameter of the node cannot be set on the robot");

@@ -164,11 +164,7 @@ impl Mirror {
             let types = self.types.lock();
             let wire_type = |name: &str, md5: &str| {
                 let known = types.get(&(name.to_owned(), md5.to_owned())).cloned();
-                known.unwrap_or(WireType {
-                    name: name.to_owned(),
-                    md5: md5.to_owned(),
-                    definition: String::new(),
-                })
+                known.unwrap_or_else(|| WireType::new(name, md5, ""))
             };
             for input in graph
                 .inputs

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use bytes::Bytes;
 use qos::SafeStop;
-use ros::bus::{AdvertiseOptions, Bus, Publisher, WireType};
+use ros::bus::{Bus, Publisher, Qos, WireType};
 use ros::schema::{MessageType, Registry, SchemaError};
 
 /// The usual one; robots without development packages have no definitions at all.
@@ -36,17 +36,10 @@ impl Stop {
         let mut bytes = Vec::new();
         ros::codec::from_json(&of, &json, &mut bytes, &Default::default())
             .with_context(|| format!("safe_stop: its message is no {}", stop.type_name))?;
-        let options = AdvertiseOptions {
-            wire_type: WireType {
-                name: stop.type_name.clone(),
-                md5: of.md5().to_owned(),
-                definition: of.full_text().to_owned(),
-            },
-            latch: false,
-            queue: 1,
-        };
         Ok(Self {
-            publisher: bus.advertise(&stop.topic, options).await?,
+            publisher: bus
+                .advertise(&stop.topic, WireType::of(&of), Qos::keep_last(1))
+                .await?,
             bytes: bytes.into(),
         })
     }

@@ -40,26 +40,26 @@ impl Mirror {
         applied.stood_in = true;
         let types = registered.outputs.iter().chain(&registered.inputs);
         for (_, wire_type) in types {
-            let key = (wire_type.name.clone(), wire_type.md5.clone());
+            let key = (wire_type.name.clone(), wire_type.digest.to_string());
             self.types.lock().insert(key, wire_type.clone());
         }
         let output = |(topic, of): (String, WireType)| Output {
             channel: NOWHERE,
             topic,
             type_name: of.name,
-            md5: of.md5,
+            md5: of.digest.to_string(),
         };
         let input = |(topic, of): (String, WireType)| Wanted {
             topic,
             type_name: of.name,
-            md5: of.md5,
+            md5: of.digest.to_string(),
             feed: true,
         };
         let serves = |(name, of): (String, ServiceType)| Served {
             channel: NOWHERE,
             name,
             type_name: of.name,
-            md5: of.md5,
+            md5: of.digest.to_string(),
         };
         let graph = Graph {
             outputs: registered.outputs.into_iter().map(output).collect(),

@@ -14,10 +14,7 @@ use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD};
 use qos::{Side, Sla};
 use reach::links::{Hub, HubOptions, Nodes};
-use ros::bus::{
-    AdvertiseOptions, Graph as Seen, Publisher, ServiceHandler, ServiceType, SubscribeOptions,
-    Subscription,
-};
+use ros::bus::{Graph as Seen, Publisher, Qos, ServiceHandler, ServiceType, Subscription};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -73,20 +70,15 @@ async fn node(at: SocketAddr, name: &str) -> Arc<Ros1Bus> {
 }
 
 async fn says(node: &Ros1Bus, topic: &str, latch: bool) -> Box<dyn Publisher> {
-    let options = AdvertiseOptions {
-        wire_type: string_type(),
-        latch,
-        queue: 100,
-    };
-    node.advertise(topic, options).await.unwrap()
+    node.advertise(topic, string_type(), Qos::keep_last(100).latching(latch))
+        .await
+        .unwrap()
 }
 
 async fn hears(node: &Ros1Bus, topic: &str) -> Subscription {
-    let options = SubscribeOptions {
-        wire_type: Some(string_type()),
-        queue: 100,
-    };
-    node.subscribe(topic, options).await.unwrap()
+    node.subscribe(topic, string_type(), Qos::keep_last(100))
+        .await
+        .unwrap()
 }
 
 async fn next(subscription: &mut Subscription) -> String {
@@ -193,8 +185,8 @@ async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before() {
     ] {
         let publisher = node(scene.robot, name).await;
         let map = says(&publisher, "/map", latch).await;
-        let mut count = map.subscribers();
-        count.wait_for(|count| *count > 0).await.unwrap();
+        let mut count = map.matched();
+        count.wait_for(|now| now.connected() > 0).await.unwrap();
         for number in 0..20 {
             map.publish(bytes(&format!("{name} {number}")));
         }
@@ -233,7 +225,7 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
         channel: 1,
         topic: "/map".to_owned(),
         type_name: string_type().name,
-        md5: string_type().md5,
+        md5: string_type().digest.to_string(),
     };
     let key = (output.type_name.clone(), output.md5.clone());
     scene.mirror.types.lock().insert(key, string_type());
@@ -241,7 +233,10 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
     outputs.apply(&scene.mirror, &[output], false).await;
     let app = node(scene.robot, "/app").await;
     let mut map = hears(&app, "/map").await;
-    map.publishers.wait_for(|count| *count > 0).await.unwrap();
+    map.matched
+        .wait_for(|now| now.connected() > 0)
+        .await
+        .unwrap();
     let cloud = Data {
         channel: 1,
         encoded: false,
@@ -313,16 +308,16 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
     .await;
     let echoed = app.call(echo, "hello".into(), SOON).await.unwrap();
     assert_eq!(echoed, "hello", "the original's own answer");
-    let mut count = input.subscribers();
-    count.wait_for(|count| *count > 0).await.unwrap();
-    out.publishers.wait_for(|count| *count > 0).await.unwrap();
+    let mut count = input.matched();
+    count.wait_for(|now| now.connected() > 0).await.unwrap();
+    out.matched
+        .wait_for(|now| now.connected() > 0)
+        .await
+        .unwrap();
     input.publish(bytes("scan"));
     assert_eq!(next(&mut out).await, "scan");
     // The cloud is reached for the first time.
-    let of = ServiceType {
-        name: "tests/Echo".into(),
-        md5: "0123456789abcdef0123456789abcdef".into(),
-    };
+    let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _serving = scene.real.serve(echo, of, Arc::new(Says("cloud"))).await;
     let _link = scene.links().await;
     let deadline = tokio::time::Instant::now() + SOON;

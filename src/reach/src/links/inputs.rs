@@ -5,11 +5,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{AdvertiseOptions, Publisher, WireType};
+use ros::bus::{Publisher, Qos, WireType, reaches};
 use ros::schema::MessageType;
 
 use super::Hub;
-use super::node_link::within;
 use link::clock::now;
 use link::control::Input;
 use link::drops::{Cause, Drops};
@@ -97,16 +96,9 @@ impl Inputs {
 
     /// Advertises, and lets messages through once the node has connected.
     pub(super) async fn open(&self, hub: &Arc<Hub>, drops: &Drops, input: Input) {
-        let options = AdvertiseOptions {
-            wire_type: WireType {
-                name: input.type_name.clone(),
-                md5: input.md5.clone(),
-                definition: input.definition.clone(),
-            },
-            latch: input.latching,
-            queue: QUEUE,
-        };
-        let publisher: Arc<dyn Publisher> = match hub.bus.advertise(&input.topic, options).await {
+        let of = WireType::new(&input.type_name, &input.md5, &input.definition);
+        let qos = Qos::keep_last(QUEUE).latching(input.latching);
+        let publisher: Arc<dyn Publisher> = match hub.bus.advertise(&input.topic, of, qos).await {
             Ok(publisher) => publisher.into(),
             Err(error) => {
                 tracing::warn!(topic = input.topic, %error, "an input cannot be published");
@@ -124,12 +116,8 @@ impl Inputs {
             .topics
             .get(&input.topic)
             .map_or(0, |ends| ends.subscribers.len());
-        within(
-            hub.options.warm_up,
-            publisher.subscribers(),
-            listeners.max(1),
-        )
-        .await;
+        let connected = reaches(publisher.matched(), listeners.max(1));
+        let _ = tokio::time::timeout(hub.options.warm_up, connected).await;
         let mut channels = self.channels.lock();
         if let Some(channel) = channels.get_mut(&input.channel) {
             if let State::Waiting(waiting) = &mut channel.state {

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Lender, Lent as LentService, ServiceHandler, ServiceType};
+use ros::bus::{Digest, Lender, Lent as LentService, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
@@ -74,7 +74,9 @@ impl There {
     /// Whether the robot tells of the same once more.
     fn is(&self, served: &Served) -> bool {
         let ours = &self.service_type;
-        self.channel == served.channel && ours.name == served.type_name && ours.md5 == served.md5
+        self.channel == served.channel
+            && ours.name == served.type_name
+            && ours.digest == *served.md5
     }
 }
 
@@ -275,10 +277,7 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     let (request, response) = stamps.unwrap_or_default();
     There {
         channel: served.channel,
-        service_type: ServiceType {
-            name: served.type_name,
-            md5: served.md5,
-        },
+        service_type: ServiceType::new(served.type_name, served.md5),
         request,
         response,
         gone: watch::Sender::new(false),
@@ -288,7 +287,9 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
 /// Lends the robot's services to the servant, from the first link on.
 pub(super) async fn begin(hub: &Arc<Hub>) {
     let lender = Arc::new(Robot(Arc::downgrade(hub)));
-    let begun = hub.lends.get_or_try_init(|| hub.bus.lend(lender));
+    let begun = hub
+        .lends
+        .get_or_try_init(|| async { hub.bus.lending()?.lend(lender).await });
     if let Err(error) = begun.await {
         tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot");
     }
@@ -320,7 +321,7 @@ impl Lender for Robot {
             handler: Arc::new(Passing {
                 hub: self.0.clone(),
                 service: service.to_owned(),
-                md5: there.service_type.md5.clone(),
+                digest: there.service_type.digest.clone(),
             }),
         })
     }
@@ -330,7 +331,7 @@ impl Lender for Robot {
 struct Passing {
     hub: Weak<Hub>,
     service: String,
-    md5: String,
+    digest: Digest,
 }
 
 #[async_trait]
@@ -342,10 +343,10 @@ impl ServiceHandler for Passing {
         let found = link.and_then(|link| Some((has(&link)?, link)));
         let (there, link) =
             found.ok_or_else(|| format!("nobody on the robot serves {} any more", self.service))?;
-        if there.service_type.md5 != self.md5 {
+        if there.service_type.digest != self.digest {
             return Err(format!(
                 "{} is served on the robot with md5sum {} now, not {} as when it was connected to",
-                self.service, there.service_type.md5, self.md5
+                self.service, there.service_type.digest, self.digest
             ));
         }
         let request = hub.skew.apply(Way::Out, &there.request, request);

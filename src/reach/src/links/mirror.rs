@@ -3,8 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros::bus::{ServiceType, WireType};
-use ros::schema::MessageType;
+use ros::bus::{Digest, ServiceType, WireType};
 
 use super::Hub;
 use super::node_link::{NodeLink, Service};
@@ -14,7 +13,7 @@ use link::stamps::Stamps;
 /// What was told so far.
 #[derive(Default)]
 struct Told {
-    types: BTreeSet<(String, String)>,
+    types: BTreeSet<(String, Digest)>,
     channels: BTreeMap<String, u32>,
     services: BTreeMap<String, (u32, ServiceType)>,
     next: u32,
@@ -66,7 +65,7 @@ impl Told {
                     channel,
                     topic: topic.clone(),
                     type_name: wire_type.name,
-                    md5: wire_type.md5,
+                    md5: wire_type.digest.to_string(),
                 });
             }
             if listening.contains(topic) {
@@ -102,19 +101,15 @@ impl Told {
         name: &str,
     ) -> Option<WireType> {
         let wire_type = match hub.registry.message(name) {
-            Ok(known) => WireType {
-                name: name.to_owned(),
-                md5: known.md5().to_owned(),
-                definition: known.full_text().to_owned(),
-            },
+            Ok(known) => WireType::of(&known),
             // Its node knows.
             Err(_) => hub.bus.topic_type(topic).await.ok()?,
         };
-        let key = (wire_type.name.clone(), wire_type.md5.clone());
+        let key = (wire_type.name.clone(), wire_type.digest.clone());
         if self.types.insert(key) {
             link.session.tell(&FromCloud::Type {
                 name: wire_type.name.clone(),
-                md5: wire_type.md5.clone(),
+                md5: wire_type.digest.to_string(),
                 definition: wire_type.definition.clone(),
             });
         }
@@ -127,10 +122,12 @@ impl Told {
         }
         self.next += 1;
         self.channels.insert(topic.to_owned(), self.next);
-        let of = MessageType::from_full_text(&wire_type.name, &wire_type.definition);
-        let stamps = of.map(|of| Stamps::of(&of)).unwrap_or_default();
+        let stamps = wire_type
+            .schema()
+            .map(|of| Stamps::of(&of))
+            .unwrap_or_default();
         link.outputs.add(self.next, topic, stamps);
-        let schema = codec::Schema::of(&wire_type.name, &wire_type.md5);
+        let schema = codec::Schema::of(&wire_type.name, wire_type.digest.as_str());
         link.session.opens(self.next, topic, schema);
         self.next
     }
@@ -144,7 +141,7 @@ impl Told {
                 let entry = (self.next, service_type);
                 self.services.insert(name.to_owned(), entry.clone());
                 let stamps = hub.registry.service(&entry.1.name).ok();
-                let stamps = stamps.filter(|known| known.md5 == entry.1.md5);
+                let stamps = stamps.filter(|known| entry.1.digest == *known.md5);
                 let service = Service {
                     name: name.to_owned(),
                     request: stamps
@@ -163,7 +160,7 @@ impl Told {
             channel,
             name: name.to_owned(),
             type_name: service_type.name,
-            md5: service_type.md5,
+            md5: service_type.digest.to_string(),
         })
     }
 

@@ -427,8 +427,3 @@ async fn tell_drops(link: Arc<NodeLink>) {
         }
     }
 }
-
-/// Waits for `done` to be true at most so long.
-pub(super) async fn within(patience: Duration, mut watched: watch::Receiver<usize>, wanted: usize) {
-    let _ = tokio::time::timeout(patience, watched.wait_for(|count| *count >= wanted)).await;
-}

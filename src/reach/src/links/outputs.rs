@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, SubscribeOptions};
+use ros::bus::{Bus, Matched, PeerId, Qos, WireType, reaches};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
@@ -114,12 +114,19 @@ impl Outputs {
                 _ => return,
             }
         };
-        let options = SubscribeOptions {
-            wire_type: None,
-            queue: QUEUE,
+        let before = match hub.bus.hearing() {
+            Some(hearing) => hearing.heard_over(&topic).await.unwrap_or_default(),
+            None => BTreeSet::new(),
         };
-        let before = hub.bus.heard_over(&topic).await.unwrap_or_default();
-        let subscription = match hub.bus.subscribe(&topic, options).await {
+        let subscription = match hub
+            .bus
+            .subscribe(
+                &topic,
+                WireType::any(),
+                Qos::keep_last(QUEUE).latching(true),
+            )
+            .await
+        {
             Ok(subscription) => subscription,
             Err(error) => {
                 tracing::warn!(topic, %error, "an output cannot be read");
@@ -128,7 +135,7 @@ impl Outputs {
         };
         link.drops
             .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
-        let publishers = subscription.publishers.clone();
+        let publishers = subscription.matched.clone();
         let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = tokio::spawn(async move {
@@ -142,7 +149,7 @@ impl Outputs {
             let read = async {
                 while let Some(message) = subscription.messages.recv().await {
                     // Other nodes of the servant have links of their own.
-                    if *message.publisher == *reader.node {
+                    if message.publisher.node() == reader.node {
                         let Some(hub) = hub.upgrade() else { break };
                         let bytes = hub.skew.apply(Way::Out, &stamps, message.bytes);
                         reader.send(channel, bytes, message.latching);
@@ -164,16 +171,19 @@ async fn heard(
     bus: &dyn Bus,
     node: &str,
     topic: &str,
-    mut publishers: watch::Receiver<usize>,
-    before: BTreeSet<(String, i32)>,
+    publishers: watch::Receiver<Matched>,
+    before: BTreeSet<PeerId>,
 ) {
-    let _ = publishers.wait_for(|count| *count > 0).await;
+    reaches(publishers, 1).await;
+    let Some(hearing) = bus.hearing() else {
+        return;
+    };
     let mut pause = LOOK;
     loop {
-        let Ok(now) = bus.heard_over(topic).await else {
+        let Ok(now) = hearing.heard_over(topic).await else {
             return;
         };
-        if now.difference(&before).any(|(of, _)| of == node) {
+        if now.difference(&before).any(|by| by.node() == node) {
             return;
         }
         tokio::time::sleep(pause).await;

@@ -45,7 +45,7 @@ impl Known {
     pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
         let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
         hub.skew.leave(hello.keep_stamps || simulated);
-        let there = match hub.bus.get_param("/").await {
+        let there = match hub.bus.parameter("/").await {
             Ok(ParamValue::Map(there)) => there,
             _ => BTreeMap::new(),
         };
@@ -57,7 +57,9 @@ impl Known {
         }
         for (key, value) in hub.nodes.parameters(&hello.node) {
             // The robot shall see what its node really has.
-            let _ = hub.bus.set_param(&key, value).await;
+            if let Ok(parameters) = hub.bus.parameters() {
+                let _ = parameters.set(&key, value).await;
+            }
         }
     }
 
@@ -71,7 +73,9 @@ impl Known {
                 Some(value) => self.set(hub, key, value).await,
                 None => {
                     self.set.lock().remove(&key);
-                    let _ = hub.bus.delete_param(&key).await;
+                    if let Ok(parameters) = hub.bus.parameters() {
+                        let _ = parameters.delete(&key).await;
+                    }
                 }
             }
         }
@@ -79,7 +83,8 @@ impl Known {
 
     async fn set(&self, hub: &Hub, key: String, value: ParamValue) {
         self.set.lock().insert(key.clone(), value.clone());
-        if let Err(error) = hub.bus.set_param(&key, value).await {
+        let set = async { hub.bus.parameters()?.set(&key, value).await };
+        if let Err(error) = set.await {
             tracing::warn!(key, %error, "a parameter of the robot cannot be set");
         }
     }
@@ -87,7 +92,7 @@ impl Known {
     /// Tells robots what nodes set, from now on.
     pub(super) async fn watch(&self, hub: &Arc<Hub>) {
         let begun = self.watching.get_or_try_init(|| async {
-            let mut changes = hub.bus.watch_params().await?;
+            let mut changes = hub.bus.parameters()?.watch().await?;
             let weak = Arc::downgrade(hub);
             let task = tokio::spawn(async move {
                 while let Some((key, value)) = changes.recv().await {

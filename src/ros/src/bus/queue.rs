@@ -155,11 +155,7 @@ mod tests {
     use crate::bus::WireType;
 
     fn message(bytes: Bytes) -> Message {
-        let wire_type = WireType {
-            name: "p/T".into(),
-            md5: "*".into(),
-            definition: String::new(),
-        };
+        let wire_type = WireType::named("p/T");
         Message {
             bytes,
             wire_type: Arc::new(wire_type),

@@ -15,6 +15,7 @@ mod heard;
 mod lending;
 mod link;
 mod master_client;
+mod parameters;
 mod publications;
 mod registrar;
 mod server;
@@ -24,7 +25,7 @@ mod subscriptions;
 mod topic_type;
 mod watcher;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::fmt;
 use std::future::Future;
 use std::io;
@@ -34,7 +35,6 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -42,57 +42,26 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 
 use self::calls::CallPool;
-use self::lending::Lending;
+use self::lending::Loans;
 use self::master_client::MasterClient;
 use self::publications::TopicOut;
 use self::registrar::Registrar;
 use self::services::Served;
 use self::subscriptions::TopicIn;
-use super::{names, tcpros};
+use super::names;
+use crate::JoinOptions;
 use crate::bus::{
-    AdvertiseOptions, Bus, BusError, Graph, Lender, ParamChange, ParamChanges, ParamValue,
-    Publisher, ServiceHandler, ServiceProvider, ServiceType, SubscribeOptions, Subscription,
-    WireType,
+    Bus, BusError, Digest, GlobalParameters, Graph, Hearing, Lending, ParamChange, ParamValue,
+    Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
-use crate::ros1::tcpros::FrameBounds;
-use crate::ros1::xmlrpc::{self, Client, Limits, Value};
+use crate::ros1::tcpros::{FrameBounds, Header};
+use crate::ros1::xmlrpc::{self, Client, Limits};
 
 /// For a peer to accept a connection and answer its header.
 const HANDSHAKE: Duration = Duration::from_secs(10);
 /// For queued messages and unregistrations when the bus closes.
 const FAREWELL: Duration = Duration::from_secs(2);
-
-/// How to join a ROS 1 system.
-#[derive(Debug, Clone)]
-pub struct Ros1Options {
-    /// Where the Master listens, as seen from the sockets' place.
-    pub master: SocketAddr,
-    /// The node's absolute name.
-    pub node_name: String,
-    /// The host that other nodes reach this one under; the address used towards the Master where `None`.
-    pub host: Option<String>,
-    /// A message longer than this ends its connection.
-    pub max_message: usize,
-    /// Where what is read from nodes counts until it is whole; what does not fit ends its connection.
-    pub budget: Budget,
-    /// A message that was begun and is not whole after this time ends its connection.
-    pub unfinished: Duration,
-}
-
-impl Ros1Options {
-    /// A node of this name at this Master.
-    pub fn new(master: SocketAddr, node_name: &str) -> Self {
-        Self {
-            master,
-            node_name: node_name.to_owned(),
-            host: None,
-            max_message: tcpros::MAX_MESSAGE,
-            budget: Budget::unlimited(),
-            unfinished: tcpros::UNFINISHED,
-        }
-    }
-}
 
 /// A ROS 1 system as a [`Bus`]. Dropping it closes all connections but leaves the registrations, as a crash
 /// would; [`Bus::close`] takes them back.
@@ -114,7 +83,7 @@ struct Inner {
     publications: Mutex<HashMap<String, Arc<TopicOut>>>,
     services: Mutex<HashMap<String, Arc<Served>>>,
     label: OnceLock<String>,
-    lending: Lending,
+    lending: Loans,
     calls: CallPool,
     publisher_clients: heard::PublisherClients,
     graph: watch::Sender<Arc<Graph>>,
@@ -133,16 +102,16 @@ impl Ros1Bus {
         master: SocketAddr,
         node_name: &str,
     ) -> Result<Arc<Self>, BusError> {
-        Self::connect_with(sockets, Ros1Options::new(master, node_name)).await
+        Self::connect_with(sockets, JoinOptions::new(master, node_name)).await
     }
 
     /// Joins a ROS system. Fails if the Master does not answer now.
     pub async fn connect_with(
         sockets: Arc<dyn Sockets>,
-        options: Ros1Options,
+        options: JoinOptions,
     ) -> Result<Arc<Self>, BusError> {
-        if !names::is_global(&options.node_name) {
-            return Err(BusError::BadName(options.node_name));
+        if !names::is_global(&options.node) {
+            return Err(BusError::BadName(options.node));
         }
         let io = |what: String| move |source: io::Error| BusError::Io { what, source };
         let to_master = format!("ROS Master at {}", options.master);
@@ -181,7 +150,7 @@ impl Ros1Bus {
         let master = Arc::new(MasterClient::new(
             sockets.clone(),
             options.master,
-            &options.node_name,
+            &options.node,
             &options.budget,
         )?);
         let registrar = Registrar::new(
@@ -191,7 +160,7 @@ impl Ros1Bus {
         );
         let inner = Arc::new(Inner {
             sockets,
-            node: options.node_name,
+            node: options.node,
             host,
             port,
             frames: FrameBounds {
@@ -205,7 +174,7 @@ impl Ros1Bus {
             publications: Mutex::default(),
             services: Mutex::default(),
             label: OnceLock::new(),
-            lending: Lending::default(),
+            lending: Loans::default(),
             calls: CallPool::default(),
             publisher_clients: heard::PublisherClients::default(),
             graph: watch::Sender::new(Arc::default()),
@@ -242,18 +211,6 @@ impl Ros1Bus {
     /// The address of this node's slave API, as the Master knows it.
     pub fn uri(&self) -> &str {
         self.inner.registrar.slave_uri()
-    }
-
-    /// Is told to whoever calls or probes services of this node, by those that are served from now on: what belongs
-    /// together knows itself by it. The first one stays.
-    pub fn set_label(&self, label: &str) {
-        let _ = self.inner.label.set(label.to_owned());
-    }
-
-    /// Becomes the reason when someone asked this node to end (`rosnode kill`, or another node of the same
-    /// name). The bus itself goes on: whether to obey is its owner's decision.
-    pub fn shutdown_requested(&self) -> watch::Receiver<Option<String>> {
-        self.inner.shutdown.subscribe()
     }
 }
 
@@ -334,8 +291,29 @@ impl Inner {
     }
 }
 
+/// What a header of TCPROS says of its end's type.
+fn announced(header: &Header) -> WireType {
+    WireType::new(
+        header.get("type").unwrap_or("*"),
+        header.get("md5sum").unwrap_or("*"),
+        header.text("message_definition"),
+    )
+}
+
 #[async_trait]
 impl Bus for Ros1Bus {
+    fn version(&self) -> RosVersion {
+        RosVersion::One
+    }
+
+    /// `/rosdistro` as roslaunch sets it.
+    async fn distribution(&self) -> String {
+        match self.get("/rosdistro").await {
+            Ok(ParamValue::String(distribution)) => distribution.trim().to_owned(),
+            _ => "noetic".to_owned(),
+        }
+    }
+
     fn node(&self) -> &str {
         &self.inner.node
     }
@@ -347,19 +325,21 @@ impl Bus for Ros1Bus {
     async fn subscribe(
         &self,
         topic: &str,
-        options: SubscribeOptions,
+        of: WireType,
+        qos: Qos,
     ) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
-        subscriptions::subscribe(&self.inner, topic, options).await
+        subscriptions::subscribe(&self.inner, topic, of, qos).await
     }
 
     async fn advertise(
         &self,
         topic: &str,
-        options: AdvertiseOptions,
+        of: WireType,
+        qos: Qos,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
-        publications::advertise(&self.inner, topic, options).await
+        publications::advertise(&self.inner, topic, of, qos).await
     }
 
     async fn call(
@@ -368,44 +348,29 @@ impl Bus for Ros1Bus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        self.inner.check_name(service)?;
-        calls::call(&self.inner, service, None, request, timeout).await
+        self.call_typed(service, &Digest::any(), request, timeout)
+            .await
     }
 
     async fn call_typed(
         &self,
         service: &str,
-        md5: &str,
+        digest: &Digest,
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
         self.inner.check_name(service)?;
-        calls::call(&self.inner, service, Some(md5), request, timeout).await
+        calls::call(&self.inner, service, digest, request, timeout).await
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
-        let provider = self.service_provider(service).await?;
+        let provider = self.provider(service).await?;
         Ok(provider.service_type)
-    }
-
-    async fn service_provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
-        self.inner.check_name(service)?;
-        calls::probe(&self.inner, service).await
-    }
-
-    async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
-        self.inner.check_open()?;
-        self.inner.lending.begin(lender);
-        self.inner.tell_that_it_lends().await
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
         self.inner.check_name(topic)?;
         topic_type::find(&self.inner, topic).await
-    }
-
-    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<(String, i32)>, BusError> {
-        heard::connections(&self.inner, topic).await
     }
 
     async fn serve(
@@ -418,58 +383,21 @@ impl Bus for Ros1Bus {
         services::serve(&self.inner, service, service_type, handler).await
     }
 
-    async fn get_param(&self, key: &str) -> Result<ParamValue, BusError> {
-        match self.inner.master.ask("getParam", vec![key.into()]).await? {
-            Ok(value) => Ok(value.into()),
-            Err(_) => Err(BusError::NoParam(key.to_owned())),
-        }
+    fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
+        Ok(self)
     }
 
-    async fn set_param(&self, key: &str, value: ParamValue) -> Result<(), BusError> {
-        let value = Value::try_from(value).map_err(|reason| BusError::BadParam {
-            key: key.to_owned(),
-            reason,
-        })?;
-        let set = self.inner.master.call("setParam", vec![key.into(), value]);
-        set.await.map(drop)
+    fn lending(&self) -> Result<&dyn Lending, BusError> {
+        Ok(self)
     }
 
-    async fn delete_param(&self, key: &str) -> Result<(), BusError> {
-        let answer = self.inner.master.ask("deleteParam", vec![key.into()]);
-        match answer.await? {
-            Ok(_) => Ok(()),
-            Err(_) => Err(BusError::NoParam(key.to_owned())),
-        }
+    fn hearing(&self) -> Option<&dyn Hearing> {
+        Some(self)
     }
 
-    async fn has_param(&self, key: &str) -> Result<bool, BusError> {
-        let has = self.inner.master.call("hasParam", vec![key.into()]).await?;
-        Ok(has == Value::Bool(true))
-    }
-
-    async fn search_param(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError> {
-        let asker = names::canonical(namespace);
-        let found = self
-            .inner
-            .master
-            .ask_as(&asker, "searchParam", vec![key.into()]);
-        Ok(match found.await? {
-            Ok(Value::String(found)) => Some(found),
-            _ => None,
-        })
-    }
-
-    async fn param_names(&self) -> Result<Vec<String>, BusError> {
-        let names = self.inner.master.call("getParamNames", vec![]).await?;
-        Ok(names.to_strings())
-    }
-
-    async fn watch_params(&self) -> Result<ParamChanges, BusError> {
-        self.inner.check_open()?;
-        let (sender, changes) = mpsc::unbounded_channel();
-        *self.inner.param_watcher.lock() = Some(sender);
-        self.inner.subscribe_params().await?;
-        Ok(changes)
+    /// By `rosnode kill`, or by another node of the same name.
+    fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {
+        Some(self.inner.shutdown.subscribe())
     }
 
     async fn close(&self) {

@@ -24,6 +24,7 @@ use tokio::sync::watch;
 
 use crate::bus::{Graph, ParamValue, ParameterUse};
 use crate::net::{LoopbackSockets, Sockets};
+use crate::ros1::actions;
 use crate::ros1::xmlrpc::{self, Limits, Value};
 use lending::Lending;
 use notify::{Notice, Notifier};
@@ -225,13 +226,14 @@ impl Inner {
         let state = self.state.lock();
         let owned = |(name, text): (&str, &str)| (name.to_owned(), text.to_owned());
         let uses = state.uses.iter();
+        let topics = state.registry.topics();
+        let topics = topics
+            .map(|(name, topic)| (name.to_owned(), topic))
+            .collect();
         Graph {
             generation: *self.generation.borrow(),
-            topics: state
-                .registry
-                .topics()
-                .map(|(name, topic)| (name.to_owned(), topic))
-                .collect(),
+            actions: actions::of_topics(&topics),
+            topics,
             services: state.registry.services().map(owned).collect(),
             nodes: state.registry.nodes().map(owned).collect(),
             parameters: uses

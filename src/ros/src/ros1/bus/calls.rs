@@ -13,7 +13,7 @@ use super::link::broken;
 use super::registrar::Kind;
 use super::services::LABEL;
 use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Graph, ServiceProvider, ServiceType};
+use crate::bus::{BusError, Digest, Graph, ServiceProvider, ServiceType};
 use crate::ros1::names::PeerUri;
 use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
 
@@ -97,7 +97,7 @@ impl CallPool {
 pub(super) async fn call(
     bus: &Arc<Inner>,
     service: &str,
-    md5: Option<&str>,
+    digest: &Digest,
     request: Bytes,
     time: Duration,
 ) -> Result<Bytes, BusError> {
@@ -117,9 +117,7 @@ pub(super) async fn call(
                     }
                 }
             };
-            if let Some(md5) = md5 {
-                same_type(service, md5, kept.connection.header())?;
-            }
+            same_type(service, digest, kept.connection.header())?;
             match kept.connection.call(request.clone()).await {
                 Ok(answer) => {
                     bus.calls.put(service, kept, &bus.graph);
@@ -147,17 +145,16 @@ pub(super) async fn call(
     })
 }
 
-fn same_type(service: &str, ours: &str, header: &Header) -> Result<(), BusError> {
-    match header.get("md5sum") {
-        Some(theirs) if theirs != ours && theirs != "*" && ours != "*" => {
-            Err(BusError::TypeMismatch {
-                what: format!("service {service}"),
-                theirs: format!("{} {theirs}", header.get("type").unwrap_or("*")),
-                ours: ours.to_owned(),
-            })
-        }
-        _ => Ok(()),
+fn same_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusError> {
+    let theirs = Digest::from(header.get("md5sum").unwrap_or("*"));
+    if theirs.agrees(ours) {
+        return Ok(());
     }
+    Err(BusError::TypeMismatch {
+        what: format!("service {service}"),
+        theirs: format!("{} {theirs}", header.get("type").unwrap_or("*")),
+        ours: ours.to_string(),
+    })
 }
 
 /// Asks a server for its type, and who it is.
@@ -177,10 +174,7 @@ pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceProv
     match (header.get("type"), header.get("md5sum")) {
         (Some(name), Some(md5)) => Ok(ServiceProvider {
             node: header.get("callerid").unwrap_or_default().to_owned(),
-            service_type: ServiceType {
-                name: name.to_owned(),
-                md5: md5.to_owned(),
-            },
+            service_type: ServiceType::new(name, md5),
             label: header.get(LABEL).map(str::to_owned),
         }),
         _ => Err(BusError::Protocol {
@@ -266,10 +260,7 @@ mod tests {
         let master = TestMaster::start().await;
         let join = |name| Ros1Bus::connect(Arc::new(HostSockets), master.address, name);
         let (server, caller) = (join("/old").await.unwrap(), join("/caller").await.unwrap());
-        let service_type = ServiceType {
-            name: "pkg/Who".to_owned(),
-            md5: "abcd".to_owned(),
-        };
+        let service_type = ServiceType::new("pkg/Who", "abcd");
         let _served = server.serve("/who", service_type, Arc::new(Echo)).await;
         let connection = || async {
             let opened = open(&caller.inner, "/who", ("persistent", "1")).await;

@@ -5,11 +5,12 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use async_trait::async_trait;
 use parking_lot::Mutex;
 
 use super::master_client::to_bus_error;
-use super::{HANDSHAKE, Inner};
-use crate::bus::BusError;
+use super::{HANDSHAKE, Inner, Ros1Bus};
+use crate::bus::{BusError, Hearing, PeerId};
 use crate::ros1::reply::Reply;
 use crate::ros1::xmlrpc::{Client, Value};
 
@@ -51,11 +52,14 @@ async fn forget(bus: Arc<Inner>) {
     }
 }
 
-/// The connections over which the topic's publishers send to `bus`: each publisher with its own number of it.
-pub(super) async fn connections(
-    bus: &Arc<Inner>,
-    topic: &str,
-) -> Result<BTreeSet<(String, i32)>, BusError> {
+#[async_trait]
+impl Hearing for Ros1Bus {
+    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
+        connections(&self.inner, topic).await
+    }
+}
+
+async fn connections(bus: &Arc<Inner>, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
     let graph = bus.graph.borrow().clone();
     let ends = graph.topics.get(topic);
     let publishers = ends.map(|ends| ends.publishers.clone());
@@ -77,7 +81,7 @@ pub(super) async fn connections(
             let ours = peer.as_str() == Some(&bus.node)
                 && direction.as_str() == Some("o")
                 && of.as_str() == Some(topic);
-            ours.then(|| (node.clone(), *id))
+            ours.then(|| PeerId::new(node.as_str(), id.unsigned_abs().into()))
         });
         found.extend(ours);
     }

@@ -3,22 +3,23 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use async_trait::async_trait;
 use parking_lot::Mutex;
 
-use super::Inner;
 use super::services::Served;
-use crate::bus::{BusError, Lender, Lent};
+use super::{Inner, Ros1Bus, calls};
+use crate::bus::{BusError, Lender, Lending, Lent, ServiceProvider};
 use crate::ros1::master::lending::LEND_SERVICES;
 use crate::ros1::names;
 
 /// The lender, and what it has lent, by name.
 #[derive(Default)]
-pub(super) struct Lending {
+pub(super) struct Loans {
     lender: Mutex<Option<Arc<dyn Lender>>>,
     lent: Mutex<HashMap<String, Arc<Served>>>,
 }
 
-impl Lending {
+impl Loans {
     pub(super) fn begin(&self, lender: Arc<dyn Lender>) {
         *self.lender.lock() = Some(lender);
     }
@@ -59,6 +60,24 @@ impl Lending {
         };
         lent.insert(service.to_owned(), Arc::new(served));
         true
+    }
+}
+
+#[async_trait]
+impl Lending for Ros1Bus {
+    async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
+        self.inner.check_open()?;
+        self.inner.lending.begin(lender);
+        self.inner.tell_that_it_lends().await
+    }
+
+    async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
+        self.inner.check_name(service)?;
+        calls::probe(&self.inner, service).await
+    }
+
+    fn set_label(&self, label: &str) {
+        let _ = self.inner.label.set(label.to_owned());
     }
 }
 

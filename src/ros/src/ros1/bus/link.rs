@@ -15,7 +15,7 @@ use tokio::time::{sleep, timeout};
 use super::master_client::to_bus_error;
 use super::subscriptions::TopicIn;
 use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Message, WireType};
+use crate::bus::{BusError, Message, PeerId, WireType};
 use crate::net;
 use crate::ros1::reply::Reply;
 use crate::ros1::tcpros::{self, FrameReader, Header};
@@ -35,7 +35,7 @@ pub(super) struct Link {
     task: Mutex<Option<AbortHandle>>,
     peer: Mutex<Option<Arc<WireType>>>,
     /// Its name, from the first connection on until it has left.
-    pub(super) publisher: Mutex<Option<Arc<str>>>,
+    pub(super) publisher: Mutex<Option<PeerId>>,
     pub(super) connected: AtomicBool,
     pub(super) messages: AtomicU64,
     pub(super) bytes: AtomicU64,
@@ -94,9 +94,8 @@ async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
             result = connect_and_read(&bus, &topic, &link) => result,
             () = left(&mut listed, GRACE) => Ok(()),
         };
-        if link.connected.swap(false, Ordering::Relaxed) {
+        if topic.lost(&link) {
             pause = PAUSE;
-            topic.connected.send_modify(|count| *count -= 1);
         } else {
             // Not even a connection: what there was before has ended for good.
             topic.left(&link);
@@ -148,10 +147,7 @@ async fn connect_and_read(
     } = connection;
     let wire_type = Arc::new(wire_type);
     *link.peer.lock() = Some(wire_type.clone());
-    let publisher: Arc<str> = publisher.into();
     topic.came(link, &publisher);
-    link.connected.store(true, Ordering::Relaxed);
-    topic.connected.send_modify(|count| *count += 1);
     loop {
         let next = frames.next(&mut stream).await;
         let Some(bytes) = next.map_err(|error| broken(&link.uri, error))? else {
@@ -175,7 +171,7 @@ async fn connect_and_read(
 pub(super) struct Connection {
     stream: TcpStream,
     frames: FrameReader,
-    publisher: String,
+    publisher: PeerId,
     latching: bool,
     pub(super) wire_type: WireType,
 }
@@ -193,7 +189,7 @@ pub(super) async fn connect(
         ("callerid", bus.node.as_str()),
         ("topic", topic),
         ("type", &wanted.name),
-        ("md5sum", &wanted.md5),
+        ("md5sum", wanted.digest.as_str()),
         ("tcp_nodelay", "1"),
     ]);
     let mut buffer = BytesMut::new();
@@ -213,22 +209,18 @@ pub(super) async fn connect(
             });
         }
     };
-    let wire_type = WireType {
-        name: answer.get("type").unwrap_or("*").to_owned(),
-        md5: answer.get("md5sum").unwrap_or("*").to_owned(),
-        definition: answer.text("message_definition").to_owned(),
-    };
-    if wanted.md5 != "*" && wire_type.md5 != "*" && wanted.md5 != wire_type.md5 {
+    let wire_type = super::announced(&answer);
+    if !wanted.agrees(&wire_type) {
         return Err(BusError::TypeMismatch {
             what: topic.to_owned(),
-            theirs: format!("{} {}", wire_type.name, wire_type.md5),
-            ours: format!("{} {}", wanted.name, wanted.md5),
+            theirs: wire_type.to_string(),
+            ours: wanted.to_string(),
         });
     }
     Ok(Connection {
         stream,
         frames: FrameReader::new(buffer, bus.frames.clone()),
-        publisher: answer.get("callerid").unwrap_or(uri).to_owned(),
+        publisher: PeerId::new(answer.get("callerid").unwrap_or(uri), 0),
         latching: answer.flag("latching"),
         wire_type,
     })

@@ -10,14 +10,14 @@ use tokio::sync::{mpsc, watch};
 
 use super::Inner;
 use super::registrar::Kind;
-use crate::bus::{AdvertiseOptions, BusError, Publisher, WireType};
+use crate::bus::{BusError, Matched, Peer, PeerId, Publisher, Qos, WireType};
 use crate::ros1::tcpros::Outbox;
 
 /// One topic with everyone here who publishes it, and every subscriber.
 #[derive(Default)]
 pub(super) struct TopicOut {
     state: Mutex<State>,
-    count: watch::Sender<usize>,
+    matched: watch::Sender<Matched>,
     dropped: AtomicU64,
 }
 
@@ -31,15 +31,14 @@ struct State {
 }
 
 struct LocalPublisher {
-    latch: bool,
-    queue: usize,
+    qos: Qos,
     last: Option<Bytes>,
 }
 
 /// One connected subscriber.
 pub(super) struct Subscriber {
     pub(super) id: i32,
-    pub(super) name: String,
+    pub(super) peer: PeerId,
     pub(super) outbox: Outbox,
     pub(super) messages: AtomicU64,
     pub(super) bytes: AtomicU64,
@@ -50,15 +49,15 @@ pub(super) struct Subscriber {
 pub(super) async fn advertise(
     bus: &Arc<Inner>,
     name: &str,
-    options: AdvertiseOptions,
+    of: WireType,
+    qos: Qos,
 ) -> Result<Box<dyn Publisher>, BusError> {
     let id = bus.id();
     let topic = {
         let mut topics = bus.publications.lock();
         let topic = topics.entry(name.to_owned()).or_default();
-        topic.add(name, id, &options)?;
-        let type_name = options.wire_type.name.as_str();
-        bus.registrar.want(Kind::Publisher, name, Some(type_name));
+        topic.add(name, id, &of, qos)?;
+        bus.registrar.want(Kind::Publisher, name, Some(&of.name));
         topic.clone()
     };
     let handle = Handle {
@@ -107,25 +106,20 @@ impl Drop for Asking {
 }
 
 impl TopicOut {
-    fn add(&self, name: &str, id: i32, options: &AdvertiseOptions) -> Result<(), BusError> {
+    fn add(&self, name: &str, id: i32, ours: &WireType, qos: Qos) -> Result<(), BusError> {
         let mut state = self.state.lock();
-        let ours = &options.wire_type;
         match &state.advert {
-            Some(before) if before.md5 != ours.md5 => {
+            Some(before) if before.digest != ours.digest => {
                 return Err(BusError::TypeMismatch {
                     what: format!("advertisement of {name}"),
-                    theirs: format!("{} {}", before.name, before.md5),
-                    ours: format!("{} {}", ours.name, ours.md5),
+                    theirs: before.to_string(),
+                    ours: ours.to_string(),
                 });
             }
             Some(_) => {}
             None => state.advert = Some(ours.clone()),
         }
-        let local = LocalPublisher {
-            latch: options.latch,
-            queue: options.queue,
-            last: None,
-        };
+        let local = LocalPublisher { qos, last: None };
         state.locals.insert(id, local);
         Ok(())
     }
@@ -133,7 +127,7 @@ impl TopicOut {
     /// What is advertised, and whether newcomers are given something.
     pub(super) fn advert(&self) -> Option<(WireType, bool)> {
         let state = self.state.lock();
-        let latching = state.locals.values().any(|local| local.latch);
+        let latching = state.locals.values().any(|local| local.qos.is_latching());
         state.advert.clone().map(|advert| (advert, latching))
     }
 
@@ -153,21 +147,21 @@ impl TopicOut {
     }
 
     /// Adds a subscriber, with all that is latched already queued for it; `None` if no longer advertised.
-    pub(super) fn attach(&self, id: i32, name: String) -> Option<Arc<Subscriber>> {
+    pub(super) fn attach(&self, id: i32, name: &str) -> Option<Arc<Subscriber>> {
         let mut state = self.state.lock();
         state.advert.as_ref()?;
-        let queue = state.locals.values().map(|local| local.queue).max();
+        let queue = state.locals.values().map(|local| local.qos.depth).max();
         let latched = state.locals.values().filter_map(|local| local.last.clone());
         let subscriber = Arc::new(Subscriber {
             id,
-            name,
+            peer: PeerId::new(name, id.unsigned_abs().into()),
             outbox: Outbox::new(queue.unwrap_or(1), latched),
             messages: AtomicU64::new(0),
             bytes: AtomicU64::new(0),
             closing: watch::Sender::new(false),
         });
         state.subscribers.push(subscriber.clone());
-        self.count.send_replace(state.subscribers.len());
+        self.matched.send_replace(state.matched());
         Some(subscriber)
     }
 
@@ -176,7 +170,7 @@ impl TopicOut {
         state
             .subscribers
             .retain(|other| !Arc::ptr_eq(other, subscriber));
-        self.count.send_replace(state.subscribers.len());
+        self.matched.send_replace(state.matched());
     }
 
     fn publish(&self, id: i32, message: Bytes) {
@@ -184,7 +178,7 @@ impl TopicOut {
         let Some(local) = state.locals.get_mut(&id) else {
             return;
         };
-        if local.latch {
+        if local.qos.is_latching() {
             local.last = Some(message.clone());
         }
         let mut lost = 0;
@@ -206,12 +200,25 @@ impl TopicOut {
 
     /// Returns when all subscribers are gone.
     pub(super) async fn emptied(&self) {
-        let _ = self.count.subscribe().wait_for(|count| *count == 0).await;
+        let mut matched = self.matched.subscribe();
+        let _ = matched.wait_for(|matched| matched.peers.is_empty()).await;
     }
 
     /// The connected subscribers.
     pub(super) fn subscribers(&self) -> Vec<Arc<Subscriber>> {
         self.state.lock().subscribers.clone()
+    }
+}
+
+impl State {
+    fn matched(&self) -> Matched {
+        let peers = self.subscribers.iter().map(|subscriber| Peer {
+            id: subscriber.peer.clone(),
+            connected: true,
+        });
+        Matched {
+            peers: peers.collect(),
+        }
     }
 }
 
@@ -260,13 +267,8 @@ impl Publisher for Handle {
         self.topic.publish(self.id, bytes);
     }
 
-    fn subscribers(&self) -> watch::Receiver<usize> {
-        self.topic.count.subscribe()
-    }
-
-    fn subscriber_names(&self) -> Vec<String> {
-        let subscribers = self.topic.subscribers();
-        subscribers.iter().map(|peer| peer.name.clone()).collect()
+    fn matched(&self) -> watch::Receiver<Matched> {
+        self.topic.matched.subscribe()
     }
 
     fn dropped(&self) -> u64 {

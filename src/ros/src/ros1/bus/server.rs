@@ -12,7 +12,6 @@ use tokio::time::timeout;
 
 use super::publications::{Subscriber, TopicOut};
 use super::{FAREWELL, HANDSHAKE, Inner, services};
-use crate::bus::WireType;
 use crate::net;
 use crate::ros1::tcpros::{Error, Header};
 
@@ -84,11 +83,7 @@ async fn subscriber(
     header: &Header,
     mut stream: TcpStream,
 ) -> Result<(), Error> {
-    let asked = WireType {
-        name: header.get("type").unwrap_or("*").to_owned(),
-        md5: header.get("md5sum").unwrap_or("*").to_owned(),
-        definition: header.text("message_definition").to_owned(),
-    };
+    let asked = super::announced(header);
     let overheard = topic.overhear(&asked);
     let caller = header.get("callerid").unwrap_or("unknown");
     let Some((advert, latching)) = topic.advert() else {
@@ -99,16 +94,16 @@ async fn subscriber(
         let node = &bus.node;
         return refuse(stream, &format!("{node} no longer publishes {name}")).await;
     };
-    if asked.md5 != "*" && advert.md5 != "*" && asked.md5 != advert.md5 {
+    if !asked.agrees(&advert) {
         let reason = format!(
             "{caller} wants topic {name} to have datatype/md5sum [{}/{}], but our version has [{}/{}]; \
              dropping connection",
-            asked.name, asked.md5, advert.name, advert.md5
+            asked.name, asked.digest, advert.name, advert.digest
         );
         tracing::warn!(topic = name, reason, "a subscriber was refused");
         return refuse(stream, &reason).await;
     }
-    let Some(subscriber) = topic.attach(bus.id(), caller.to_owned()) else {
+    let Some(subscriber) = topic.attach(bus.id(), caller) else {
         return Ok(());
     };
     let attached = Attached { topic, subscriber };
@@ -116,7 +111,7 @@ async fn subscriber(
         ("callerid", bus.node.as_str()),
         ("topic", name),
         ("type", &advert.name),
-        ("md5sum", &advert.md5),
+        ("md5sum", advert.digest.as_str()),
         ("message_definition", &advert.definition),
         ("latching", if latching { "1" } else { "0" }),
     ]);

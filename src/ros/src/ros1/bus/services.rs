@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use super::Inner;
 use super::registrar::Kind;
 use super::server::refuse;
-use crate::bus::{BusError, ServiceHandler, ServiceType};
+use crate::bus::{BusError, Digest, ServiceHandler, ServiceType};
 use crate::ros1::tcpros::{Error, Header, serve_calls};
 
 /// For a caller to take a header.
@@ -106,11 +106,11 @@ pub(super) async fn answer(
         return refuse(stream, &format!("{} does not serve {name}", bus.node)).await;
     };
     let ours = &served.service_type;
-    let asked = header.get("md5sum").unwrap_or("*");
-    if asked != "*" && ours.md5 != "*" && asked != ours.md5 {
+    let asked = Digest::from(header.get("md5sum").unwrap_or("*"));
+    if !asked.agrees(&ours.digest) {
         let reason = format!(
             "client wants service {name} to have md5sum {asked}, but it has {}; dropping connection",
-            ours.md5
+            ours.digest
         );
         return refuse(stream, &reason).await;
     }
@@ -118,7 +118,7 @@ pub(super) async fn answer(
         ("callerid", bus.node.as_str()),
         ("service", name),
         ("type", &ours.name),
-        ("md5sum", &ours.md5),
+        ("md5sum", ours.digest.as_str()),
         ("request_type", &format!("{}Request", ours.name)),
         ("response_type", &format!("{}Response", ours.name)),
     ]);
@@ -133,7 +133,7 @@ pub(super) async fn answer(
         return Ok(stream.shutdown().await?);
     }
     let caller = header.get("callerid").unwrap_or("unknown");
-    let handler = served.handler.for_md5(asked);
+    let handler = served.handler.for_type(&asked);
     serve_calls(
         stream,
         buffer,

@@ -174,7 +174,7 @@ impl Slave {
         let mut rows = Vec::new();
         for (name, topic) in self.bus.publications.lock().iter() {
             for subscriber in topic.subscribers() {
-                rows.push(row(subscriber.id, &subscriber.name, "o", name, true));
+                rows.push(row(subscriber.id, subscriber.peer.node(), "o", name, true));
             }
         }
         for topic in self.bus.subscriptions.lock().values() {

@@ -1,7 +1,8 @@
 //! Topics that this node subscribes to: several local subscriptions share one set of connections.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -11,7 +12,8 @@ use super::Inner;
 use super::link::{self, Link};
 use super::registrar::Kind;
 use crate::bus::{
-    BusError, Message, MessageSender, SubscribeOptions, Subscription, WireType, message_queue,
+    BusError, Matched, Message, MessageSender, Peer, PeerId, Qos, Subscription, WireType,
+    message_queue,
 };
 use crate::ros1::tcpros;
 
@@ -20,10 +22,8 @@ pub(super) struct TopicIn {
     pub(super) name: String,
     locals: Mutex<Locals>,
     links: Mutex<Links>,
-    /// Links that are connected.
-    pub(super) connected: watch::Sender<usize>,
     /// Publishers that have not left.
-    present: watch::Sender<BTreeSet<Arc<str>>>,
+    matched: watch::Sender<Matched>,
 }
 
 /// One connection per publisher, by its address.
@@ -43,19 +43,12 @@ struct Locals {
 struct Local {
     id: i32,
     sender: MessageSender,
-    wanted: Option<WireType>,
+    wanted: WireType,
 }
 
 impl Local {
-    fn takes(&self, offered: &WireType) -> bool {
-        let Some(wanted) = &self.wanted else {
-            return true;
-        };
-        wanted.md5 == "*" || offered.md5 == "*" || wanted.md5 == offered.md5
-    }
-
     fn send(&self, message: Message) {
-        if self.takes(&message.wire_type) {
+        if self.wanted.agrees(&message.wire_type) {
             self.sender.send(message);
         }
     }
@@ -65,9 +58,10 @@ impl Local {
 pub(super) async fn subscribe(
     bus: &Arc<Inner>,
     name: &str,
-    options: SubscribeOptions,
+    wanted: WireType,
+    qos: Qos,
 ) -> Result<Subscription, BusError> {
-    let (sender, messages) = message_queue(options.queue);
+    let (sender, messages) = message_queue(qos.depth);
     let id = bus.id();
     let (topic, first) = {
         let mut topics = bus.subscriptions.lock();
@@ -78,15 +72,10 @@ pub(super) async fn subscribe(
                 name: name.to_owned(),
                 locals: Mutex::default(),
                 links: Mutex::default(),
-                connected: watch::Sender::new(0),
-                present: watch::Sender::default(),
+                matched: watch::Sender::default(),
             })
         });
-        topic.add(Local {
-            id,
-            sender,
-            wanted: options.wire_type,
-        });
+        topic.add(Local { id, sender, wanted });
         bus.registrar
             .want(Kind::Subscriber, name, Some(&topic.type_name()));
         (topic.clone(), first)
@@ -104,8 +93,7 @@ pub(super) async fn subscribe(
     Ok(Subscription {
         dropped: messages.dropped(),
         messages,
-        publishers: topic.connected.subscribe(),
-        present: topic.present.subscribe(),
+        matched: topic.matched.subscribe(),
         guard: Box::new(guard),
     })
 }
@@ -122,24 +110,19 @@ impl TopicIn {
     /// What publishers are asked for: the type all locals agree on, or any.
     pub(super) fn wanted(&self) -> WireType {
         let locals = self.locals.lock();
-        let any = || WireType {
-            name: "*".to_owned(),
-            md5: "*".to_owned(),
-            definition: String::new(),
-        };
-        let mut types = locals.list.iter().map(|local| local.wanted.as_ref());
+        let mut types = locals.list.iter().map(|local| &local.wanted);
         match types.next() {
-            Some(Some(first)) if types.all(|other| other.is_some_and(|o| o.md5 == first.md5)) => {
+            Some(first) if types.all(|o| (&o.name, &o.digest) == (&first.name, &first.digest)) => {
                 first.clone()
             }
-            _ => any(),
+            _ => WireType::any(),
         }
     }
 
     /// What the Master is told: the first type that anyone here named.
     pub(super) fn type_name(&self) -> String {
         let locals = self.locals.lock();
-        let mut types = locals.list.iter().filter_map(|local| local.wanted.as_ref());
+        let mut types = locals.list.iter().map(|local| &local.wanted);
         let named = types.find(|wanted| wanted.name != "*");
         named.map_or("*", |wanted| &wanted.name).to_owned()
     }
@@ -197,16 +180,24 @@ impl TopicIn {
         true
     }
 
-    /// The link's publisher has said its name.
-    pub(super) fn came(&self, link: &Link, publisher: &Arc<str>) {
+    /// The link's publisher is connected, and has said its name.
+    pub(super) fn came(&self, link: &Link, publisher: &PeerId) {
         let links = self.links.lock();
         let before = link.publisher.lock().clone();
         if before.is_some_and(|before| before != *publisher) {
             self.forget(&links, link);
         }
         *link.publisher.lock() = Some(publisher.clone());
-        self.present
-            .send_if_modified(|present| present.insert(publisher.clone()));
+        link.connected.store(true, Ordering::Relaxed);
+        self.show(&links);
+    }
+
+    /// The link has lost its connection; whether it had one.
+    pub(super) fn lost(&self, link: &Link) -> bool {
+        let links = self.links.lock();
+        let was_connected = link.connected.swap(false, Ordering::Relaxed);
+        self.show(&links);
+        was_connected
     }
 
     /// The link's publisher cannot be reached any more: what it has latched is gone with it.
@@ -216,16 +207,29 @@ impl TopicIn {
 
     fn forget(&self, links: &Links, link: &Link) {
         self.locals.lock().latched.remove(link.uri());
-        let Some(publisher) = link.publisher.lock().take() else {
-            return;
-        };
-        // It may be back at another address.
-        let mut others = links.by_uri.values();
-        let back = others.any(|other| other.publisher.lock().as_ref() == Some(&publisher));
-        if !back {
-            self.present
-                .send_if_modified(|present| present.remove(&publisher));
+        if link.publisher.lock().take().is_some() {
+            self.show(links);
         }
+    }
+
+    /// Tells the subscriptions who is there.
+    fn show(&self, links: &Links) {
+        let peers = links.by_uri.values().filter_map(|link| {
+            Some(Peer {
+                id: link.publisher.lock().clone()?,
+                connected: link.connected.load(Ordering::Relaxed),
+            })
+        });
+        let now = Matched {
+            peers: peers.collect(),
+        };
+        self.matched.send_if_modified(|before| {
+            let news = *before != now;
+            if news {
+                *before = now;
+            }
+            news
+        });
     }
 
     /// Closes all connections and ends all local subscriptions.

@@ -6,7 +6,7 @@ mod services;
 mod topics;
 
 use super::*;
-use crate::bus::{Message, MessageReceiver};
+use crate::bus::{Message, MessageReceiver, PeerId};
 use crate::net::HostSockets;
 use crate::ros1::testing::{LONG, TestMaster};
 
@@ -18,32 +18,23 @@ pub(super) async fn join(master: &TestMaster, name: &str) -> Arc<Ros1Bus> {
 }
 
 pub(super) fn text_type(md5: &str) -> WireType {
-    WireType {
-        name: "std_msgs/String".to_owned(),
-        md5: md5.to_owned(),
-        definition: "string data\n".to_owned(),
-    }
+    WireType::new("std_msgs/String", md5, "string data\n")
 }
 
-pub(super) fn publishing(latch: bool) -> AdvertiseOptions {
-    AdvertiseOptions {
-        wire_type: text_type("992c"),
-        latch,
-        queue: 100,
-    }
+pub(super) async fn says(bus: &Ros1Bus, topic: &str, latch: bool) -> Box<dyn Publisher> {
+    let qos = Qos::keep_last(100).latching(latch);
+    bus.advertise(topic, text_type("992c"), qos).await.unwrap()
 }
 
-pub(super) fn any() -> SubscribeOptions {
-    SubscribeOptions {
-        wire_type: None,
-        queue: 100,
-    }
+pub(super) async fn hears(bus: &Ros1Bus, topic: &str) -> Subscription {
+    let qos = Qos::keep_last(100);
+    bus.subscribe(topic, WireType::any(), qos).await.unwrap()
 }
 
 /// Waits until `count` subscribers are connected.
 pub(super) async fn connected(publisher: &dyn Publisher, count: usize) {
-    let mut now = publisher.subscribers();
-    let reached = tokio::time::timeout(LONG, now.wait_for(|now| *now == count));
+    let mut now = publisher.matched();
+    let reached = tokio::time::timeout(LONG, now.wait_for(|now| now.connected() == count));
     reached.await.expect("subscribers should connect").unwrap();
 }
 

@@ -13,7 +13,7 @@ use crate::bus::{BusError, Graph, TopicNodes, WireType};
 const ANSWER: Duration = Duration::from_secs(3);
 
 /// The type by whatever is at hand: what we advertise, what we are connected to, a publisher's header, what
-/// subscribers ask for. Where only a name is known (all ends take any md5), md5 is `*`.
+/// subscribers ask for. Where only a name is known (all ends take any md5), the digest is `*`.
 pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusError> {
     let ours = bus.publications.lock().get(name).cloned();
     if let Some((advert, _)) = ours.as_ref().and_then(|topic| topic.advert()) {
@@ -32,8 +32,10 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
     let mut failure = None;
     let publishers = topic.publishers.iter().filter(|node| **node != bus.node);
     for uri in publishers.filter_map(|node| graph.nodes.get(node)) {
-        match link::connect(bus, name, uri, &any()).await {
-            Ok(connection) if connection.wire_type.md5 != "*" => return Ok(connection.wire_type),
+        match link::connect(bus, name, uri, &WireType::any()).await {
+            Ok(connection) if !connection.wire_type.digest.is_any() => {
+                return Ok(connection.wire_type);
+            }
             Ok(_) => {}
             Err(error) => failure = Some(error),
         }
@@ -42,20 +44,9 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
         return Ok(asked);
     }
     match failure {
-        _ if topic.type_name != "*" => Ok(WireType {
-            name: topic.type_name.clone(),
-            ..any()
-        }),
+        _ if topic.type_name != "*" => Ok(WireType::named(&topic.type_name)),
         Some(failure) => Err(failure),
-        None => Ok(any()),
-    }
-}
-
-fn any() -> WireType {
-    WireType {
-        name: "*".to_owned(),
-        md5: "*".to_owned(),
-        definition: String::new(),
+        None => Ok(WireType::any()),
     }
 }
 
@@ -79,7 +70,7 @@ async fn subscribers(
             let Some(asked) = asking.answers.recv().await else {
                 break;
             };
-            if asked.md5 != "*" {
+            if !asked.digest.is_any() {
                 return Some(asked);
             }
             missing -= 1;

@@ -9,6 +9,7 @@ use tokio::time::sleep;
 use super::Inner;
 use super::master_client::to_bus_error;
 use crate::bus::{BusError, Graph, TopicNodes};
+use crate::ros1::actions;
 use crate::ros1::master::graph::{WAIT_GRAPH, from_value, wire_generation};
 use crate::ros1::xmlrpc::{self, Value};
 
@@ -129,7 +130,8 @@ impl Watcher {
     }
 
     /// Brings everything in line with the graph, then shows it.
-    async fn take(&self, graph: Graph) {
+    async fn take(&self, mut graph: Graph) {
+        graph.actions = actions::of_topics(&graph.topics);
         let bus = &self.bus;
         bus.calls.keep_current(&graph);
         if self.waits {

@@ -136,6 +136,7 @@ mod tests {
                 },
             )]
             .into(),
+            actions: BTreeMap::new(),
             sought: [("/map".to_owned(), vec!["/b".to_owned()])].into(),
         };
         let (read, run_id) = from_value(&to_value(&graph, "r")).unwrap();

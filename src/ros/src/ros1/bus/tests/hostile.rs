@@ -6,7 +6,7 @@ use tokio::net::TcpListener;
 use super::*;
 use crate::ros1::tcpros::Header;
 use crate::ros1::testing::TestNode;
-use crate::ros1::xmlrpc::Client;
+use crate::ros1::xmlrpc::{Client, Value};
 
 /// A publisher made by hand: what it sends to one connection after the other.
 async fn publisher(master: &TestMaster, scripts: Vec<Vec<u8>>) -> TestNode {
@@ -49,11 +49,11 @@ async fn a_publisher_that_breaks_off_or_lies_is_tried_again() {
         script(b"\x04\0\0\0good"),
     ];
     let node = publisher(&master, scripts).await;
-    let mut subscription = bus.subscribe("/chat", any()).await.unwrap();
+    let mut subscription = hears(&bus, "/chat").await;
     let message = next(&mut subscription.messages).await;
     assert_eq!(message.bytes, "good");
     // It did not say who it is: then its address has to do.
-    assert_eq!(*message.publisher, *node.uri);
+    assert_eq!(message.publisher.node(), node.uri);
 }
 
 #[tokio::test]
@@ -76,8 +76,8 @@ async fn a_publisher_that_stalls_holds_up_no_other() {
     let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
     let list = ["/hung", "/chat", "std_msgs/String", &hung_uri].map(Value::from);
     master.call("registerPublisher", &list).await;
-    let mut subscription = one.subscribe("/chat", any()).await.unwrap();
-    let good = two.advertise("/chat", publishing(true)).await.unwrap();
+    let mut subscription = hears(&one, "/chat").await;
+    let good = says(&two, "/chat", true).await;
     good.publish("here".into());
     assert_eq!(next_text(&mut subscription.messages).await, "here");
 }
@@ -86,16 +86,16 @@ async fn a_publisher_that_stalls_holds_up_no_other() {
 async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let options = AdvertiseOptions {
-        queue: 2,
-        ..publishing(false)
-    };
-    let publisher = one.advertise("/chat", options).await.unwrap();
+    let qos = Qos::keep_last(2);
+    let publisher = one
+        .advertise("/chat", text_type("992c"), qos)
+        .await
+        .unwrap();
     let address: SocketAddr = ([127, 0, 0, 1], one.inner.port).into();
     let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
     let header = Header::new([("topic", "/chat"), ("md5sum", "*"), ("callerid", "/lazy")]);
     header.write(&mut lazy).await.unwrap();
-    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    let mut subscription = hears(&two, "/chat").await;
     connected(&*publisher, 2).await;
     let big = Bytes::from(vec![7; 1 << 20]);
     for _ in 0..100 {
@@ -110,7 +110,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     let read = tokio::time::timeout(LONG, lazy.read_to_end(&mut rest)).await;
     assert!(read.is_ok() && rest.len() > 1 << 20);
     // A publisher's end does not wait for the like of it for longer than the farewell.
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
     let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
     header.write(&mut lazy).await.unwrap();
     connected(&*publisher, 2).await;
@@ -136,7 +136,7 @@ async fn a_master_that_refuses_is_quoted() {
     // A refusal of a single call.
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
-    let error = bus.set_param("/", ParamValue::Int(1)).await.unwrap_err();
+    let error = bus.set("/", ParamValue::Int(1)).await.unwrap_err();
     assert!(error.to_string().contains("refused setParam"), "{error}");
     assert!(error.to_string().contains("dictionary"), "{error}");
 }
@@ -146,13 +146,21 @@ async fn a_failed_registration_leaves_nothing_behind() {
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     let address = master.stop().await;
-    assert!(bus.subscribe("/chat", any()).await.is_err());
-    assert!(bus.advertise("/chat", publishing(false)).await.is_err());
+    assert!(
+        bus.subscribe("/chat", WireType::any(), Qos::keep_last(100))
+            .await
+            .is_err()
+    );
+    assert!(
+        bus.advertise("/chat", text_type("992c"), Qos::keep_last(100))
+            .await
+            .is_err()
+    );
     assert_eq!(bus.inner.subscriptions.lock().len(), 0);
     assert_eq!(bus.inner.publications.lock().len(), 0);
     let fresh = crate::ros1::master::Master::new(Default::default());
     let master = TestMaster::with(fresh, Some(address)).await;
-    let _subscription = bus.subscribe("/chat", any()).await.unwrap();
+    let _subscription = hears(&bus, "/chat").await;
     master
         .until(|graph| graph.topics.contains_key("/chat"))
         .await;
@@ -162,8 +170,8 @@ async fn a_failed_registration_leaves_nothing_behind() {
 async fn the_slave_api_answers_what_tools_ask() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
-    let _subscription = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
+    let _subscription = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     let client = Client::new(Arc::new(HostSockets), one.uri()).unwrap();
     let ask = async |method: &str, args: &[Value]| {
@@ -193,7 +201,7 @@ async fn the_slave_api_answers_what_tools_ask() {
     assert_eq!(ask("publisherUpdate", &caller).await[0], (-1).into());
     // Told to end, the bus passes it on and lives.
     ask("shutdown", &["/tool".into(), "enough".into()]).await;
-    let mut asked = one.shutdown_requested();
+    let mut asked = one.shutdown_requested().unwrap();
     let reason = asked.wait_for(Option::is_some).await.unwrap().clone();
     assert_eq!(reason.as_deref(), Some("enough"));
     assert_eq!(ask("getPid", &caller).await[0], 1.into());

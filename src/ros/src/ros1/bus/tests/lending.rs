@@ -1,7 +1,8 @@
 use super::*;
-use crate::bus::Lent;
+use crate::bus::{Lender, Lent};
 use crate::ros1::master::{Master, MasterOptions};
 use crate::ros1::testing::args;
+use crate::ros1::xmlrpc::Value;
 
 /// Lends one service as long as it is there, and notes who looked for what.
 #[derive(Default)]
@@ -31,10 +32,7 @@ impl Lender for Counters {
         self.0.asked.lock().push(asked);
         let (md5, gone) = self.0.on_offer.lock().clone()?;
         Some(Lent {
-            service_type: ServiceType {
-                name: "pkg/Add".to_owned(),
-                md5,
-            },
+            service_type: ServiceType::new("pkg/Add", md5),
             handler: Arc::new(Counter),
             gone,
         })
@@ -64,9 +62,9 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     let missing = node.call("/add", "x".into(), LONG).await.unwrap_err();
     assert!(matches!(missing, BusError::NoService(_)), "{missing}");
     let ending = shop.offers("abcd");
-    let provider = node.service_provider("/add").await.unwrap();
+    let provider = node.provider("/add").await.unwrap();
     assert_eq!(provider.node, "/keeper");
-    assert_eq!(provider.service_type.md5, "abcd");
+    assert_eq!(provider.service_type.digest, "abcd");
     assert_eq!(node.call("/add", "1".into(), LONG).await.unwrap(), "1");
     let failed = node.call("/add", "fail".into(), LONG).await.unwrap_err();
     assert!(failed.to_string().contains("not for /node"), "{failed}");
@@ -76,7 +74,10 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     // One with another type takes its place: kept connections end, and who means the first is told.
     let _second = shop.offers("beef");
     ending.send_replace(true);
-    let typed = |md5: &'static str| node.call_typed("/add", md5, "2".into(), LONG);
+    let typed = async |digest: &str| {
+        let digest = Digest::from(digest);
+        node.call_typed("/add", &digest, "2".into(), LONG).await
+    };
     let other = async {
         loop {
             match typed("abcd").await {
@@ -98,19 +99,16 @@ async fn what_is_registered_comes_first_and_the_lender_asks_for_itself_in_vain()
     let _ending = shop.offers("abcd");
     let node = join(&master, "/node").await;
     let own = Arc::new(Counter);
-    let of_type = ServiceType {
-        name: "pkg/Add".to_owned(),
-        md5: "beef".to_owned(),
-    };
+    let of_type = ServiceType::new("pkg/Add", "beef");
     let serving = node.serve("/add", of_type, own).await.unwrap();
     let other = join(&master, "/other").await;
-    assert_eq!(other.service_type("/add").await.unwrap().md5, "beef");
+    assert_eq!(other.service_type("/add").await.unwrap().digest, "beef");
     assert!(shop.asked.lock().is_empty(), "{:?}", shop.asked);
     drop(serving);
     master.until(|graph| graph.services.is_empty()).await;
     let missing = keeper.call("/add", "x".into(), LONG).await.unwrap_err();
     assert!(matches!(missing, BusError::NoService(_)), "{missing}");
-    assert_eq!(other.service_type("/add").await.unwrap().md5, "abcd");
+    assert_eq!(other.service_type("/add").await.unwrap().digest, "abcd");
     // Those that were looked for in vain are remembered, with who did.
     assert!(master.master.graph().sought.contains_key("/add"));
 }

@@ -5,8 +5,9 @@ use tokio::net::TcpListener;
 use tokio::sync::Barrier;
 
 use super::*;
-use crate::ros1::tcpros::Header;
+use crate::ros1::tcpros::{self, Header};
 use crate::ros1::testing::TestNode;
+use crate::ros1::xmlrpc::Value;
 
 /// Answers with what it was asked; `fail` fails, `meet` waits for a second one.
 struct Echo {
@@ -29,10 +30,7 @@ impl ServiceHandler for Echo {
 }
 
 fn add_type() -> ServiceType {
-    ServiceType {
-        name: "pkg/Add".to_owned(),
-        md5: "abcd".to_owned(),
-    }
+    ServiceType::new("pkg/Add", "abcd")
 }
 
 async fn serve(bus: &Ros1Bus) -> Box<dyn Send + Sync> {

@@ -3,21 +3,22 @@ use std::sync::atomic::AtomicUsize;
 use super::*;
 use crate::ros1::master::{Master, MasterOptions};
 use crate::ros1::testing::args;
+use crate::ros1::xmlrpc::Value;
 
 #[tokio::test]
 async fn messages_go_from_bus_to_bus_with_their_type() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     // The subscription comes first: the publisher is connected when it registers.
-    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let mut subscription = hears(&two, "/chat").await;
+    let publisher = says(&one, "/chat", false).await;
     connected(&*publisher, 1).await;
     publisher.publish("a".into());
     publisher.publish(Bytes::from(vec![b'x'; 1_000_000]));
     publisher.publish("".into());
     let message = next(&mut subscription.messages).await;
     assert_eq!(
-        (&message.bytes[..], &*message.publisher),
+        (&message.bytes[..], message.publisher.node()),
         (&b"a"[..], "/one")
     );
     assert_eq!(*message.wire_type, text_type("992c"));
@@ -40,8 +41,8 @@ async fn messages_go_from_bus_to_bus_with_their_type() {
 async fn what_is_queued_is_sent_before_a_publisher_ends() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let mut subscription = hears(&two, "/chat").await;
+    let publisher = says(&one, "/chat", false).await;
     connected(&*publisher, 1).await;
     for n in 0..100u8 {
         publisher.publish(Bytes::from(vec![n; 10_000]));
@@ -56,10 +57,10 @@ async fn what_is_queued_is_sent_before_a_publisher_ends() {
 async fn a_bus_does_not_hear_itself() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let mut echo = one.subscribe("/chat", any()).await.unwrap();
-    let ours = one.advertise("/chat", publishing(true)).await.unwrap();
-    let theirs = two.advertise("/chat", publishing(true)).await.unwrap();
-    let mut other = two.subscribe("/chat", any()).await.unwrap();
+    let mut echo = hears(&one, "/chat").await;
+    let ours = says(&one, "/chat", true).await;
+    let theirs = says(&two, "/chat", true).await;
+    let mut other = hears(&two, "/chat").await;
     ours.publish("mine".into());
     theirs.publish("yours".into());
     assert_eq!(next_text(&mut other.messages).await, "mine");
@@ -72,16 +73,16 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     // Two handles of one bus keep a message each, so do two buses.
-    let first = one.advertise("/tf_static", publishing(true)).await.unwrap();
-    let second = one.advertise("/tf_static", publishing(true)).await.unwrap();
-    let third = two.advertise("/tf_static", publishing(true)).await.unwrap();
+    let first = says(&one, "/tf_static", true).await;
+    let second = says(&one, "/tf_static", true).await;
+    let third = says(&two, "/tf_static", true).await;
     first.publish("old".into());
     first.publish("first".into());
     second.publish("second".into());
     third.publish("third".into());
     let three = join(&master, "/three").await;
     let hear = async || {
-        let mut subscription = three.subscribe("/tf_static", any()).await.unwrap();
+        let mut subscription = hears(&three, "/tf_static").await;
         let mut heard = Vec::new();
         for _ in 0..2 {
             let message = next(&mut subscription.messages).await;
@@ -95,13 +96,13 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
     let (_subscription, heard) = hear().await;
     assert_eq!(heard, ["first", "second", "third"]);
     // A later local subscription shares the connections; the last of each publisher is kept for it.
-    let mut later = three.subscribe("/tf_static", any()).await.unwrap();
+    let mut later = hears(&three, "/tf_static").await;
     let mut again = [
         next(&mut later.messages).await,
         next(&mut later.messages).await,
     ];
     again.sort_by(|a, b| a.publisher.cmp(&b.publisher));
-    assert_eq!(&*again[0].publisher, "/one");
+    assert_eq!(again[0].publisher.node(), "/one");
     assert_eq!(again[1].bytes, "third");
     // What a publisher latched goes with it.
     drop(third);
@@ -115,8 +116,8 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
         }
     };
     tokio::time::timeout(LONG, released).await.unwrap();
-    let mut last = three.subscribe("/tf_static", any()).await.unwrap();
-    assert_eq!(&*next(&mut last.messages).await.publisher, "/one");
+    let mut last = hears(&three, "/tf_static").await;
+    assert_eq!(next(&mut last.messages).await.publisher.node(), "/one");
     assert!(last.messages.is_empty());
 }
 
@@ -124,19 +125,19 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
 async fn a_publisher_says_whom_it_sends_to() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
     until(&two, |graph| graph.topics.contains_key("/chat")).await;
     assert!(two.heard_over("/chat").await.unwrap().is_empty());
-    let first = two.subscribe("/chat", any()).await.unwrap();
+    let first = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     let before = two.heard_over("/chat").await.unwrap();
     assert_eq!(
-        before.iter().map(|(node, _)| node).collect::<Vec<_>>(),
+        before.iter().map(PeerId::node).collect::<Vec<_>>(),
         ["/one"]
     );
     drop(first);
     connected(&*publisher, 0).await;
-    let _second = two.subscribe("/chat", any()).await.unwrap();
+    let _second = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     let after = two.heard_over("/chat").await.unwrap();
     assert!(
@@ -167,7 +168,7 @@ async fn counted(to: std::net::SocketAddr) -> (String, Arc<AtomicUsize>) {
 async fn a_publisher_is_asked_again_on_the_same_connection() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let _publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let _publisher = says(&one, "/chat", false).await;
     let address = one.uri().trim_start_matches("http://");
     let address = address.trim_end_matches('/').to_owned();
     let (uri, count) = counted(address.parse().unwrap()).await;
@@ -185,21 +186,21 @@ async fn a_publisher_is_asked_again_on_the_same_connection() {
 async fn local_subscriptions_share_one_connection() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
-    let mut first = two.subscribe("/chat", any()).await.unwrap();
-    let mut second = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
+    let mut first = hears(&two, "/chat").await;
+    let mut second = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     publisher.publish("both".into());
     assert_eq!(next_text(&mut first.messages).await, "both");
     assert_eq!(next_text(&mut second.messages).await, "both");
-    assert_eq!(*publisher.subscribers().borrow(), 1);
+    assert_eq!(publisher.matched().borrow().connected(), 1);
     drop(first);
     publisher.publish("one".into());
     assert_eq!(next_text(&mut second.messages).await, "one");
     drop(second);
     connected(&*publisher, 0).await;
     // And again at once, while the end of the former is perhaps still under way.
-    let mut third = two.subscribe("/chat", any()).await.unwrap();
+    let mut third = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     publisher.publish("back".into());
     assert_eq!(next_text(&mut third.messages).await, "back");
@@ -209,10 +210,10 @@ async fn local_subscriptions_share_one_connection() {
 async fn a_slow_receiver_loses_the_oldest_and_knows_how_many() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
-    let options = SubscribeOptions { queue: 3, ..any() };
-    let mut slow = two.subscribe("/chat", options).await.unwrap();
-    let mut quick = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
+    let qos = Qos::keep_last(3);
+    let mut slow = two.subscribe("/chat", WireType::any(), qos).await.unwrap();
+    let mut quick = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     for n in 0..10u8 {
         publisher.publish(Bytes::from(vec![n]));
@@ -228,12 +229,11 @@ async fn a_slow_receiver_loses_the_oldest_and_knows_how_many() {
 async fn different_definitions_do_not_meet() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
-    let options = SubscribeOptions {
-        wire_type: Some(text_type("0000")),
-        queue: 10,
-    };
-    let mut wrong = two.subscribe("/chat", options).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
+    let mut wrong = two
+        .subscribe("/chat", text_type("0000"), Qos::keep_last(10))
+        .await
+        .unwrap();
     let direct = link::connect(&two.inner, "/chat", one.uri(), &text_type("0000")).await;
     let refusal = direct.err().unwrap().to_string();
     assert!(
@@ -241,17 +241,14 @@ async fn different_definitions_do_not_meet() {
         "{refusal}"
     );
     // Beside one that takes anything, it still gets nothing of the other type.
-    let mut right = two.subscribe("/chat", any()).await.unwrap();
+    let mut right = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     publisher.publish("text".into());
     assert_eq!(next_text(&mut right.messages).await, "text");
     assert!(wrong.messages.try_recv().is_none());
     // Nor may one side advertise a topic as two things.
-    let options = AdvertiseOptions {
-        wire_type: text_type("0000"),
-        ..publishing(false)
-    };
-    let error = one.advertise("/chat", options).await.err().unwrap();
+    let again = one.advertise("/chat", text_type("0000"), Qos::keep_last(1));
+    let error = again.await.err().unwrap();
     assert!(matches!(error, BusError::TypeMismatch { .. }), "{error}");
 }
 
@@ -261,14 +258,13 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let error = two.topic_type("/chat").await.unwrap_err();
     assert!(matches!(error, BusError::NoTopic(_)), "{error}");
-    let options = SubscribeOptions {
-        wire_type: Some(text_type("992c")),
-        queue: 1,
-    };
-    let subscription = one.subscribe("/chat", options).await.unwrap();
+    let subscription = one
+        .subscribe("/chat", text_type("992c"), Qos::keep_last(1))
+        .await
+        .unwrap();
     let asked = two.topic_type("/chat").await.unwrap();
     assert_eq!(
-        (asked.name.as_str(), asked.md5.as_str()),
+        (asked.name.as_str(), asked.digest.as_str()),
         ("std_msgs/String", "992c")
     );
     // Nothing of the question remains.
@@ -276,21 +272,21 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
         .until(|graph| graph.topics["/chat"].publishers.is_empty())
         .await;
     drop(subscription);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
     assert_eq!(two.topic_type("/chat").await.unwrap(), text_type("992c"));
     assert_eq!(one.topic_type("/chat").await.unwrap(), text_type("992c"));
     drop(publisher);
     // Someone who takes anything can only say that.
-    let _relay = one.subscribe("/any", any()).await.unwrap();
-    assert_eq!(two.topic_type("/any").await.unwrap().md5, "*");
+    let _relay = hears(&one, "/any").await;
+    assert_eq!(two.topic_type("/any").await.unwrap().digest, "*");
 }
 
 #[tokio::test]
 async fn a_master_that_forgot_is_told_again() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(false)).await.unwrap();
-    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    let publisher = says(&one, "/chat", false).await;
+    let mut subscription = hears(&two, "/chat").await;
     connected(&*publisher, 1).await;
     let address = master.stop().await;
     let master = TestMaster::with(Master::new(MasterOptions::default()), Some(address)).await;
@@ -306,7 +302,7 @@ async fn a_master_that_forgot_is_told_again() {
     assert_eq!(next_text(&mut subscription.messages).await, "still here");
     // Newcomers find each other as before.
     let three = join(&master, "/three").await;
-    let mut late = three.subscribe("/chat", any()).await.unwrap();
+    let mut late = hears(&three, "/chat").await;
     connected(&*publisher, 2).await;
     publisher.publish("welcome".into());
     assert_eq!(next_text(&mut late.messages).await, "welcome");
@@ -327,12 +323,12 @@ async fn what_the_master_has_too_much_is_taken_back() {
 async fn the_graph_follows_and_close_takes_everything_back() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = one.advertise("/chat", publishing(true)).await.unwrap();
+    let publisher = says(&one, "/chat", true).await;
     publisher.publish("last words".into());
-    let mut own = one.subscribe("/other", any()).await.unwrap();
-    let mut subscription = two.subscribe("/chat", any()).await.unwrap();
+    let mut own = hears(&one, "/other").await;
+    let mut subscription = hears(&two, "/chat").await;
     until(&two, |graph| graph.topics.contains_key("/other")).await;
-    one.set_param("/p", ParamValue::Int(1)).await.unwrap();
+    one.set("/p", ParamValue::Int(1)).await.unwrap();
     until(&two, |graph| graph.parameters.contains_key("/p")).await;
     connected(&*publisher, 1).await;
     one.close().await;
@@ -340,7 +336,9 @@ async fn the_graph_follows_and_close_takes_everything_back() {
     until(&two, |graph| !graph.nodes.contains_key("/one")).await;
     assert!(own.messages.recv().await.is_none());
     publisher.publish("into the void".into());
-    let late = one.subscribe("/chat", any()).await;
+    let late = one
+        .subscribe("/chat", WireType::any(), Qos::keep_last(100))
+        .await;
     assert!(matches!(late, Err(BusError::Closed)));
 }
 
@@ -358,27 +356,19 @@ async fn parameters_are_read_and_written() {
         ]
         .into(),
     );
-    bus.set_param("/ns", map.clone()).await.unwrap();
-    assert_eq!(bus.get_param("/ns").await.unwrap(), map);
-    assert!(bus.has_param("/ns/a").await.unwrap());
-    let found = bus.search_param("/ns/deeper", "a").await.unwrap();
+    bus.set("/ns", map.clone()).await.unwrap();
+    assert_eq!(bus.get("/ns").await.unwrap(), map);
+    assert!(bus.has("/ns/a").await.unwrap());
+    let found = bus.search("/ns/deeper", "a").await.unwrap();
     assert_eq!(found.as_deref(), Some("/ns/a"));
-    assert_eq!(bus.search_param("/", "a").await.unwrap(), None);
-    assert!(
-        bus.param_names()
-            .await
-            .unwrap()
-            .contains(&"/ns/b".to_owned())
-    );
-    bus.delete_param("/ns").await.unwrap();
-    for gone in [
-        bus.get_param("/ns/a").await.err(),
-        bus.delete_param("/ns").await.err(),
-    ] {
+    assert_eq!(bus.search("/", "a").await.unwrap(), None);
+    assert!(bus.names().await.unwrap().contains(&"/ns/b".to_owned()));
+    bus.delete("/ns").await.unwrap();
+    for gone in [bus.get("/ns/a").await.err(), bus.delete("/ns").await.err()] {
         assert!(matches!(gone, Some(BusError::NoParam(_))));
     }
     let wide = ParamValue::Map([("w".to_owned(), ParamValue::Int(1 << 40))].into());
-    let error = bus.set_param("/ns", wide).await.unwrap_err().to_string();
+    let error = bus.set("/ns", wide).await.unwrap_err().to_string();
     assert!(error.contains("/ns") && error.contains("w: "), "{error}");
 }
 
@@ -387,7 +377,11 @@ async fn only_absolute_names_are_taken() {
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     for name in ["", "relative", "/a b", "~private", "/a//b"] {
-        let error = bus.subscribe(name, any()).await.err().unwrap();
+        let error = bus
+            .subscribe(name, WireType::any(), Qos::keep_last(100))
+            .await
+            .err()
+            .unwrap();
         assert!(matches!(error, BusError::BadName(_)), "{name}: {error}");
     }
     let sockets = Arc::new(HostSockets);

@@ -1,0 +1,78 @@
+//! Parameters that all nodes share, where a ROS has them.
+
+use std::collections::BTreeMap;
+
+use async_trait::async_trait;
+use tokio::sync::mpsc;
+
+use super::BusError;
+
+/// One changed parameter: its key, and its value unless it was deleted.
+pub type ParamChange = (String, Option<ParamValue>);
+
+/// Parameters as they change: key and value, or no value where one was deleted.
+pub type ParamChanges = mpsc::UnboundedReceiver<ParamChange>;
+
+/// The parameters of a whole ROS system. ROS 1 has them; ROS 2's belong to nodes.
+#[async_trait]
+pub trait GlobalParameters: Send + Sync {
+    /// Reads a parameter or a whole namespace (`/` for all).
+    async fn get(&self, key: &str) -> Result<ParamValue, BusError>;
+    /// Sets a parameter; a map replaces the namespace below `key`.
+    async fn set(&self, key: &str, value: ParamValue) -> Result<(), BusError>;
+    /// Removes a parameter.
+    async fn delete(&self, key: &str) -> Result<(), BusError>;
+    /// Whether it is set.
+    async fn has(&self, key: &str) -> Result<bool, BusError>;
+    /// Searches upwards from `namespace`, as ROS does.
+    async fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
+    /// All keys that are set.
+    async fn names(&self) -> Result<Vec<String>, BusError>;
+    /// Every change of any parameter from now on, those made by this side included. One watcher at a time: another
+    /// takes the place of the first.
+    async fn watch(&self) -> Result<ParamChanges, BusError>;
+}
+
+/// A ROS parameter value. NaN equals NaN: whoever looks for what has changed would never be done otherwise.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+#[serde(untagged)]
+pub enum ParamValue {
+    /// `true` or `false`.
+    Bool(bool),
+    /// 32-bit on the XML-RPC wire; wider values are refused there.
+    Int(i64),
+    /// A double.
+    Double(f64),
+    /// UTF-8 text.
+    String(String),
+    /// Bytes: XML-RPC's base64. In JSON it is written as base64 text, and read back as text.
+    #[serde(serialize_with = "as_base64", skip_deserializing)]
+    Binary(Vec<u8>),
+    /// Nothing: a Master may hold it, ROS knows no such value. It is never sent.
+    #[serde(skip_deserializing)]
+    Nil,
+    /// A list.
+    List(Vec<ParamValue>),
+    /// A dictionary.
+    Map(BTreeMap<String, ParamValue>),
+}
+
+fn as_base64<S: serde::Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&base64_simd::STANDARD.encode_to_string(bytes))
+}
+
+impl PartialEq for ParamValue {
+    fn eq(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Bool(a), Self::Bool(b)) => a == b,
+            (Self::Int(a), Self::Int(b)) => a == b,
+            (Self::Double(a), Self::Double(b)) => a == b || (a.is_nan() && b.is_nan()),
+            (Self::String(a), Self::String(b)) => a == b,
+            (Self::Binary(a), Self::Binary(b)) => a == b,
+            (Self::Nil, Self::Nil) => true,
+            (Self::List(a), Self::List(b)) => a == b,
+            (Self::Map(a), Self::Map(b)) => a == b,
+            _ => false,
+        }
+    }
+}

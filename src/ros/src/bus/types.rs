@@ -1,0 +1,177 @@
+//! The types of topics and services as their ends declare them to each other.
+
+use std::fmt;
+use std::sync::Arc;
+
+use crate::schema::{MessageType, SchemaError, ServiceDef};
+
+/// How messages are written between the ends of a topic or service.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum WireFormat {
+    /// Little endian, unaligned, lengths of four bytes (<http://wiki.ros.org/ROS/Technical%20Overview>).
+    #[default]
+    Ros1,
+}
+
+/// What tells definitions of one name apart: the MD5 of a ROS 1 type, 32 lower-case hex digits, or the type hash of a ROS 2
+/// type (`RIHS01_…`).
+#[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Digest(Arc<str>);
+
+impl Digest {
+    /// `*`: agrees with all.
+    pub fn any() -> Self {
+        Self::from("*")
+    }
+
+    /// Whether it is `*`.
+    pub fn is_any(&self) -> bool {
+        &*self.0 == "*"
+    }
+
+    /// As text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    /// Whether ends with these digests understand each other.
+    pub fn agrees(&self, other: &Digest) -> bool {
+        self.is_any() || other.is_any() || self == other
+    }
+}
+
+impl From<&str> for Digest {
+    fn from(text: &str) -> Self {
+        Self(text.into())
+    }
+}
+
+impl From<&String> for Digest {
+    fn from(text: &String) -> Self {
+        Self(text.as_str().into())
+    }
+}
+
+impl From<String> for Digest {
+    fn from(text: String) -> Self {
+        Self(text.into())
+    }
+}
+
+impl From<&Digest> for Digest {
+    fn from(digest: &Digest) -> Self {
+        digest.clone()
+    }
+}
+
+impl PartialEq<str> for Digest {
+    fn eq(&self, other: &str) -> bool {
+        &*self.0 == other
+    }
+}
+
+impl PartialEq<&str> for Digest {
+    fn eq(&self, other: &&str) -> bool {
+        &*self.0 == *other
+    }
+}
+
+impl fmt::Display for Digest {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(&self.0)
+    }
+}
+
+impl fmt::Debug for Digest {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(&self.0)
+    }
+}
+
+/// The type of a topic's messages.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct WireType {
+    /// `package/Type`, or `*` where nobody has said.
+    pub name: String,
+    /// How its messages are written.
+    pub format: WireFormat,
+    /// Of its definition and all that this contains.
+    pub digest: Digest,
+    /// The full text with dependencies, where it is known (ROS 1 publishers send it), else empty.
+    pub definition: String,
+}
+
+impl WireType {
+    /// A type of the ROS 1 format.
+    pub fn new(
+        name: impl Into<String>,
+        digest: impl Into<Digest>,
+        definition: impl Into<String>,
+    ) -> Self {
+        Self {
+            name: name.into(),
+            format: WireFormat::Ros1,
+            digest: digest.into(),
+            definition: definition.into(),
+        }
+    }
+
+    /// A type whose definition is known.
+    pub fn of(message: &MessageType) -> Self {
+        Self::new(message.name(), message.md5(), message.full_text())
+    }
+
+    /// A type of which only the name is known: any definition will do.
+    pub fn named(name: &str) -> Self {
+        Self::new(name, "*", "")
+    }
+
+    /// Any type.
+    pub fn any() -> Self {
+        Self::named("*")
+    }
+
+    /// Whether messages of one are understood by who expects the other.
+    pub fn agrees(&self, other: &WireType) -> bool {
+        self.format == other.format && self.digest.agrees(&other.digest)
+    }
+
+    /// What its definition says.
+    pub fn schema(&self) -> Result<Arc<MessageType>, SchemaError> {
+        MessageType::from_full_text(&self.name, &self.definition)
+    }
+}
+
+/// Name and digest, for messages.
+impl fmt::Display for WireType {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{} {}", self.name, self.digest)
+    }
+}
+
+/// The type of a service's requests and responses.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServiceType {
+    /// `package/Type`.
+    pub name: String,
+    /// How its messages are written.
+    pub format: WireFormat,
+    /// Of request and response together.
+    pub digest: Digest,
+}
+
+impl ServiceType {
+    /// A type of the ROS 1 format.
+    pub fn new(name: impl Into<String>, digest: impl Into<Digest>) -> Self {
+        Self {
+            name: name.into(),
+            format: WireFormat::Ros1,
+            digest: digest.into(),
+        }
+    }
+
+    /// A type whose definition is known.
+    pub fn of(service: &ServiceDef) -> Self {
+        Self::new(&*service.name, &*service.md5)
+    }
+}

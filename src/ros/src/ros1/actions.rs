@@ -1,0 +1,70 @@
+//! Actions of ROS 1: five topics below one name, as actionlib has them
+//! (<http://wiki.ros.org/actionlib/DetailedDescription>).
+
+use std::collections::BTreeMap;
+
+use crate::bus::{ActionNodes, TopicNodes};
+
+/// What follows an action's name in the names of its topics.
+pub(crate) const PARTS: [&str; 5] = ["goal", "cancel", "status", "feedback", "result"];
+
+/// The actions that these topics make.
+pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<String, ActionNodes> {
+    let mut found = BTreeMap::new();
+    for (topic, goal) in topics {
+        let Some(name) = topic.strip_suffix("/goal").filter(|name| !name.is_empty()) else {
+            continue;
+        };
+        let parts = PARTS.map(|part| format!("{name}/{part}"));
+        let Some(result) = topics.get(&parts[4]) else {
+            continue;
+        };
+        if !parts.iter().all(|part| topics.contains_key(part)) {
+            continue;
+        }
+        let answers = |node: &&String| result.publishers.contains(*node);
+        let type_name = goal.type_name.strip_suffix("ActionGoal");
+        let nodes = ActionNodes {
+            type_name: type_name.unwrap_or("*").to_owned(),
+            servers: goal.subscribers.iter().filter(answers).cloned().collect(),
+            clients: goal.publishers.clone(),
+            topics: parts.into(),
+        };
+        found.insert(name.to_owned(), nodes);
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn five_topics_below_one_name_are_an_action() {
+        let topic = |name: &str| {
+            let of_server = name.ends_with("result") || name.ends_with("status");
+            let mut ends = [vec!["/user".to_owned()], vec!["/server".to_owned()]];
+            if of_server {
+                ends.reverse();
+            }
+            let [publishers, subscribers] = ends;
+            let nodes = TopicNodes {
+                type_name: "x/DoActionGoal".to_owned(),
+                publishers,
+                subscribers,
+            };
+            (name.to_owned(), nodes)
+        };
+        let mut topics: BTreeMap<_, _> = PARTS.map(|part| topic(&format!("/do/{part}"))).into();
+        topics.extend(PARTS.map(|part| topic(&format!("/{part}"))));
+        topics.extend([topic("/half/goal"), topic("/half/result")]);
+        let found = of_topics(&topics);
+        let action = ActionNodes {
+            type_name: "x/Do".to_owned(),
+            servers: vec!["/server".to_owned()],
+            clients: vec!["/user".to_owned()],
+            topics: PARTS.map(|part| format!("/do/{part}")).into(),
+        };
+        assert_eq!(found, [("/do".to_owned(), action)].into());
+    }
+}

@@ -1,0 +1,287 @@
+//! How actionlib (ROS 1) writes goals, feedback and results: the parts common to all actions stand before the
+//! action's own message, so they are read and written by hand and the rest stays a slice.
+//!
+//! <http://wiki.ros.org/actionlib/DetailedDescription>
+
+use bytes::Bytes;
+use ros::codec::Time;
+
+/// `actionlib_msgs/GoalStatus`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub(crate) enum Status {
+    Pending = 0,
+    Active = 1,
+    Preempted = 2,
+    Succeeded = 3,
+    Aborted = 4,
+    Rejected = 5,
+    Preempting = 6,
+    Recalling = 7,
+    Recalled = 8,
+    Lost = 9,
+}
+
+impl Status {
+    fn from_number(number: u8) -> Option<Self> {
+        use Status::*;
+        [
+            Pending, Active, Preempted, Succeeded, Aborted, Rejected, Preempting, Recalling,
+            Recalled, Lost,
+        ]
+        .into_iter()
+        .find(|status| *status as u8 == number)
+    }
+
+    pub(crate) fn is_terminal(self) -> bool {
+        use Status::*;
+        matches!(
+            self,
+            Preempted | Succeeded | Aborted | Rejected | Recalled | Lost
+        )
+    }
+}
+
+/// `actionlib_msgs/GoalID`.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(crate) struct GoalId {
+    pub(crate) stamp: Time,
+    pub(crate) id: String,
+}
+
+/// One entry of `actionlib_msgs/GoalStatusArray`, and the head of every feedback and result.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct GoalState {
+    pub(crate) goal: GoalId,
+    pub(crate) status: Status,
+    pub(crate) text: String,
+}
+
+/// Reads a `…ActionGoal`: its id and the goal's own bytes.
+pub(crate) fn read_goal(bytes: &Bytes) -> Option<(GoalId, Bytes)> {
+    let mut reader = Reader { bytes, at: 0 };
+    reader.header()?;
+    let goal = reader.goal_id()?;
+    Some((goal, bytes.slice(reader.at..)))
+}
+
+/// Reads a `…ActionResult` or `…ActionFeedback`: the goal's state and the result's or feedback's own bytes.
+pub(crate) fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
+    let mut reader = Reader { bytes, at: 0 };
+    reader.header()?;
+    let state = reader.goal_state()?;
+    Some((state, bytes.slice(reader.at..)))
+}
+
+/// Reads an `actionlib_msgs/GoalID`: a request to cancel.
+pub(crate) fn read_cancel(bytes: &[u8]) -> Option<GoalId> {
+    Reader { bytes, at: 0 }.goal_id()
+}
+
+/// Reads an `actionlib_msgs/GoalStatusArray`.
+pub(crate) fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
+    let mut reader = Reader { bytes, at: 0 };
+    reader.header()?;
+    let count = reader.word()?;
+    // Each entry takes at least 17 bytes, so a false count ends here.
+    (0..count).map(|_| reader.goal_state()).collect()
+}
+
+/// A `…ActionGoal`.
+pub(crate) fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
+    let mut out = Vec::with_capacity(64 + body.len());
+    write_header(&mut out, now);
+    write_goal_id(&mut out, goal);
+    out.extend_from_slice(body);
+    out.into()
+}
+
+/// A `…ActionResult` or `…ActionFeedback`.
+pub(crate) fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
+    let mut out = Vec::with_capacity(96 + body.len());
+    write_header(&mut out, now);
+    write_goal_state(&mut out, state);
+    out.extend_from_slice(body);
+    out.into()
+}
+
+/// An `actionlib_msgs/GoalID`.
+pub(crate) fn write_cancel(goal: &GoalId) -> Bytes {
+    let mut out = Vec::new();
+    write_goal_id(&mut out, goal);
+    out.into()
+}
+
+/// An `actionlib_msgs/GoalStatusArray`.
+pub(crate) fn write_states<'s>(
+    now: Time,
+    states: impl ExactSizeIterator<Item = &'s GoalState>,
+) -> Bytes {
+    let mut out = Vec::new();
+    write_header(&mut out, now);
+    write_word(&mut out, states.len() as u32);
+    for state in states {
+        write_goal_state(&mut out, state);
+    }
+    out.into()
+}
+
+struct Reader<'b> {
+    bytes: &'b [u8],
+    at: usize,
+}
+
+impl Reader<'_> {
+    fn word(&mut self) -> Option<u32> {
+        let word = self.bytes.get(self.at..self.at.checked_add(4)?)?;
+        self.at += 4;
+        word.try_into().ok().map(u32::from_le_bytes)
+    }
+
+    fn string(&mut self) -> Option<String> {
+        let length = self.word()? as usize;
+        let text = self.bytes.get(self.at..self.at.checked_add(length)?)?;
+        self.at += length;
+        Some(String::from_utf8_lossy(text).into_owned())
+    }
+
+    fn time(&mut self) -> Option<Time> {
+        Some(Time {
+            secs: self.word()?,
+            nsecs: self.word()?,
+        })
+    }
+
+    fn header(&mut self) -> Option<()> {
+        self.word()?;
+        self.time()?;
+        self.string().map(drop)
+    }
+
+    fn goal_id(&mut self) -> Option<GoalId> {
+        Some(GoalId {
+            stamp: self.time()?,
+            id: self.string()?,
+        })
+    }
+
+    fn goal_state(&mut self) -> Option<GoalState> {
+        let goal = self.goal_id()?;
+        let status = Status::from_number(*self.bytes.get(self.at)?)?;
+        self.at += 1;
+        Some(GoalState {
+            goal,
+            status,
+            text: self.string()?,
+        })
+    }
+}
+
+fn write_word(out: &mut Vec<u8>, word: u32) {
+    out.extend_from_slice(&word.to_le_bytes());
+}
+
+fn write_string(out: &mut Vec<u8>, text: &str) {
+    write_word(out, text.len() as u32);
+    out.extend_from_slice(text.as_bytes());
+}
+
+fn write_time(out: &mut Vec<u8>, time: Time) {
+    write_word(out, time.secs);
+    write_word(out, time.nsecs);
+}
+
+fn write_header(out: &mut Vec<u8>, stamp: Time) {
+    write_word(out, 0);
+    write_time(out, stamp);
+    write_string(out, "");
+}
+
+fn write_goal_id(out: &mut Vec<u8>, goal: &GoalId) {
+    write_time(out, goal.stamp);
+    write_string(out, &goal.id);
+}
+
+fn write_goal_state(out: &mut Vec<u8>, state: &GoalState) {
+    write_goal_id(out, &state.goal);
+    out.push(state.status as u8);
+    write_string(out, &state.text);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state() -> GoalState {
+        let goal = GoalId {
+            stamp: Time { secs: 5, nsecs: 6 },
+            id: "g-1".to_owned(),
+        };
+        GoalState {
+            goal,
+            status: Status::Active,
+            text: "on it".to_owned(),
+        }
+    }
+
+    #[test]
+    fn goals_and_results_survive() {
+        let now = Time { secs: 1, nsecs: 2 };
+        let goal = write_goal(now, &state().goal, b"body");
+        assert_eq!(
+            read_goal(&goal),
+            Some((state().goal, Bytes::from_static(b"body")))
+        );
+        let result = write_state(now, &state(), b"body");
+        assert_eq!(
+            read_state(&result),
+            Some((state(), Bytes::from_static(b"body")))
+        );
+        assert_eq!(
+            read_cancel(&write_cancel(&state().goal)),
+            Some(state().goal)
+        );
+        let states = [
+            state(),
+            GoalState {
+                status: Status::Lost,
+                ..state()
+            },
+        ];
+        assert_eq!(
+            read_states(&write_states(now, states.iter())).unwrap(),
+            states
+        );
+    }
+
+    #[test]
+    fn the_layout_is_that_of_the_generated_messages() {
+        let registry = ros::schema::Registry::new();
+        registry
+            .insert(
+                "x/action/Do",
+                "int32 order\n---\nint32 sum\n---\nint32 part\n",
+            )
+            .unwrap();
+        let action = registry.action("x/Do").unwrap();
+        let goal = write_goal(Time::default(), &state().goal, &7i32.to_le_bytes());
+        ros::codec::validate(&action.action_goal, &goal).unwrap();
+        let result = write_state(Time::default(), &state(), &7i32.to_le_bytes());
+        ros::codec::validate(&action.action_result, &result).unwrap();
+        ros::codec::validate(&action.action_feedback, &result).unwrap();
+        let states = registry.message("actionlib_msgs/GoalStatusArray").unwrap();
+        ros::codec::validate(&states, &write_states(Time::default(), [state()].iter())).unwrap();
+    }
+
+    #[test]
+    fn torn_messages_are_refused() {
+        let whole = write_state(Time::default(), &state(), b"");
+        for end in 0..whole.len() {
+            assert_eq!(read_state(&whole.slice(..end)), None, "{end}");
+        }
+        let mut many = write_states(Time::default(), [].iter()).to_vec();
+        let at = many.len() - 4;
+        many[at..].copy_from_slice(&u32::MAX.to_le_bytes());
+        assert_eq!(read_states(&many), None);
+    }
+}

@@ -1,0 +1,64 @@
+//! The parameters at the Master.
+
+use async_trait::async_trait;
+use tokio::sync::mpsc;
+
+use super::Ros1Bus;
+use crate::bus::{BusError, GlobalParameters, ParamChanges, ParamValue};
+use crate::ros1::names;
+use crate::ros1::xmlrpc::Value;
+
+#[async_trait]
+impl GlobalParameters for Ros1Bus {
+    async fn get(&self, key: &str) -> Result<ParamValue, BusError> {
+        match self.inner.master.ask("getParam", vec![key.into()]).await? {
+            Ok(value) => Ok(value.into()),
+            Err(_) => Err(BusError::NoParam(key.to_owned())),
+        }
+    }
+
+    async fn set(&self, key: &str, value: ParamValue) -> Result<(), BusError> {
+        let value = Value::try_from(value).map_err(|reason| BusError::BadParam {
+            key: key.to_owned(),
+            reason,
+        })?;
+        let set = self.inner.master.call("setParam", vec![key.into(), value]);
+        set.await.map(drop)
+    }
+
+    async fn delete(&self, key: &str) -> Result<(), BusError> {
+        let answer = self.inner.master.ask("deleteParam", vec![key.into()]);
+        match answer.await? {
+            Ok(_) => Ok(()),
+            Err(_) => Err(BusError::NoParam(key.to_owned())),
+        }
+    }
+
+    async fn has(&self, key: &str) -> Result<bool, BusError> {
+        let has = self.inner.master.call("hasParam", vec![key.into()]).await?;
+        Ok(has == Value::Bool(true))
+    }
+
+    async fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError> {
+        let asker = names::canonical(namespace);
+        let master = &self.inner.master;
+        let found = master.ask_as(&asker, "searchParam", vec![key.into()]);
+        Ok(match found.await? {
+            Ok(Value::String(found)) => Some(found),
+            _ => None,
+        })
+    }
+
+    async fn names(&self) -> Result<Vec<String>, BusError> {
+        let names = self.inner.master.call("getParamNames", vec![]).await?;
+        Ok(names.to_strings())
+    }
+
+    async fn watch(&self) -> Result<ParamChanges, BusError> {
+        self.inner.check_open()?;
+        let (sender, changes) = mpsc::unbounded_channel();
+        *self.inner.param_watcher.lock() = Some(sender);
+        self.inner.subscribe_params().await?;
+        Ok(changes)
+    }
+}
