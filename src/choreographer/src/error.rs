@@ -1,4 +1,4 @@
-use crate::admission::Refused;
+use crate::decide::admission::Refused;
 use crate::grants::GrantError;
 
 /// Why a servant cannot be had, used or changed.

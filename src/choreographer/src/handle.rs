@@ -10,7 +10,9 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::Error;
-use crate::admission::{Promise, Refused};
+use crate::decide::admission::Refused;
+use crate::decide::demand::Asked;
+use crate::lives::waiting::Promise;
 use store::{NewEvent, RevisionRecord};
 
 /// Why a servant failed.
@@ -63,37 +65,6 @@ impl Life {
     }
 }
 
-/// Limits of a servant, and where they come from.
-#[derive(Debug, Clone, Copy)]
-pub struct Asked {
-    /// By whoever pushed the package, or changed the servant: a promise.
-    promised: Limits,
-    /// Where they said nothing.
-    default: Limits,
-}
-
-impl Asked {
-    /// Of a new servant.
-    pub fn new(promised: Limits, default: Limits) -> Asked {
-        Asked { promised, default }
-    }
-
-    /// Both together.
-    pub fn limits(&self) -> Limits {
-        with_weight(self.promised).or(self.default)
-    }
-}
-
-/// Whoever is promised cores gets them before those who are not: a thousand of weight for each, where others have a
-/// hundred, unless a weight was asked for.
-pub(crate) fn with_weight(asked: Limits) -> Limits {
-    let promised = |cpus: f64| ((cpus * 1000.0).round() as u64).clamp(100, 10_000);
-    Limits {
-        cpu_weight: asked.cpu_weight.or(asked.cpus.map(promised)),
-        ..asked
-    }
-}
-
 /// A servant.
 pub struct Handle {
     /// Its id.
@@ -123,7 +94,7 @@ pub struct Handle {
 
 impl Handle {
     /// A servant that has been asked for.
-    pub fn new(
+    pub(crate) fn new(
         id: String,
         robot: String,
         anonymous: bool,

@@ -11,13 +11,30 @@
 //!                                    └── adopted: an earlier daemon started it
 //! ```
 //!
+//! What is decided, [`decide`] decides by pure functions of what is, what is asked and the time; what it says is carried out
+//! by the tasks of [`lives`], which alone wait, lock and talk to the engine.
+//!
+//! ```text
+//!   robots, stubs, pushes, operators           connections, ends of nodes, the graph, time
+//!             │ ask                                          │ facts
+//!             ▼                                              ▼
+//!   ┌ lives ───────────────────────────────────────────────────────────────────────────┐
+//!   │ ensure, waiting, limits     driver ─ starting ─ lifetime ─ nodes     spares      │
+//!   └──────┬──────────────────────────────────┬──────────────────────────────┬─────────┘
+//!      facts ▼ ▲ what to do, and why      facts ▼ ▲                      facts ▼ ▲
+//!   ┌ decide ──────────────────────────────────────────────────────────────────────────┐
+//!   │ placement, admission,             lifetime, nodes                 spares         │
+//!   │ capacity, demand                  adoption                                       │
+//!   └──────────────────────────────────────────────────────────────────────────────────┘
+//! ```
+//!
 //! Each servant has one task ([`lives::driver`]) that alone changes its state; everybody else asks for its end, counts
-//! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided under one
+//! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided and recorded under one
 //! short lock: a servant that is being ended is never given to anyone.
 
 #![forbid(unsafe_code)]
 
-mod admission;
+mod decide;
 mod error;
 pub mod grants;
 mod handle;
@@ -25,7 +42,6 @@ pub mod limits;
 mod lives;
 mod memory;
 mod options;
-mod restart;
 mod tail;
 
 use std::sync::Arc;
@@ -41,14 +57,18 @@ use reach::egress::Way;
 use servant::engine::Engine;
 use store::Journal;
 
-pub use admission::{Admission, Amount, Permit, Refused};
+pub use decide::Amount;
+pub use decide::admission::Refused;
 pub use error::{Error, with_last_words};
-pub use handle::{Asked, Handle, Lease};
+pub use handle::{Handle, Lease};
 pub use limits::engine_limits;
+pub use lives::waiting::{Admission, Permit};
 pub use memory::{Memory, MemoryOptions};
 pub use options::Options;
 pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
+use decide::admission::Class;
+use decide::placement::Placement;
 use grants::Granted;
 use lives::Inner;
 use lives::driver::{self, Beginning};
@@ -118,22 +138,18 @@ impl Choreographer {
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
-            if let Some(handle) = servants.given.get(&key) {
-                if handle.revision.number != revision.number && handle.connections() == 0 {
-                    handle.end("another revision takes its place");
-                }
-                // Someone may have asked for its end before its task has seen that.
-                if !handle.is_ending() {
-                    return Ok(Lease::new(Arc::clone(handle)));
-                }
+            let has = servants.given.get(&key).map(|handle| inner.facts(handle));
+            let (placement, spare) = inner.spares.place(has.as_ref(), &revision);
+            match placement {
+                Placement::Keep(id) => return Ok(Lease::new(Arc::clone(&servants.all[id]))),
+                Placement::Start { ends, .. } => servants.end(ends),
             }
-            let spare = inner.spares.take(&revision);
             let id = spare.as_ref().map(|spare| spare.container.id().to_owned());
             let handle = Arc::new(Handle::new(
                 id.unwrap_or_else(|| names::servant_id(service)),
                 robot.to_owned(),
                 anonymous,
-                Asked::new(revision.plan.limits, inner.options.limits),
+                inner.asked(revision.plan.limits),
                 revision,
                 store::now(),
             ));
@@ -248,14 +264,14 @@ impl Choreographer {
         deadline: Duration,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Error> {
-        let wanted = self.inner.promised_for(asked);
+        let wanted = self.inner.promised(asked);
         let make_room = || {
             on_wait();
             self.inner.make_room();
         };
         let admission = &self.inner.admission;
         Ok(admission
-            .admit_yielding(wanted, deadline, make_room)
+            .admit(wanted, Class::Push, deadline, make_room)
             .await?)
     }
 
@@ -281,10 +297,7 @@ impl Choreographer {
 
     /// Refuses limits that would never be admitted.
     pub fn check_limits(&self, limits: &api::Limits) -> Result<(), Error> {
-        Ok(self
-            .inner
-            .admission
-            .check(self.inner.promised_for(limits))?)
+        Ok(self.inner.admission.check(self.inner.promised(limits))?)
     }
 
     /// Images that live servants and spares were started from; they must stay.

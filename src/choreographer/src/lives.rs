@@ -3,10 +3,13 @@
 
 mod adoption;
 pub(crate) mod driver;
+mod lifetime;
+mod limits;
 mod nodes;
 mod reaching;
-mod room;
 pub(crate) mod spares;
+mod starting;
+pub(crate) mod waiting;
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -18,11 +21,13 @@ use reach::RequestTimes;
 use servant::engine::Engine;
 use store::{Journal, State};
 
-use crate::admission::{Admission, Amount};
+use crate::decide::demand::{self, Asked};
+use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
 use spares::Spares;
+use waiting::Admission;
 
 /// What the choreographer and its tasks share.
 pub(crate) struct Inner {
@@ -50,22 +55,40 @@ pub(crate) struct Servants {
 }
 
 impl Inner {
-    pub(crate) fn promised(&self, handle: &Handle) -> Amount {
-        self.promised_for(&handle.asked())
-    }
-
     pub(crate) fn is_ending(&self) -> bool {
         self.ending.load(Ordering::SeqCst)
     }
 
-    /// Limits asked for at push are a promise; else the configured reserve is.
-    pub(crate) fn promised_for(&self, asked: &api::Limits) -> Amount {
+    /// The limits of a servant for which `promised` was asked.
+    pub(crate) fn asked(&self, promised: api::Limits) -> Asked {
+        let default = self.options.limits;
+        Asked { promised, default }
+    }
+
+    /// What is promised to a servant of these limits.
+    pub(crate) fn promised(&self, asked: &api::Limits) -> Amount {
         let options = &self.options;
-        let memory = asked.memory.map(|memory| memory.0);
-        Amount::new(
-            asked.cpus.unwrap_or(options.reserve_cpus),
-            memory.unwrap_or(options.reserve_memory),
-        )
+        demand::promised(asked, (options.reserve_cpus, options.reserve_memory))
+    }
+
+    /// A servant as decisions see it.
+    pub(crate) fn facts<'a>(&self, handle: &'a Handle) -> Servant<'a> {
+        let admitted = handle.promise().is_some();
+        Servant {
+            id: &handle.id,
+            revision: handle.revision.number,
+            connections: handle.connections(),
+            promised: admitted.then(|| self.promised(&handle.asked())),
+            idle_until: handle.idle_until(),
+            ending: handle.is_ending(),
+        }
+    }
+
+    /// Ends idle servants for those who wait for capacity.
+    pub(crate) fn make_room(&self) {
+        let servants = self.servants.lock();
+        let all = servants.all.values().map(|handle| self.facts(handle));
+        servants.end(capacity::make_room(self.admission.lacking(), all));
     }
 
     /// Takes the servant out of reach if nobody is connected; true when so.
@@ -91,6 +114,13 @@ impl Inner {
 }
 
 impl Servants {
+    /// Asks for the end of those that are to end.
+    pub(crate) fn end<'a>(&self, ends: impl IntoIterator<Item = End<'a>>) {
+        for end in ends {
+            self.all[end.id].end(end.reason);
+        }
+    }
+
     fn take_back(&mut self, handle: &Arc<Handle>) {
         let key = (handle.service().to_owned(), handle.robot.clone());
         if self

@@ -90,9 +90,9 @@ async fn runs(
 ) -> Arc<Handle> {
     let inner = &choreographer.inner;
     let revision = Arc::new(revision("sha256:1", cpus));
-    let asked = Asked::new(revision.plan.limits, inner.options.limits);
+    let asked = inner.asked(revision.plan.limits);
     let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
-    let permit = inner.admission.adopt(inner.promised(&handle));
+    let permit = inner.admission.adopt(inner.promised(&handle.asked()));
     handle.set_promise(permit.promise());
     std::mem::forget(permit);
     handle.set_idle_until(idle_until);
@@ -117,7 +117,7 @@ async fn as_many_idle_servants_end_as_it_takes() {
     let deadline = Duration::from_secs(1);
     let waiting = inner
         .admission
-        .admit(wanted, deadline, || inner.make_room());
+        .admit(wanted, Class::Robot, deadline, || inner.make_room());
     let refused = waiting.await;
     assert!(refused.is_err(), "none of them ends in this test");
     assert!(
@@ -129,7 +129,7 @@ async fn as_many_idle_servants_end_as_it_takes() {
     let wanted = Amount::new(2.0, 0);
     let waiting = inner
         .admission
-        .admit(wanted, deadline, || inner.make_room());
+        .admit(wanted, Class::Robot, deadline, || inner.make_room());
     let left = async {
         tokio::time::sleep(deadline / 2).await;
         assert!(ending(&newest) && !ending(&busy));

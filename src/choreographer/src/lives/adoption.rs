@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use super::driver::{self, Beginning};
 use crate::Error;
-use crate::{Asked, Choreographer, Handle};
+use crate::decide::adoption::{Fate, Found, fate};
+use crate::{Choreographer, Handle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
 impl Choreographer {
@@ -31,16 +32,18 @@ impl Choreographer {
                 Some(record) => inner.state.revision(&record.service, record.revision)?,
                 None => None,
             };
-            match (record, revision) {
-                (Some(record), Some(revision)) => {
+            let fate = fate(Found {
+                recorded: record.is_some(),
+                published: revision.is_some(),
+                empty: servant.processes().await.is_ok_and(|all| all.is_empty()),
+            });
+            match (fate, record.zip(revision)) {
+                (Fate::Kept, Some((record, revision))) => {
                     self.adopt_one(record, revision, servant);
                     adopted += 1;
                 }
-                // A spare, or one that was killed before it had nodes: nobody misses it.
-                (None, _) if servant.processes().await.is_ok_and(|all| all.is_empty()) => {
-                    self.end_unknown(&servant).await;
-                }
-                _ => {
+                (Fate::Unused, _) => self.end_unknown(&servant).await,
+                (Fate::Unknown | Fate::Kept, _) => {
                     inner.journal.warning(
                         "servant-unknown",
                         &format!(
@@ -95,7 +98,7 @@ impl Choreographer {
         servant: Arc<dyn servant::engine::Servant>,
     ) {
         let inner = &self.inner;
-        let asked = Asked::new(record.limits.or(revision.plan.limits), inner.options.limits);
+        let asked = inner.asked(record.limits.or(revision.plan.limits));
         let key = (record.service, record.robot.clone());
         let handle = Arc::new(Handle::new(
             record.id.clone(),
@@ -113,7 +116,7 @@ impl Choreographer {
             servants.all.insert(record.id, Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
         }
-        let permit = inner.admission.adopt(inner.promised(&handle));
+        let permit = inner.admission.adopt(inner.promised(&handle.asked()));
         tokio::spawn(driver::drive(
             Arc::clone(inner),
             handle,

@@ -14,23 +14,24 @@ use tokio::sync::broadcast::error::RecvError;
 use tokio::time::Instant;
 
 use super::Inner;
+use crate::decide::nodes::{Crew, Ended, Event, Next, after};
 use crate::handle::{Failure, Handle};
-use crate::restart::Backoff;
 use crate::tail;
 
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
 
-type Ended<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
+type Exit<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
 
 /// The servant's nodes: who ended, and who is started again. A node that asked for `respawn` is the engine's.
 pub(crate) struct Nodes<'a> {
     inner: &'a Inner,
     handle: &'a Handle,
     container: &'a Arc<dyn Servant>,
-    running: FuturesUnordered<Ended<'a>>,
+    running: FuturesUnordered<Exit<'a>>,
     pausing: FuturesUnordered<BoxFuture<'a, NodeSpec>>,
-    backoffs: HashMap<String, Backoff>,
+    /// How often in a row a node has failed.
+    failures: HashMap<String, u32>,
     events: tokio::sync::broadcast::Receiver<NodeEvent>,
     /// How those that the engine starts again ended last.
     ends: HashMap<String, String>,
@@ -50,7 +51,7 @@ impl<'a> Nodes<'a> {
             container,
             running: FuturesUnordered::new(),
             pausing: FuturesUnordered::new(),
-            backoffs: HashMap::new(),
+            failures: HashMap::new(),
             events: container.events(),
             ends: HashMap::new(),
             alive: handle.revision.plan.nodes.len(),
@@ -135,7 +136,10 @@ impl<'a> Nodes<'a> {
                 let how = self.ends.remove(&node);
                 let how = how.as_deref().unwrap_or("ended");
                 let message = format!("{node} {how} and is started again after {delay} s");
-                return self.tell("node-respawned", &message);
+                return self.report(&Event {
+                    kind: "node-respawned",
+                    message,
+                });
             }
             NodeEvent::Started { .. } => return,
         };
@@ -157,56 +161,46 @@ impl<'a> Nodes<'a> {
     ) -> Result<(), Failure> {
         // The engine lost it: the container's own state says why.
         let Ok(exit) = exit else { return Ok(()) };
-        if self.handle.is_linked() {
-            // A stub took its place.
-            return Ok(());
-        }
         let how = how_it_ended(&exit, &self.handle.limits());
-        if exit.out_of_memory {
-            // What it knew is lost, and it would do the same again: its robot is told and begins anew.
-            self.tell("out-of-memory", &format!("{} {how}", node.name));
-            return Err(self
-                .failure(&node, format!("lost {}: it {how}", node.name))
-                .await);
+        let crew = Crew {
+            linked: self.handle.is_linked(),
+            ready: self.handle.life().phase >= Phase::Ready,
+            restarts: self.handle.revision.plan.restart,
+            alive: self.alive,
+        };
+        let end = Ended {
+            node: &node.name,
+            how: &how,
+            failed: exit.code != Some(0),
+            out_of_memory: exit.out_of_memory,
+            ran: began.elapsed(),
+            failures: self.failures.get(&node.name).copied().unwrap_or_default(),
+        };
+        match after(crew, end) {
+            Next::Nothing => Ok(()),
+            Next::Without(event) => {
+                self.alive -= 1;
+                self.report(&event);
+                Ok(())
+            }
+            Next::Restart {
+                after,
+                failures,
+                event,
+            } => {
+                self.report(&event);
+                self.failures.insert(node.name.clone(), failures);
+                self.pausing.push(Box::pin(async move {
+                    tokio::time::sleep(after).await;
+                    node
+                }));
+                Ok(())
+            }
+            Next::Fail { event, reason } => {
+                event.iter().for_each(|event| self.report(event));
+                Err(self.failure(&node, reason).await)
+            }
         }
-        let failed = exit.code != Some(0);
-        if failed && self.handle.life().phase < Phase::Ready {
-            return Err(self
-                .failure(&node, format!("did not become ready: {} {how}", node.name))
-                .await);
-        }
-        if failed && self.handle.revision.plan.restart {
-            let backoff = self.backoffs.entry(node.name.clone()).or_default();
-            let Some(pause) = backoff.failed(began.elapsed()) else {
-                return Err(self
-                    .failure(
-                        &node,
-                        format!("gave {} up: it {how}, again and again", node.name),
-                    )
-                    .await);
-            };
-            self.tell(
-                "node-failed",
-                &format!(
-                    "{} {how}; it is started again in {} ms",
-                    node.name,
-                    pause.as_millis()
-                ),
-            );
-            self.pausing.push(Box::pin(async move {
-                tokio::time::sleep(pause).await;
-                node
-            }));
-            return Ok(());
-        }
-        self.alive -= 1;
-        if self.alive == 0 {
-            return Err(self
-                .failure(&node, format!("has no node left: {} {how}", node.name))
-                .await);
-        }
-        self.tell("node-ended", &format!("{} {how}", node.name));
-        Ok(())
     }
 
     async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
@@ -241,12 +235,9 @@ impl<'a> Nodes<'a> {
         }
     }
 
-    fn tell(&self, kind: &str, message: &str) {
+    fn report(&self, event: &Event) {
+        let message = format!("servant {}: {}", self.handle.id, event.message);
         let about = self.handle.about();
-        self.inner.journal.warning(
-            kind,
-            &format!("servant {}: {message}", self.handle.id),
-            &about,
-        );
+        self.inner.journal.warning(event.kind, &message, &about);
     }
 }

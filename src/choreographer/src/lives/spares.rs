@@ -15,8 +15,12 @@ use reach::Reach;
 use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 
-use super::{Inner, driver, reaching};
-use crate::{Asked, Error};
+use super::{Inner, reaching, starting};
+use crate::Error;
+use crate::decide;
+use crate::decide::placement::{Placement, place};
+use crate::decide::spares::{Spare as Facts, Wanted, deserving, stale};
+
 use store::RevisionRecord;
 
 /// A servant without nodes.
@@ -54,8 +58,15 @@ impl Spare {
         )
     }
 
-    fn is_of(&self, revision: &RevisionRecord) -> bool {
-        self.revision.number == revision.number && self.revision.image == revision.image
+    /// As decisions see it.
+    fn facts(&self) -> Facts<'_> {
+        Facts {
+            id: self.container.id(),
+            service: &self.revision.service,
+            revision: self.revision.number,
+            image: &self.revision.image,
+            runs: self.runs(),
+        }
     }
 
     /// Ends it; nothing is left.
@@ -69,18 +80,24 @@ impl Spare {
 }
 
 impl Spares {
-    /// Gives the one of this revision, if there is one that lives, and remembers that the service was asked for.
-    pub(crate) fn take(&self, revision: &RevisionRecord) -> Option<Spare> {
+    /// Decides which servant a robot is given that asks for this revision and `has` that servant so far. Where a new one is
+    /// to be made of a spare, gives that; and remembers that the service was asked for.
+    pub(crate) fn place<'a>(
+        &self,
+        has: Option<&decide::Servant<'a>>,
+        revision: &RevisionRecord,
+    ) -> (Placement<'a>, Option<Spare>) {
         let mut kept = self.kept.lock();
-        kept.asked_for
-            .retain(|service| *service != revision.service);
-        kept.asked_for.push(revision.service.clone());
-        let fits = kept
-            .by_service
-            .get(&revision.service)
-            .is_some_and(|spare| spare.is_of(revision) && spare.runs());
-        fits.then(|| kept.by_service.remove(&revision.service))
-            .flatten()
+        let service = &revision.service;
+        let spare = kept.by_service.get(service).map(Spare::facts);
+        let placement = place(has, spare.as_ref(), revision.number, &revision.image);
+        let Placement::Start { spare, .. } = placement else {
+            return (placement, None);
+        };
+        kept.asked_for.retain(|asked| asked != service);
+        kept.asked_for.push(service.clone());
+        let taken = spare.then(|| kept.by_service.remove(service));
+        (placement, taken.flatten())
     }
 
     /// Takes one back that its robot had no use for; gives it if it is not wanted here either.
@@ -113,37 +130,26 @@ impl Spares {
             .collect()
     }
 
-    /// Removes those that are not of one of these revisions, or do not live.
-    fn remove_all_but(&self, wanted: &[Arc<RevisionRecord>]) -> Vec<Spare> {
-        let mut kept = self.kept.lock();
-        let (stay, leave) =
-            std::mem::take(&mut kept.by_service)
-                .into_iter()
-                .partition(|(_, spare)| {
-                    spare.runs() && wanted.iter().any(|revision| spare.is_of(revision))
-                });
-        kept.by_service = stay;
-        leave.into_values().collect()
+    /// Removes those that are not of one of these revisions, or do not run.
+    fn remove_stale(&self, wanted: &[Arc<RevisionRecord>]) -> Vec<Spare> {
+        let wanted: Vec<Wanted<'_>> = wanted
+            .iter()
+            .map(|revision| Wanted {
+                service: &revision.service,
+                revision: revision.number,
+                image: &revision.image,
+            })
+            .collect();
+        let kept = &mut *self.kept.lock();
+        let ends = stale(kept.by_service.values().map(Spare::facts), &wanted);
+        let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
+        let ends = |_: &String, spare: &mut Spare| ends.iter().any(|id| id == spare.container.id());
+        let removed = kept.by_service.extract_if(ends);
+        removed.map(|(_, spare)| spare).collect()
     }
 
     fn has(&self, service: &str) -> bool {
         self.kept.lock().by_service.contains_key(service)
-    }
-
-    /// The services of `published` that are to have one, those asked for last first.
-    fn deserving(&self, published: Vec<String>, count: usize) -> Vec<String> {
-        let kept = self.kept.lock();
-        let asked = kept.asked_for.iter().rev().cloned();
-        let mut order: Vec<String> = asked
-            .filter(|service| published.contains(service))
-            .collect();
-        for service in published {
-            if !order.contains(&service) {
-                order.push(service);
-            }
-        }
-        order.truncate(count);
-        order
     }
 }
 
@@ -162,14 +168,14 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
     let _turn = inner.spares.turn.lock().await;
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
-    let deserving = inner.spares.deserving(published, inner.options.spares);
-    for service in deserving {
+    let asked_for = inner.spares.kept.lock().asked_for.clone();
+    for service in deserving(&published, &asked_for, inner.options.spares) {
         wanted.extend(inner.state.current(&service)?);
     }
     join_all(
         inner
             .spares
-            .remove_all_but(&wanted)
+            .remove_stale(&wanted)
             .into_iter()
             .map(Spare::end),
     )
@@ -188,8 +194,8 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare, Error> {
     let id = names::servant_id(&revision.service);
-    let limits = Asked::new(revision.plan.limits, inner.options.limits).limits();
-    let spec = driver::spec(inner, &id, &revision, &limits, Vec::new()).await?;
+    let limits = inner.asked(revision.plan.limits).limits();
+    let spec = starting::spec(inner, &id, &revision, &limits, Vec::new()).await?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.options.start;
     let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
@@ -224,23 +230,4 @@ pub(crate) async fn end_all(inner: &Inner) {
     join_all(all.into_values().map(Spare::end)).await;
     // One that is being made just now is ended by whoever makes it.
     let _turn = inner.spares.turn.lock().await;
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_services_asked_for_last_have_spares() {
-        let spares = Spares::default();
-        let published = || ["a", "b", "c", "d"].map(str::to_owned).to_vec();
-        assert_eq!(spares.deserving(published(), 2), ["a", "b"]);
-        for service in ["c", "gone", "d", "c"] {
-            let mut kept = spares.kept.lock();
-            kept.asked_for.retain(|asked| asked != service);
-            kept.asked_for.push(service.to_owned());
-        }
-        assert_eq!(spares.deserving(published(), 3), ["c", "d", "a"]);
-        assert!(spares.deserving(published(), 0).is_empty());
-    }
 }

@@ -1,0 +1,59 @@
+//! Decides which servants live, where and with what, by pure functions: of what is, of what is asked, and of the time, to what
+//! is to be done, with the reason. None reads a clock, holds a lock or waits, and all types are plain data. The tasks of
+//! [`crate::lives`] collect the facts, ask, and carry the answer out.
+//!
+//! | file | decides | from |
+//! |---|---|---|
+//! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
+//! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
+//! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue |
+//! | [`capacity`] | which idle servants end for those who wait | what they lack, all servants |
+//! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
+//! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
+//! | [`spares`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
+//! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
+//!
+//! What is decided under the choreographer's lock, or the queue's, is recorded under the same lock.
+
+pub(crate) mod admission;
+pub(crate) mod adoption;
+mod amount;
+pub(crate) mod capacity;
+pub(crate) mod demand;
+pub(crate) mod lifetime;
+pub(crate) mod nodes;
+pub(crate) mod placement;
+pub(crate) mod spares;
+
+#[cfg(test)]
+mod properties;
+
+use api::Millis;
+
+pub use amount::Amount;
+
+/// A servant that lives, as decisions about several of them see it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Servant<'a> {
+    /// Its id.
+    pub(crate) id: &'a str,
+    /// The revision that it was started from.
+    pub(crate) revision: u64,
+    /// Connections that use it.
+    pub(crate) connections: usize,
+    /// What it is promised; none before it is admitted.
+    pub(crate) promised: Option<Amount>,
+    /// When it is ended if nobody connects before; none where somebody is connected.
+    pub(crate) idle_until: Option<Millis>,
+    /// Its end has been asked for.
+    pub(crate) ending: bool,
+}
+
+/// A servant, or a container of the warm pool, is to end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct End<'a> {
+    /// Its id.
+    pub(crate) id: &'a str,
+    /// Why.
+    pub(crate) reason: &'static str,
+}

@@ -1,0 +1,483 @@
+//! The machine of the properties: what the daemon does with decisions, done with plain data, and what has to hold of it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use super::{SERVICES, Step};
+use crate::decide::admission::{Admitted, Book, Class, Ticket, Verdict};
+use crate::decide::lifetime::{Need, Stage, Tenancy, needed};
+use crate::decide::placement::{Placement, place};
+use crate::decide::spares::{Spare, Wanted, deserving, stale};
+use crate::decide::{Amount, End, Servant, capacity};
+
+const GRACE: Duration = Duration::from_secs(60);
+const QUEUE: usize = 4;
+const POOL: usize = 2;
+
+fn cores(millicpus: u64) -> Amount {
+    Amount {
+        millicpus,
+        memory: 0,
+    }
+}
+
+struct Lives {
+    id: String,
+    ticket: Ticket,
+    key: (usize, usize),
+    revision: u64,
+    stage: Stage,
+    wants: Amount,
+    promised: Option<Amount>,
+    connections: usize,
+    idle_since: Option<Instant>,
+    ending: bool,
+}
+
+impl Lives {
+    /// Robot 0 names no name.
+    fn anonymous(&self) -> bool {
+        self.key.1 == 0
+    }
+
+    fn tenancy(&self) -> Tenancy {
+        Tenancy {
+            stage: self.stage,
+            adopted: false,
+            anonymous: self.anonymous(),
+            connections: self.connections,
+            idle_since: self.idle_since,
+            grace: if self.anonymous() {
+                Duration::ZERO
+            } else {
+                GRACE
+            },
+        }
+    }
+
+    fn facts(&self, began: Instant) -> Servant<'_> {
+        let until = |since: Instant| (since - began + GRACE).as_millis() as u64;
+        Servant {
+            id: &self.id,
+            revision: self.revision,
+            connections: self.connections,
+            promised: self.promised,
+            idle_until: self.idle_since.map(until),
+            ending: self.ending,
+        }
+    }
+}
+
+struct Pooled {
+    id: String,
+    service: usize,
+    revision: u64,
+    runs: bool,
+}
+
+impl Pooled {
+    fn facts(&self) -> Spare<'_> {
+        Spare {
+            id: &self.id,
+            service: SERVICES[self.service].0,
+            revision: self.revision,
+            image: "an image",
+            runs: self.runs,
+        }
+    }
+}
+
+pub(super) struct Machine {
+    began: Instant,
+    now: Instant,
+    book: Book,
+    servants: Vec<Lives>,
+    /// By service and robot: the ids of those that may be given.
+    given: BTreeMap<(usize, usize), String>,
+    pushes: BTreeMap<Ticket, Option<Amount>>,
+    pool: Vec<Pooled>,
+    asked_for: Vec<String>,
+    revisions: [u64; SERVICES.len()],
+    /// Robots that wait, as they came.
+    line: Vec<Ticket>,
+    made: u64,
+    /// Containers that a robot was given.
+    used: BTreeSet<String>,
+}
+
+fn nth<T>(all: impl Iterator<Item = T>, which: usize) -> Option<T> {
+    let mut all: Vec<T> = all.collect();
+    (!all.is_empty()).then(|| all.swap_remove(which % all.len()))
+}
+
+impl Machine {
+    pub(super) fn new() -> Machine {
+        let now = Instant::now();
+        Machine {
+            began: now,
+            now,
+            book: Book::new(cores(4000), QUEUE),
+            servants: Vec::new(),
+            given: BTreeMap::new(),
+            pushes: BTreeMap::new(),
+            pool: Vec::new(),
+            asked_for: Vec::new(),
+            revisions: [1; SERVICES.len()],
+            line: Vec::new(),
+            made: 0,
+            used: BTreeSet::new(),
+        }
+    }
+
+    fn name(&mut self) -> (Ticket, String) {
+        self.made += 1;
+        (self.made, format!("made-{}", self.made))
+    }
+
+    fn servant(&mut self, id: &str) -> &mut Lives {
+        let found = self.servants.iter_mut().find(|servant| servant.id == id);
+        found.expect("decisions are about servants that live")
+    }
+
+    /// Its end is asked for. It stays where its robot finds it until its task has seen that.
+    fn end(&mut self, id: &str) {
+        let servant = self.servant(id);
+        assert!(!servant.ending, "{id} is being ended already");
+        servant.ending = true;
+        let (queued, ticket) = (servant.stage == Stage::Queued, servant.ticket);
+        if queued {
+            self.line.retain(|one| *one != ticket);
+            let admitted = self.book.leave(ticket);
+            self.admitted(admitted);
+        }
+    }
+
+    /// Those who waited are admitted: robots in the order in which they came.
+    fn admitted(&mut self, admitted: Vec<Admitted>) {
+        for Admitted { ticket, amount } in admitted {
+            if let Some(push) = self.pushes.get_mut(&ticket) {
+                *push = Some(amount);
+                continue;
+            }
+            assert_eq!(self.line.first(), Some(&ticket), "a robot was overtaken");
+            self.line.remove(0);
+            let servant = self.servants.iter_mut().find(|one| one.ticket == ticket);
+            let servant = servant.expect("who waits is there");
+            assert!(!servant.ending, "it waits no longer");
+            servant.promised = Some(amount);
+            servant.stage = Stage::Admitted;
+        }
+    }
+
+    fn make_room(&mut self) {
+        let lacking = self.book.lacking();
+        let began = self.began;
+        let decide =
+            || capacity::make_room(lacking, self.servants.iter().map(|it| it.facts(began)));
+        let ends = decide();
+        assert_eq!(ends, decide(), "the same facts, another decision");
+        let having = |ids: &[End<'_>]| {
+            let all = self.servants.iter();
+            let free = all.filter(|it| it.ending || ids.iter().any(|end| end.id == it.id));
+            free.filter_map(|it| it.promised)
+                .fold(Amount::NONE, Amount::plus)
+        };
+        if let Some((_, others)) = ends.split_last() {
+            assert_ne!(
+                lacking.minus(having(others)),
+                Amount::NONE,
+                "one end too many"
+            );
+        }
+        let ids: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
+        for id in ids {
+            let servant = self.servant(&id);
+            assert!(servant.connections == 0 && servant.stage == Stage::Ready);
+            self.end(&id);
+        }
+    }
+
+    fn asks(&mut self, service: usize, robot: usize) {
+        let began = self.began;
+        let key = (service, robot);
+        let name = SERVICES[service].0;
+        self.asked_for.retain(|it| it != name);
+        self.asked_for.push(name.to_owned());
+        let current = self.revisions[service];
+        let has = self.given.get(&key).map(|id| {
+            let found = self.servants.iter().find(|servant| &servant.id == id);
+            found.expect("what is given lives")
+        });
+        let facts = has.map(|it| it.facts(began));
+        let spare = self.pool.iter().find(|it| it.service == service);
+        let spare = spare.map(Pooled::facts);
+        let decide = || place(facts.as_ref(), spare.as_ref(), current, "an image");
+        let placement = decide();
+        assert_eq!(placement, decide(), "the same facts, another decision");
+        let (ends, spare) = match placement {
+            Placement::Keep(id) => {
+                let id = id.to_owned();
+                let servant = self.servant(&id);
+                assert!(!servant.ending, "a servant that is being ended was given");
+                servant.connections += 1;
+                servant.idle_since = None;
+                return;
+            }
+            Placement::Start { ends, spare } => (ends.map(|end| end.id.to_owned()), spare),
+        };
+        if let Some(id) = ends {
+            assert_eq!(self.servant(&id).connections, 0, "its robot uses it");
+            self.end(&id);
+        }
+        let (ticket, fresh) = self.name();
+        let spare = spare.then(|| {
+            let index = self.pool.iter().position(|it| it.service == service);
+            let spare = self.pool.remove(index.expect("the pool has it"));
+            assert_eq!((spare.revision, spare.runs), (current, true));
+            assert!(
+                self.used.insert(spare.id.clone()),
+                "two robots have the same container"
+            );
+            spare.id
+        });
+        let wants = cores(SERVICES[service].1);
+        let promised = match self.book.ask(ticket, wants, Class::Robot) {
+            Verdict::Admitted => {
+                assert!(self.line.is_empty(), "robots were overtaken");
+                Some(wants)
+            }
+            Verdict::Waits => None,
+            Verdict::Refused(_) => return,
+        };
+        let id = spare.unwrap_or(fresh);
+        self.given.insert(key, id.clone());
+        self.servants.push(Lives {
+            id,
+            ticket,
+            key,
+            revision: current,
+            stage: if promised.is_some() {
+                Stage::Admitted
+            } else {
+                Stage::Queued
+            },
+            wants,
+            promised,
+            connections: 1,
+            idle_since: None,
+            ending: false,
+        });
+        if promised.is_none() {
+            self.line.push(ticket);
+            self.make_room();
+        }
+    }
+
+    fn tidy(&mut self) {
+        let before = self.book.clone();
+        let published: Vec<String> = SERVICES.iter().map(|it| it.0.to_owned()).collect();
+        let wanted = deserving(&published, &self.asked_for, POOL);
+        let number = |name: &String| SERVICES.iter().position(|it| it.0 == name).expect("known");
+        let wanted: Vec<usize> = wanted.iter().map(number).collect();
+        let revisions = self.revisions;
+        let facts: Vec<Wanted<'_>> = wanted
+            .iter()
+            .map(|service| Wanted {
+                service: SERVICES[*service].0,
+                revision: revisions[*service],
+                image: "an image",
+            })
+            .collect();
+        let ends = stale(self.pool.iter().map(Pooled::facts), &facts);
+        let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
+        for id in &ends {
+            assert!(!self.used.contains(id), "{id} is a robot's");
+        }
+        self.pool.retain(|it| !ends.contains(&it.id));
+        for service in wanted {
+            if !self.pool.iter().any(|it| it.service == service) {
+                let (_, id) = self.name();
+                let revision = revisions[service];
+                self.pool.push(Pooled {
+                    id,
+                    service,
+                    revision,
+                    runs: true,
+                });
+            }
+        }
+        assert!(self.pool.len() <= POOL);
+        assert_eq!(self.book, before, "the warm pool is promised nothing");
+    }
+
+    pub(super) fn takes(&mut self, step: Step) {
+        match step {
+            Step::Asks { service, robot } => self.asks(service, robot),
+            Step::Leaves(which) => {
+                let used = self.servants.iter_mut().filter(|it| it.connections > 0);
+                if let Some(servant) = nth(used, which) {
+                    servant.connections -= 1;
+                }
+            }
+            Step::Proceeds(which) => {
+                let admitted = self.servants.iter_mut();
+                let admitted = admitted.filter(|it| it.promised.is_some() && !it.ending);
+                if let Some(servant) = nth(admitted, which) {
+                    servant.stage = match servant.stage {
+                        Stage::Queued | Stage::Admitted => Stage::Starting,
+                        Stage::Starting | Stage::Ready => Stage::Ready,
+                    };
+                }
+            }
+            Step::Stopped(which) => {
+                let lives = self.servants.iter().filter(|it| !it.ending);
+                if let Some(id) = nth(lives.map(|it| it.id.clone()), which) {
+                    self.end(&id);
+                }
+            }
+            Step::Gone(which) => {
+                let ending = self.servants.iter().filter(|it| it.ending);
+                if let Some(id) = nth(ending.map(|it| it.id.clone()), which) {
+                    let index = self.servants.iter().position(|it| it.id == id);
+                    let gone = self.servants.remove(index.expect("just seen"));
+                    if self.given.get(&gone.key) == Some(&gone.id) {
+                        self.given.remove(&gone.key);
+                    }
+                    let admitted = self.book.release(gone.promised.unwrap_or_default());
+                    self.admitted(admitted);
+                    self.make_room();
+                }
+            }
+            Step::Resized(which, size) => {
+                let running = self.servants.iter().filter(|it| it.promised.is_some());
+                if let Some(id) = nth(running.map(|it| it.id.clone()), which) {
+                    let promised = self.servant(&id).promised.unwrap_or_default();
+                    let before = self.book.clone();
+                    match self.book.change(promised, cores(size)) {
+                        Ok(admitted) => {
+                            self.servant(&id).promised = Some(cores(size));
+                            self.admitted(admitted);
+                        }
+                        Err(_) => assert_eq!(self.book, before, "refused, and yet changed"),
+                    }
+                }
+            }
+            Step::GivesUp(which) => {
+                let queued = self.servants.iter();
+                let queued = queued.filter(|it| it.stage == Stage::Queued && !it.ending);
+                if let Some(id) = nth(queued.map(|it| it.id.clone()), which) {
+                    self.end(&id);
+                }
+            }
+            Step::Pushes(size) => {
+                let (ticket, _) = self.name();
+                match self.book.ask(ticket, cores(size), Class::Push) {
+                    Verdict::Admitted => drop(self.pushes.insert(ticket, Some(cores(size)))),
+                    Verdict::Waits => {
+                        self.pushes.insert(ticket, None);
+                        self.make_room();
+                    }
+                    Verdict::Refused(_) => assert!(size > 4000, "it would fit"),
+                }
+            }
+            Step::Pushed(which) => {
+                if let Some(ticket) = nth(self.pushes.keys().copied(), which) {
+                    let admitted = match self.pushes.remove(&ticket).flatten() {
+                        Some(amount) => self.book.release(amount),
+                        None => self.book.leave(ticket),
+                    };
+                    self.admitted(admitted);
+                }
+            }
+            Step::Published(service) => self.revisions[service] += 1,
+            Step::Tidied => self.tidy(),
+            Step::SpareDies(which) => {
+                if let Some(spare) = nth(self.pool.iter_mut(), which) {
+                    spare.runs = false;
+                }
+            }
+            Step::Passes(seconds) => self.now += Duration::from_secs(seconds),
+        }
+        self.settles();
+    }
+
+    /// What nobody needs is ended.
+    fn settles(&mut self) {
+        let now = self.now;
+        for servant in self.servants.iter_mut().filter(|it| !it.ending) {
+            let idle = servant.stage == Stage::Ready && servant.connections == 0;
+            servant.idle_since = idle.then(|| servant.idle_since.unwrap_or(now));
+        }
+        let over: Vec<String> = self
+            .servants
+            .iter()
+            .filter(|it| !it.ending)
+            .filter(|it| {
+                let need = needed(&it.tenancy(), now);
+                assert!(
+                    it.connections == 0 || need == Need::Stays,
+                    "its robot uses it"
+                );
+                matches!(need, Need::Over(_))
+            })
+            .map(|it| it.id.clone())
+            .collect();
+        for id in over {
+            self.end(&id);
+        }
+    }
+
+    pub(super) fn holds(&self) {
+        let servants = self.servants.iter().filter_map(|it| it.promised);
+        let pushes = self.pushes.values().filter_map(|promised| *promised);
+        let promised = servants.chain(pushes).fold(Amount::NONE, Amount::plus);
+        assert_eq!(self.book.promised(), promised);
+        assert!(
+            promised.fits(self.book.capacity()),
+            "more is promised than there is"
+        );
+        assert!(self.line.len() <= QUEUE);
+        let waiting = self.pushes.values().filter(|it| it.is_none()).count();
+        assert_eq!(self.book.waiting(), self.line.len() + waiting);
+        let free = self.book.capacity().minus(promised);
+        if let Some(first) = self.line.first() {
+            let first = self.servants.iter().find(|it| it.ticket == *first);
+            let first = first.expect("who waits is there");
+            assert!(!first.wants.fits(free), "it waits for what is free");
+        }
+        let mut given = BTreeSet::new();
+        for servant in self.servants.iter().filter(|it| !it.ending) {
+            assert!(
+                given.insert(servant.key),
+                "a robot has two servants of one service"
+            );
+            assert_eq!(self.given.get(&servant.key), Some(&servant.id));
+        }
+    }
+
+    /// All that are admitted leave, one after the other.
+    pub(super) fn empties(&mut self) {
+        for _ in 0..1000 {
+            let push = self.pushes.iter().find(|it| it.1.is_some()).map(|it| *it.0);
+            let lives = self.servants.iter().find(|it| it.promised.is_some());
+            let lives = lives.map(|it| (it.id.clone(), it.ending));
+            match (push, lives) {
+                (Some(_), _) => self.takes(Step::Pushed(
+                    self.pushes.values().take_while(|it| it.is_none()).count(),
+                )),
+                (None, Some((id, ending))) => {
+                    if !ending {
+                        self.end(&id);
+                    }
+                    let ending = self.servants.iter().filter(|it| it.ending);
+                    let which = ending.take_while(|it| it.id != id).count();
+                    self.takes(Step::Gone(which));
+                }
+                (None, None) => break,
+            }
+            self.holds();
+        }
+        assert_eq!(self.book.promised(), Amount::NONE);
+        assert_eq!(self.book.waiting(), 0, "somebody waits for ever");
+    }
+}

@@ -1,0 +1,118 @@
+//! Carries out what is decided of a servant's lifetime: waits until it can be used, and until nobody needs it.
+
+use std::sync::Arc;
+
+use api::Phase;
+use package::interface::Interface;
+use reach::Reach;
+use reach::readiness::{missing, missing_nodes};
+use tokio::time::{Instant, timeout_at};
+
+use super::Inner;
+use crate::decide::lifetime::{Need, Readiness, Shown, Stage, Tenancy, needed, readiness};
+use crate::handle::{Failure, Handle};
+
+/// Waits until everything that the interface promises is registered. Nodes may take their time between their
+/// registration and their first topic: all that the servant's start may take.
+pub(super) async fn interface_there(
+    inner: &Inner,
+    handle: &Handle,
+    reach: &Reach,
+    deadline: Instant,
+    fresh: bool,
+) -> Result<(), Failure> {
+    let interface: &Interface = &handle.revision.interface;
+    let image = &handle.revision.image;
+    let mut graphs = reach.bus.graph();
+    let mut changed = Instant::now();
+    loop {
+        let graph = graphs.borrow_and_update().clone();
+        let missing = missing(interface, &graph);
+        let nodes_missing = missing_nodes(interface, &graph);
+        let shown = Shown {
+            missing: &missing,
+            nodes_missing: &nodes_missing,
+            patient: fresh && !inner.incomplete.lock().contains(image),
+            changed: changed.into_std(),
+            deadline: deadline.into_std(),
+            limit: inner.options.start,
+        };
+        let until = match readiness(&shown, Instant::now().into_std()) {
+            Readiness::Ready => return Ok(()),
+            Readiness::Waits(until) => Instant::from_std(until),
+            Readiness::Incomplete => {
+                inner.incomplete.lock().insert(image.clone());
+                let missing = missing.join(", ");
+                let message = format!("servant {} is ready without {missing}", handle.id);
+                let about = handle.about();
+                inner
+                    .journal
+                    .warning("interface-incomplete", &message, &about);
+                return Ok(());
+            }
+            Readiness::Late(reason) => return Err(Failure::broken(reason)),
+        };
+        match timeout_at(until, graphs.changed()).await {
+            Ok(Ok(())) => changed = Instant::now(),
+            Ok(Err(_)) => return Err(Failure::broken("lost its ROS Master")),
+            Err(_) => {}
+        }
+    }
+}
+
+/// Comes back when nobody needs the servant any more, with the reason. It is given to nobody from then on.
+pub(super) async fn unneeded(inner: &Inner, handle: &Arc<Handle>, fresh: bool) -> String {
+    let times = &inner.options;
+    let grace = match handle.anonymous {
+        true => times.anonymous_grace,
+        false => times.grace,
+    };
+    let (mut connections, mut life) = (handle.watch_connections(), handle.watch());
+    let mut idle_since = None;
+    loop {
+        let now = Instant::now();
+        let stage = match life.borrow_and_update().phase {
+            Phase::Requested => Stage::Queued,
+            Phase::Admitted => Stage::Admitted,
+            Phase::Created | Phase::Starting => Stage::Starting,
+            _ => Stage::Ready,
+        };
+        let count = *connections.borrow_and_update();
+        let idle = stage == Stage::Ready && count == 0;
+        let was_idle = idle_since.is_some();
+        idle_since = idle.then(|| idle_since.unwrap_or(now.into_std()));
+        let tenancy = Tenancy {
+            stage,
+            adopted: !fresh,
+            anonymous: handle.anonymous,
+            connections: count,
+            idle_since,
+            grace,
+        };
+        let until = match needed(&tenancy, now.into_std()) {
+            Need::Stays => None,
+            Need::Until(until) => Some(Instant::from_std(until)),
+            Need::Over(reason) => {
+                if inner.retire_if_idle(handle) {
+                    handle.set_idle_until(None);
+                    return reason;
+                }
+                // Somebody came just now.
+                continue;
+            }
+        };
+        if idle != was_idle {
+            let millis = idle.then(|| store::now() + grace.as_millis() as u64);
+            handle.set_idle_until(millis);
+        }
+        if idle && !was_idle {
+            // Somebody may have been waiting for longer.
+            inner.make_room();
+        }
+        tokio::select! {
+            _ = connections.changed() => {}
+            _ = life.changed() => {}
+            () = tokio::time::sleep_until(until.unwrap_or(now)), if until.is_some() => {}
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! From a servant that has capacity to one that can be reached: its container is made, or taken from the warm pool.
+
+use std::sync::Arc;
+
+use futures_util::future::join_all;
+use reach::Reach;
+use reach::master::resident_config;
+use servant::engine::Servant;
+use servant::spec::{NodeSpec, Profile, Spec};
+use store::{NewEvent, RevisionRecord, ServantRecord};
+use tokio::time::{Instant, timeout_at};
+
+use super::spares::Spare;
+use super::{Inner, reaching};
+use crate::handle::{Failure, Handle};
+use crate::{Error, engine_limits, grants};
+
+/// Writes down that the servant is, before it runs: a daemon killed now finds it again.
+pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
+    let record = ServantRecord {
+        id: handle.id.clone(),
+        service: handle.service().to_owned(),
+        revision: handle.revision.number,
+        robot: handle.robot.clone(),
+        anonymous: handle.anonymous,
+        created: handle.created,
+        limits: api::Limits::default(),
+    };
+    let added = inner.state.add_servant(&record);
+    added.map_err(|error| could_not_start(error.into()))
+}
+
+pub(super) async fn start(
+    inner: &Arc<Inner>,
+    handle: &Arc<Handle>,
+) -> Result<Arc<dyn Servant>, Failure> {
+    let nodes = planned(handle);
+    let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes).await;
+    let started = inner.engine.start(spec.map_err(could_not_start)?).await;
+    started.map_err(|error| could_not_start(error.into()))
+}
+
+/// The nodes to begin with: those of a robot's stubs come one by one.
+fn planned(handle: &Handle) -> Vec<NodeSpec> {
+    if handle.is_linked() {
+        return Vec::new();
+    }
+    handle.revision.plan.nodes.clone()
+}
+
+/// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
+pub(super) async fn use_spare(handle: &Handle, spare: Option<Spare>) -> Option<Spare> {
+    let spare = spare?;
+    // In their order and without waiting for one another. A program that cannot be executed is refused here, and
+    // looked at where the ends of nodes are.
+    let nodes = planned(handle).into_iter();
+    let started = join_all(nodes.map(|node| spare.container.start_node(node))).await;
+    let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
+    if started.iter().any(lost) {
+        spare.end().await;
+        return None;
+    }
+    Some(spare)
+}
+
+fn could_not_start(error: Error) -> Failure {
+    Failure::broken(format!("could not be started: {error}"))
+}
+
+/// Reaches the ROS Master in the container and sets a bridge before it.
+pub(super) async fn reach(
+    inner: &Arc<Inner>,
+    handle: &Arc<Handle>,
+    container: &Arc<dyn Servant>,
+    deadline: Instant,
+) -> Result<Arc<Reach>, Failure> {
+    let late = |_| {
+        let limit = inner.options.start.as_secs();
+        Failure::broken(format!("did not start its ROS Master within {limit} s"))
+    };
+    timeout_at(deadline, reaching::open(inner, &handle.revision, container))
+        .await
+        .map_err(late)?
+        .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))
+}
+
+/// What the engine is to make: a servant of this revision, with these nodes.
+pub(super) async fn spec(
+    inner: &Arc<Inner>,
+    id: &str,
+    revision: &RevisionRecord,
+    limits: &api::Limits,
+    nodes: Vec<NodeSpec>,
+) -> Result<Spec, Error> {
+    let layers = inner.catalogue.layers(revision).await?;
+    let plan = &revision.plan;
+    let granted = grants::resolve(&plan.grants, &inner.options.allow)?;
+    for what in &granted.unfulfilled {
+        let about = NewEvent {
+            service: Some(&revision.service),
+            servant: Some(id),
+            robot: None,
+        };
+        let message = format!("servant {id} of {}: {what}", revision.service);
+        inner.journal.warning("device-incomplete", &message, &about);
+    }
+    Ok(Spec {
+        id: id.to_owned(),
+        layers,
+        writable: None,
+        profile: Profile::Servant,
+        limits: engine_limits(limits),
+        environment: granted.environment_over(&plan.environment),
+        nodes,
+        owned_directories: Vec::new(),
+        mounts: granted.mounts,
+        hosts: granted.hosts,
+        resident: resident_config(&plan.parameters),
+    })
+}
+
+/// Of limits that somebody asked for and that are not in force; that of the others the daemon has warned at its start.
+pub(super) fn tell_unmet(inner: &Inner, handle: &Handle, container: &Arc<dyn Servant>) {
+    let unmet = container.enforced().unmet(&engine_limits(&handle.asked()));
+    if !unmet.is_empty() {
+        let message = format!(
+            "servant {} runs without a limit that was asked for: {}",
+            handle.id,
+            unmet.join(", ")
+        );
+        let about = handle.about();
+        inner.journal.warning("limits-unmet", &message, &about);
+    }
+}
