@@ -516,15 +516,11 @@ pub fn settings_are_changed_through_dynamic_reconfigure() -> Told {
     // At its start the node tells its settings more than once.
     while !holds(&with_log(site.next(&mut updates), &stub)?.bytes) {}
     // The node has written it to the robot's parameter server, too.
-    let deadline = Instant::now() + PATIENCE;
-    loop {
+    support::until("the node's setting on the robot's parameter server", || {
         let value = site.runtime.block_on(app.get("/people/padding"))?;
-        if value == ParamValue::Int(16) {
-            return Ok(());
-        }
-        ensure!(Instant::now() < deadline, "{value:?}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+        let is = value == ParamValue::Int(16);
+        Ok(is.then_some(()).ok_or_else(|| format!("{value:?}")))
+    })
 }
 
 /// A sensor_msgs/Image: a wall with a shadow on it, which moves.

@@ -3,7 +3,6 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicUsize, Ordering};
-use std::time::Instant;
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
@@ -222,22 +221,17 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> T
         "{answered} answers, {greeted} greetings"
     );
     // Each answered call has told its sum on a topic, too: it was heard once, or is told as dropped.
-    let deadline = Instant::now() + PATIENCE;
-    loop {
+    let all_known = support::until("each answered call's sum, heard or told as dropped", || {
         let here = sums.dropped.load(Ordering::Relaxed);
         let dropped = here + told_as_dropped(&daemon, "cut-adder_py", "/sums")?;
         let known = executed as u64 + dropped;
-        if (u64::from(answered)..=u64::from(answered + failed)).contains(&known) {
-            println!("{executed} of {answered} sums heard, {dropped} told as dropped");
-            break;
-        }
-        ensure!(
-            Instant::now() < deadline,
-            "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as dropped:\n{}",
-            said()
+        let told = format!(
+            "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as dropped"
         );
-        std::thread::sleep(std::time::Duration::from_millis(100));
-    }
+        let all = (u64::from(answered)..=u64::from(answered + failed)).contains(&known);
+        Ok(if all { Ok(told) } else { Err(told) })
+    });
+    println!("{}", all_known.with_context(said)?);
     for ((fds, threads, memory), (fds_after, threads_after, memory_after)) in
         before.iter().zip(&after)
     {

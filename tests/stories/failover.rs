@@ -118,18 +118,13 @@ impl Scene {
 
     /// Waits until `explain` names this.
     fn explains(&self, words: &str) -> Told {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let explained = self.explained()?;
-            let causes = explained["causes"].to_string();
-            if causes.contains(words) {
-                return Ok(());
-            }
-            ensure!(
-                Instant::now() < deadline,
-                "it should name {words:?}: {explained:#}"
-            );
-        }
+        let what = format!("an explanation that names {words:?}");
+        self.daemon.awaits(&self.explanation(), &what, |explained| {
+            explained["causes"]
+                .to_string()
+                .contains(words)
+                .then_some(())
+        })
     }
 
     /// Waits until the last events of this robot about its local original are of these kinds.
@@ -168,15 +163,19 @@ impl Scene {
 
     /// Waits until `explain` has this of the link.
     fn explains_link(&self, key: &str, value: f64) -> Told {
-        let path = format!("/api/v1/robots/{}/explain", self.robot);
         let what = format!("a link whose {key} is {value}");
-        self.daemon.awaits(&path, &what, |explained| {
+        self.daemon.awaits(&self.explanation(), &what, |explained| {
             (explained["servants"][0]["links"][0][key] == value).then_some(())
         })
     }
 
+    /// Where the API explains this robot.
+    fn explanation(&self) -> String {
+        format!("/api/v1/robots/{}/explain", self.robot)
+    }
+
     fn explained(&self) -> anyhow::Result<serde_json::Value> {
-        self.daemon.deployer().asks(&["explain", &self.robot])
+        self.daemon.api(&self.explanation())
     }
 }
 

@@ -217,18 +217,6 @@ fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Told {
     }
 }
 
-/// Waits until `explain` says this.
-fn explains(daemon: &Daemon, robot: &str, words: &str) -> Told {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let said = daemon.deployer().types(&["explain", robot])?.succeeded()?;
-        if said.stdout.contains(words) {
-            return Ok(());
-        }
-        ensure!(Instant::now() < deadline, "{words:?}: {}", said.stdout);
-    }
-}
-
 pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() -> Told {
     let daemon = world().with(LOCALISER)?;
     let cable = Cable::new(&daemon.address)?;
@@ -258,16 +246,17 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
             &mut diagnostics,
             "the link is down, the local original answers",
         )?;
-        explains(
-            &daemon,
-            "fallback-cut",
-            "where the original is installed on the robot, it stands in after 3.0 s",
-        )?;
-        explains(
-            &daemon,
-            "fallback-cut",
-            "no time promised, fallback 3.0 s after the link is lost",
-        )?;
+        let words = "where the original is installed on the robot, it stands in after 3.0 s";
+        daemon.awaits("/api/v1/robots/fallback-cut/explain", words, |explained| {
+            explained["causes"]
+                .to_string()
+                .contains(words)
+                .then_some(())
+        })?;
+        let explained = daemon.deployer().types(&["explain", "fallback-cut"])?;
+        let explained = explained.succeeded()?.stdout;
+        let words = "no time promised, fallback 3.0 s after the link is lost";
+        ensure!(explained.contains(words), "{explained}");
         // Who comes now is given what the original has latched, not the cloud's last pose.
         let newcomer = robot.site.node(&format!("/newcomer{round}"))?;
         let mut late = robot.site.hears(&newcomer, "/localiser/pose")?;

@@ -1,7 +1,6 @@
 //! A robot's node in the cloud: the robot's side cannot tell it from the original.
 
 use std::collections::BTreeSet;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
@@ -118,14 +117,13 @@ fn comes_to(
     node: &str,
     wanted: impl Fn(&BTreeSet<String>) -> bool,
 ) -> BTreeSet<String> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let lines = told_of(site, watcher, node);
-        if wanted(&lines) || Instant::now() > deadline {
-            return lines;
-        }
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    let mut last = BTreeSet::new();
+    // Who compares says better than this what is missing.
+    let _ = support::until(node, || {
+        last = told_of(site, watcher, node);
+        Ok(wanted(&last).then_some(()).ok_or_else(String::new))
+    });
+    last
 }
 
 /// What is told of people_detect in three states: nobody listens, one does, it has left. In each, `arrived` decides
@@ -427,15 +425,11 @@ pub fn one_message_right_after_connecting_is_not_lost() -> Told {
         with_log(site.connected(&*names, 1), &stub)?;
         names.publish(string("only"));
         site.until(&app, "the service", serves("/greeter/count"))?;
-        let deadline = Instant::now() + PATIENCE;
-        while with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?[0] != 1 {
-            ensure!(
-                Instant::now() < deadline,
-                "the message was lost in round {round}:\n{}",
-                stub.said()
-            );
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        support::until("a greeting of what was said at once", || {
+            let greeted = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?[0];
+            let lost = || format!("{greeted} in round {round}:\n{}", stub.said());
+            Ok((greeted == 1).then_some(()).ok_or_else(lost))
+        })?;
         let mut stub = stub;
         stub.signal(Signal::SIGINT)?;
         stub.ends()?;

@@ -6,7 +6,7 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use nix::sys::signal::{Signal, kill};
@@ -96,40 +96,31 @@ impl Setup {
                     .append(true)
                     .open(self.home.join("daemon.log"))
             })?;
-        let mut child = self
+        let child = self
             .command()?
             .stdout(log.try_clone()?)
             .stderr(log)
             .spawn()?;
-        let deployer = Deployer {
+        let mut daemon = Daemon {
             home: self.home.clone(),
+            address: "localhost".to_owned(),
+            child: Some(child),
         };
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            if let Ok(status) = deployer.asks(&["status"])
-                && status["pid"] == child.id()
+        let answers = crate::until("a daemon that answers", || {
+            if let Some(child) = &mut daemon.child
+                && let Some(status) = child.try_wait()?
             {
-                let address = status["listen"]
-                    .as_str()
-                    .context("status says where it listens")?
-                    .to_owned();
-                return Ok(Daemon {
-                    home: self.home.clone(),
-                    address,
-                    child: Some(child),
-                });
-            }
-            if let Some(status) = child.try_wait()? {
                 bail!("cloudroidd ended with {status}:\n{}", read_log(&self.home));
             }
-            if Instant::now() > deadline {
-                let _ = child.kill();
-                bail!(
-                    "cloudroidd did not answer within {PATIENCE:?}:\n{}",
-                    read_log(&self.home)
-                );
-            }
-        }
+            let pid = daemon.pid();
+            let listens = daemon.status().and_then(|status| {
+                ensure!(status["pid"] == pid, "{status:#}");
+                address_in(&status)
+            });
+            Ok(listens.map_err(|error| format!("{error:#}")))
+        });
+        daemon.address = answers.with_context(|| read_log(&self.home))?;
+        Ok(daemon)
     }
 
     /// Starts it where it must refuse, and gives its status and words.
@@ -189,33 +180,23 @@ fn read_log(home: &Path) -> String {
 impl Daemon {
     /// The one that another has started with its state in `home`, once it answers; not the one with the pid `not`.
     pub fn of_another(home: &Path, not: Option<i32>) -> anyhow::Result<Daemon> {
-        let deployer = Deployer {
+        let mut daemon = Daemon {
             home: home.to_owned(),
+            address: "localhost".to_owned(),
+            child: None,
         };
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            match deployer.asks(&["status"]) {
-                Ok(status) if not.is_none_or(|pid| status["pid"] != pid) => {
-                    let address = status["listen"]
-                        .as_str()
-                        .context("status says where it listens")?
-                        .to_owned();
-                    return Ok(Daemon {
-                        home: home.to_owned(),
-                        address,
-                        child: None,
-                    });
-                }
-                outcome if Instant::now() > deadline => {
-                    let why = outcome.err().map(|error| format!(": {error:#}"));
-                    bail!(
-                        "no daemon answered within {PATIENCE:?}{}",
-                        why.unwrap_or_default()
-                    );
-                }
-                _ => std::thread::sleep(Duration::from_millis(20)),
-            }
-        }
+        daemon.address = crate::until("a daemon that answers", || {
+            let listens = daemon.status().and_then(|status| {
+                ensure!(not.is_none_or(|pid| status["pid"] != pid), "{status:#}");
+                address_in(&status)
+            });
+            Ok(listens.map_err(|error| format!("{error:#}")))
+        })?;
+        Ok(daemon)
+    }
+
+    fn status(&self) -> anyhow::Result<Value> {
+        self.api("/api/v1/status")
     }
 
     /// A deployer at a shell of this machine.
@@ -380,6 +361,11 @@ impl Drop for Daemon {
             let _ = child.wait();
         }
     }
+}
+
+fn address_in(status: &Value) -> anyhow::Result<String> {
+    let address = status["listen"].as_str();
+    Ok(address.context("status says where it listens")?.to_owned())
 }
 
 fn dechunk(mut body: &str) -> String {
