@@ -71,10 +71,7 @@ fn told(app: &App, published: Published) -> Result<PushEvent, Error> {
 }
 
 fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
-    let uri: axum::http::Uri = format!("/?{}", query_of.unwrap_or_default())
-        .parse()
-        .map_err(|_| Error::BadRequest("the push options cannot be read".to_owned()))?;
-    match query(&uri, "options") {
+    match query(query_of, "options") {
         Some(text) => serde_json::from_str(&text).map_err(|error| {
             Error::BadRequest(format!("the push options cannot be read: {error}"))
         }),

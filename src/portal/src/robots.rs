@@ -119,7 +119,7 @@ struct Asked {
 
 impl Asked {
     fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<Asked, Error> {
-        let named = guard::query(uri, "robot");
+        let named = guard::query(uri.query(), "robot");
         let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
         let robot = if shared {
             app.options.default_robot.clone()
@@ -139,7 +139,7 @@ impl Asked {
             service,
             robot,
             shared,
-            resume: guard::query(uri, "resume").filter(|token| !token.is_empty()),
+            resume: guard::query(uri.query(), "resume").filter(|token| !token.is_empty()),
         })
     }
 }
