@@ -267,7 +267,7 @@ async fn run() -> Result<(), Failure> {
     println!(
         "  {} parameters, {} definitions",
         outcome.plan.parameters.len(),
-        outcome.definitions.len()
+        outcome.inventory.definitions.len()
     );
     if wish.probe {
         let begun = Instant::now();
@@ -301,14 +301,7 @@ async fn look(
     engine: &dyn Engine,
 ) -> Result<(), Failure> {
     let mut environment = outcome.environment.clone();
-    for (name, value) in [
-        ("ROS_MASTER_URI", "http://localhost:11311"),
-        ("ROS_HOSTNAME", "localhost"),
-        ("HOME", "/root"),
-        ("ROS_LOG_DIR", "/tmp"),
-    ] {
-        environment.insert(name.into(), value.into());
-    }
+    environment.extend(outcome.flavour.environment("/root"));
     let layers = outcome
         .layers
         .iter()
@@ -391,7 +384,7 @@ async fn watch(
         OWN_NAME,
     )
     .await?;
-    let registry = Registry::from_definitions(&outcome.definitions)?;
+    let registry = Registry::from_definitions(&outcome.inventory.definitions)?;
     let names = outcome
         .plan
         .nodes
@@ -420,5 +413,12 @@ async fn watch(
         work: Some(work),
         ..ProbeOptions::new(names, OWN_NAME)
     };
-    Ok(probe(&*bus, &registry, &outcome.definitions, &options, exited).await?)
+    Ok(probe(
+        &*bus,
+        &registry,
+        &outcome.inventory.definitions,
+        &options,
+        exited,
+    )
+    .await?)
 }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ros::flavour::{Flavour, Version};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, IoAt};
@@ -18,6 +19,15 @@ pub struct Base {
 }
 
 impl Base {
+    /// What a revision records of it.
+    pub fn flavour(&self) -> Flavour {
+        Flavour {
+            base: self.name.clone(),
+            ros: self.ros,
+            distribution: self.ros_distribution.clone(),
+        }
+    }
+
     /// What makes a difference to installed trees: part of their keys. A new rosdep key does not.
     pub(crate) fn system_key(&self) -> String {
         let parts = (&self.distribution, &self.suite, &self.runtime, &self.strip);
@@ -49,7 +59,7 @@ pub struct Definition {
     /// The archive's name of the release: `bookworm`.
     pub suite: String,
     /// Which ROS its packages speak.
-    pub ros: RosFlavour,
+    pub ros: Version,
     /// What `$ROS_DISTRO` stands for in the conditions of a package.xml: `noetic`.
     pub ros_distribution: String,
     /// What every image has.
@@ -68,14 +78,6 @@ pub struct Definition {
     /// rosdep key → Debian packages.
     #[serde(default)]
     pub keys: BTreeMap<String, Vec<String>>,
-}
-
-/// Which ROS.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum RosFlavour {
-    /// Master, TCPROS, catkin.
-    Ros1,
 }
 
 /// What every image has.

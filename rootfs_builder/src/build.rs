@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use image::{Digest, ImageSpec};
+use package::inventory::{Inventory, Published};
 
 use crate::advice;
 use crate::apt::Deb;
@@ -16,7 +17,6 @@ use crate::event::Progress;
 use crate::install::{self, Addition, Made};
 use crate::key::Key;
 use crate::launch::{self, Ask, LaunchPlan};
-use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
 use crate::workshop::{Layer, Workshop};
 
@@ -174,6 +174,7 @@ impl Build<'_> {
         };
         let answer = launch::ask(
             &self.shop,
+            self.base.ros,
             trees.clone(),
             self.base.environment.clone(),
             &ask,
@@ -186,19 +187,23 @@ impl Build<'_> {
         let mut environment = self.base.environment.clone();
         environment.extend(answer.environment);
         // Where it works is made when it is run.
-        for name in [
-            "HOME",
-            "ROS_LOG_DIR",
-            "ROS_HOME",
-            "ROS_MASTER_URI",
-            "ROS_HOSTNAME",
-        ] {
+        let flavour = self.base.flavour();
+        for name in flavour.environment("").keys() {
             environment.remove(name);
         }
-        let shares = pushed::shares(made.prefix.as_deref());
-        let definitions =
-            crate::blocking::spawn(move || package::definitions::read(&trees, &shares)).await??;
         let package = made.packages.first().cloned().unwrap_or_default();
+        let of = (package.clone(), environment.clone(), answer.nodes.clone());
+        let inventory = crate::blocking::spawn(move || {
+            let (package, environment, nodes) = of;
+            let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
+            let of = Published {
+                package: &package,
+                environment: &environment,
+                commands: &commands,
+            };
+            Inventory::take(&trees, of)
+        })
+        .await??;
         let layers = self.packed(parts).await?;
         let spec = ImageSpec {
             layers: layers.iter().map(|layer| layer.info).collect(),
@@ -223,7 +228,7 @@ impl Build<'_> {
         Ok(BuildOutcome {
             package,
             version: made.version,
-            base: self.base.name.clone(),
+            flavour,
             image,
             layers,
             environment,
@@ -231,7 +236,7 @@ impl Build<'_> {
                 nodes: answer.nodes,
                 parameters: answer.parameters,
             },
-            definitions,
+            inventory,
             hold,
         })
     }

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use ros::bus::ParamValue;
+use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 use servant::spec::{Mount, NodeSpec, Profile};
 
@@ -131,11 +132,17 @@ enum Reply {
     Planned(Answer),
 }
 
-const SCRIPT: &str = include_str!("inside/launch_plan.py");
+/// What resolves launch files, by the image's own tools.
+fn script(ros: Version) -> &'static str {
+    match ros {
+        Version::Ros1 => include_str!("inside/launch_plan.py"),
+    }
+}
 
 /// Asks, in a container of these trees.
 pub(crate) async fn ask(
     shop: &Workshop,
+    ros: Version,
     mut layers: Vec<PathBuf>,
     mut environment: BTreeMap<String, String>,
     ask: &Ask,
@@ -148,7 +155,7 @@ pub(crate) async fn ask(
         &BTreeMap::from([
             (
                 PathBuf::from("cloudroid/launch_plan.py"),
-                SCRIPT.as_bytes().to_vec(),
+                script(ros).as_bytes().to_vec(),
             ),
             (PathBuf::from("cloudroid/ask.json"), question),
             (PathBuf::from("cloudroid/out/.keep"), Vec::new()),

@@ -14,7 +14,11 @@ pub(crate) fn run_dependencies(
     path: &Path,
     base: &Base,
 ) -> Result<BTreeSet<String>, package::Error> {
-    let manifest = Manifest::parse(text, path, &Variables::ros1(&base.ros_distribution))?;
+    let manifest = Manifest::parse(
+        text,
+        path,
+        &Variables::ros(base.ros.bus().number(), &base.ros_distribution),
+    )?;
     Ok(manifest
         .needs(&[Kind::Exec])
         .into_iter()

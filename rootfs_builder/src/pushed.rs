@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use foreign::Visit;
 use package::condition::Variables;
@@ -16,7 +16,10 @@ use crate::keys::Asked;
 
 /// Looks at a pushed tree.
 pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
-    let pushed = workspace::inspect(root, &Variables::ros1(&base.ros_distribution))?;
+    let pushed = workspace::inspect(
+        root,
+        &Variables::ros(base.ros.bus().number(), &base.ros_distribution),
+    )?;
     if let Pushed::Source(sources) = &pushed {
         for Package { manifest, .. } in &sources.packages {
             if !matches!(manifest.build_type.as_str(), "catkin" | "cmake") {
@@ -141,14 +144,6 @@ pub(crate) fn has_python(root: &Path) -> bool {
     found
 }
 
-/// Where definitions are looked for, the package's own first.
-pub(crate) fn shares(prefix: Option<&Path>) -> Vec<String> {
-    let own = prefix.map(|prefix| prefix.join("share"));
-    let all = own.into_iter().chain([PathBuf::from("/usr/share")]);
-    all.map(|share| share.to_string_lossy().trim_start_matches('/').to_owned())
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -239,14 +234,5 @@ mod tests {
         assert!(!has_python(root.path()));
         write("scripts/node", "#!/usr/bin/env python3\n");
         assert!(has_python(root.path()));
-    }
-
-    #[test]
-    fn own_definitions_come_first() {
-        assert_eq!(
-            shares(Some(Path::new("/opt/x"))),
-            ["opt/x/share", "usr/share"]
-        );
-        assert_eq!(shares(None), ["usr/share"]);
     }
 }

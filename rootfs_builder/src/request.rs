@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use image::{Digest, LayerInfo};
+use package::inventory::Inventory;
+use ros::flavour::Flavour;
 
 use crate::launch::LaunchPlan;
 
@@ -56,8 +58,8 @@ pub struct BuildOutcome {
     pub package: String,
     /// Its version, where its package.xml or the archive says one.
     pub version: String,
-    /// The base it stands on.
-    pub base: String,
+    /// The base it stands on, and its ROS.
+    pub flavour: Flavour,
     /// The image in the store, untagged.
     pub image: Digest,
     /// Its layers, lowest first.
@@ -66,8 +68,8 @@ pub struct BuildOutcome {
     pub environment: BTreeMap<String, String>,
     /// What to run.
     pub plan: LaunchPlan,
-    /// Texts of every message, service and action definition in the image, by `package/msg/Type` and the like.
-    pub definitions: BTreeMap<String, String>,
+    /// What the image holds.
+    pub inventory: Inventory,
     /// Keeps the garbage collector from the image until it is tagged.
     pub hold: image::Hold,
 }

@@ -36,7 +36,7 @@ impl Lab {
     }
 
     fn read_on(&self, below: &[Digest], build_key: &str) -> Units {
-        let pushed = inspect(self.root.path(), &Variables::ros1("noetic")).expect("a workspace");
+        let pushed = inspect(self.root.path(), &Variables::ros(1, "noetic")).expect("a workspace");
         let Pushed::Source(workspace) = pushed else {
             panic!("sources");
         };

@@ -46,9 +46,9 @@ pub enum Error {
     /// A name that cannot be given.
     #[error(transparent)]
     Name(#[from] NameError),
-    /// The message definitions of an image cannot be read.
+    /// What an image holds cannot be read.
     #[error(transparent)]
-    Definitions(package::Error),
+    Inventory(package::Error),
     /// The state database.
     #[error(transparent)]
     State(#[from] store::Error),

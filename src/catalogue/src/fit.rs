@@ -73,6 +73,7 @@ mod tests {
             published: 0,
             package: "p".into(),
             source: String::new(),
+            flavour: Default::default(),
             plan: Default::default(),
             interface: Interface {
                 topics: topics.iter().map(topic).collect(),
@@ -91,7 +92,9 @@ mod tests {
             revision(3, &["/b"]),
         ];
         for revision in &all {
-            state.publish(revision).expect("published");
+            state
+                .publish(revision, &Default::default())
+                .expect("published");
         }
         let fits = |now: usize, image: &str| super::fits(&state, &all[now], Some(1), image);
         assert_eq!(fits(1, "sha256:1"), Ok(()), "something is new");

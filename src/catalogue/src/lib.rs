@@ -2,40 +2,38 @@
 //! that robots install in a package's place, composed of both).
 //!
 //! ```text
-//!  push ──revision──▶ Catalogue ─┬─ state database: the revision, its plan, its interface
+//!  push ──revision──▶ Catalogue ─┬─ state database: the revision, its plan, its interface, what its image holds
 //!                                └─ image store: tags follow the database
-//!  choreographer ◀── current revision, layers, message definitions
+//!  choreographer ◀── current revision, layers, programs, message definitions
 //!  portal        ◀── stubs, images, interfaces
 //! ```
 
 #![forbid(unsafe_code)]
 
-mod definitions;
 mod error;
 mod fit;
+mod inventory;
 pub mod names;
-mod prefixes;
 mod publish;
 pub mod stubs;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use ros::schema::Registry;
 use store::{RevisionRecord, State};
 
 pub use error::Error;
 pub use fit::fits;
-pub use prefixes::prefixes;
+pub use inventory::Known;
 pub use publish::{RolledBack, Withdrawn};
 
-use definitions::Definitions;
+use inventory::InUse;
 
 /// Services, their revisions, and what these are made of.
 pub struct Catalogue {
     state: Arc<State>,
     images: Arc<image::Store>,
-    definitions: Definitions,
+    in_use: InUse,
 }
 
 impl Catalogue {
@@ -44,7 +42,7 @@ impl Catalogue {
         Catalogue {
             state,
             images,
-            definitions: Definitions::default(),
+            in_use: InUse::default(),
         }
     }
 
@@ -78,24 +76,9 @@ impl Catalogue {
     pub async fn layers(&self, revision: &RevisionRecord) -> Result<Vec<PathBuf>, Error> {
         let (images, digest) = (Arc::clone(&self.images), revision.image.clone());
         blocking("extracting layers", move || {
-            definitions::layers(&images, &digest)
+            inventory::layers(&images, &digest)
         })
         .await
-    }
-
-    /// All message definitions that a servant of `revision` knows: its interface's, and those in its image.
-    pub async fn registry(&self, revision: &RevisionRecord) -> Arc<Registry> {
-        self.definitions.registry(&self.images, revision).await
-    }
-
-    /// Reads the definitions of everything published, so that no robot waits for that.
-    pub async fn read_definitions(&self) -> Result<(), Error> {
-        for service in self.state.service_names()? {
-            if let Some(revision) = self.state.current(&service)? {
-                self.definitions.read(&self.images, &revision.image).await;
-            }
-        }
-        Ok(())
     }
 }
 

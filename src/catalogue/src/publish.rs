@@ -5,8 +5,10 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use image::{Digest, Store};
+use package::inventory::Inventory;
 use store::{RevisionLine, RevisionRecord};
 
+use crate::inventory::digest;
 use crate::{Catalogue, Error, blocking};
 
 /// A service that went back (or on) to another revision.
@@ -27,10 +29,14 @@ pub struct Withdrawn {
 
 impl Catalogue {
     /// Writes the revision; from here on it is what new servants are started from. Gives its number.
-    pub async fn publish(&self, record: RevisionRecord) -> Result<u64, Error> {
+    pub async fn publish(
+        &self,
+        record: RevisionRecord,
+        inventory: Inventory,
+    ) -> Result<u64, Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("publishing", move || {
-            let number = state.publish(&record)?;
+            let number = state.publish(&record, &inventory)?;
             // A crash before these is repaired at the next start.
             tag(&store, &record.service, number, &record.image)?;
             tag_current(&store, &record.service, &record.image)?;
@@ -141,13 +147,6 @@ impl Catalogue {
             Ok(_) => {}
             Err(error) => tracing::warn!("garbage could not be collected: {error}"),
         }
-        if let Ok(revisions) = self.state.all_revisions() {
-            let images = revisions
-                .into_iter()
-                .map(|revision| revision.image)
-                .collect();
-            self.definitions.keep_only(&images);
-        }
     }
 }
 
@@ -161,10 +160,7 @@ fn tag_current(store: &Store, service: &str, image: &str) -> Result<(), Error> {
 }
 
 fn set_tag(store: &Store, name: &str, image: &str) -> Result<(), Error> {
-    let digest = image.parse().map_err(|_| Error::UnknownImage {
-        what: image.to_owned(),
-    })?;
-    match store.tag(name, &digest) {
+    match store.tag(name, &digest(image)?) {
         Err(error @ image::Error::UnknownImage { .. }) => {
             tracing::error!("{name} cannot be served: {error}");
             Ok(())

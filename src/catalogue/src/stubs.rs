@@ -1,17 +1,18 @@
 //! Stubs of published services: composed from the image and the interface, packed with the robot's program.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use api::stub::{ARCHITECTURES, architecture};
 use flate2::{Compression, GzBuilder};
+use package::inventory::Inventory;
 use package::stub::{About, Content, Contents, Files, PROGRAM, compose};
 use store::RevisionRecord;
 use tar::{EntryType, Header};
 
-use crate::{Error, definitions};
+use crate::{Error, inventory};
 
 /// The time of every file: the same input gives the same archive.
 const MTIME: u64 = 1_700_000_000;
@@ -92,42 +93,11 @@ pub fn is_authority(text: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
-/// Executables of the package that run in the cloud, those that a revision's servants run, by name: where each is, as its
-/// push recorded it. A stub may have these started and no others. `layers`: the image's, extracted, lowest first. Blocking.
-pub fn programs<L: AsRef<Path>>(
-    revision: &RevisionRecord,
-    layers: &[L],
-) -> BTreeMap<String, PathBuf> {
-    let package = &revision.package;
-    let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
-    let of_package = |argument: &String| {
-        let inside = below
-            .iter()
-            .any(|below| argument.starts_with('/') && argument.contains(below));
-        let name = argument.rsplit('/').next().unwrap_or_default();
-        inside.then(|| (name.to_owned(), PathBuf::from(argument)))
-    };
-    // Nodes are given files of the package, too. What cannot be found or looked at is taken for a program, as it was
-    // when it was started.
-    let runs = |(_, path): &(String, PathBuf)| {
-        !matches!(package::stub::is_program(layers, path), Ok(Some(false)))
-    };
-    let nodes = revision.plan.nodes.iter();
-    nodes
-        .filter_map(|node| node.argv.iter().filter_map(of_package).find(runs))
-        .filter(|(name, _)| package::names::is_executable(name))
-        .collect()
-}
-
-/// Their names.
-fn outsourced<L: AsRef<Path>>(revision: &RevisionRecord, layers: &[L]) -> BTreeSet<String> {
-    programs(revision, layers).into_keys().collect()
-}
-
 /// The files of a revision's stub, but for the robot's program.
 pub fn files(
     store: &image::Store,
     revision: &RevisionRecord,
+    inventory: &Inventory,
     architecture: &str,
     server: &str,
 ) -> Result<Files, Error> {
@@ -135,8 +105,11 @@ pub fn files(
         service: revision.service.clone(),
         reason: error.to_string(),
     };
-    let layers = definitions::layers(store, &revision.image)?;
-    let contents = Contents::read(&layers, &prefixes(revision), &revision.package);
+    let layers = inventory::layers(store, &revision.image)?;
+    let contents = match inventory.packages.get(&revision.package) {
+        Some(package) => Contents::read(&layers, package).map_err(no_stub)?,
+        None => Contents::default(),
+    };
     let about = About {
         service: &revision.service,
         package: &revision.package,
@@ -144,49 +117,22 @@ pub fn files(
         image: &revision.image,
         server,
         architecture,
-        outsourced: &outsourced(revision, &layers),
+        outsourced: &inventory.programs.keys().cloned().collect(),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
     };
-    compose(&about, contents.map_err(no_stub)?).map_err(no_stub)
-}
-
-/// Install spaces of an image in the order in which its nodes search them, without the leading slash.
-fn prefixes(revision: &RevisionRecord) -> Vec<String> {
-    let variable = |name: &str| {
-        let value = revision.plan.environment.get(name);
-        value
-            .map(String::as_str)
-            .unwrap_or_default()
-            .split(':')
-            .map(str::to_owned)
-            .collect::<Vec<_>>()
-    };
-    let mut prefixes = variable("CMAKE_PREFIX_PATH");
-    let shares = variable("ROS_PACKAGE_PATH");
-    prefixes.extend(
-        shares
-            .iter()
-            .filter_map(|share| share.strip_suffix("/share"))
-            .map(str::to_owned),
-    );
-    prefixes.push("/usr".to_owned());
-    let mut seen = BTreeSet::new();
-    prefixes
-        .iter()
-        .map(|prefix| prefix.trim_matches('/').to_owned())
-        .filter(|prefix| !prefix.is_empty() && seen.insert(prefix.clone()))
-        .collect()
+    compose(&about, contents).map_err(no_stub)
 }
 
 /// The archive of a revision's stub, in a file that is gone when it is closed.
 pub fn archive(
     store: &image::Store,
     revision: &RevisionRecord,
+    inventory: &Inventory,
     program: &Program,
     server: &str,
 ) -> Result<File, Error> {
-    let files = files(store, revision, program.architecture, server)?;
+    let files = files(store, revision, inventory, program.architecture, server)?;
     let failed = |error: std::io::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: format!("it could not be packed: {error}"),
@@ -256,90 +202,8 @@ fn header(kind: EntryType, executable: bool, size: u64) -> Header {
 #[cfg(test)]
 mod tests {
     use std::io::Read;
-    use std::os::unix::fs::PermissionsExt;
-
-    use store::Plan;
 
     use super::*;
-
-    fn revision(argv: &[&[&str]]) -> RevisionRecord {
-        RevisionRecord {
-            service: "serves".into(),
-            number: 1,
-            image: String::new(),
-            published: 0,
-            package: "p".into(),
-            source: String::new(),
-            plan: Plan {
-                environment: [
-                    ("CMAKE_PREFIX_PATH", "/opt/mine:/usr"),
-                    ("ROS_PACKAGE_PATH", "/opt/mine/share:/opt/other/share"),
-                ]
-                .map(|(key, value)| (key.to_owned(), value.to_owned()))
-                .into(),
-                nodes: argv
-                    .iter()
-                    .map(|argv| servant::spec::NodeSpec {
-                        name: "/n".into(),
-                        argv: argv.iter().map(|word| (*word).to_owned()).collect(),
-                        environment: Default::default(),
-                        directory: "/root".into(),
-                        respawn: false,
-                        respawn_delay: 0.0,
-                        required: false,
-                    })
-                    .collect(),
-                ..Plan::default()
-            },
-            interface: Default::default(),
-        }
-    }
-
-    #[test]
-    fn what_servants_run_of_the_package_is_outsourced() {
-        let revision = revision(&[
-            &["/usr/bin/nice", "-n", "5", "/usr/lib/p/node", "__name:=n"],
-            &["/opt/mine/share/p/scripts/tool.py", "x:=/lib/p/y"],
-            &["/usr/lib/q/other"],
-        ]);
-        let none: [PathBuf; 0] = [];
-        let names: Vec<String> = super::outsourced(&revision, &none).into_iter().collect();
-        assert_eq!(names, ["node", "tool.py"]);
-        let programs = programs(&revision, &none);
-        assert_eq!(
-            programs.get("tool.py").map(PathBuf::as_path),
-            Some(Path::new("/opt/mine/share/p/scripts/tool.py"))
-        );
-        assert!(!programs.contains_key("nice") && !programs.contains_key("other"));
-        assert_eq!(prefixes(&revision), ["opt/mine", "usr", "opt/other"]);
-    }
-
-    #[test]
-    fn data_that_a_node_is_given_is_not_outsourced() {
-        let layer = tempfile::tempdir().expect("a directory");
-        let files = [
-            ("usr/share/p/maps/map.yaml", 0o644),
-            ("usr/lib/p/model", 0o644),
-            ("usr/lib/p/node", 0o755),
-        ];
-        for (path, mode) in files {
-            let path = layer.path().join(path);
-            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
-            std::fs::write(&path, "").expect("written");
-            std::fs::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
-        }
-        let revision = revision(&[
-            &[
-                "/usr/lib/map_server/map_server",
-                "/usr/share/p/maps/map.yaml",
-            ],
-            &["/usr/bin/nice", "/usr/lib/p/model", "/usr/lib/p/node"],
-        ]);
-        let names: Vec<String> = super::outsourced(&revision, &[layer.path()])
-            .into_iter()
-            .collect();
-        assert_eq!(names, ["node"]);
-    }
 
     #[test]
     fn the_same_files_make_the_same_archive() {

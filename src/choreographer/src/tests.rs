@@ -32,6 +32,7 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
         published: store::now(),
         package: "detect".into(),
         source: "a test".into(),
+        flavour: Default::default(),
         plan: Plan {
             limits: api::Limits {
                 cpus: Some(cpus),
@@ -145,7 +146,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
     let (_home, choreographer) = choreographer();
     let state = &choreographer.inner.state;
     let first = state
-        .publish(&revision("sha256:1", 9.0))
+        .publish(&revision("sha256:1", 9.0), &Default::default())
         .expect("published");
     // Somebody asks while others are being given theirs, and meanwhile there is a new revision.
     let held = choreographer.inner.servants.lock();
@@ -167,7 +168,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
         std::thread::yield_now();
     }
     let second = state
-        .publish(&revision("sha256:2", 9.0))
+        .publish(&revision("sha256:2", 9.0), &Default::default())
         .expect("published");
     drop(held);
     let given = asking.join().expect("no panic");

@@ -221,7 +221,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         home.path().display()
     );
     supervision::ready();
-    app.catalogue.read_definitions().await?;
+    app.catalogue.complete().await?;
     app.choreographer.keep_spares();
     asked.cancelled().await;
     supervision::stopping();

@@ -16,10 +16,10 @@ use std::collections::BTreeMap;
 pub struct Variables(BTreeMap<String, String>);
 
 impl Variables {
-    /// Those of a ROS 1 distribution such as `noetic`, with Python 3.
-    pub fn ros1(distribution: &str) -> Self {
+    /// Those of a distribution such as `noetic` of this version of ROS, with Python 3.
+    pub fn ros(version: u8, distribution: &str) -> Self {
         Self::from_iter([
-            ("ROS_VERSION", "1"),
+            ("ROS_VERSION", &*version.to_string()),
             ("ROS_DISTRO", distribution),
             ("ROS_PYTHON_VERSION", "3"),
         ])
@@ -194,7 +194,7 @@ mod tests {
     use super::*;
 
     fn holds(condition: &str) -> bool {
-        Variables::ros1("noetic").hold(condition).unwrap()
+        Variables::ros(1, "noetic").hold(condition).unwrap()
     }
 
     #[test]

@@ -3,9 +3,9 @@
 //! ```text
 //!   directory ──workspace::inspect──▶ Pushed: packages in build order │ an install space
 //!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
-//!   layers ──definitions::read──▶ "pkg/msg/Type" → text
+//!   layers ──inventory::take──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
-//!   layers, interface ──stub──▶ the files that a robot installs in the package's place
+//!   layers, inventory, interface ──stub──▶ the files that a robot installs in the package's place
 //! ```
 //!
 //! Everything here comes from strangers: names are checked before anyone puts them into a path or a command, sizes
@@ -19,6 +19,7 @@ pub mod difference;
 mod error;
 pub mod interface;
 mod interface_toml;
+pub mod inventory;
 pub mod manifest;
 mod merged;
 pub mod names;

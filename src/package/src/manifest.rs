@@ -299,7 +299,7 @@ mod tests {
         Manifest::parse(
             text,
             Path::new("src/x/package.xml"),
-            &Variables::ros1("noetic"),
+            &Variables::ros(1, "noetic"),
         )
     }
 
@@ -449,7 +449,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("package.xml");
         let read = || {
-            Manifest::read(&path, &Variables::ros1("noetic"))
+            Manifest::read(&path, &Variables::ros(1, "noetic"))
                 .unwrap_err()
                 .to_string()
         };

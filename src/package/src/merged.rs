@@ -91,6 +91,11 @@ impl Merged {
         })
     }
 
+    /// Whether there is such a directory.
+    pub(crate) fn exists(&self) -> bool {
+        !self.levels.is_empty()
+    }
+
     /// A directory in this one; one without parts if there is none.
     pub(crate) fn below(&self, name: &[u8]) -> Result<Self, Error> {
         let mut levels = Vec::new();

@@ -15,7 +15,7 @@ mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-pub use contents::{Content, Contents, is_program};
+pub use contents::{Content, Contents};
 
 use crate::Error;
 use crate::interface::Interface;

@@ -317,7 +317,7 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
         }
         C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
         C::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
-        C::Definitions(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
+        C::Inventory(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
         C::State(_) | C::Image(_) | C::Internal(_) => INTERNAL,
     }
 }

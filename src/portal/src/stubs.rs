@@ -54,12 +54,13 @@ pub async fn archive(
     let revision = app.catalogue.current(name)?;
     let program = Programs::look().of(asked.arch.as_deref())?;
     let server = server(&app, &caller, &headers);
+    let inventory = app.catalogue.known(&revision).await?.inventory;
     let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
-    let file =
-        tokio::task::spawn_blocking(move || stubs::archive(&store, &revision, &program, &server))
-            .await
-            .map_err(|_| Error::Internal("packing a stub"))??;
+    let packing = move || stubs::archive(&store, &revision, &inventory, &program, &server);
+    let file = tokio::task::spawn_blocking(packing)
+        .await
+        .map_err(|_| Error::Internal("packing a stub"))??;
     let headers = [
         (header::CONTENT_TYPE, "application/gzip".to_owned()),
         (

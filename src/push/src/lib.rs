@@ -198,7 +198,7 @@ impl Pusher {
         }
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
-            supplement::add(&mut interface, text, &built.definitions)
+            supplement::add(&mut interface, text, &built.inventory.definitions)
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         interface_limits::check_interface(&interface)?;
@@ -209,12 +209,12 @@ impl Pusher {
             published: store::now(),
             package: built.package.clone(),
             source: options.source.clone(),
+            flavour: built.flavour,
             plan,
             interface,
         };
         tell.step("publishing").await;
-        let number = self.publish(record).await?;
-        self.catalogue.read_definitions().await?;
+        let number = self.publish(record, built.inventory).await?;
         let about = NewEvent {
             service: Some(&name),
             ..NewEvent::default()
@@ -277,15 +277,7 @@ impl Pusher {
 
 fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
     let mut environment = built.environment.clone();
-    for (name, value) in [
-        ("HOME", HOME_INSIDE),
-        ("ROS_HOME", HOME_INSIDE),
-        ("ROS_LOG_DIR", "/root/log"),
-        ("ROS_MASTER_URI", "http://localhost:11311"),
-        ("ROS_HOSTNAME", "localhost"),
-    ] {
-        environment.insert(name.to_owned(), value.to_owned());
-    }
+    environment.extend(built.flavour.environment(HOME_INSIDE));
     Plan {
         environment,
         nodes: built

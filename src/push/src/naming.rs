@@ -16,6 +16,7 @@ use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
 use ros::JoinOptions;
 use ros::bus::{Graph, RosVersion};
+use ros::flavour::Flavour;
 use servant::engine::Servant;
 use tokio::time::timeout;
 
@@ -50,17 +51,18 @@ pub(super) async fn settle(
         .iter()
         .map(|index| {
             let mut node = plan.nodes[*index].clone();
-            node.environment
-                .insert("ROS_NAMESPACE".to_owned(), namespace(*index));
+            let put = built.flavour.namespace(&namespace(*index));
+            node.environment.extend([put]);
             node
         })
         .collect();
     let mut spec = probe::spec(pusher, id, built, &alone, options).await?;
     spec.id = format!("{id}-names");
     let (servant, trial) = probe::start(pusher, spec).await?;
-    let found = look(pusher, &servant, &alone, &unnamed).await;
+    let ros = built.flavour.ros.bus();
+    let found = look(pusher, &servant, ros, &alone, &unnamed).await;
     trial.end().await?;
-    apply(plan, &unnamed, &found?, options);
+    apply(plan, &built.flavour, &unnamed, &found?, options);
     Ok(())
 }
 
@@ -68,6 +70,7 @@ pub(super) async fn settle(
 async fn look(
     pusher: &Pusher,
     servant: &Arc<dyn Servant>,
+    ros: RosVersion,
     alone: &Plan,
     unnamed: &[usize],
 ) -> Result<Vec<(usize, String)>, Error> {
@@ -79,13 +82,9 @@ async fn look(
     // A container is a host of that name.
     let host = servant.id();
     let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-    let bus = ros::connect(
-        RosVersion::One,
-        sockets,
-        JoinOptions::new(master::ADDRESS, NODE),
-    )
-    .await
-    .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+    let bus = ros::connect(ros, sockets, JoinOptions::new(master::ADDRESS, NODE))
+        .await
+        .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
     let mut graph = bus.graph();
     let seen = graph.clone();
     let patience = pusher.options.probe;
@@ -179,7 +178,13 @@ fn without_host(name: &str, host: &str) -> String {
 }
 
 /// Writes names into the plan, and moves private parameters there. A node whose name is not known is told the guess.
-fn apply(plan: &mut Plan, unnamed: &[usize], found: &[(usize, String)], options: &PushOptions) {
+fn apply(
+    plan: &mut Plan,
+    flavour: &Flavour,
+    unnamed: &[usize],
+    found: &[(usize, String)],
+    options: &PushOptions,
+) {
     let mut taken: BTreeSet<String> = plan
         .nodes
         .iter()
@@ -204,14 +209,9 @@ fn apply(plan: &mut Plan, unnamed: &[usize], found: &[(usize, String)], options:
             }
         }
         let node = &mut plan.nodes[*index];
-        match name.rsplit_once('/') {
-            Some((namespace, last)) if !namespace.is_empty() => {
-                node.environment
-                    .insert("ROS_NAMESPACE".to_owned(), namespace.to_owned());
-                node.argv.push(format!("__name:={last}"));
-            }
-            _ => node.argv.push(format!("__name:={}", &name[1..])),
-        }
+        let identity = flavour.identity(&name);
+        node.argv.push(identity.argument);
+        node.environment.extend([identity.environment]);
         node.name = name;
     }
 }
@@ -283,7 +283,7 @@ mod tests {
                 .insert(key.to_owned(), ros::bus::ParamValue::Int(1));
         }
         let found = [(0, "costmap_2d".to_owned()), (2, "other".to_owned())];
-        apply(&mut plan, &[0, 2], &found, &options);
+        apply(&mut plan, &Flavour::default(), &[0, 2], &found, &options);
         let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
         assert_eq!(names, ["/costmap_2d", "/other", "/other_2"]);
         assert_eq!(plan.nodes[0].argv, ["/x", "__name:=costmap_2d"]);

@@ -11,7 +11,7 @@ use reach::{ServantSockets, how_it_ended, master};
 use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
 use rootfs_builder::{BuildOutcome, blocking};
 use ros::JoinOptions;
-use ros::bus::{Bus, RosVersion};
+use ros::bus::Bus;
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::{Profile, Spec};
@@ -115,7 +115,7 @@ async fn look(
         next: None,
         log: Vec::new(),
     };
-    let registry = Registry::from_definitions(&built.definitions)
+    let registry = Registry::from_definitions(&built.inventory.definitions)
         .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
     let working = Arc::clone(servant);
     let options = ProbeOptions {
@@ -137,14 +137,14 @@ async fn look(
             // First: of a node that ended, nothing else is worth saying.
             biased;
             words = ended(servant, plan) => return Err(failed(words)),
-            bus = ros::connect(RosVersion::One, sockets, JoinOptions::new(master::ADDRESS, NODE)) => {
+            bus = ros::connect(built.flavour.ros.bus(), sockets, JoinOptions::new(master::ADDRESS, NODE)) => {
                 bus.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
             }
         };
         rootfs_builder::probe::probe(
             &*bus,
             &registry,
-            &built.definitions,
+            &built.inventory.definitions,
             &options,
             ended(servant, plan),
         )
@@ -162,7 +162,10 @@ async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
             next: None,
             log,
         } => {
-            let advice = pusher.builder.advice(&built.base, &log.join("\n")).await;
+            let advice = pusher
+                .builder
+                .advice(&built.flavour.base, &log.join("\n"))
+                .await;
             Error::Failed {
                 message,
                 next: (!advice.is_empty()).then(|| advice.join("; ")),
@@ -289,7 +292,7 @@ pub(super) async fn spec(
         owned_directories: Vec::new(),
         mounts: granted.mounts,
         hosts: granted.hosts,
-        resident: master::resident_config(&plan.parameters),
+        resident: master::resident_config(&built.flavour, &plan.parameters),
     })
 }
 

@@ -1,6 +1,7 @@
 //! Publishing, rolling back and removing services: the catalogue does it, servants and spares follow.
 
 use catalogue::RolledBack;
+use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
 
 use super::Pusher;
@@ -8,8 +9,12 @@ use crate::Error;
 
 impl Pusher {
     /// Publishes the revision, and has a spare made of it.
-    pub(super) async fn publish(&self, record: RevisionRecord) -> Result<u64, Error> {
-        let published = self.catalogue.publish(record).await;
+    pub(super) async fn publish(
+        &self,
+        record: RevisionRecord,
+        inventory: Inventory,
+    ) -> Result<u64, Error> {
+        let published = self.catalogue.publish(record, inventory).await;
         self.choreographer.look_at_spares();
         Ok(published?)
     }

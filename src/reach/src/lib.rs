@@ -22,15 +22,16 @@ mod sockets;
 
 use std::collections::BTreeMap;
 use std::future::Future;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bridge::{Bridge, BridgeOptions};
 use budget::Budget;
 use link::control::Request;
+use package::inventory::Inventory;
 use ros::JoinOptions;
 use ros::bus::{Bus, BusError, ParamValue, RosVersion};
+use ros::flavour::Flavour;
 use ros::schema::Registry;
 use servant::spec::NodeSpec;
 
@@ -52,18 +53,16 @@ pub struct Recorded {
     pub service: String,
     /// The ROS package that was pushed.
     pub package: String,
+    /// The ROS that the image is built for.
+    pub flavour: Flavour,
     /// Environment of every process.
     pub environment: BTreeMap<String, String>,
     /// The revision's own nodes.
     pub nodes: Vec<NodeSpec>,
     /// Parameters that the deployer gave, absolute names.
     pub parameters: BTreeMap<String, ParamValue>,
-    /// Programs that stubs may have started, by name.
-    pub programs: BTreeMap<String, PathBuf>,
-    /// Install spaces of the image, absolute, in the order in which they are searched.
-    pub prefixes: Vec<PathBuf>,
-    /// Extracted layers of the image, lowest first.
-    pub layers: Vec<PathBuf>,
+    /// What the image holds.
+    pub inventory: Arc<Inventory>,
     /// Message definitions.
     pub registry: Arc<Registry>,
     /// Hosts that its nodes may connect to.
@@ -93,6 +92,8 @@ pub trait Tenant: Send + Sync + 'static {
 /// Habits of one servant's reach.
 #[derive(Debug, Clone)]
 pub struct ReachOptions {
+    /// What its nodes speak.
+    pub ros: RosVersion,
     /// Sessions of rosbridge.
     pub bridge: BridgeOptions,
     /// How long a link outlives its connection.
@@ -130,7 +131,7 @@ impl Reach {
             unfinished: options.unfinished,
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
-        let joined = ros::connect(RosVersion::One, sockets, joining);
+        let joined = ros::connect(options.ros, sockets, joining);
         let (bus, recorded) = tokio::join!(joined, recorded);
         let bus = bus?;
         let registry = Arc::clone(&recorded.registry);

@@ -2,13 +2,12 @@
 
 mod planned;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use api::Level;
 use async_trait::async_trait;
-use foreign::Tree;
 use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request, Sla};
 use parking_lot::Mutex;
@@ -84,15 +83,6 @@ impl LinkedNodes {
         let _ = self.tenant.set(tenant);
     }
 
-    /// Where the image has a file, as seen from inside.
-    fn has(&self, path: &Path) -> bool {
-        let below = path.strip_prefix("/").unwrap_or(path);
-        let mut layers = self.recorded.layers.iter().rev();
-        let found = layers.find_map(|layer| Tree::open(layer).ok()?.kind_in_root(below));
-        // A character device is a whiteout.
-        found.is_some_and(|found| found.is_file() || found.is_dir() || found.is_symlink())
-    }
-
     fn tenant(&self) -> Result<Arc<dyn Tenant>, String> {
         self.tenant
             .get()
@@ -100,31 +90,25 @@ impl LinkedNodes {
             .ok_or_else(|| "the servant has ended".to_owned())
     }
 
-    fn share(&self, node: &Node) -> Option<PathBuf> {
-        if node.package != self.recorded.package {
-            return None;
-        }
-        let prefixes = self.recorded.prefixes.iter();
-        prefixes
-            .map(|prefix| prefix.join("share").join(&node.package))
-            .find(|share| self.has(share))
-    }
-
     /// Where the program runs: as on the robot, or where ROS's own default leads.
-    fn directory(&self, node: &Node, program: &Path) -> String {
+    fn directory(&self, node: &Node, program: &str) -> String {
         let overlay = Path::new(&node.share).parent().and_then(Path::parent);
         let beside = overlay
             .is_some_and(|overlay| Path::new(&node.directory).starts_with(overlay.join("lib")));
         if beside {
-            let parent = program.parent().unwrap_or(Path::new("/"));
+            let parent = Path::new(program).parent().unwrap_or(Path::new("/"));
             return parent.to_string_lossy().into_owned();
         }
         let translated = self.translate(node, &node.directory);
         if translated != node.directory {
             return translated;
         }
-        let home = self.recorded.environment.get("ROS_HOME").cloned();
-        home.unwrap_or_default()
+        let Recorded {
+            flavour,
+            environment,
+            ..
+        } = &self.recorded;
+        flavour.home(environment).to_owned()
     }
 
     /// The revision's own nodes end: a stub's take their place.
@@ -136,11 +120,13 @@ impl LinkedNodes {
 
 /// The program that a stub's node stands for. A robot says which, so nothing but what the push recorded is run: other
 /// programs of the image, by whatever path, are not.
-fn program(recorded: &Recorded, node: &Node) -> Option<PathBuf> {
-    if node.package != recorded.package {
-        return None;
-    }
-    recorded.programs.get(&node.executable).cloned()
+fn program<'a>(recorded: &'a Recorded, node: &Node) -> Option<&'a String> {
+    let same = node.package == recorded.package;
+    recorded
+        .inventory
+        .programs
+        .get(&node.executable)
+        .filter(|_| same)
 }
 
 #[async_trait]
@@ -155,20 +141,19 @@ impl Nodes for LinkedNodes {
             ));
         };
         self.end_planned(&*tenant).await;
-        let (namespace, name) = node.name.rsplit_once('/').unwrap_or(("", &node.name));
-        let mut argv = vec![program.to_string_lossy().into_owned()];
+        let identity = self.recorded.flavour.identity(&node.name);
+        let mut argv = vec![program.clone()];
         argv.extend(
             node.argv
                 .iter()
                 .map(|argument| self.translate(node, argument)),
         );
-        argv.push(format!("__name:={name}"));
-        let namespace = if namespace.is_empty() { "/" } else { namespace };
-        let directory = self.directory(node, &program);
+        argv.push(identity.argument);
+        let directory = self.directory(node, program);
         let spec = NodeSpec {
             name: node.name.clone(),
             argv,
-            environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
+            environment: [identity.environment].into(),
             directory,
             respawn: false,
             respawn_delay: 0.0,
@@ -230,8 +215,10 @@ impl Nodes for LinkedNodes {
         if node.share.is_empty() || !text.contains(&node.share) {
             return text.to_owned();
         }
-        match self.share(node) {
-            Some(share) => text.replace(&node.share, &share.to_string_lossy()),
+        let own = node.package == self.recorded.package;
+        let packages = &self.recorded.inventory.packages;
+        match packages.get(&node.package).filter(|_| own) {
+            Some(package) => text.replace(&node.share, &package.share),
             None => text.to_owned(),
         }
     }
@@ -305,29 +292,33 @@ impl Nodes for LinkedNodes {
 
 #[cfg(test)]
 mod tests {
+    use package::inventory::Inventory;
+
     use super::*;
 
     fn recorded() -> Recorded {
         Recorded {
             service: "vision".into(),
             package: "vision".into(),
+            flavour: Default::default(),
             environment: Default::default(),
             nodes: Vec::new(),
             parameters: Default::default(),
-            programs: [
-                ("see", "/opt/mine/lib/vision/see"),
-                ("look.py", "/opt/mine/share/vision/scripts/look.py"),
-            ]
-            .map(|(name, path)| (name.to_owned(), path.into()))
-            .into(),
-            prefixes: Vec::new(),
-            layers: Vec::new(),
+            inventory: Arc::new(Inventory {
+                programs: [
+                    ("see", "/opt/mine/lib/vision/see"),
+                    ("look.py", "/opt/mine/share/vision/scripts/look.py"),
+                ]
+                .map(|(name, path)| (name.to_owned(), path.to_owned()))
+                .into(),
+                ..Inventory::default()
+            }),
             registry: Default::default(),
             ways_out: Vec::new(),
         }
     }
 
-    fn asks(package: &str, executable: &str) -> Option<PathBuf> {
+    fn asks(package: &str, executable: &str) -> Option<String> {
         let node = Node {
             name: "/see".into(),
             package: package.into(),
@@ -339,12 +330,12 @@ mod tests {
             revision: None,
             image: String::new(),
         };
-        program(&recorded(), &node)
+        program(&recorded(), &node).cloned()
     }
 
     #[test]
     fn a_stub_starts_what_its_push_recorded_and_nothing_else() {
-        let path = |text: &str| Some(PathBuf::from(text));
+        let path = |text: &str| Some(text.to_owned());
         assert_eq!(asks("vision", "see"), path("/opt/mine/lib/vision/see"));
         assert_eq!(
             asks("vision", "look.py"),

@@ -8,6 +8,7 @@ pub mod bag;
 pub mod bus;
 pub mod codec;
 mod connect;
+pub mod flavour;
 pub mod net;
 pub mod ring;
 pub mod ros1;

@@ -4,6 +4,7 @@ mod actions;
 mod bus;
 pub mod master;
 pub mod names;
+pub mod process;
 mod reply;
 pub mod tcpros;
 #[cfg(test)]

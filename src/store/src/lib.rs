@@ -33,9 +33,10 @@ pub use servants::ServantRecord;
 pub use services::{Plan, RevisionLine, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 2] = [
+const MIGRATIONS: [&str; 3] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
+    include_str!("003-inventory.sql"),
 ];
 
 /// What can go wrong.

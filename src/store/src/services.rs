@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use api::Millis;
+use package::inventory::Inventory;
+use ros::flavour::Flavour;
 use rusqlite::{OptionalExtension, Row, params};
 use serde::{Deserialize, Serialize};
 
@@ -24,6 +26,8 @@ pub struct RevisionRecord {
     pub package: String,
     /// What was pushed, in words.
     pub source: String,
+    /// The ROS that its image is built for.
+    pub flavour: Flavour,
     /// How its servants are started.
     pub plan: Plan,
     /// Its interface, definitions included.
@@ -71,8 +75,11 @@ pub struct Plan {
 }
 
 impl State {
-    /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns.
-    pub fn publish(&self, revision: &RevisionRecord) -> Result<u64, Error> {
+    /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns. `inventory`:
+    /// what its image holds.
+    pub fn publish(&self, revision: &RevisionRecord, inventory: &Inventory) -> Result<u64, Error> {
+        let flavour = to_json(&revision.flavour, &revision.service)?;
+        let inventory = to_json(inventory, &revision.service)?;
         let plan = to_json(&revision.plan, &revision.service)?;
         let interface = to_json(&revision.interface, &revision.service)?;
         self.durably(|connection| {
@@ -90,8 +97,9 @@ impl State {
                 params![revision.service, revision.package, number],
             )?;
             transaction.execute(
-                "INSERT INTO revisions (service, number, image, published, source, plan, interface)
-                 VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
+                "INSERT INTO revisions
+                     (service, number, image, published, source, plan, interface, flavour, inventory)
+                 VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9)",
                 params![
                     revision.service,
                     number,
@@ -99,7 +107,9 @@ impl State {
                     revision.published as i64,
                     revision.source,
                     plan,
-                    interface
+                    interface,
+                    flavour,
+                    inventory
                 ],
             )?;
             transaction.commit()?;
@@ -185,7 +195,8 @@ impl State {
     }
 
     fn read_revision(&self, service: &str, number: u64) -> Result<Option<RevisionRecord>, Error> {
-        let read = |row: &Row<'_>| -> rusqlite::Result<(RevisionRecord, String, String)> {
+        type Texts = (String, String, Option<String>);
+        let read = |row: &Row<'_>| -> rusqlite::Result<(RevisionRecord, Texts)> {
             let record = RevisionRecord {
                 service: service.to_owned(),
                 number,
@@ -193,33 +204,80 @@ impl State {
                 published: row.get::<_, i64>(1)? as Millis,
                 package: row.get(2)?,
                 source: row.get(3)?,
+                flavour: Flavour::default(),
                 plan: Plan::default(),
                 interface: package::interface::Interface::default(),
             };
-            Ok((record, row.get(4)?, row.get(5)?))
+            Ok((record, (row.get(4)?, row.get(5)?, row.get(6)?)))
         };
         let found = self.read(|connection| {
             connection
                 .prepare_cached(
-                    "SELECT r.image, r.published, s.package, r.source, r.plan, r.interface
+                    "SELECT r.image, r.published, s.package, r.source, r.plan, r.interface, r.flavour
                      FROM revisions r JOIN services s ON s.name = r.service
                      WHERE r.service = ?1 AND r.number = ?2",
                 )?
                 .query_row(params![service, number], read)
                 .optional()
         })?;
-        let Some((record, plan, interface)) = found else {
+        let Some((record, (plan, interface, flavour))) = found else {
             return Ok(None);
         };
-        let unreadable = |source| Error::Record {
-            what: format!("revision {number} of {service}"),
-            source,
-        };
+        let unreadable = |source| unreadable(service, number, source);
         Ok(Some(RevisionRecord {
+            // Revisions of earlier versions have none until their image was asked.
+            flavour: flavour.map_or(Ok(record.flavour), |flavour| {
+                serde_json::from_str(&flavour).map_err(unreadable)
+            })?,
             plan: serde_json::from_str(&plan).map_err(unreadable)?,
             interface: serde_json::from_str(&interface).map_err(unreadable)?,
             ..record
         }))
+    }
+
+    /// What the image of a revision holds; none for one that was published by a version that did not record it.
+    pub fn inventory(&self, service: &str, number: u64) -> Result<Option<Inventory>, Error> {
+        let found: Option<Option<String>> = self.read(|connection| {
+            connection
+                .prepare_cached(
+                    "SELECT inventory FROM revisions WHERE service = ?1 AND number = ?2",
+                )?
+                .query_row(params![service, number], |row| row.get(0))
+                .optional()
+        })?;
+        let Some(text) = found.flatten() else {
+            return Ok(None);
+        };
+        serde_json::from_str(&text)
+            .map(Some)
+            .map_err(|source| unreadable(service, number, source))
+    }
+
+    /// Records what was not when the revision was published.
+    pub fn complete(
+        &self,
+        service: &str,
+        number: u64,
+        flavour: &Flavour,
+        inventory: &Inventory,
+    ) -> Result<(), Error> {
+        let (flavour, inventory) = (to_json(flavour, service)?, to_json(inventory, service)?);
+        self.durably(|connection| {
+            connection.execute(
+                "UPDATE revisions SET flavour = ?3, inventory = ?4 WHERE service = ?1 AND number = ?2",
+                params![service, number, flavour, inventory],
+            )
+        })?;
+        self.revisions.lock().remove(&(service.to_owned(), number));
+        Ok(())
+    }
+
+    /// Current revisions that were published by a version that did not record what their images hold.
+    pub fn incomplete(&self) -> Result<Vec<RevisionLine>, Error> {
+        self.lines(
+            "JOIN services s ON s.name = service AND s.current = number WHERE inventory IS NULL",
+            [],
+        )
     }
 
     /// All revisions of a service in short, newest first.
@@ -254,5 +312,12 @@ impl State {
                 })?
                 .collect()
         })
+    }
+}
+
+fn unreadable(service: &str, number: u64, source: serde_json::Error) -> Error {
+    Error::Record {
+        what: format!("revision {number} of {service}"),
+        source,
     }
 }

@@ -1,4 +1,6 @@
 use api::Level;
+use package::inventory::Inventory;
+use ros::flavour::Flavour;
 
 use super::*;
 
@@ -10,6 +12,7 @@ fn revision(service: &str, image: &str) -> RevisionRecord {
         published: now(),
         package: "opencv_apps".into(),
         source: "--apt opencv_apps".into(),
+        flavour: Default::default(),
         plan: Plan {
             nodes: vec![servant::spec::NodeSpec {
                 name: "/people_detect".into(),
@@ -37,15 +40,24 @@ fn a_published_revision_is_read_back_after_a_restart() {
     let (directory, state) = state();
     assert_eq!(
         state
-            .publish(&revision("opencv_apps", "sha256:1"))
+            .publish(&revision("opencv_apps", "sha256:1"), &Inventory::default())
             .expect("published"),
         1
     );
-    let second = revision("opencv_apps", "sha256:2");
-    assert_eq!(state.publish(&second).expect("published"), 2);
+    let mut second = revision("opencv_apps", "sha256:2");
+    second.flavour.distribution = "melodic".into();
+    let inventory = Inventory {
+        prefixes: vec!["/usr".into()],
+        ..Inventory::default()
+    };
+    assert_eq!(state.publish(&second, &inventory).expect("published"), 2);
     drop(state);
     let state = State::open(&directory.path().join("cloudroid.db")).expect("the same database");
     assert_eq!(state.service_names().expect("readable"), ["opencv_apps"]);
+    assert_eq!(
+        state.inventory("opencv_apps", 2).expect("readable"),
+        Some(inventory)
+    );
     let current = state
         .current("opencv_apps")
         .expect("readable")
@@ -70,10 +82,10 @@ fn a_published_revision_is_read_back_after_a_restart() {
 fn rolling_back_needs_a_revision_that_exists() {
     let (_directory, state) = state();
     state
-        .publish(&revision("a", "sha256:1"))
+        .publish(&revision("a", "sha256:1"), &Inventory::default())
         .expect("published");
     state
-        .publish(&revision("a", "sha256:2"))
+        .publish(&revision("a", "sha256:2"), &Inventory::default())
         .expect("published");
     assert!(state.set_current("a", 1).expect("readable"));
     assert_eq!(
@@ -84,7 +96,7 @@ fn rolling_back_needs_a_revision_that_exists() {
     assert!(!state.set_current("b", 1).expect("readable"));
     assert_eq!(
         state
-            .publish(&revision("a", "sha256:3"))
+            .publish(&revision("a", "sha256:3"), &Inventory::default())
             .expect("published"),
         3,
         "numbers go on"
@@ -95,7 +107,7 @@ fn rolling_back_needs_a_revision_that_exists() {
 fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
     let (_directory, state) = state();
     state
-        .publish(&revision("a", "sha256:1"))
+        .publish(&revision("a", "sha256:1"), &Inventory::default())
         .expect("published");
     assert!(state.remove_service("a").expect("readable"));
     assert!(!state.remove_service("a").expect("readable"));
@@ -103,7 +115,7 @@ fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
     assert!(state.all_revisions().expect("readable").is_empty());
     assert_eq!(
         state
-            .publish(&revision("a", "sha256:1"))
+            .publish(&revision("a", "sha256:1"), &Inventory::default())
             .expect("published"),
         2
     );
@@ -173,6 +185,58 @@ fn the_newest_events_come_oldest_first() {
     };
     assert_eq!(texts(0, 2), ["number 4", "number 5"]);
     assert_eq!(texts(4, 10), ["number 5"]);
+}
+
+#[test]
+fn revisions_of_an_earlier_version_are_kept_and_completed() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("cloudroid.db");
+    let earlier = Connection::open(&path).expect("a database");
+    earlier.execute_batch(MIGRATIONS[0]).expect("made");
+    earlier.execute_batch(MIGRATIONS[1]).expect("migrated");
+    earlier
+        .execute_batch(
+            "PRAGMA user_version = 2; PRAGMA foreign_keys = OFF;
+             INSERT INTO services VALUES ('a', 'p', 2);
+             INSERT INTO revisions VALUES ('a', 1, 'sha256:1', 5, 'x', '{\"nodes\":[]}', '{}');
+             INSERT INTO revisions VALUES ('a', 2, 'sha256:2', 6, 'y', '{\"nodes\":[]}', '{}');",
+        )
+        .expect("written");
+    drop(earlier);
+    let state = State::open(&path).expect("migrated");
+    let current = state.current("a").expect("readable").expect("there");
+    assert_eq!((current.number, &*current.source), (2, "y"));
+    assert_eq!(current.flavour, Flavour::default());
+    assert_eq!(state.inventory("a", 2).expect("readable"), None);
+    let incomplete = state.incomplete().expect("readable");
+    assert_eq!(
+        incomplete
+            .iter()
+            .map(|line| line.number)
+            .collect::<Vec<_>>(),
+        [2],
+        "the current one"
+    );
+    let inventory = Inventory {
+        prefixes: vec!["/usr".into()],
+        ..Inventory::default()
+    };
+    let flavour = Flavour {
+        base: "lab".into(),
+        ..Flavour::default()
+    };
+    state
+        .complete("a", 2, &flavour, &inventory)
+        .expect("written");
+    assert!(state.incomplete().expect("readable").is_empty());
+    assert_eq!(state.inventory("a", 2).expect("readable"), Some(inventory));
+    let current = state.current("a").expect("readable").expect("there");
+    assert_eq!(current.flavour, flavour);
+    assert_eq!(
+        state.inventory("a", 1).expect("readable"),
+        None,
+        "another's"
+    );
 }
 
 #[test]

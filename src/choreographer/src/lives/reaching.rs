@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use api::Level;
-use catalogue::{Catalogue, stubs};
+use catalogue::{Catalogue, Known};
 use link::control::Request;
 use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
 use ros::bus::BusError;
@@ -21,6 +21,7 @@ pub(crate) async fn open(
 ) -> Result<Arc<Reach>, BusError> {
     let memory = &inner.memory;
     let options = ReachOptions {
+        ros: revision.flavour.ros.bus(),
         bridge: inner.options.bridge.clone(),
         grace: inner.options.grace,
         budget: memory.servant(container.id()),
@@ -43,21 +44,27 @@ pub(crate) async fn open(
 }
 
 async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
-    let (registry, layers) = tokio::join!(
-        inner.catalogue.registry(revision),
-        inner.catalogue.layers(revision),
-    );
-    let layers = layers.unwrap_or_default();
+    let known = inner.catalogue.known(revision).await;
+    // What runs is to be reached all the same.
+    let Known {
+        inventory,
+        registry,
+    } = known.unwrap_or_else(|error| {
+        tracing::warn!(
+            "what the image of {} holds is not known: {error}",
+            revision.service
+        );
+        Known::default()
+    });
     let plan = &revision.plan;
     Recorded {
         service: revision.service.clone(),
         package: revision.package.clone(),
+        flavour: revision.flavour.clone(),
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         parameters: plan.parameters.clone(),
-        programs: stubs::programs(revision, &layers),
-        prefixes: catalogue::prefixes(revision, &layers),
-        layers,
+        inventory,
         registry,
         // Not allowed any more: then the servant would not have been started either.
         ways_out: grants::ways_out(&plan.grants, &inner.options.allow).unwrap_or_default(),

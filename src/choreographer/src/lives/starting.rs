@@ -115,7 +115,7 @@ pub(super) async fn spec(
         owned_directories: Vec::new(),
         mounts: granted.mounts,
         hosts: granted.hosts,
-        resident: resident_config(&plan.parameters),
+        resident: resident_config(&revision.flavour, &plan.parameters),
     })
 }
 

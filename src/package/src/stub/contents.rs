@@ -1,18 +1,17 @@
-//! What an image holds of a package: its executables, and all that it shares.
+//! What an image holds of a package: its executables, as recorded, and all that it shares.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
+use crate::Error;
+use crate::inventory::Installed;
 use crate::merged::{self, Level, Merged};
-use crate::{Error, names};
 
 /// The largest single file: meshes and maps are shared, too.
 const MAX_BYTES: u64 = 64 << 20;
 /// All files together.
 const MAX_TOTAL: usize = 256 << 20;
 const MAX_FILES: usize = 20_000;
-/// Links that are followed from one to the next.
-const MAX_LINKS: usize = 8;
 /// Directories below a package's.
 const MAX_DEPTH: usize = 16;
 
@@ -40,81 +39,22 @@ pub enum Content {
 }
 
 impl Contents {
-    /// Reads `package` from a stack of extracted layers, given lowest first, as a process in the image would find
-    /// it on these prefixes (`usr`, `opt/ros/noetic`), the first that has it. Nothing is found where none has.
+    /// Reads a package from a stack of extracted layers, given lowest first.
     ///
     /// What is no file, and links that lead out of the package, are left out.
-    pub fn read<L: AsRef<Path>, P: AsRef<str>>(
-        layers: &[L],
-        prefixes: &[P],
-        package: &str,
-    ) -> Result<Self, Error> {
-        let mut contents = Self::default();
-        if !names::is_package(package) {
-            return Ok(contents);
-        }
-        let stack = merged::open(layers)?;
-        let (mut found_share, mut found_lib) = (false, false);
-        for prefix in prefixes {
-            let prefix = prefix.as_ref();
-            if !found_lib {
-                let lib = Merged::at(&stack, &format!("{prefix}/lib/{package}"))?;
-                contents.executables = executables(&lib)?;
-                found_lib = !contents.executables.is_empty();
-            }
-            if !found_share {
-                let share = Merged::at(&stack, &format!("{prefix}/share/{package}"))?;
-                let mut reader = Reader {
-                    share: &mut contents.share,
-                    total: 0,
-                };
-                reader.directory(&share, "", 0)?;
-                found_share = !contents.share.is_empty();
-            }
-        }
-        Ok(contents)
+    pub fn read<L: AsRef<Path>>(layers: &[L], package: &Installed) -> Result<Self, Error> {
+        let mut share = BTreeMap::new();
+        let directory = Merged::at(&merged::open(layers)?, &package.share)?;
+        let mut reader = Reader {
+            share: &mut share,
+            total: 0,
+        };
+        reader.directory(&directory, "", 0)?;
+        Ok(Self {
+            executables: package.executables.clone(),
+            share,
+        })
     }
-}
-
-/// Whether the file at an absolute path of an image, given as in [`Contents::read`], may be executed; none where there is
-/// none. Links are followed as a process in the image would.
-pub fn is_program<L: AsRef<Path>>(layers: &[L], path: &Path) -> Result<Option<bool>, Error> {
-    let stack = merged::open(layers)?;
-    let mut path = path.to_owned();
-    for _ in 0..MAX_LINKS {
-        let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
-            return Ok(None);
-        };
-        let Some(directory) = parent.to_str() else {
-            return Ok(None);
-        };
-        let directory = Merged::at(&stack, directory)?;
-        let names = directory.names()?;
-        let Some((name, level)) = names.get_key_value(name.as_encoded_bytes()) else {
-            return Ok(None);
-        };
-        match level.link(name) {
-            Some(target) => path = parent.join(target),
-            None => return Ok(Some(level.is_executable(name))),
-        }
-    }
-    Ok(None)
-}
-
-/// Of programs only the names are wanted, and a link to one is one.
-fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
-    let mut found = BTreeSet::new();
-    for (name, level) in lib.names()? {
-        let Ok(text) = String::from_utf8(name.clone()) else {
-            continue;
-        };
-        if names::is_executable(&text)
-            && (level.is_executable(&name) || level.link(&name).is_some())
-        {
-            found.insert(text);
-        }
-    }
-    Ok(found)
 }
 
 struct Reader<'a> {
@@ -209,17 +149,20 @@ mod tests {
             path
         }
 
-        fn read(&self, package: &str) -> Contents {
+        fn read(&self) -> Contents {
             let layers = [self.0.path().join("low"), self.0.path().join("high")];
-            Contents::read(&layers, &["opt/mine", "usr"], package).expect("read")
+            let package = Installed {
+                share: "/usr/share/p".into(),
+                lib: "/usr/lib/p".into(),
+                executables: ["node".to_owned()].into(),
+            };
+            Contents::read(&layers, &package).expect("read")
         }
     }
 
     fn layers() -> Layers {
         let layers = Layers(tempfile::tempdir().expect("a directory"));
         layers
-            .file("low/usr/lib/p/node", "ELF", 0o755)
-            .file("low/usr/lib/p/notes.txt", "", 0o644)
             .file("low/usr/share/p/package.xml", "low", 0o644)
             .file("low/usr/share/p/launch/a.launch", "<launch/>", 0o644)
             .file("high/usr/share/p/package.xml", "high", 0o644)
@@ -228,8 +171,8 @@ mod tests {
     }
 
     #[test]
-    fn programs_and_shared_files_of_all_layers_are_found() {
-        let contents = layers().read("p");
+    fn shared_files_of_all_layers_are_found() {
+        let contents = layers().read();
         assert_eq!(contents.executables, ["node".to_owned()].into());
         let names: Vec<&str> = contents.share.keys().map(String::as_str).collect();
         assert_eq!(names, ["launch/a.launch", "package.xml", "scripts/tool.py"]);
@@ -240,69 +183,6 @@ mod tests {
     }
 
     #[test]
-    fn the_first_prefix_wins_and_an_unknown_package_is_empty() {
-        let layers = layers();
-        layers
-            .file("high/opt/mine/share/p/package.xml", "mine", 0o644)
-            .file("high/opt/mine/lib/p/other", "", 0o755);
-        let contents = layers.read("p");
-        assert_eq!(contents.executables, ["other".to_owned()].into());
-        assert_eq!(contents.share.len(), 1);
-        assert_eq!(layers.read("q"), Contents::default());
-        assert_eq!(layers.read("../p"), Contents::default());
-    }
-
-    #[test]
-    fn programs_are_told_from_data() {
-        let layers = layers();
-        layers
-            .file("low/usr/share/p/map.yaml", "", 0o644)
-            .file("high/usr/lib/p/hidden", "", 0o644)
-            .file("low/usr/lib/p/hidden", "", 0o755);
-        for (name, target) in [
-            ("high/usr/lib/p/alias", "../../share/p/scripts/tool.py"),
-            ("high/usr/lib/p/data", "/usr/share/p/map.yaml"),
-            ("high/usr/lib/p/lost", "nowhere"),
-            ("high/usr/lib/p/round", "round"),
-        ] {
-            symlink(target, layers.place(name)).expect("linked");
-        }
-        let stack = [layers.0.path().join("low"), layers.0.path().join("high")];
-        for (path, expected) in [
-            ("/usr/lib/p/node", Some(true)),
-            ("/usr/share/p/scripts/tool.py", Some(true)),
-            ("/usr/lib/p/alias", Some(true)),
-            ("/usr/share/p/map.yaml", Some(false)),
-            ("/usr/share/p/launch", Some(false)),
-            ("/usr/lib/p/data", Some(false)),
-            ("/usr/lib/p/hidden", Some(false)),
-            ("/usr/lib/p/lost", None),
-            ("/usr/lib/p/round", None),
-            ("/usr/lib/p/none", None),
-            ("/", None),
-        ] {
-            let told = is_program(&stack, Path::new(path)).expect("read");
-            assert_eq!(told, expected, "{path}");
-        }
-    }
-
-    #[test]
-    fn a_prefix_cannot_lead_out_of_the_layers() {
-        let layers = layers();
-        layers
-            .file("secret/share/p/package.xml", "the host's", 0o600)
-            .file("secret/lib/p/tool", "", 0o755);
-        let stack = [layers.0.path().join("low"), layers.0.path().join("high")];
-        for prefix in ["../secret", "usr/../../secret", "/../../../secret"] {
-            let contents = Contents::read(&stack, &[prefix], "p").expect("read");
-            assert_eq!(contents, Contents::default(), "{prefix}");
-        }
-        // As a process in the image would find it.
-        let contents = Contents::read(&stack, &["opt/../usr", "../usr"], "p").expect("read");
-        assert!(contents.share.contains_key("package.xml"));
-    }
-
-    #[test]
     fn links_stay_in_the_package_or_are_left_out() {
         let layers = layers();
         for (name, target) in [
@@ -310,11 +190,10 @@ mod tests {
             ("high/usr/share/p/launch/up", "../package.xml"),
             ("high/usr/share/p/launch/out", "../../q/package.xml"),
             ("high/usr/share/p/launch/host", "/etc/shadow"),
-            ("high/usr/lib/p/alias", "node"),
         ] {
             symlink(target, layers.place(name)).expect("linked");
         }
-        let contents = layers.read("p");
+        let contents = layers.read();
         assert_eq!(
             contents.share["launch/b.launch"],
             Content::Link("a.launch".into())
@@ -322,6 +201,5 @@ mod tests {
         assert!(contents.share.contains_key("launch/up"));
         assert!(!contents.share.contains_key("launch/out"));
         assert!(!contents.share.contains_key("launch/host"));
-        assert!(contents.executables.contains("alias"));
     }
 }

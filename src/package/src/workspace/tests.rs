@@ -34,7 +34,7 @@ impl Place {
     }
 
     fn inspect(&self) -> Result<Pushed, Error> {
-        inspect(self.0.path(), &Variables::ros1("noetic"))
+        inspect(self.0.path(), &Variables::ros(1, "noetic"))
     }
 
     fn refused(&self) -> String {

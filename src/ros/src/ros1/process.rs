@@ -1,0 +1,79 @@
+//! How a process becomes a node of ROS 1: its environment and its command line
+//! (<http://wiki.ros.org/ROS/EnvironmentVariables>, <http://wiki.ros.org/Remapping%20Arguments>).
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
+use crate::bus::ParamValue;
+use crate::flavour::Identity;
+
+/// Where every servant's Master listens, as seen from inside.
+pub const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
+
+/// The variable that says where nodes run, and where they keep what they write.
+pub(crate) const HOME: &str = "ROS_HOME";
+
+pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
+    [
+        ("HOME", home.to_owned()),
+        (HOME, home.to_owned()),
+        ("ROS_LOG_DIR", format!("{home}/log")),
+        (
+            "ROS_MASTER_URI",
+            format!("http://localhost:{}", MASTER.port()),
+        ),
+        ("ROS_HOSTNAME", "localhost".to_owned()),
+    ]
+    .map(|(name, value)| (name.to_owned(), value))
+    .into()
+}
+
+pub(crate) fn identity(node: &str) -> Identity {
+    let (above, last) = node.rsplit_once('/').unwrap_or(("", node));
+    Identity {
+        argument: format!("__name:={last}"),
+        environment: namespace(above),
+    }
+}
+
+pub(crate) fn namespace(namespace: &str) -> (String, String) {
+    let namespace = if namespace.is_empty() { "/" } else { namespace };
+    ("ROS_NAMESPACE".to_owned(), namespace.to_owned())
+}
+
+/// What roslaunch sets. The line end is its own: it fills the parameter from the output of a command.
+pub(crate) fn parameters(distribution: &str) -> BTreeMap<String, ParamValue> {
+    let distribution = ParamValue::String(format!("{distribution}\n"));
+    BTreeMap::from([("/rosdistro".to_owned(), distribution)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_is_told_its_name_and_its_namespace() {
+        for (node, argument, namespace) in [
+            ("/camera/see", "__name:=see", "/camera"),
+            ("/see", "__name:=see", "/"),
+            ("see", "__name:=see", "/"),
+            ("/a/b/c", "__name:=c", "/a/b"),
+        ] {
+            let identity = identity(node);
+            assert_eq!(identity.argument, argument, "{node}");
+            let variable = ("ROS_NAMESPACE".to_owned(), namespace.to_owned());
+            assert_eq!(identity.environment, variable, "{node}");
+        }
+    }
+
+    #[test]
+    fn all_that_a_node_writes_is_below_its_home() {
+        let environment = environment("/root");
+        assert_eq!(environment["ROS_LOG_DIR"], "/root/log");
+        assert_eq!(environment["ROS_MASTER_URI"], "http://localhost:11311");
+        assert_eq!(
+            (&*environment["HOME"], &*environment[HOME]),
+            ("/root", "/root")
+        );
+    }
+}

@@ -1,0 +1,2 @@
+ALTER TABLE revisions ADD COLUMN flavour TEXT;
+ALTER TABLE revisions ADD COLUMN inventory TEXT;
