@@ -80,7 +80,7 @@ pub(crate) struct Compiled {
     /// Owned by the compiling user, whiteouts of the overlay included.
     pub(crate) tree: PathBuf,
     /// The directory that it is in.
-    pub(crate) room: PathBuf,
+    pub(crate) directory: PathBuf,
     /// First host uid of the container.
     pub(crate) uid_offset: u32,
 }
@@ -138,8 +138,8 @@ pub(crate) async fn run(
         Task::Check => "configure",
         Task::Compile => "compile",
     };
-    let room = shop.site.fresh(name)?;
-    let (tools, upper) = (room.join("tools"), room.join("upper"));
+    let directory = shop.site.fresh(name)?;
+    let (tools, upper) = (directory.join("tools"), directory.join("upper"));
     fs::create_dir(&upper).at("making", &upper)?;
     let job = Job {
         check: task == Task::Check,
@@ -265,7 +265,7 @@ pub(crate) async fn run(
         // However it ended, it found nothing to blame on a package.
         return Ok(Compiled {
             tree: upper,
-            room,
+            directory,
             uid_offset: finished.uid_offset,
         });
     }
@@ -292,12 +292,12 @@ pub(crate) async fn run(
             advice: Vec::new(),
         });
     }
-    let (prefix, tree) = (base.build.prefix.clone(), room.join("tree"));
+    let (prefix, tree) = (base.build.prefix.clone(), directory.join("tree"));
     let result = tree.clone();
     blocking::spawn(move || take_out(&upper, &prefix, &tree)).await??;
     Ok(Compiled {
         tree: result,
-        room,
+        directory,
         uid_offset: finished.uid_offset,
     })
 }

@@ -186,8 +186,8 @@ pub enum Error {
     /// The container engine.
     #[error(transparent)]
     Servant(#[from] servant::Error),
-    /// No room left.
-    #[error("no room left on the disk that holds {path} while {what}; make room (`cloudroidctl rm` removes services) and push again", path = path.display())]
+    /// No space left.
+    #[error("no space left on the disk that holds {path} while {what}; free some (`cloudroidctl rm` removes services) and push again", path = path.display())]
     DiskFull {
         /// A path on the full disk.
         path: PathBuf,

@@ -158,7 +158,7 @@ pub(crate) async fn layers(
                 let packing = Packing {
                     key: key.clone(),
                     made_from: link.items.iter().cloned().collect(),
-                    room: upper.parent().unwrap_or(&upper).to_owned(),
+                    directory: upper.parent().unwrap_or(&upper).to_owned(),
                     tree: upper,
                     options,
                     turn,
@@ -250,7 +250,7 @@ async fn ros_sources(archive: &Archive, shop: &Workshop) -> Result<BTreeSet<Stri
     Ok(sources)
 }
 
-/// Installs a part in a container on top of `below`; gives the container's upper directory, in a room of its own, and how
+/// Installs a part in a container on top of `below`; gives the container's upper directory, in a directory of its own, and how
 /// it is to be packed.
 async fn install(
     shop: &Workshop,
@@ -268,8 +268,12 @@ async fn install(
             count => format!("installing {count} packages of the {name}"),
         })
         .await;
-    let room = shop.site.fresh(name)?;
-    let (tools, debs, upper) = (room.join("tools"), room.join("debs"), room.join("upper"));
+    let directory = shop.site.fresh(name)?;
+    let (tools, debs, upper) = (
+        directory.join("tools"),
+        directory.join("debs"),
+        directory.join("upper"),
+    );
     fs::create_dir(&debs).at("making", &debs)?;
     fs::create_dir(&upper).at("making", &upper)?;
     set_mode(&debs, 0o755)?;
@@ -293,7 +297,7 @@ async fn install(
         (path, text.into_bytes())
     }));
     if !part.extras.is_empty() {
-        let path = room.join("extras.tar");
+        let path = directory.join("extras.tar");
         deb::write_tar(&part.extras, &path)?;
         given.insert(
             "cloudroid/extras.tar".into(),

@@ -147,8 +147,8 @@ pub(crate) async fn ask(
     mut environment: BTreeMap<String, String>,
     ask: &Ask,
 ) -> Result<Answer, Error> {
-    let room = shop.site.fresh("plan")?;
-    let (tools, out) = (room.join("tools"), room.join("out"));
+    let directory = shop.site.fresh("plan")?;
+    let (tools, out) = (directory.join("tools"), directory.join("out"));
     let question = serde_json::to_vec(ask).unwrap_or_default();
     lay_out(
         &tools,

@@ -79,8 +79,8 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         return Ok(Made::one(layer.diff_id, true));
     }
     build.progress.step("packing the install space").await;
-    let room = shop.site.fresh("prebuilt")?;
-    let tree = room.join("tree");
+    let directory = shop.site.fresh("prebuilt")?;
+    let tree = directory.join("tree");
     let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
     fs::create_dir_all(&parent).at("making", &parent)?;
@@ -99,7 +99,7 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         made_from: pushed::names(&space.packages).into_iter().collect(),
         tree,
         options: compile::package_options(&build.base, 0),
-        room,
+        directory,
         turn,
     };
     Ok(Made::one(shop.pack(packing, |_| Ok(())).await?, false))

@@ -354,10 +354,10 @@ impl Making<'_> {
                 .collect(),
             workspace: &self.units.units,
         };
-        let room = compile::run(&build.shop, Task::Check, &order, log, build.progress)
+        let directory = compile::run(&build.shop, Task::Check, &order, log, build.progress)
             .await?
-            .room;
-        crate::blocking::spawn(move || Ok(foreign::remove(&room)?)).await?
+            .directory;
+        crate::blocking::spawn(move || Ok(foreign::remove(&directory)?)).await?
     }
 
     /// One package: from the cache, or compiled now.
@@ -400,7 +400,7 @@ impl Making<'_> {
             made_from: vec![self.units.units[index].name.clone()],
             tree: made.tree,
             options: compile::unit_options(&build.base, made.uid_offset),
-            room: made.room,
+            directory: made.directory,
             turn,
         };
         let diff_id = build.shop.pack(packing, |_| Ok(())).await?;
@@ -462,8 +462,8 @@ impl Making<'_> {
             return Ok(Made::one(diff_id, true));
         }
         self.build.progress.step("packing the package").await;
-        let room = shop.site.fresh("package")?;
-        let tree = room.join("tree");
+        let directory = shop.site.fresh("package")?;
+        let tree = directory.join("tree");
         fs::create_dir(&tree).at("making", &tree)?;
         let diff_ids: Vec<Digest> = self.diff_ids.iter().copied().flatten().collect();
         let (trees, into) = (shop.extracted(&diff_ids).await?, tree.clone());
@@ -475,7 +475,7 @@ impl Making<'_> {
             made_from: made_from.collect(),
             tree,
             options: compile::package_options(&self.build.base, servant::rootfs::COMPILE_USER),
-            room,
+            directory,
             turn,
         };
         let diff_id = shop.pack(packing, |_| Ok(())).await?;

@@ -40,7 +40,7 @@ pub(crate) struct Packing {
     pub(crate) tree: PathBuf,
     pub(crate) options: TreeOptions,
     /// Removed when all is done: the tree's own directory.
-    pub(crate) room: PathBuf,
+    pub(crate) directory: PathBuf,
     /// The turn at this key; others wait until the layer is in the cache.
     pub(crate) turn: tokio::sync::OwnedMutexGuard<()>,
 }
@@ -88,7 +88,7 @@ impl Workshop {
             )?;
             record(bytes)?;
             drop(packing.turn);
-            Ok(foreign::remove(&packing.room)?)
+            Ok(foreign::remove(&packing.directory)?)
         });
         self.packing
             .lock()

@@ -158,7 +158,7 @@ pub fn a_probe_waits_for_room_like_any_servant() -> Told {
     // Room for one servant whose push asked for nothing.
     let daemon = world()
         .own("probe-room")
-        .config("[room]\nmemory = \"100M\"\n[servant]\nspares = 0\n")
+        .config("[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n")
         .start()?;
     daemon
         .deployer()

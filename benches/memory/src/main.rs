@@ -76,7 +76,7 @@ fn main() -> Result<()> {
         .prefix("cloudroid-bench-")
         .tempdir()?;
     let daemon = Setup::new(&place.path().join("home"))
-        .config("[servant]\nspares = 0\n")
+        .config("[servant]\nwarm_pool = 0\n")
         .start()?;
     let node = ["--node", "adder.py"];
     let deployer = daemon.deployer();

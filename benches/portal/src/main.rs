@@ -27,7 +27,7 @@ use crate::watch::Watch;
 
 /// One servant, which stays.
 const CONFIG: &str =
-    "[room]\ncpus = 64.0\nmemory = \"64G\"\n[servant]\nreserve_cpus = 0.1\ngrace = \"1h\"\n";
+    "[capacity]\ncpus = 64.0\nmemory = \"64G\"\n[servant]\nreserve_cpus = 0.1\ngrace = \"1h\"\n";
 
 /// What the daemon may need, in megabytes.
 const MEMORY: f64 = 60.0;

@@ -27,7 +27,7 @@ use nix::sched::{CloneFlags, unshare};
 use image::Image;
 
 /// Room is not what is measured; servants stay until they are ended.
-const CONFIG: &str = "[room]\ncpus = 4096.0\nmemory = \"4096G\"\n\
+const CONFIG: &str = "[capacity]\ncpus = 4096.0\nmemory = \"4096G\"\n\
     [servant]\nreserve_cpus = 0.01\ngrace = \"1h\"\nanonymous_grace = \"0s\"\n";
 
 fn main() -> Result<()> {
@@ -79,15 +79,15 @@ fn measure() -> Result<()> {
     let daemon = serving("")?;
     let image = Image::of(&daemon, "relay")?;
     let mut report = Report::new("servant");
-    let without_spares = serving("spares = 0\n")?;
+    let without_warm_pool = serving("warm_pool = 0\n")?;
     starts::measure(
         &mut report,
         &daemon,
-        &without_spares,
+        &without_warm_pool,
         &image,
         runtime.handle(),
     )?;
-    drop(without_spares);
+    drop(without_warm_pool);
     crowd::measure(&mut report, &daemon, &image)?;
     report.finish()?;
     Ok(())

@@ -90,7 +90,7 @@ const UNLIMITED: &str = "libcontainer alone, without cgroups";
 pub(crate) fn measure(
     report: &mut Report,
     daemon: &Daemon,
-    without_spares: &Daemon,
+    without_warm_pool: &Daemon,
     image: &Image,
     runtime: &Handle,
 ) -> Result<()> {
@@ -102,7 +102,7 @@ pub(crate) fn measure(
     let bundle = place.join("bundle");
     let mut contestants = vec![
         Contestant::ours(ROBOT, |_| robot(daemon, image)),
-        Contestant::ours(COLD, |_| robot(without_spares, image)),
+        Contestant::ours(COLD, |_| robot(without_warm_pool, image)),
         Contestant::ours(NODE, |_| native.time()),
         Contestant::ours(ENGINE, |spec| ours.time(spec.clone())),
         Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),

@@ -15,7 +15,7 @@ use support::robot::Robot;
 const ROUNDS: u32 = 100;
 /// Servants that are to be found again each time.
 const ROBOTS: [&str; 3] = ["r1", "r2", "r3"];
-const CONFIG: &str = "keep_servants = true\n[servant]\nspares = 0\ngrace = \"1h\"\n";
+const CONFIG: &str = "keep_servants = true\n[servant]\nwarm_pool = 0\ngrace = \"1h\"\n";
 
 fn path(robot: &str) -> String {
     format!("greeter_cpp?robot={robot}")

@@ -38,7 +38,8 @@ pub struct Config {
     /// Limits of a servant where its push says nothing.
     pub limits: Limits,
     /// How many servants fit.
-    pub room: Room,
+    #[serde(alias = "room")]
+    pub capacity: Capacity,
     /// The life of a servant.
     pub servant: Servant,
     /// What clients may do.
@@ -74,12 +75,12 @@ impl fmt::Display for IsolationMode {
 /// What of this machine may be promised to servants.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Room {
+pub struct Capacity {
     /// Cores to promise; all of the machine's by default.
     pub cpus: Option<f64>,
     /// Memory to promise; nine tenths of the machine's by default.
     pub memory: Option<Size>,
-    /// Robots that may wait for room.
+    /// Robots that may wait for capacity.
     pub queue: usize,
     /// How long each may wait.
     pub deadline: Time,
@@ -99,8 +100,9 @@ pub struct Servant {
     pub grace: Time,
     /// The same for connections that named no robot.
     pub anonymous_grace: Time,
-    /// Containers made ahead, without nodes: one for each of the services used last, so many at most.
-    pub spares: usize,
+    /// Containers of the warm pool, made before a robot asks and without nodes: one for each of the services used last, at most.
+    #[serde(alias = "spares")]
+    pub warm_pool: usize,
 }
 
 /// What JSON has no word for.
@@ -209,7 +211,7 @@ impl Default for Config {
                 pids: Some(512),
                 ..Limits::default()
             },
-            room: Room::default(),
+            capacity: Capacity::default(),
             servant: Servant::default(),
             portal: Portal::default(),
             memory: Memory::default(),
@@ -219,9 +221,9 @@ impl Default for Config {
     }
 }
 
-impl Default for Room {
+impl Default for Capacity {
     fn default() -> Self {
-        Room {
+        Capacity {
             cpus: None,
             memory: None,
             queue: 64,
@@ -238,7 +240,7 @@ impl Default for Servant {
             start: Time::seconds(30),
             grace: Time::seconds(60),
             anonymous_grace: Time::seconds(0),
-            spares: 8,
+            warm_pool: 8,
         }
     }
 }
@@ -487,11 +489,11 @@ mod tests {
             .collect();
         let written = Config::parse(&uncommented).expect("every example value is valid");
         assert_eq!(
-            written.room,
-            Room {
+            written.capacity,
+            Capacity {
                 cpus: Some(2.0),
                 memory: Some(Size(4 << 30)),
-                ..Room::default()
+                ..Capacity::default()
             }
         );
         assert_eq!(written.servant, Servant::default());
@@ -618,6 +620,12 @@ mod tests {
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[push]"), "{refused}");
         }
+    }
+
+    #[test]
+    fn names_of_earlier_versions_are_read() {
+        let config = Config::parse("[room]\nqueue = 3\n[servant]\nspares = 2\n").expect("read");
+        assert_eq!((config.capacity.queue, config.servant.warm_pool), (3, 2));
     }
 
     #[test]

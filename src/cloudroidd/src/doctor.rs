@@ -13,7 +13,7 @@ use portal::Machine;
 const OLDEST_KERNEL: (u32, u32) = (5, 19);
 /// A base image and one package with its dependencies.
 const ROOM_NEEDED: u64 = 2 << 30;
-const ROOM_WANTED: u64 = 10 << 30;
+const SPACE_WANTED: u64 = 10 << 30;
 
 /// Every check. `listening`: the portal that runs already and holds its port.
 pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {
@@ -30,7 +30,7 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {
     checks.push(program("apt-get", "apt", "resolves and fetches packages"));
     checks.push(program("dpkg-deb", "dpkg", "unpacks packages"));
     checks.push(apt_lists());
-    checks.push(room(home));
+    checks.push(disk_space(home));
     checks.push(init());
     checks.push(port(listening));
     Doctor { checks }
@@ -63,7 +63,7 @@ pub fn look(home: &Path) -> (Machine, Vec<Check>) {
     for check in [
         program("mmdebstrap", "mmdebstrap", ""),
         apt_lists(),
-        room(home),
+        disk_space(home),
     ] {
         if check.status != CheckStatus::Ok {
             warnings.push(format!("{}: {}", check.name, check.found));
@@ -270,8 +270,8 @@ fn apt_lists() -> Check {
     }
 }
 
-fn room(home: &Path) -> Check {
-    const NAME: &str = "disk room";
+fn disk_space(home: &Path) -> Check {
+    const NAME: &str = "disk space";
     let existing = home
         .ancestors()
         .find(|path| path.is_dir())
@@ -285,14 +285,14 @@ fn room(home: &Path) -> Check {
     };
     let free = found.blocks_available() * found.fragment_size();
     let text = format!("{} free at {}", Size(free), existing.display());
-    let fix = "make room, or choose another state directory with --home; cloudroidctl rm removes services";
+    let fix = "free some, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {
         _ if free < ROOM_NEEDED => missing(
             NAME,
             format!("{text}; a first push needs {}", Size(ROOM_NEEDED)),
             fix,
         ),
-        _ if free < ROOM_WANTED => warning(NAME, text, fix),
+        _ if free < SPACE_WANTED => warning(NAME, text, fix),
         _ => ok(NAME, text),
     }
 }

@@ -35,16 +35,16 @@ pub fn build(
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
     let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(config, home)?)?);
-    let room = &config.room;
-    let memory = room
+    let promised = &config.capacity;
+    let memory = promised
         .memory
         .map_or_else(supervision::machine_memory, |size| size.0);
-    let capacity = Amount::new(room.cpus.unwrap_or_else(config::machine_cores), memory);
+    let capacity = Amount::new(promised.cpus.unwrap_or_else(config::machine_cores), memory);
     let choreographer = Choreographer::new(
         config.choreographer(),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
-        Admission::new(capacity, room.queue),
+        Admission::new(capacity, promised.queue),
     );
     let definitions = bases::directory(config, home)?;
     let builder = builder(config, home, definitions, catalogue.images(), &engine)?;

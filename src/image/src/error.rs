@@ -10,8 +10,8 @@ use crate::{Digest, Refusal};
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The disk (or the quota) is full. Nothing half-made remains.
-    #[error("no room to write {}: {}; free some space there or use a home directory on a larger disk", .path.display(), FreeSpace { needed: *.needed, free: *.free })]
-    NoRoom {
+    #[error("no space to write {}: {}; free some space there or use a home directory on a larger disk", .path.display(), FreeSpace { needed: *.needed, free: *.free })]
+    DiskFull {
         /// The file or tree that was being written.
         path: PathBuf,
         /// Bytes it takes in all, where known.
@@ -143,15 +143,15 @@ impl std::fmt::Display for Bytes {
 }
 
 impl Error {
-    /// A failed file operation; a full disk becomes [`Error::NoRoom`].
+    /// A failed file operation; a full disk becomes [`Error::DiskFull`].
     pub(crate) fn file(
         action: &'static str,
         path: impl AsRef<Path>,
         source: impl Into<io::Error>,
     ) -> Self {
         let (path, source) = (path.as_ref().to_owned(), source.into());
-        if is_no_room(&source) {
-            Self::no_room(&path, None)
+        if is_disk_full(&source) {
+            Self::disk_full(&path, None)
         } else {
             Self::File {
                 action,
@@ -162,8 +162,8 @@ impl Error {
     }
 
     /// The disk is full while writing `path`, which takes `needed` bytes.
-    pub(crate) fn no_room(path: &Path, needed: Option<u64>) -> Self {
-        Self::NoRoom {
+    pub(crate) fn disk_full(path: &Path, needed: Option<u64>) -> Self {
+        Self::DiskFull {
             path: path.to_owned(),
             needed,
             free: free_bytes(path),
@@ -184,11 +184,11 @@ impl Error {
     /// The same error, with what the whole thing takes filled in where it is a full disk.
     pub(crate) fn needing(self, needed: u64) -> Self {
         match self {
-            Self::NoRoom {
+            Self::DiskFull {
                 path,
                 needed: None,
                 free,
-            } => Self::NoRoom {
+            } => Self::DiskFull {
                 path,
                 needed: Some(needed),
                 free,
@@ -199,7 +199,7 @@ impl Error {
 }
 
 /// Whether this is a full disk or an exhausted quota.
-pub(crate) fn is_no_room(error: &io::Error) -> bool {
+pub(crate) fn is_disk_full(error: &io::Error) -> bool {
     matches!(
         error.kind(),
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded
@@ -218,13 +218,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_full_disk_is_told_with_the_room_needed_and_left() {
+    fn a_full_disk_is_told_with_the_space_needed_and_left() {
         let error = std::fs::write("/dev/full", "x").unwrap_err();
         let text = Error::file("write", "/dev/full", error)
             .needing(230_000_000)
             .to_string();
         assert!(
-            text.starts_with("no room to write /dev/full: 230 MB are needed and "),
+            text.starts_with("no space to write /dev/full: 230 MB are needed and "),
             "{text}"
         );
         assert!(text.contains(" are free; free some space there"), "{text}");

@@ -58,7 +58,7 @@ const STREAM: &str = "the archive";
 /// # Errors
 /// [`Error::Archive`] for `..`, absolute paths, devices, links that leave the tree, paths behind links, second
 /// entries of one name, unusable names, more than `limits` allow, and a stream that is cut off or damaged;
-/// [`Error::NoRoom`] and [`Error::File`] otherwise.
+/// [`Error::DiskFull`] and [`Error::File`] otherwise.
 pub fn unpack(archive: impl Read, destination: &Path, limits: &Limits) -> Result<Unpacked, Error> {
     claim(destination)?;
     let result = unpack_into(archive, destination, limits);

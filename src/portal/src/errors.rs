@@ -286,7 +286,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
     let text = match error {
         C::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
         C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
-        C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [room] in the configuration".into(),
+        C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
         }

@@ -22,8 +22,8 @@ pub fn installs() -> Told {
     // Containers made ahead would be in the way of stories that count what is there.
     let configuration = "/etc/cloudroid/cloudroid.toml";
     let text = std::fs::read_to_string(configuration)?;
-    ensure!(text.contains("#: spares = 8"), "{text}");
-    let text = text.replace("#: spares = 8", "spares = 0");
+    ensure!(text.contains("#: warm_pool = 8"), "{text}");
+    let text = text.replace("#: warm_pool = 8", "warm_pool = 0");
     let text = text.replace(
         "[allow]\n",
         &format!("[allow]\n{}\n", confinement::allowed()),

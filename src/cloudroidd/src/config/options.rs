@@ -21,11 +21,11 @@ impl Config {
             limits: self.limits,
             reserve_cpus: servant.reserve_cpus,
             reserve_memory: servant.reserve_memory.0,
-            deadline: self.room.deadline.0,
+            deadline: self.capacity.deadline.0,
             start: servant.start.0,
             grace: servant.grace.0,
             anonymous_grace: servant.anonymous_grace.0,
-            spares: servant.spares,
+            spares: servant.warm_pool,
             allow: self.allow.clone(),
             bridge: bridge_options(self),
             memory: MemoryOptions {

@@ -1005,7 +1005,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     std::fs::write(tree.join("noise"), &noise).unwrap();
     let told = |error: Error| {
         let text = error.to_string();
-        assert!(matches!(error, Error::NoRoom { .. }), "{text}");
+        assert!(matches!(error, Error::DiskFull { .. }), "{text}");
         assert!(
             text.contains(disk.to_str().unwrap()) && text.contains("free some space"),
             "{text}"
@@ -1042,7 +1042,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     assert!(text.contains("6293 kB are needed"), "{text}");
     assert!(matches!(
         large.export_layer(&layer.diff_id, &disk.join("x")),
-        Err(Error::NoRoom { .. })
+        Err(Error::DiskFull { .. })
     ));
 
     // The blob fits, the tree does not.
@@ -1055,7 +1055,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     assert!(
         matches!(
             error,
-            Error::NoRoom {
+            Error::DiskFull {
                 needed: Some(_),
                 ..
             }
