@@ -228,7 +228,7 @@ mod tests {
             })
             .expect("as it was before");
         catalogue.complete().await.expect("completed");
-        let state = catalogue.state();
+        let state = &catalogue.state;
         let inventory = state.inventory("serves", 1).expect("readable");
         let inventory = inventory.expect("recorded");
         assert_eq!(inventory.programs["node"], "/usr/lib/p/node");

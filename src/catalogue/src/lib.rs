@@ -23,7 +23,6 @@ use std::sync::Arc;
 use store::{RevisionRecord, State};
 
 pub use error::Error;
-pub use fit::fits;
 pub use inventory::Known;
 pub use publish::{RolledBack, Withdrawn};
 
@@ -46,11 +45,6 @@ impl Catalogue {
         }
     }
 
-    /// The database.
-    pub fn state(&self) -> &Arc<State> {
-        &self.state
-    }
-
     /// The images.
     pub fn images(&self) -> &Arc<image::Store> {
         &self.images
@@ -62,6 +56,21 @@ impl Catalogue {
             Some(revision) => Ok(revision),
             None => Err(self.unknown(service)?),
         }
+    }
+
+    /// The ROS package that a service was first made of.
+    pub fn package(&self, service: &str) -> Result<Option<String>, Error> {
+        Ok(self.state.service_package(service)?)
+    }
+
+    /// Whether a stub that was made of revision `made_of`, with this image, can use `now`; or why not and what to do.
+    pub fn fits(
+        &self,
+        now: &RevisionRecord,
+        made_of: Option<u64>,
+        image: &str,
+    ) -> Result<(), String> {
+        fit::fits(&self.state, now, made_of, image)
     }
 
     /// The refusal of a service that does not exist: it names those that do.

@@ -55,7 +55,7 @@ use parking_lot::Mutex;
 use reach::RequestTimes;
 use reach::egress::Way;
 use servant::engine::Engine;
-use store::Journal;
+use store::{Journal, State};
 
 pub use decide::Amount;
 pub use decide::admission::Refused;
@@ -84,11 +84,11 @@ impl Choreographer {
     /// One that starts servants by `engine`.
     pub fn new(
         options: Options,
+        state: Arc<State>,
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         admission: Admission,
     ) -> Choreographer {
-        let state = Arc::clone(catalogue.state());
         let journal = Journal::new(Arc::clone(&state));
         let memory = Memory::new(&options.memory, journal.clone());
         let inner = Inner {

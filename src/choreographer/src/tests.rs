@@ -71,11 +71,13 @@ fn options() -> Options {
 fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let home = tempfile::tempdir().expect("a directory");
     let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+    let state = Arc::new(state);
     let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
         .expect("a store");
     let choreographer = Choreographer::new(
         options(),
-        Arc::new(Catalogue::new(Arc::new(state), Arc::new(store))),
+        Arc::clone(&state),
+        Arc::new(Catalogue::new(state, Arc::new(store))),
         Arc::new(NoEngine),
         Admission::new(Amount::new(2.0, 0), 16),
     );

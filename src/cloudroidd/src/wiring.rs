@@ -12,7 +12,7 @@ use push::Pusher;
 use rootfs_builder::Builder;
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
-use store::State;
+use store::{Journal, State};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -42,6 +42,7 @@ pub fn build(
     let capacity = Amount::new(promised.cpus.unwrap_or_else(config::machine_cores), memory);
     let choreographer = Choreographer::new(
         config.choreographer(),
+        Arc::clone(&state),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
         Admission::new(capacity, promised.queue),
@@ -55,6 +56,7 @@ pub fn build(
         Arc::clone(&catalogue),
         engine,
         choreographer.clone(),
+        Journal::new(Arc::clone(&state)),
     );
     let examined = home.path().to_owned();
     Ok(Arc::new(App {

@@ -41,7 +41,7 @@ use tokio_util::task::TaskTracker;
 use bounds::Left;
 use places::Places;
 use request::Tell;
-use store::{Journal, NewEvent, Plan, RevisionRecord, State};
+use store::{Journal, NewEvent, Plan, RevisionRecord};
 
 pub use error::Error;
 pub use options::Options;
@@ -59,7 +59,6 @@ const HOME_INSIDE: &str = "/root";
 pub struct Pusher {
     options: Options,
     home: PathBuf,
-    state: Arc<State>,
     catalogue: Arc<Catalogue>,
     engine: Arc<dyn Engine>,
     choreographer: Choreographer,
@@ -81,13 +80,13 @@ impl Pusher {
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
         choreographer: Choreographer,
+        journal: Journal,
     ) -> Pusher {
         Pusher {
             places: Places::new(&options),
             options,
             home,
-            journal: Journal::new(Arc::clone(catalogue.state())),
-            state: Arc::clone(catalogue.state()),
+            journal,
             catalogue,
             engine,
             choreographer,
@@ -235,7 +234,7 @@ impl Pusher {
 
     /// A service belongs to the package that it was first made of.
     fn check_owner(&self, name: &str, packages: &[String]) -> Result<(), Error> {
-        match (self.state.service_package(name)?, packages) {
+        match (self.catalogue.package(name)?, packages) {
             (Some(owner), [first, ..]) if !packages.contains(&owner) => Err(Error::NameTaken {
                 name: name.to_owned(),
                 package: owner,

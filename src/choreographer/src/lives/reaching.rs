@@ -82,7 +82,7 @@ struct Told {
 
 impl Observer for Told {
     fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
-        catalogue::fits(self.catalogue.state(), &self.revision, made_of, image)
+        self.catalogue.fits(&self.revision, made_of, image)
     }
 
     fn event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {
