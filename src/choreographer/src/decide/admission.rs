@@ -135,9 +135,12 @@ impl Book {
 
     /// How much more would have to be free for all who wait.
     pub fn lacking(&self) -> Amount {
-        let waiting = self.waiting.iter();
-        let wanted = waiting.fold(Amount::NONE, |sum, waiter| sum.plus(waiter.wanted));
-        wanted.minus(self.free())
+        self.wanted_by(|_| true).minus(self.free())
+    }
+
+    fn wanted_by(&self, who: impl Fn(&Waiter) -> bool) -> Amount {
+        let waiting = self.waiting.iter().filter(|waiter| who(waiter));
+        waiting.fold(Amount::NONE, |sum, waiter| sum.plus(waiter.wanted))
     }
 
     /// Refuses what would not fit on an empty machine.
@@ -191,13 +194,14 @@ impl Book {
         self.admit()
     }
 
-    /// A servant is promised `wanted` instead of `promised`, if what is more is free; gives those who are admitted for
-    /// what is less.
+    /// A servant is promised `wanted` instead of `promised`, if what is more is free and no robot waits for it; gives those
+    /// who are admitted for what is less.
     pub fn change(&mut self, promised: Amount, wanted: Amount) -> Result<Vec<Admitted>, Refused> {
         let others = self.promised.minus(promised);
-        let free = self.capacity.minus(others);
-        let grows = !wanted.fits(promised);
-        if grows && !wanted.fits(free) {
+        let spoken_for = self.wanted_by(|waiter| waiter.class == Class::Robot);
+        let free = self.capacity.minus(others).minus(spoken_for);
+        let free = free.max(promised);
+        if !wanted.fits(free) {
             return Err(Refused::NoMore { wanted, free });
         }
         self.promised = others.plus(wanted);
@@ -316,5 +320,20 @@ mod tests {
         // Where more is promised than there is (servants of an earlier daemon), a promise may shrink.
         book.promise(cores(2.0));
         assert_eq!(book.change(cores(1.0), cores(0.9)), Ok(vec![]));
+    }
+
+    #[test]
+    fn a_promise_does_not_grow_by_what_robots_wait_for() {
+        let mut book = machine(4, 1.0);
+        assert_eq!(book.ask(1, cores(1.5), Robot), Verdict::Waits);
+        let wanted = cores(1.1);
+        let free = Amount::new(1.0, 1000);
+        let refused = book.change(cores(1.0), wanted);
+        assert_eq!(refused, Err(Refused::NoMore { wanted, free }));
+        // Of what nobody waits for it may have more.
+        assert_eq!(book.change(cores(1.0), free), Ok(vec![]));
+        let mut book = machine(4, 1.0);
+        assert_eq!(book.ask(1, cores(1.5), Push), Verdict::Waits);
+        assert_eq!(book.change(cores(1.0), wanted), Ok(vec![]));
     }
 }

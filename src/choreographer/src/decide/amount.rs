@@ -45,6 +45,14 @@ impl Amount {
         }
     }
 
+    /// The more of both, of cores and of memory.
+    pub fn max(self, other: Amount) -> Amount {
+        Amount {
+            millicpus: self.millicpus.max(other.millicpus),
+            memory: self.memory.max(other.memory),
+        }
+    }
+
     /// Whether it is no more than `free`, of cores and of memory.
     pub fn fits(self, free: Amount) -> bool {
         self.millicpus <= free.millicpus && self.memory <= free.memory

@@ -197,6 +197,13 @@ impl Machine {
         }
     }
 
+    /// How much more would have to be free for all robots that wait.
+    fn lacked(&self) -> Amount {
+        let waiting = self.servants.iter().filter(|it| self.line.contains(&it.ticket));
+        let wanted = waiting.fold(Amount::NONE, |sum, it| sum.plus(it.wants));
+        wanted.minus(self.book.capacity().minus(self.book.promised()))
+    }
+
     fn asks(&mut self, service: usize, robot: usize) {
         let began = self.began;
         let key = (service, robot);
@@ -352,7 +359,7 @@ impl Machine {
                 let running = self.servants.iter().filter(|it| it.promised.is_some());
                 if let Some(id) = nth(running.map(|it| it.id.clone()), which) {
                     let promised = self.servant(&id).promised.unwrap_or_default();
-                    let before = self.book.clone();
+                    let (before, lacked) = (self.book.clone(), self.lacked());
                     match self.book.change(promised, cores(size)) {
                         Ok(admitted) => {
                             self.servant(&id).promised = Some(cores(size));
@@ -360,6 +367,8 @@ impl Machine {
                         }
                         Err(_) => assert_eq!(self.book, before, "refused, and yet changed"),
                     }
+                    let grew = !cores(size).fits(promised);
+                    assert!(!grew || self.lacked().fits(lacked), "a servant overtook who waits");
                 }
             }
             Step::GivesUp(which) => {
