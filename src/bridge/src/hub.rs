@@ -244,12 +244,15 @@ async fn pump(
             return;
         }
     };
+    let own = bus.node().to_owned();
     drop(bus);
     let mut dropped = 0;
     while let Some(message) = subscription.messages.recv().await {
         let Some(hub) = hub.upgrade() else { return };
         metrics.received.add(1);
-        hub.deliver(message, false);
+        // From an action of another client.
+        let local = message.publisher.node() == own;
+        hub.deliver(message, local);
         let now_dropped = subscription.dropped.load(Ordering::Relaxed);
         if now_dropped > dropped {
             metrics.bus_dropped.add(now_dropped - dropped);

@@ -28,7 +28,6 @@
 #![forbid(unsafe_code)]
 
 mod acks;
-mod actionlib;
 mod bridge;
 mod client;
 mod clock;

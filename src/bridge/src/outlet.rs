@@ -1,7 +1,7 @@
 //! A topic that a client publishes on.
 
 use std::collections::{BTreeSet, VecDeque};
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
@@ -30,8 +30,6 @@ pub(crate) struct Outlet {
     last: Mutex<Option<Bytes>>,
     /// Subscribers that were waited for in vain: they have another definition of the type, or nobody answers there.
     given_up: Mutex<BTreeSet<Node>>,
-    /// How many nodes are connected; follows the publisher once there is one.
-    connected: watch::Sender<usize>,
     state: Mutex<State>,
 }
 
@@ -84,7 +82,6 @@ impl Outlet {
             shared: shared.clone(),
             last: Mutex::default(),
             given_up: Mutex::default(),
-            connected: watch::Sender::default(),
             state: Mutex::new(State::warming(None)),
         });
         shared.add_outlet(&outlet);
@@ -135,17 +132,6 @@ impl Outlet {
                 }
             }
         }
-    }
-
-    /// Ready when a node has connected.
-    pub(crate) async fn connected(&self) {
-        let mut connected = self.connected.subscribe();
-        // The sender lives as long as `self`.
-        let _ = connected.wait_for(|count| *count > 0).await;
-    }
-
-    pub(crate) fn has_subscriber(&self) -> bool {
-        *self.connected.borrow() > 0
     }
 
     /// What a newcomer is given.
@@ -247,7 +233,6 @@ async fn warm_up(outlet: Arc<Outlet>, of: WireType, qos: Qos, failed: impl FnOnc
     {
         *held = Some(publisher);
     }
-    follow(Arc::downgrade(&outlet), subscribers.clone());
     settle(outlet, subscribers, deadline).await;
 }
 
@@ -268,27 +253,7 @@ async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<Matched>, 
         // Not waited for again while they are what they are.
         *outlet.given_up.lock() = outlet.missing(&subscribers.borrow());
     }
-    let connected = subscribers.borrow().connected();
-    outlet.connected.send_replace(connected);
     outlet.go_live();
-}
-
-/// Tells those who wait for a first subscriber, for as long as the outlet lives.
-fn follow(outlet: Weak<Outlet>, mut subscribers: watch::Receiver<Matched>) {
-    tokio::spawn(async move {
-        loop {
-            let Some(outlet) = outlet.upgrade() else {
-                return;
-            };
-            let connected = subscribers.borrow_and_update().connected();
-            outlet.connected.send_replace(connected);
-            drop(outlet);
-            // An error means that the publisher is gone, and the outlet with it.
-            if subscribers.changed().await.is_err() {
-                return;
-            }
-        }
-    });
 }
 
 #[cfg(test)]

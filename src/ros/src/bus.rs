@@ -12,6 +12,9 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use tokio::sync::watch;
 
+use crate::schema::ActionDef;
+
+mod actions;
 mod error;
 mod graph;
 mod lending;
@@ -21,6 +24,7 @@ mod qos;
 mod queue;
 mod types;
 
+pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, Outcome};
 pub use error::BusError;
 pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
@@ -170,6 +174,19 @@ pub trait Bus: Send + Sync + 'static {
         service_type: ServiceType,
         handler: Arc<dyn ServiceHandler>,
     ) -> Result<Box<dyn Send + Sync>, BusError>;
+    /// An action to send goals to; it is opened in the background.
+    fn action_client(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+    ) -> Result<Box<dyn ActionClient>, BusError>;
+    /// Serves an action until what is returned is dropped; it is opened in the background.
+    fn serve_action(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+        handler: Arc<dyn ActionHandler>,
+    ) -> Result<Box<dyn ActionServer>, BusError>;
     /// The parameters that all nodes share.
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
         Err(BusError::NotOffered("global parameters"))

@@ -1,6 +1,6 @@
 //! ROS 1: XML-RPC, Master, TCPROS and the bus made of them.
 
-mod actions;
+pub mod actions;
 mod bus;
 pub mod master;
 pub mod names;

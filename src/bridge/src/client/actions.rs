@@ -1,4 +1,4 @@
-//! The ops on actions, mapped onto actionlib's topics.
+//! The ops on actions.
 
 mod answering;
 mod goals;
@@ -8,16 +8,13 @@ mod server;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use ros::bus::WireType;
-use ros::schema::{ActionDef, MessageType};
+use ros::schema::ActionDef;
 use rosbridge::Id;
 use tokio_util::sync::CancellationToken;
 
 use super::Client;
 use crate::lacking::explain;
 use crate::names::plain_type;
-use crate::outlet::Outlet;
-use crate::shared::Shared;
 use goals::ActionClient;
 use server::ActionServer;
 
@@ -55,46 +52,4 @@ impl Client {
             });
         def.map_err(|error| format!("action {action}: {}", explain(error)))
     }
-
-    fn action_outlet(
-        self: &Arc<Self>,
-        topic: String,
-        message_type: &Arc<MessageType>,
-        latch: bool,
-    ) -> Arc<Outlet> {
-        let client = Arc::downgrade(self);
-        let name = topic.clone();
-        let failed = move |reason: String| {
-            if let Some(client) = client.upgrade() {
-                let text = format!("topic {name}: {reason}");
-                client.status(
-                    rosbridge::Level::Error,
-                    None,
-                    rosbridge::Format::Json,
-                    &text,
-                );
-            }
-        };
-        Outlet::open(
-            &self.shared,
-            &topic,
-            message_type.clone(),
-            latch,
-            100,
-            failed,
-        )
-    }
-}
-
-/// The type that an action's topic has, for those that do not depend on the action.
-fn common_type(shared: &Shared, name: &str) -> Result<Arc<MessageType>, String> {
-    shared
-        .registry
-        .message(name)
-        .map_err(|error| error.to_string())
-}
-
-/// Whether what a node sends is what we take it for.
-fn is_type(wire: &WireType, expected: &MessageType) -> bool {
-    wire.digest.agrees(&expected.md5().into())
 }

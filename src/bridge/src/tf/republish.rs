@@ -8,6 +8,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{Message, PeerId, WireType};
 use ros::codec::{self, JsonOptions, Time};
+use ros::ros1::actions::messages::{self, GoalId, GoalState, Status};
 use ros::schema::{MessageType, Registry, ServiceDef};
 use serde::Deserialize;
 use tokio::time::Instant;
@@ -16,7 +17,6 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use super::buffer::Found;
 use super::transform::Transform;
 use super::{Buffer, SharedBuffer, buffer, write_transforms};
-use crate::actionlib::{self, GoalId, GoalState, Status};
 use crate::clock;
 use crate::hub::{Listener, Listening};
 use crate::sample::Sample;
@@ -224,7 +224,7 @@ impl Republisher {
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
             if let (Some(hub), Some(transforms)) = (shared.live_hub(FEEDBACK_TOPIC), transforms) {
                 let bytes =
-                    actionlib::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
+                    messages::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
                 hub.deliver(message(&action.action_feedback, bytes), true);
             }
             // The goal of a client that is gone is given up.
@@ -266,7 +266,7 @@ impl Republisher {
                 id,
                 ..GoalId::default()
             };
-            let bytes = actionlib::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
+            let bytes = messages::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
             hub.deliver(message(&action.action_result, bytes), true);
         }
     }
@@ -317,10 +317,10 @@ impl Listener for Goals {
             return;
         };
         if self.cancels {
-            if let Some(goal) = actionlib::read_cancel(&sample.bytes) {
+            if let Some(goal) = messages::read_cancel(&sample.bytes) {
                 shared.republisher.cancel(&shared, &goal);
             }
-        } else if let Some((goal, body)) = actionlib::read_goal(&sample.bytes)
+        } else if let Some((goal, body)) = messages::read_goal(&sample.bytes)
             && let Err(reason) =
                 shared
                     .republisher

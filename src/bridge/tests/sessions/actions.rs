@@ -1,13 +1,13 @@
-//! Actions both ways, over actionlib's topics.
+//! Actions both ways.
 
 use bridge::{BridgeOptions, SessionOptions};
 use serde_json::{Value, json};
 
-use crate::support::{Client, World};
+use super::support::{Client, World};
 
 const COUNT: &str = "x_msgs/Count";
 
-async fn serve(client: &mut Client) {
+pub(super) async fn serve(client: &mut Client) {
     client
         .send(json!({"op": "set_level", "level": "info"}))
         .await;
@@ -200,36 +200,6 @@ async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
 }
 
 #[tokio::test]
-async fn the_topics_of_an_action_can_be_used_directly_too() {
-    let world = World::new().await;
-    let (mut server, mut user) = (world.client().await, world.client().await);
-    serve(&mut server).await;
-    user.send(
-        json!({"op": "subscribe", "topic": "/count/result", "type": "x_msgs/CountActionResult"}),
-    )
-    .await;
-    user.send(json!({"op": "advertise", "topic": "/count/goal", "type": "x_msgs/CountActionGoal"}))
-        .await;
-    let id = json!({"stamp": {"secs": 1, "nsecs": 0}, "id": "mine"});
-    user.send(
-        json!({"op": "publish", "topic": "/count/goal", "msg": {"goal_id": id, "goal": {"to": 1}}}),
-    )
-    .await;
-    let asked = server.json().await;
-    assert_eq!(asked["args"], json!({"to": 1}));
-    server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": [1]}, "result": true})).await;
-    let result = user.json().await;
-    assert_eq!(
-        result["msg"]["status"],
-        json!({"goal_id": id, "status": 3, "text": ""})
-    );
-    assert_eq!(result["msg"]["result"], json!({"all": [1]}));
-    user.send(json!({"op": "call_service", "service": "/rosapi/action_servers"}))
-        .await;
-    assert_eq!(user.json().await["op"], "service_response");
-}
-
-#[tokio::test]
 async fn a_goal_that_is_cancelled_before_its_server_is_there_is_never_sent() {
     let world = World::new().await;
     let other = world.another_bridge().await;
@@ -253,37 +223,4 @@ async fn a_goal_that_is_cancelled_before_its_server_is_there_is_never_sent() {
     user.send(json!({"op": "cancel_action_goal", "id": "h", "action": "/count"}))
         .await;
     assert_eq!(server.json().await["op"], "cancel_action_goal");
-}
-
-#[tokio::test]
-async fn a_cancel_that_is_faster_than_its_goal_is_kept() {
-    let world = World::new().await;
-    let (mut server, mut user) = (world.client().await, world.client().await);
-    serve(&mut server).await;
-    user.send(
-        json!({"op": "subscribe", "topic": "/count/result", "type": "x_msgs/CountActionResult"}),
-    )
-    .await;
-    for (topic, type_name) in [
-        ("/count/cancel", "actionlib_msgs/GoalID"),
-        ("/count/goal", "x_msgs/CountActionGoal"),
-    ] {
-        user.send(json!({"op": "advertise", "topic": topic, "type": type_name}))
-            .await;
-    }
-    let id = |id: &str, secs: u32| json!({"stamp": {"secs": secs, "nsecs": 0}, "id": id});
-    let publish = |topic: &str, msg: Value| json!({"op": "publish", "topic": topic, "msg": msg});
-    let sent = |id: Value| publish("/count/goal", json!({"goal_id": id, "goal": {"to": 1}}));
-    // By its id, and by the time up to which all are cancelled.
-    user.send(publish("/count/cancel", id("early", 0))).await;
-    user.send(publish("/count/cancel", id("", 5))).await;
-    for (name, secs) in [("early", 7), ("old", 5)] {
-        user.send(sent(id(name, secs))).await;
-        let result = user.json().await;
-        assert_eq!(result["msg"]["status"]["goal_id"]["id"], name);
-        // Recalled: it was never begun.
-        assert_eq!(result["msg"]["status"]["status"], 8, "{result}");
-    }
-    user.send(sent(id("new", 6))).await;
-    assert_eq!(server.json().await["op"], "send_action_goal");
 }

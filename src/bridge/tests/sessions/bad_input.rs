@@ -5,7 +5,7 @@ use rosbridge::Format;
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
 
-use crate::support::{Client, World};
+use super::support::{Client, World};
 
 /// A correct message of each op with all its fields, but without an id; and the fields that it means nothing without.
 fn messages() -> Vec<(Value, &'static [&'static str])> {

@@ -1,16 +1,11 @@
-//! What clients and nodes see of a bridge: a real Master, a real node on its own bus, real TCPROS on loopback, and
-//! clients that speak WebSocket by another implementation than the bridge's.
+//! What clients and nodes see of a bridge, with clients that speak WebSocket by another implementation than the bridge's:
+//! over ROS 1 (a real Master, a real node on its own bus, real TCPROS on loopback), and over a bus of another kind.
 
+// The same tests, over two buses.
+#![allow(clippy::duplicate_mod)]
+
+#[path = "../../../../tests/support/memory_bus.rs"]
+mod memory_bus;
+mod over_memory;
+mod over_ros1;
 mod support;
-
-mod actions;
-mod bad_input;
-mod manners;
-mod memory;
-mod publishing;
-mod resuming;
-mod rosapi;
-mod services;
-mod subscribing;
-mod transforms;
-mod waiting;

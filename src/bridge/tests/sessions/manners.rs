@@ -6,7 +6,7 @@ use bridge::{BridgeOptions, SessionEnd, refuse};
 use serde_json::json;
 use tokio_tungstenite::tungstenite::protocol::Message;
 
-use crate::support::{World, connected, patiently};
+use super::support::{World, connected, patiently};
 
 #[tokio::test]
 async fn rubbish_is_answered_and_the_connection_lives() {

@@ -1,11 +1,15 @@
 //! What waits for clients that do not read counts in budgets until it is written.
 
+use std::sync::Arc;
+
+use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionOptions};
 use budget::Budget;
 use bytes::Bytes;
+use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::{Value, json};
 
-use crate::support::{Client, World, connected, patiently};
+use super::support::{Client, World, connected, patiently};
 
 const MIB: usize = 1 << 20;
 
@@ -182,25 +186,34 @@ async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budge
     budgets.are_empty().await;
 }
 
+/// Always says the same.
+struct Says(Bytes);
+
+#[async_trait]
+impl ServiceHandler for Says {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        Ok(self.0.clone())
+    }
+}
+
 #[tokio::test]
 async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
     for (size, calls) in [(2 * MIB, 8), (30_000, 250)] {
         let budgets = Budgets::new(3 * MIB);
         let world = budgets.world().await;
         let mut client = budgets.client(&world).await;
-        let value = Value::from("x".repeat(size)).to_string();
-        client
-            .send(json!({
-                "op": "call_service", "service": "/rosapi/set_param",
-                "args": {"name": "/long", "value": value},
-            }))
+        let words = json!({"words": "x".repeat(size)});
+        let words = world.message("x_msgs/SayResponse", words);
+        let of = ServiceType::of(&world.registry.service("x_msgs/Say").unwrap());
+        let served = world.node.serve("/long", of, Arc::new(Says(words)));
+        let _served = served.await.unwrap();
+        world
+            .in_graph(|graph| graph.services.contains_key("/long"))
             .await;
-        assert_eq!(client.json().await["result"], true);
         for _ in 0..calls {
-            let call = json!({
-                "op": "call_service", "service": "/rosapi/get_param", "args": {"name": "/long"},
-            });
-            client.send(call).await;
+            client
+                .send(json!({"op": "call_service", "service": "/long"}))
+                .await;
         }
         until(|| budgets.client.refused() > 0).await;
         let (code, reason) = client.closed().await;

@@ -3,7 +3,7 @@
 use rosbridge::{Compression, Format, Op, Publish};
 use serde_json::json;
 
-use crate::support::{World, patiently};
+use super::support::{World, patiently};
 
 #[tokio::test]
 async fn what_is_published_right_behind_advertise_arrives() {

@@ -6,11 +6,11 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
-use ros::bus::{Bus, ServiceHandler, ServiceType};
+use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::Notify;
 
-use crate::support::{World, connected, patiently};
+use super::support::{World, connected, patiently};
 
 fn with_token(token: &str) -> SessionOptions {
     SessionOptions {

@@ -6,12 +6,12 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bridge::BridgeOptions;
 use bytes::Bytes;
-use ros::bus::{Bus, ServiceHandler, ServiceType};
+use ros::bus::{ServiceHandler, ServiceType};
 use rosbridge::{CallService, Compression, Format, Frame, Op, Payload};
 use serde_json::json;
 use tokio::sync::Notify;
 
-use crate::support::{World, patiently};
+use super::support::{World, patiently};
 
 /// Adds; waits first where told to.
 struct Add {

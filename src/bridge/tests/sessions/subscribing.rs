@@ -7,7 +7,7 @@ use ros::codec::{self, FillOptions};
 use rosbridge::{Frame, Op};
 use serde_json::json;
 
-use crate::support::{World, connected};
+use super::support::{World, connected};
 
 #[tokio::test]
 async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
@@ -71,7 +71,7 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
         client.settled().await;
         client.lose().await;
         let mut subscribers = publisher.matched();
-        crate::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
+        super::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
             .await
             .unwrap();
     }
@@ -112,7 +112,7 @@ async fn each_latching_publisher_is_replayed_to_a_newcomer() {
         .node_publishes("/latched", "std_msgs/String", true)
         .await;
     let two = world
-        .publishes(&other, "/latched", "std_msgs/String", true)
+        .publishes(&*other, "/latched", "std_msgs/String", true)
         .await;
     one.publish(world.message("std_msgs/String", json!({"data": "one"})));
     two.publish(world.message("std_msgs/String", json!({"data": "two"})));
@@ -188,7 +188,7 @@ async fn subscriptions_are_ended_one_by_one_or_all_at_once() {
         .await;
     client.settled().await;
     let mut subscribers = publisher.matched();
-    crate::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
+    super::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
     client.settled().await;
@@ -269,7 +269,7 @@ async fn a_later_publisher_of_another_type_is_named_and_left_out() {
     client.settled().await;
     let other = world.another_node("/other").await;
     let wrong = world
-        .publishes(&other, "/late", "std_msgs/Int32", false)
+        .publishes(&*other, "/late", "std_msgs/Int32", false)
         .await;
     connected(wrong.as_ref(), 1).await;
     for _ in 0..100 {
@@ -306,7 +306,7 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
         |definition: String| ros::bus::WireType::new("x_msgs/Tag", newer.md5(), definition);
     let bytes = bytes::Bytes::from_static(b"\x01\0\0\0x\x07\x01");
     let told = ros::bus::Bus::advertise(
-        world.node.as_ref(),
+        &*world.node,
         "/told",
         wire_type(definition),
         ros::bus::Qos::keep_last(1).latching(true),
@@ -315,7 +315,7 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
     .unwrap();
     told.publish(bytes.clone());
     let mute = ros::bus::Bus::advertise(
-        world.node.as_ref(),
+        &*world.node,
         "/mute",
         wire_type(String::new()),
         ros::bus::Qos::keep_last(1).latching(true),
@@ -354,7 +354,7 @@ async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
     let message_type = ros::schema::MessageType::from_full_text("y_msgs/New", &definition).unwrap();
     let wire_type = ros::bus::WireType::new("y_msgs/New", message_type.md5(), definition);
     let publisher = ros::bus::Bus::advertise(
-        world.node.as_ref(),
+        &*world.node,
         "/new",
         wire_type,
         ros::bus::Qos::keep_last(1).latching(true),

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use async_trait::async_trait;
 use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
-use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
+use ros::JoinOptions;
+use ros::bus::{Bus, Publisher, Qos, RosVersion, Subscription, WireType};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
-use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
 use serde_json::Value;
@@ -18,6 +19,8 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role, WebSocketConfig};
+
+use crate::memory_bus::MemorySystem;
 
 /// Long enough on a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(20);
@@ -33,28 +36,35 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ("x_msgs/msg/Tag", "string name\nuint8 number\n"),
     ("x_msgs/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n"),
     ("x_msgs/srv/Nothing", "---\n"),
+    ("x_msgs/srv/Say", "---\nstring words\n"),
     (
         "x_msgs/action/Count",
         "int32 to\n---\nint32[] all\n---\nint32 at\n",
     ),
 ];
 
-/// A ROS system with a node in it, and a bridge.
-pub struct World {
-    pub bridge: Arc<Bridge>,
-    /// The servant's node.
-    pub node: Arc<Ros1Bus>,
-    pub registry: Arc<Registry>,
+/// A ROS system that nodes join.
+#[async_trait]
+pub trait System: Sized + Send + Sync + 'static {
+    /// The host that its nodes seem to run on.
+    const HOST: &str;
+    /// A new one.
+    async fn start() -> Self;
+    /// Joins it as a node of this name.
+    async fn join(&self, node: &str) -> Arc<dyn Bus>;
+}
+
+/// A real Master, real TCPROS on loopback.
+pub struct Ros1 {
     address: std::net::SocketAddr,
     master: JoinHandle<()>,
 }
 
-impl World {
-    pub async fn new() -> World {
-        Self::with(BridgeOptions::default()).await
-    }
+#[async_trait]
+impl System for Ros1 {
+    const HOST: &str = "127.0.0.1";
 
-    pub async fn with(options: BridgeOptions) -> World {
+    async fn start() -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let master = Master::new(MasterOptions {
@@ -63,32 +73,75 @@ impl World {
         });
         let master =
             tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        Self { address, master }
+    }
+
+    async fn join(&self, node: &str) -> Arc<dyn Bus> {
+        let options = JoinOptions::new(self.address, node);
+        let joined = ros::connect(RosVersion::One, Arc::new(HostSockets), options);
+        joined.await.unwrap()
+    }
+}
+
+impl Drop for Ros1 {
+    fn drop(&mut self) {
+        self.master.abort();
+    }
+}
+
+#[async_trait]
+impl System for Arc<MemorySystem> {
+    const HOST: &str = "memory";
+
+    async fn start() -> Self {
+        Arc::default()
+    }
+
+    async fn join(&self, node: &str) -> Arc<dyn Bus> {
+        MemorySystem::join(self, node)
+    }
+}
+
+/// A ROS system with a node in it, and a bridge.
+pub struct World<S> {
+    pub bridge: Arc<Bridge>,
+    /// The servant's node.
+    pub node: Arc<dyn Bus>,
+    pub registry: Arc<Registry>,
+    system: S,
+}
+
+impl<S: System> World<S> {
+    pub async fn new() -> Self {
+        Self::with(BridgeOptions::default()).await
+    }
+
+    pub async fn with(options: BridgeOptions) -> Self {
+        let system = S::start().await;
         let registry = Registry::new();
         for (key, text) in DEFINITIONS {
             registry.insert(key, text).unwrap();
         }
         let registry = Arc::new(registry);
-        let node = Ros1Bus::connect(Arc::new(HostSockets), address, "/node")
-            .await
-            .unwrap();
-        let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/cloudroid_bridge")
-            .await
-            .unwrap();
+        let node = system.join("/node").await;
+        let bus = system.join("/cloudroid_bridge").await;
         let bridge = Bridge::new(bus, registry.clone(), options);
         World {
             bridge,
             node,
             registry,
-            address,
-            master,
+            system,
         }
     }
 
+    /// The host that nodes seem to run on.
+    pub fn host(&self) -> &'static str {
+        S::HOST
+    }
+
     /// Another node.
-    pub async fn another_node(&self, name: &str) -> Arc<Ros1Bus> {
-        Ros1Bus::connect(Arc::new(HostSockets), self.address, name)
-            .await
-            .unwrap()
+    pub async fn another_node(&self, name: &str) -> Arc<dyn Bus> {
+        self.system.join(name).await
     }
 
     /// A bridge of its own at the same Master.
@@ -140,12 +193,12 @@ impl World {
         type_name: &str,
         latch: bool,
     ) -> Box<dyn Publisher> {
-        self.publishes(&self.node, topic, type_name, latch).await
+        self.publishes(&*self.node, topic, type_name, latch).await
     }
 
     pub async fn publishes(
         &self,
-        node: &Ros1Bus,
+        node: &dyn Bus,
         topic: &str,
         type_name: &str,
         latch: bool,
@@ -176,12 +229,6 @@ impl World {
         patiently(graph.wait_for(|graph| condition(graph)))
             .await
             .unwrap();
-    }
-}
-
-impl Drop for World {
-    fn drop(&mut self) {
-        self.master.abort();
     }
 }
 

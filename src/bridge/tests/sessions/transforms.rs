@@ -3,7 +3,7 @@
 use ros::bus::Publisher;
 use serde_json::{Value, json};
 
-use crate::support::{Client, World, connected};
+use super::support::{Client, World, connected};
 
 const TF: &str = "geometry_msgs/TransformStamped[] transforms\n";
 
@@ -137,7 +137,7 @@ async fn a_goal_carries_transforms_as_feedback_until_it_is_cancelled() {
         (&json!("/tf2_web_republisher/result"), &json!(2))
     );
     // Nobody needs /tf any more.
-    crate::support::patiently(publisher.matched().wait_for(|now| now.connected() == 0))
+    super::support::patiently(publisher.matched().wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
 }
@@ -155,7 +155,7 @@ async fn the_goals_of_a_client_that_is_gone_are_given_up() {
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     client.lose().await;
-    crate::support::patiently(publisher.matched().wait_for(|now| now.connected() == 0))
+    super::support::patiently(publisher.matched().wait_for(|now| now.connected() == 0))
         .await
         .unwrap();
 }

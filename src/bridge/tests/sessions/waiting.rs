@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role};
 
-use crate::support::{World, patiently};
+use super::support::{World, patiently};
 
 type Socket = WebSocketStream<DuplexStream>;
 

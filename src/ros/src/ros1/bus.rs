@@ -16,12 +16,12 @@ mod lending;
 mod link;
 mod master_client;
 mod parameters;
-mod publications;
+pub(super) mod publications;
 mod registrar;
 mod server;
 mod services;
 mod slave;
-mod subscriptions;
+pub(super) mod subscriptions;
 mod topic_type;
 mod watcher;
 
@@ -48,15 +48,17 @@ use self::publications::TopicOut;
 use self::registrar::Registrar;
 use self::services::Served;
 use self::subscriptions::TopicIn;
-use super::names;
+use super::{actions, names};
 use crate::JoinOptions;
 use crate::bus::{
-    Bus, BusError, Digest, GlobalParameters, Graph, Hearing, Lending, ParamChange, ParamValue,
-    Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
+    Hearing, Lending, ParamChange, ParamValue, Publisher, Qos, RosVersion, ServiceHandler,
+    ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
 use crate::ros1::tcpros::{FrameBounds, Header};
 use crate::ros1::xmlrpc::{self, Client, Limits};
+use crate::schema::ActionDef;
 
 /// For a peer to accept a connection and answer its header.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -69,10 +71,20 @@ pub struct Ros1Bus {
     inner: Arc<Inner>,
 }
 
+/// Whom one end of a topic belongs to. What this node publishes itself is not brought back to it, unless one of both ends is
+/// an action's: its topics may be used directly, too, and its client may have its server here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
+    /// Whoever holds the bus.
+    User,
+    /// An action of this node.
+    Action,
+}
+
 /// What all parts of a bus share.
-struct Inner {
+pub(super) struct Inner {
     sockets: Arc<dyn Sockets>,
-    node: String,
+    pub(super) node: String,
     /// The host in our addresses, and the port of our TCPROS server.
     host: String,
     port: u16,
@@ -86,7 +98,7 @@ struct Inner {
     lending: Loans,
     calls: CallPool,
     publisher_clients: heard::PublisherClients,
-    graph: watch::Sender<Arc<Graph>>,
+    pub(super) graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
     param_watcher: Mutex<Option<mpsc::UnboundedSender<ParamChange>>>,
     closed: AtomicBool,
@@ -232,7 +244,7 @@ impl fmt::Debug for Ros1Bus {
 
 impl Inner {
     /// Runs a task that ends with the bus.
-    fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
+    pub(super) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
         let mut tasks = self.tasks.lock();
         while tasks.try_join_next().is_some() {}
         let handle = tasks.spawn_on(task, &self.runtime);
@@ -243,7 +255,7 @@ impl Inner {
     }
 
     /// A number for a connection or a local registration.
-    fn id(&self) -> i32 {
+    pub(super) fn id(&self) -> i32 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
@@ -329,7 +341,7 @@ impl Bus for Ros1Bus {
         qos: Qos,
     ) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
-        subscriptions::subscribe(&self.inner, topic, of, qos).await
+        subscriptions::subscribe(&self.inner, topic, of, qos, End::User).await
     }
 
     async fn advertise(
@@ -339,7 +351,7 @@ impl Bus for Ros1Bus {
         qos: Qos,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
-        publications::advertise(&self.inner, topic, of, qos).await
+        publications::advertise(&self.inner, topic, of, qos, End::User).await
     }
 
     async fn call(
@@ -381,6 +393,26 @@ impl Bus for Ros1Bus {
     ) -> Result<Box<dyn Send + Sync>, BusError> {
         self.inner.check_name(service)?;
         services::serve(&self.inner, service, service_type, handler).await
+    }
+
+    fn action_client(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+    ) -> Result<Box<dyn ActionClient>, BusError> {
+        self.inner.check_name(action)?;
+        Ok(Box::new(actions::Client::open(&self.inner, action, of)))
+    }
+
+    fn serve_action(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+        handler: Arc<dyn ActionHandler>,
+    ) -> Result<Box<dyn ActionServer>, BusError> {
+        self.inner.check_name(action)?;
+        let server = actions::Server::open(&self.inner, action, of, handler);
+        Ok(Box::new(server))
     }
 
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {

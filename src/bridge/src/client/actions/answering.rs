@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
+use ros::bus::Outcome;
 use rosbridge::{ActionFeedback, ActionResult, AdvertiseAction, GoalStatus, UnadvertiseAction};
 
 use super::server::ActionServer;
-use crate::actionlib::Status;
 use crate::client::publishing::{decode, decode_args};
 use crate::client::{Client, Reply};
 use crate::names::resolve;
@@ -33,8 +33,11 @@ impl Client {
             );
         }
         drop(earlier);
+        // Under the lock: what its first goal is answered with finds it.
+        let mut actions = self.actions.lock();
         let server = ActionServer::open(self, &name, op, def)?;
-        let replaced = self.actions.lock().served.insert(name.clone(), server);
+        let replaced = actions.served.insert(name.clone(), server);
+        drop(actions);
         drop(replaced);
         self.info(reply, &format!("advertise_action: advertised {name}"));
         Ok(())
@@ -65,12 +68,9 @@ impl Client {
         let servers: Vec<_> = self.actions.lock().served.values().cloned().collect();
         let text = format!("the result cannot be used: {reason}");
         for server in servers {
-            let body = vec![0; server.def.result.min_size()];
             // Most of them have no such goal.
-            if server
-                .end_goal(request, Status::Aborted, &text, &body)
-                .is_ok()
-            {
+            let ended = server.end_goal(request, Outcome::Aborted, &text, server.nothing());
+            if ended.is_ok() {
                 return;
             }
         }
@@ -88,7 +88,7 @@ impl Client {
         let server = self.action_server(&op.action)?;
         let request = op.id.to_string();
         let body = decode(&server.def.feedback, op.values, op.compression, None)?;
-        server.publish_feedback(&request, &body)
+        server.publish_feedback(&request, body)
     }
 
     pub(in crate::client) fn action_result(&self, op: &ActionResult<'_>) -> Result<(), String> {
@@ -103,27 +103,21 @@ impl Client {
             None => Some("".into()),
             Some(values) => values.text(),
         };
-        let status = match op.status {
-            Some(GoalStatus::Canceled) => Status::Preempted,
-            Some(GoalStatus::Aborted) => Status::Aborted,
-            _ if !op.result => Status::Aborted,
-            _ => Status::Succeeded,
+        let outcome = match op.status {
+            Some(GoalStatus::Canceled) => Outcome::Canceled,
+            Some(GoalStatus::Aborted) => Outcome::Aborted,
+            _ if !op.result => Outcome::Aborted,
+            _ => Outcome::Succeeded,
         };
         // Who fails says why in a text, or gives a result all the same.
         if let Some(text) = text {
-            let body = vec![0; server.def.result.min_size()];
-            return server.end_goal(&request, status, &text, &body);
+            return server.end_goal(&request, outcome, &text, server.nothing());
         }
         match decode_args(&server.def.result, op.values, op.compression) {
-            Ok(body) => server.end_goal(&request, status, "", &body),
+            Ok(body) => server.end_goal(&request, outcome, "", body),
             Err(reason) => {
-                let body = vec![0; server.def.result.min_size()];
-                server.end_goal(
-                    &request,
-                    Status::Aborted,
-                    &format!("the result does not fit: {reason}"),
-                    &body,
-                )?;
+                let text = format!("the result does not fit: {reason}");
+                server.end_goal(&request, Outcome::Aborted, &text, server.nothing())?;
                 Err(reason)
             }
         }

@@ -1,19 +1,16 @@
 //! `send_action_goal`, `cancel_action_goal` from the client.
 
-use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
 
 use bytes::Bytes;
-use ros::bus::Graph;
+use ros::bus::BusError;
 use ros::codec::Time;
 use ros::schema::ActionDef;
 use rosbridge::{CancelActionGoal, Compression, Format, SendActionGoal};
-use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::UnderWayGoal;
 use super::goals::{ActionClient, Goal};
-use crate::actionlib::{self, GoalId};
 use crate::client::publishing::decode_args;
 use crate::client::{Client, Reply};
 use crate::names::resolve;
@@ -44,14 +41,13 @@ impl Client {
             return Err(format!("a goal with id {id} is under way already"));
         }
         let goal = Goal {
+            client: Arc::downgrade(self),
             action: op.action.clone().into_owned(),
             id: reply.id.clone(),
             feedback: op.feedback,
             compression,
             fragment_size: op.fragment_size,
-            seen: Instant::now(),
-            done: Arc::default(),
-            _under_way: None,
+            begun: None,
         };
         let prepared = self.begin(op.args).and_then(|guard| {
             let prepared = self.prepare_goal(&op, reply, compression)?;
@@ -60,7 +56,7 @@ impl Client {
         match prepared {
             Ok((prepared, guard)) => {
                 let goal = Goal {
-                    _under_way: Some(guard),
+                    begun: Some((prepared.action.def.clone(), guard)),
                     ..goal
                 };
                 if let Some(id) = &goal.id {
@@ -71,9 +67,9 @@ impl Client {
                     };
                     self.actions.lock().goals.insert(id.clone(), known);
                 }
-                tokio::spawn(run_goal(Arc::downgrade(self), prepared, goal));
+                tokio::spawn(run_goal(prepared, Arc::new(goal)));
             }
-            Err(reason) => goal.fail(self, &reason),
+            Err(reason) => goal.fail(&reason),
         }
         Ok(())
     }
@@ -117,7 +113,9 @@ impl Client {
         } else if actions.used.len() >= limit {
             return Err(format!("this client uses {limit} actions already"));
         }
-        let action = ActionClient::open(self, name, def)?;
+        let opened = self.shared.bus.action_client(name, &def);
+        let bus = opened.map_err(|error| error.to_string())?;
+        let action = Arc::new(ActionClient { def, bus });
         let replaced = actions.used.insert(name.to_owned(), action.clone());
         drop(actions);
         drop(replaced);
@@ -140,15 +138,13 @@ impl Client {
         drop(actions);
         // One that still waits for its server need not be sent at all; `run_goal` looks at this last of all.
         recalled.cancel();
-        if action.goals.lock().contains_key(&goal_id) {
-            action.cancel(&goal_id);
-        }
+        action.bus.cancel(&goal_id);
         Ok(())
     }
 }
 
-/// Sends a goal when its server is there, and sees to it that it is answered.
-async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
+/// Sends a goal when its server is there.
+async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
     let Prepared {
         action,
         name,
@@ -156,87 +152,28 @@ async fn run_goal(client: Weak<Client>, prepared: Prepared, goal: Goal) {
         body,
         recalled,
     } = prepared;
-    let Some((patience, ended, graph)) = client.upgrade().map(|client| {
-        let graph = client.shared.bus.graph();
-        (
-            client.shared.options.action_timeout,
-            client.ended.clone(),
-            graph,
-        )
+    let Some((patience, ended)) = goal.client.upgrade().map(|client| {
+        let patience = client.shared.options.action_timeout;
+        (patience, client.ended.clone())
     }) else {
         return;
     };
-    let there = tokio::select! {
+    let ready = tokio::select! {
         () = ended.cancelled() => return,
-        () = recalled.cancelled() => {
-            if let Some(client) = client.upgrade() {
-                goal.recalled(&client, &action.def);
-            }
-            return;
-        }
-        there = tokio::time::timeout(patience, action.connected()) => there,
+        () = recalled.cancelled() => return goal.recalled(),
+        ready = action.bus.ready(patience) => ready,
     };
-    if there.is_err() && !action.goal.has_subscriber() && !action.is_local() {
-        if let Some(client) = client.upgrade() {
-            goal.fail(
-                &client,
-                &format!("action server {name} did not connect within {patience:?}"),
-            );
+    match ready {
+        Ok(()) => {}
+        Err(BusError::Timeout { .. }) => {
+            let text = format!("action server {name} did not connect within {patience:?}");
+            return goal.fail(&text);
         }
-        return;
+        Err(error) => return goal.fail(&error.to_string()),
     }
-    let done = goal.done.clone();
-    let now = Time::now();
-    let goal = Goal {
-        seen: Instant::now(),
-        ..goal
-    };
-    let known_in_time = {
-        let mut goals = action.goals.lock();
-        goals.insert(goal_id.clone(), goal);
-        !recalled.is_cancelled()
-    };
-    action.goal.publish(actionlib::write_goal(
-        now,
-        &GoalId {
-            stamp: now,
-            id: goal_id.clone(),
-        },
-        &body,
-    ));
+    action.bus.send(&goal_id, body, goal);
     // Cancelled while it was being sent.
-    if !known_in_time {
-        action.cancel(&goal_id);
-    }
-    let gone = server_gone(graph, format!("{name}/result"));
-    tokio::select! {
-        () = ended.cancelled() => {}
-        () = done.notified() => {}
-        () = gone => {
-            let goal = action.goals.lock().remove(&goal_id);
-            if let (Some(client), Some(goal)) = (client.upgrade(), goal) {
-                goal.fail(&client, &format!("action server {name} is gone"));
-            }
-        }
-    }
-}
-
-/// Ready when nobody has published on the topic for a while.
-async fn server_gone(mut graph: watch::Receiver<Arc<Graph>>, topic: String) {
-    const PATIENCE: Duration = Duration::from_secs(3);
-    let nobody = |graph: &Arc<Graph>| {
-        graph
-            .topics
-            .get(&topic)
-            .is_none_or(|nodes| nodes.publishers.is_empty())
-    };
-    loop {
-        if graph.wait_for(nobody).await.is_err() {
-            return;
-        }
-        let back = graph.wait_for(|graph| !nobody(graph));
-        if tokio::time::timeout(PATIENCE, back).await.is_err() {
-            return;
-        }
+    if recalled.is_cancelled() {
+        action.bus.cancel(&goal_id);
     }
 }

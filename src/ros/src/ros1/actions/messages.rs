@@ -3,22 +3,32 @@
 //!
 //! <http://wiki.ros.org/actionlib/DetailedDescription>
 
+use crate::codec::Time;
 use bytes::Bytes;
-use ros::codec::Time;
 
 /// `actionlib_msgs/GoalStatus`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-pub(crate) enum Status {
+pub enum Status {
+    /// Waits to be begun.
     Pending = 0,
+    /// Is worked on.
     Active = 1,
+    /// Ended since somebody wanted it to.
     Preempted = 2,
+    /// Ended as wished for.
     Succeeded = 3,
+    /// Failed.
     Aborted = 4,
+    /// Refused.
     Rejected = 5,
+    /// Worked on, and asked to end.
     Preempting = 6,
+    /// Waits, and asked to end.
     Recalling = 7,
+    /// Ended before it was begun.
     Recalled = 8,
+    /// Its client has not heard of it for long.
     Lost = 9,
 }
 
@@ -33,7 +43,8 @@ impl Status {
         .find(|status| *status as u8 == number)
     }
 
-    pub(crate) fn is_terminal(self) -> bool {
+    /// Whether the goal has ended.
+    pub fn is_terminal(self) -> bool {
         use Status::*;
         matches!(
             self,
@@ -44,21 +55,26 @@ impl Status {
 
 /// `actionlib_msgs/GoalID`.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub(crate) struct GoalId {
-    pub(crate) stamp: Time,
-    pub(crate) id: String,
+pub struct GoalId {
+    /// When it was sent; zero where that does not matter.
+    pub stamp: Time,
+    /// Its name.
+    pub id: String,
 }
 
 /// One entry of `actionlib_msgs/GoalStatusArray`, and the head of every feedback and result.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct GoalState {
-    pub(crate) goal: GoalId,
-    pub(crate) status: Status,
-    pub(crate) text: String,
+pub struct GoalState {
+    /// Which goal.
+    pub goal: GoalId,
+    /// How it stands.
+    pub status: Status,
+    /// What the server says of that.
+    pub text: String,
 }
 
 /// Reads a `…ActionGoal`: its id and the goal's own bytes.
-pub(crate) fn read_goal(bytes: &Bytes) -> Option<(GoalId, Bytes)> {
+pub fn read_goal(bytes: &Bytes) -> Option<(GoalId, Bytes)> {
     let mut reader = Reader { bytes, at: 0 };
     reader.header()?;
     let goal = reader.goal_id()?;
@@ -66,7 +82,7 @@ pub(crate) fn read_goal(bytes: &Bytes) -> Option<(GoalId, Bytes)> {
 }
 
 /// Reads a `…ActionResult` or `…ActionFeedback`: the goal's state and the result's or feedback's own bytes.
-pub(crate) fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
+pub fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
     let mut reader = Reader { bytes, at: 0 };
     reader.header()?;
     let state = reader.goal_state()?;
@@ -74,12 +90,12 @@ pub(crate) fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
 }
 
 /// Reads an `actionlib_msgs/GoalID`: a request to cancel.
-pub(crate) fn read_cancel(bytes: &[u8]) -> Option<GoalId> {
+pub fn read_cancel(bytes: &[u8]) -> Option<GoalId> {
     Reader { bytes, at: 0 }.goal_id()
 }
 
 /// Reads an `actionlib_msgs/GoalStatusArray`.
-pub(crate) fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
+pub fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
     let mut reader = Reader { bytes, at: 0 };
     reader.header()?;
     let count = reader.word()?;
@@ -88,7 +104,7 @@ pub(crate) fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
 }
 
 /// A `…ActionGoal`.
-pub(crate) fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
+pub fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
     let mut out = Vec::with_capacity(64 + body.len());
     write_header(&mut out, now);
     write_goal_id(&mut out, goal);
@@ -97,7 +113,7 @@ pub(crate) fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
 }
 
 /// A `…ActionResult` or `…ActionFeedback`.
-pub(crate) fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
+pub fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
     let mut out = Vec::with_capacity(96 + body.len());
     write_header(&mut out, now);
     write_goal_state(&mut out, state);
@@ -106,17 +122,14 @@ pub(crate) fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
 }
 
 /// An `actionlib_msgs/GoalID`.
-pub(crate) fn write_cancel(goal: &GoalId) -> Bytes {
+pub fn write_cancel(goal: &GoalId) -> Bytes {
     let mut out = Vec::new();
     write_goal_id(&mut out, goal);
     out.into()
 }
 
 /// An `actionlib_msgs/GoalStatusArray`.
-pub(crate) fn write_states<'s>(
-    now: Time,
-    states: impl ExactSizeIterator<Item = &'s GoalState>,
-) -> Bytes {
+pub fn write_states<'s>(now: Time, states: impl ExactSizeIterator<Item = &'s GoalState>) -> Bytes {
     let mut out = Vec::new();
     write_header(&mut out, now);
     write_word(&mut out, states.len() as u32);
@@ -256,7 +269,7 @@ mod tests {
 
     #[test]
     fn the_layout_is_that_of_the_generated_messages() {
-        let registry = ros::schema::Registry::new();
+        let registry = crate::schema::Registry::new();
         registry
             .insert(
                 "x/action/Do",
@@ -265,12 +278,12 @@ mod tests {
             .unwrap();
         let action = registry.action("x/Do").unwrap();
         let goal = write_goal(Time::default(), &state().goal, &7i32.to_le_bytes());
-        ros::codec::validate(&action.action_goal, &goal).unwrap();
+        crate::codec::validate(&action.action_goal, &goal).unwrap();
         let result = write_state(Time::default(), &state(), &7i32.to_le_bytes());
-        ros::codec::validate(&action.action_result, &result).unwrap();
-        ros::codec::validate(&action.action_feedback, &result).unwrap();
+        crate::codec::validate(&action.action_result, &result).unwrap();
+        crate::codec::validate(&action.action_feedback, &result).unwrap();
         let states = registry.message("actionlib_msgs/GoalStatusArray").unwrap();
-        ros::codec::validate(&states, &write_states(Time::default(), [state()].iter())).unwrap();
+        crate::codec::validate(&states, &write_states(Time::default(), [state()].iter())).unwrap();
     }
 
     #[test]

@@ -8,9 +8,9 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 
-use super::Inner;
 use super::registrar::Kind;
-use crate::bus::{BusError, Matched, Peer, PeerId, Publisher, Qos, WireType};
+use super::{End, Inner, subscriptions};
+use crate::bus::{BusError, Matched, Message, Peer, PeerId, Publisher, Qos, WireType};
 use crate::ros1::tcpros::Outbox;
 
 /// One topic with everyone here who publishes it, and every subscriber.
@@ -26,11 +26,14 @@ struct State {
     advert: Option<WireType>,
     locals: BTreeMap<i32, LocalPublisher>,
     subscribers: Vec<Arc<Subscriber>>,
+    /// Actions of this node that listen.
+    actions: Vec<PeerId>,
     /// Those who only want to know what subscribers ask for.
     askers: Vec<mpsc::UnboundedSender<WireType>>,
 }
 
 struct LocalPublisher {
+    end: End,
     qos: Qos,
     last: Option<Bytes>,
 }
@@ -46,17 +49,18 @@ pub(super) struct Subscriber {
 }
 
 /// Advertises, and registers if this is the topic's first local publisher.
-pub(super) async fn advertise(
+pub(in crate::ros1) async fn advertise(
     bus: &Arc<Inner>,
     name: &str,
     of: WireType,
     qos: Qos,
+    end: End,
 ) -> Result<Box<dyn Publisher>, BusError> {
     let id = bus.id();
     let topic = {
         let mut topics = bus.publications.lock();
         let topic = topics.entry(name.to_owned()).or_default();
-        topic.add(name, id, &of, qos)?;
+        topic.add(name, id, &of, (qos, end))?;
         bus.registrar.want(Kind::Publisher, name, Some(&of.name));
         topic.clone()
     };
@@ -65,7 +69,11 @@ pub(super) async fn advertise(
         name: name.to_owned(),
         topic,
         id,
+        end,
+        of: Arc::new(of),
+        latching: qos.is_latching(),
     };
+    handle.topic.hear(subscriptions::actions(bus, name));
     bus.registrar.sync(Kind::Publisher, name, false).await?;
     Ok(Box::new(handle))
 }
@@ -106,7 +114,13 @@ impl Drop for Asking {
 }
 
 impl TopicOut {
-    fn add(&self, name: &str, id: i32, ours: &WireType, qos: Qos) -> Result<(), BusError> {
+    fn add(
+        &self,
+        name: &str,
+        id: i32,
+        ours: &WireType,
+        (qos, end): (Qos, End),
+    ) -> Result<(), BusError> {
         let mut state = self.state.lock();
         match &state.advert {
             Some(before) if before.digest != ours.digest => {
@@ -119,7 +133,11 @@ impl TopicOut {
             Some(_) => {}
             None => state.advert = Some(ours.clone()),
         }
-        let local = LocalPublisher { qos, last: None };
+        let local = LocalPublisher {
+            end,
+            qos,
+            last: None,
+        };
         state.locals.insert(id, local);
         Ok(())
     }
@@ -173,10 +191,38 @@ impl TopicOut {
         self.matched.send_replace(state.matched());
     }
 
-    fn publish(&self, id: i32, message: Bytes) {
+    /// Actions of this node that listen to the topic are these.
+    pub(super) fn hear(&self, actions: Vec<PeerId>) {
+        let mut state = self.state.lock();
+        if state.actions != actions {
+            state.actions = actions;
+            self.matched.send_replace(state.matched());
+        }
+    }
+
+    /// What a new subscription of this node is given.
+    pub(super) fn latched(&self, node: &str, end: End) -> Vec<Message> {
+        let state = self.state.lock();
+        let Some(advert) = state.advert.clone().map(Arc::new) else {
+            return Vec::new();
+        };
+        let heard = state.locals.iter().filter_map(|(id, local)| {
+            let heard = end == End::Action || local.end == End::Action;
+            Some(Message {
+                bytes: local.last.clone().filter(|_| heard)?,
+                wire_type: advert.clone(),
+                publisher: own(node, *id),
+                latching: true,
+            })
+        });
+        heard.collect()
+    }
+
+    /// Whether an action of this node listens.
+    fn publish(&self, id: i32, message: Bytes) -> bool {
         let mut state = self.state.lock();
         let Some(local) = state.locals.get_mut(&id) else {
-            return;
+            return false;
         };
         if local.qos.is_latching() {
             local.last = Some(message.clone());
@@ -191,6 +237,7 @@ impl TopicOut {
         if lost > 0 {
             self.dropped.fetch_add(lost, Ordering::Relaxed);
         }
+        !state.actions.is_empty()
     }
 
     /// Publishes no more; what is queued is still sent.
@@ -201,7 +248,7 @@ impl TopicOut {
     /// Returns when all subscribers are gone.
     pub(super) async fn emptied(&self) {
         let mut matched = self.matched.subscribe();
-        let _ = matched.wait_for(|matched| matched.peers.is_empty()).await;
+        let _ = matched.wait_for(|matched| matched.connected() == 0).await;
     }
 
     /// The connected subscribers.
@@ -212,8 +259,9 @@ impl TopicOut {
 
 impl State {
     fn matched(&self) -> Matched {
-        let peers = self.subscribers.iter().map(|subscriber| Peer {
-            id: subscriber.peer.clone(),
+        let subscribers = self.subscribers.iter().map(|subscriber| &subscriber.peer);
+        let peers = subscribers.chain(&self.actions).map(|id| Peer {
+            id: id.clone(),
             connected: true,
         });
         Matched {
@@ -225,6 +273,7 @@ impl State {
 fn retire(state: &mut State) {
     state.advert = None;
     state.locals.clear();
+    state.actions.clear();
     for subscriber in &state.subscribers {
         subscriber.outbox.close();
         subscriber.closing.send_replace(true);
@@ -254,17 +303,34 @@ fn release(bus: &Arc<Inner>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(
     });
 }
 
+/// How a publisher of this node is told from others.
+fn own(node: &str, id: i32) -> PeerId {
+    PeerId::new(node, id.unsigned_abs().into())
+}
+
 /// One local publisher.
 struct Handle {
     bus: Arc<Inner>,
     name: String,
     topic: Arc<TopicOut>,
     id: i32,
+    end: End,
+    of: Arc<WireType>,
+    latching: bool,
 }
 
 impl Publisher for Handle {
     fn publish(&self, bytes: Bytes) {
-        self.topic.publish(self.id, bytes);
+        let heard = self.topic.publish(self.id, bytes.clone());
+        if heard || self.end == End::Action {
+            let message = Message {
+                bytes,
+                wire_type: self.of.clone(),
+                publisher: own(&self.bus.node, self.id),
+                latching: self.latching,
+            };
+            subscriptions::bring_back(&self.bus, &self.name, self.end, &message);
+        }
     }
 
     fn matched(&self) -> watch::Receiver<Matched> {

@@ -8,9 +8,9 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::Inner;
 use super::link::{self, Link};
 use super::registrar::Kind;
+use super::{End, Inner};
 use crate::bus::{
     BusError, Matched, Message, MessageSender, Peer, PeerId, Qos, Subscription, WireType,
     message_queue,
@@ -42,6 +42,7 @@ struct Locals {
 
 struct Local {
     id: i32,
+    end: End,
     sender: MessageSender,
     wanted: WireType,
 }
@@ -55,11 +56,12 @@ impl Local {
 }
 
 /// Subscribes, and registers if this is the topic's first local subscription.
-pub(super) async fn subscribe(
+pub(in crate::ros1) async fn subscribe(
     bus: &Arc<Inner>,
     name: &str,
     wanted: WireType,
     qos: Qos,
+    end: End,
 ) -> Result<Subscription, BusError> {
     let (sender, messages) = message_queue(qos.depth);
     let id = bus.id();
@@ -75,7 +77,12 @@ pub(super) async fn subscribe(
                 matched: watch::Sender::default(),
             })
         });
-        topic.add(Local { id, sender, wanted });
+        topic.add(Local {
+            id,
+            end,
+            sender,
+            wanted,
+        });
         bus.registrar
             .want(Kind::Subscriber, name, Some(&topic.type_name()));
         (topic.clone(), first)
@@ -85,6 +92,7 @@ pub(super) async fn subscribe(
         topic: topic.clone(),
         id,
     };
+    topic.add_own(bus, id);
     // Of a new set of connections the publishers must be learnt, even if an earlier registration still stands.
     let answer = bus.registrar.sync(Kind::Subscriber, name, first).await?;
     if let Some(publishers) = answer {
@@ -98,7 +106,45 @@ pub(super) async fn subscribe(
     })
 }
 
+/// Actions of this node that listen to a topic.
+pub(super) fn actions(bus: &Inner, name: &str) -> Vec<PeerId> {
+    let topic = bus.subscriptions.lock().get(name).cloned();
+    topic.map_or_else(Vec::new, |topic| topic.actions(&bus.node))
+}
+
+/// Gives those here who hear it what this node itself publishes, through an end of that kind.
+pub(super) fn bring_back(bus: &Inner, name: &str, by: End, message: &Message) {
+    let topic = bus.subscriptions.lock().get(name).cloned();
+    let Some(topic) = topic else { return };
+    for local in &topic.locals.lock().list {
+        if by == End::Action || local.end == End::Action {
+            local.send(message.clone());
+        }
+    }
+}
+
 impl TopicIn {
+    fn actions(&self, node: &str) -> Vec<PeerId> {
+        let locals = self.locals.lock();
+        let actions = locals.list.iter().filter(|local| local.end == End::Action);
+        let ids = actions.map(|local| PeerId::new(node, local.id.unsigned_abs().into()));
+        ids.collect()
+    }
+
+    /// Gives a new subscription what this node has latched itself, and tells its publishers.
+    fn add_own(&self, bus: &Inner, id: i32) {
+        let published = bus.publications.lock().get(&self.name).cloned();
+        let Some(published) = published else { return };
+        let locals = self.locals.lock();
+        let new = locals.list.iter().find(|local| local.id == id);
+        let Some(new) = new else { return };
+        for message in published.latched(&bus.node, new.end) {
+            new.send(message);
+        }
+        drop(locals);
+        published.hear(actions(bus, &self.name));
+    }
+
     fn add(&self, local: Local) {
         let mut locals = self.locals.lock();
         for message in locals.latched.values() {
@@ -259,7 +305,7 @@ impl Drop for Guard {
     fn drop(&mut self) {
         let bus = &self.bus;
         let name = &self.topic.name;
-        {
+        let gone = {
             let mut topics = bus.subscriptions.lock();
             let empty = {
                 let mut locals = self.topic.locals.lock();
@@ -269,11 +315,19 @@ impl Drop for Guard {
             let current = topics
                 .get(name)
                 .is_some_and(|t| Arc::ptr_eq(t, &self.topic));
-            if !empty || !current {
-                return;
+            let gone = empty && current;
+            if gone {
+                topics.remove(name);
+                bus.registrar.want(Kind::Subscriber, name, None);
             }
-            topics.remove(name);
-            bus.registrar.want(Kind::Subscriber, name, None);
+            gone
+        };
+        let published = bus.publications.lock().get(name).cloned();
+        if let Some(published) = published {
+            published.hear(actions(bus, name));
+        }
+        if !gone {
+            return;
         }
         self.topic.end();
         let (bus, name) = (bus.clone(), name.clone());

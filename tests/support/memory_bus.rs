@@ -1,0 +1,627 @@
+//! A ROS system in memory, of another kind than ROS 1: ends are matched by type and quality of service, actions are its
+//! own, and there are neither global parameters nor services of other systems. Whoever uses a bus must not notice.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{
+    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, Digest, GoalEnd,
+    GoalEvents, Graph, Matched, Message, MessageSender, Outcome, Peer, PeerId, Publisher, Qos,
+    RosVersion, ServiceHandler, ServiceType, Subscription, TopicNodes, WireType, message_queue,
+};
+use ros::schema::ActionDef;
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+/// All nodes, and what they have registered.
+#[derive(Default)]
+pub struct MemorySystem {
+    state: Mutex<State>,
+    graph: watch::Sender<Arc<Graph>>,
+}
+
+#[derive(Default)]
+struct State {
+    numbers: u128,
+    nodes: BTreeSet<String>,
+    topics: BTreeMap<String, Topic>,
+    services: BTreeMap<String, Service>,
+    actions: BTreeMap<String, Action>,
+}
+
+#[derive(Default)]
+struct Topic {
+    /// Its ends are not the same any more, and have not been told.
+    changed: bool,
+    publishers: Vec<Publication>,
+    subscribers: Vec<Listener>,
+}
+
+struct Publication {
+    id: PeerId,
+    of: Arc<WireType>,
+    qos: Qos,
+    last: Option<Bytes>,
+    matched: watch::Sender<Matched>,
+}
+
+struct Listener {
+    id: PeerId,
+    of: WireType,
+    messages: MessageSender,
+    matched: watch::Sender<Matched>,
+}
+
+struct Service {
+    number: u128,
+    node: String,
+    of: ServiceType,
+    handler: Arc<dyn ServiceHandler>,
+}
+
+#[derive(Default)]
+struct Action {
+    type_name: String,
+    /// Who serves it, if anybody does.
+    server: Option<(u128, String, Arc<dyn ActionHandler>)>,
+    clients: BTreeMap<u128, String>,
+    /// Goals under way, with their client's number and who hears of them.
+    goals: HashMap<String, (u128, Arc<dyn GoalEvents>)>,
+}
+
+impl Publication {
+    /// What of this end's goes to that one. What a node publishes itself is not brought back to it.
+    fn reaches(&self, listener: &Listener) -> bool {
+        self.id.node() != listener.id.node() && self.of.agrees(&listener.of)
+    }
+
+    fn message(&self, bytes: Bytes) -> Message {
+        Message {
+            bytes,
+            wire_type: self.of.clone(),
+            publisher: self.id.clone(),
+            latching: self.qos.is_latching(),
+        }
+    }
+}
+
+impl Topic {
+    /// Tells all ends who is at the other.
+    fn show(&self) {
+        let peers = |ids: Vec<&PeerId>| Matched {
+            peers: ids
+                .into_iter()
+                .map(|id| Peer {
+                    id: id.clone(),
+                    connected: true,
+                })
+                .collect(),
+        };
+        let tell = |end: &watch::Sender<Matched>, now: Matched| {
+            end.send_if_modified(|before| std::mem::replace(before, now.clone()) != now);
+        };
+        for publisher in &self.publishers {
+            let others = self
+                .subscribers
+                .iter()
+                .filter(|other| publisher.reaches(other));
+            tell(&publisher.matched, peers(others.map(|it| &it.id).collect()));
+        }
+        for listener in &self.subscribers {
+            let others = self
+                .publishers
+                .iter()
+                .filter(|other| other.reaches(listener));
+            tell(&listener.matched, peers(others.map(|it| &it.id).collect()));
+        }
+    }
+}
+
+impl State {
+    fn number(&mut self) -> u128 {
+        self.numbers += 1;
+        self.numbers
+    }
+
+    fn graph(&self, generation: u64) -> Graph {
+        let node = |id: &PeerId| id.node().to_owned();
+        let topics = self.topics.iter().map(|(name, topic)| {
+            let publishers = topic.publishers.iter();
+            let types = publishers.map(|it| &*it.of);
+            let types = types.chain(topic.subscribers.iter().map(|it| &it.of));
+            let named = types.map(|of| of.name.as_str()).find(|name| *name != "*");
+            let nodes = TopicNodes {
+                type_name: named.unwrap_or("*").to_owned(),
+                publishers: topic.publishers.iter().map(|it| node(&it.id)).collect(),
+                subscribers: topic.subscribers.iter().map(|it| node(&it.id)).collect(),
+            };
+            (name.clone(), nodes)
+        });
+        let actions = self.actions.iter().map(|(name, action)| {
+            let servers = action.server.iter().map(|(_, node, _)| node.clone());
+            let nodes = ActionNodes {
+                type_name: action.type_name.clone(),
+                servers: servers.collect(),
+                clients: action.clients.values().cloned().collect(),
+                topics: Vec::new(),
+            };
+            (name.clone(), nodes)
+        });
+        let services = self.services.iter();
+        let nodes = self.nodes.iter();
+        Graph {
+            generation,
+            topics: topics.collect(),
+            services: services
+                .map(|(name, it)| (name.clone(), it.node.clone()))
+                .collect(),
+            actions: actions.collect(),
+            nodes: nodes
+                .map(|name| (name.clone(), "memory".to_owned()))
+                .collect(),
+            ..Graph::default()
+        }
+    }
+}
+
+impl MemorySystem {
+    /// A node of this name.
+    pub fn join(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
+        self.change(|state| state.nodes.insert(node.to_owned()));
+        Arc::new(MemoryBus {
+            system: self.clone(),
+            node: node.to_owned(),
+        })
+    }
+
+    /// Changes what is registered, and tells it.
+    fn change<T>(&self, by: impl FnOnce(&mut State) -> T) -> T {
+        let mut state = self.state.lock();
+        let done = by(&mut state);
+        state.topics.retain(|_, topic| {
+            if std::mem::take(&mut topic.changed) {
+                topic.show();
+            }
+            !topic.publishers.is_empty() || !topic.subscribers.is_empty()
+        });
+        let unused = |action: &Action| action.server.is_none() && action.clients.is_empty();
+        state.actions.retain(|_, action| !unused(action));
+        let generation = self.graph.borrow().generation + 1;
+        self.graph.send_replace(Arc::new(state.graph(generation)));
+        done
+    }
+}
+
+/// One node of a system in memory.
+pub struct MemoryBus {
+    system: Arc<MemorySystem>,
+    node: String,
+}
+
+impl Drop for MemoryBus {
+    fn drop(&mut self) {
+        let node = &self.node;
+        self.system.change(|state| state.nodes.remove(node));
+    }
+}
+
+/// Undoes a registration when it is dropped.
+struct Guard(Option<Box<dyn FnOnce() + Send + Sync>>);
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        if let Some(undo) = self.0.take() {
+            undo();
+        }
+    }
+}
+
+impl MemoryBus {
+    fn guard(&self, undo: impl FnOnce(&mut State) + Send + Sync + 'static) -> Guard {
+        let system = self.system.clone();
+        Guard(Some(Box::new(move || system.change(undo))))
+    }
+
+    fn served(&self, service: &str) -> Result<(ServiceType, Arc<dyn ServiceHandler>), BusError> {
+        let state = self.system.state.lock();
+        let found = state.services.get(service);
+        found
+            .map(|served| (served.of.clone(), served.handler.clone()))
+            .ok_or_else(|| BusError::NoService(service.to_owned()))
+    }
+}
+
+struct MemoryPublisher {
+    system: Arc<MemorySystem>,
+    topic: String,
+    id: PeerId,
+    matched: watch::Receiver<Matched>,
+    _guard: Guard,
+}
+
+impl Publisher for MemoryPublisher {
+    fn publish(&self, bytes: Bytes) {
+        let mut state = self.system.state.lock();
+        let Some(topic) = state.topics.get_mut(&self.topic) else {
+            return;
+        };
+        let publisher = topic.publishers.iter_mut().find(|it| it.id == self.id);
+        let Some(publisher) = publisher else { return };
+        if publisher.qos.is_latching() {
+            publisher.last = Some(bytes.clone());
+        }
+        for listener in topic.subscribers.iter().filter(|it| publisher.reaches(it)) {
+            listener.messages.send(publisher.message(bytes.clone()));
+        }
+    }
+
+    fn matched(&self) -> watch::Receiver<Matched> {
+        self.matched.clone()
+    }
+}
+
+#[async_trait]
+impl Bus for MemoryBus {
+    fn version(&self) -> RosVersion {
+        RosVersion::Two
+    }
+
+    async fn distribution(&self) -> String {
+        "memory".to_owned()
+    }
+
+    fn node(&self) -> &str {
+        &self.node
+    }
+
+    fn graph(&self) -> watch::Receiver<Arc<Graph>> {
+        self.system.graph.subscribe()
+    }
+
+    async fn subscribe(
+        &self,
+        topic: &str,
+        of: WireType,
+        qos: Qos,
+    ) -> Result<Subscription, BusError> {
+        let (sender, messages) = message_queue(qos.depth);
+        let (end, matched) = watch::channel(Matched::default());
+        let id = self.system.change(|state| {
+            let id = PeerId::new(self.node.as_str(), state.number());
+            let topic = state.topics.entry(topic.to_owned()).or_default();
+            topic.changed = true;
+            let listener = Listener {
+                id: id.clone(),
+                of,
+                messages: sender,
+                matched: end,
+            };
+            let kept = topic.publishers.iter().filter(|it| it.reaches(&listener));
+            for publisher in kept.filter(|_| qos.is_latching()) {
+                if let Some(last) = publisher.last.clone() {
+                    listener.messages.send(publisher.message(last));
+                }
+            }
+            topic.subscribers.push(listener);
+            id
+        });
+        let topic = topic.to_owned();
+        let guard = self.guard(move |state| {
+            if let Some(topic) = state.topics.get_mut(&topic) {
+                topic.changed = true;
+                topic.subscribers.retain(|it| it.id != id);
+            }
+        });
+        Ok(Subscription {
+            dropped: messages.dropped(),
+            messages,
+            matched,
+            guard: Box::new(guard),
+        })
+    }
+
+    async fn advertise(
+        &self,
+        topic: &str,
+        of: WireType,
+        qos: Qos,
+    ) -> Result<Box<dyn Publisher>, BusError> {
+        let (end, matched) = watch::channel(Matched::default());
+        let id = self.system.change(|state| {
+            let id = PeerId::new(self.node.as_str(), state.number());
+            let topic = state.topics.entry(topic.to_owned()).or_default();
+            topic.changed = true;
+            topic.publishers.push(Publication {
+                id: id.clone(),
+                of: Arc::new(of),
+                qos,
+                last: None,
+                matched: end,
+            });
+            id
+        });
+        let (name, own) = (topic.to_owned(), id.clone());
+        let guard = self.guard(move |state| {
+            if let Some(topic) = state.topics.get_mut(&name) {
+                topic.changed = true;
+                topic.publishers.retain(|it| it.id != own);
+            }
+        });
+        Ok(Box::new(MemoryPublisher {
+            system: self.system.clone(),
+            topic: topic.to_owned(),
+            id,
+            matched,
+            _guard: guard,
+        }))
+    }
+
+    async fn call(
+        &self,
+        service: &str,
+        request: Bytes,
+        timeout: Duration,
+    ) -> Result<Bytes, BusError> {
+        self.call_typed(service, &Digest::any(), request, timeout)
+            .await
+    }
+
+    async fn call_typed(
+        &self,
+        service: &str,
+        digest: &Digest,
+        request: Bytes,
+        patience: Duration,
+    ) -> Result<Bytes, BusError> {
+        let (of, handler) = self.served(service)?;
+        if !of.digest.agrees(digest) {
+            return Err(BusError::TypeMismatch {
+                what: format!("service {service}"),
+                theirs: format!("{} {}", of.name, of.digest),
+                ours: digest.to_string(),
+            });
+        }
+        match timeout(patience, handler.call(request, &self.node)).await {
+            Ok(answer) => answer.map_err(|reason| BusError::CallFailed {
+                service: service.to_owned(),
+                reason,
+            }),
+            Err(_) => Err(BusError::Timeout {
+                what: format!("service {service}"),
+                after: patience,
+            }),
+        }
+    }
+
+    async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
+        Ok(self.served(service)?.0)
+    }
+
+    async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
+        let state = self.system.state.lock();
+        let known = state.topics.get(topic);
+        let known = known.ok_or_else(|| BusError::NoTopic(topic.to_owned()))?;
+        let publishers = known.publishers.iter().map(|it| WireType::clone(&it.of));
+        let mut types = publishers.chain(known.subscribers.iter().map(|it| it.of.clone()));
+        let told = types.find(|of| !of.digest.is_any());
+        Ok(told.unwrap_or_else(WireType::any))
+    }
+
+    async fn serve(
+        &self,
+        service: &str,
+        of: ServiceType,
+        handler: Arc<dyn ServiceHandler>,
+    ) -> Result<Box<dyn Send + Sync>, BusError> {
+        let name = service.to_owned();
+        let number = self.system.change(|state| {
+            let earlier = state.services.get(&name);
+            if earlier.is_some_and(|earlier| earlier.node == self.node) {
+                return Err(BusError::AlreadyServed(name.clone()));
+            }
+            let number = state.number();
+            let served = Service {
+                number,
+                node: self.node.clone(),
+                of,
+                handler,
+            };
+            state.services.insert(name.clone(), served);
+            Ok(number)
+        })?;
+        Ok(Box::new(self.guard(move |state| {
+            if state
+                .services
+                .get(&name)
+                .is_some_and(|it| it.number == number)
+            {
+                state.services.remove(&name);
+            }
+        })))
+    }
+
+    fn action_client(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+    ) -> Result<Box<dyn ActionClient>, BusError> {
+        let number = self.system.change(|state| {
+            let number = state.number();
+            let known = state.actions.entry(action.to_owned()).or_default();
+            known.type_name.clone_from(&of.name);
+            known.clients.insert(number, self.node.clone());
+            number
+        });
+        Ok(Box::new(MemoryClient {
+            system: self.system.clone(),
+            action: action.to_owned(),
+            number,
+        }))
+    }
+
+    fn serve_action(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+        handler: Arc<dyn ActionHandler>,
+    ) -> Result<Box<dyn ActionServer>, BusError> {
+        let number = self.system.change(|state| {
+            let number = state.number();
+            let known = state.actions.entry(action.to_owned()).or_default();
+            known.type_name.clone_from(&of.name);
+            known.server = Some((number, self.node.clone(), handler));
+            number
+        });
+        Ok(Box::new(MemoryServer {
+            system: self.system.clone(),
+            action: action.to_owned(),
+            number,
+        }))
+    }
+}
+
+struct MemoryClient {
+    system: Arc<MemorySystem>,
+    action: String,
+    number: u128,
+}
+
+impl MemoryClient {
+    fn server(&self) -> Option<Arc<dyn ActionHandler>> {
+        let state = self.system.state.lock();
+        let (.., handler) = state.actions.get(&self.action)?.server.as_ref()?;
+        Some(handler.clone())
+    }
+}
+
+#[async_trait]
+impl ActionClient for MemoryClient {
+    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
+        let mut graph = self.system.graph.subscribe();
+        let served = |graph: &Arc<Graph>| {
+            let action = graph.actions.get(&self.action);
+            action.is_some_and(|action| !action.servers.is_empty())
+        };
+        match timeout(patience, graph.wait_for(served)).await {
+            Ok(_) => Ok(()),
+            Err(_) => Err(BusError::Timeout {
+                what: format!("action {}", self.action),
+                after: patience,
+            }),
+        }
+    }
+
+    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+        let Some(server) = self.server() else {
+            return events.ended(Err(format!("action server {} is gone", self.action)));
+        };
+        {
+            let mut state = self.system.state.lock();
+            let action = state.actions.entry(self.action.clone()).or_default();
+            action
+                .goals
+                .insert(id.to_owned(), (self.number, events.clone()));
+        }
+        if let Err(text) = server.goal(id, goal) {
+            let mut state = self.system.state.lock();
+            let action = state.actions.entry(self.action.clone()).or_default();
+            action.goals.remove(id);
+            drop(state);
+            events.ended(Ok(GoalEnd {
+                outcome: Outcome::Rejected,
+                text,
+                result: Bytes::new(),
+            }));
+        }
+    }
+
+    fn cancel(&self, id: &str) {
+        let under_way = {
+            let state = self.system.state.lock();
+            let action = state.actions.get(&self.action);
+            action.is_some_and(|action| action.goals.contains_key(id))
+        };
+        if let Some(server) = self.server().filter(|_| under_way) {
+            server.cancel(id);
+        }
+    }
+}
+
+impl Drop for MemoryClient {
+    fn drop(&mut self) {
+        let server = self.server();
+        let gone: Vec<String> = self.system.change(|state| {
+            let Some(action) = state.actions.get_mut(&self.action) else {
+                return Vec::new();
+            };
+            action.clients.remove(&self.number);
+            let goals = action.goals.iter();
+            let own = goals.filter(|(_, (client, _))| *client == self.number);
+            own.map(|(id, _)| id.clone()).collect()
+        });
+        for id in gone {
+            if let Some(server) = &server {
+                server.cancel(&id);
+            }
+        }
+    }
+}
+
+struct MemoryServer {
+    system: Arc<MemorySystem>,
+    action: String,
+    number: u128,
+}
+
+impl ActionServer for MemoryServer {
+    fn feedback(&self, id: &str, feedback: Bytes) -> bool {
+        let events = {
+            let state = self.system.state.lock();
+            let action = state.actions.get(&self.action);
+            action.and_then(|action| action.goals.get(id).map(|(_, events)| events.clone()))
+        };
+        match events {
+            Some(events) => {
+                events.feedback(feedback);
+                true
+            }
+            None => false,
+        }
+    }
+
+    fn end(&self, id: &str, end: GoalEnd) -> bool {
+        let goal = {
+            let mut state = self.system.state.lock();
+            let action = state.actions.get_mut(&self.action);
+            action.and_then(|action| action.goals.remove(id))
+        };
+        match goal {
+            Some((_, events)) => {
+                events.ended(Ok(end));
+                true
+            }
+            None => false,
+        }
+    }
+}
+
+impl Drop for MemoryServer {
+    fn drop(&mut self) {
+        let left = self.system.change(|state| {
+            let action = state.actions.get_mut(&self.action)?;
+            let (number, ..) = action.server.as_ref()?;
+            if *number != self.number {
+                return None;
+            }
+            action.server = None;
+            Some(std::mem::take(&mut action.goals))
+        });
+        for (_, events) in left.unwrap_or_default().into_values() {
+            events.ended(Err(format!("action server {} is gone", self.action)));
+        }
+    }
+}
