@@ -306,7 +306,7 @@ impl<'a> Feed<'a> {
             }),
             asked => asked,
         };
-        if tells_an_action(name) {
+        if ros::ros1::actions::commands(name) {
             return Ok(None);
         }
         let message = self
@@ -330,11 +330,6 @@ fn ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
     graph.topics.get(topic).map_or((false, false), |topic| {
         (others(&topic.subscribers), others(&topic.publishers))
     })
-}
-
-/// Whether a message of this type makes a server of an action begin or stop something.
-fn tells_an_action(type_name: &str) -> bool {
-    type_name.ends_with("ActionGoal") || type_name == "actionlib_msgs/GoalID"
 }
 
 /// Level, node and text of a `rosgraph_msgs/Log`.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros::bus::ParamValue;
-use ros::codec::Time;
+use ros::codec::{Stamps, Time};
 use tokio::sync::mpsc;
 
 use crate::hub::Listener;
@@ -18,12 +18,8 @@ struct Ticks(mpsc::UnboundedSender<Time>);
 
 impl Listener for Ticks {
     fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
-        // rosgraph_msgs/Clock is one time.
-        if let [a, b, c, d, e, f, g, h] = sample.bytes[..] {
-            let time = Time {
-                secs: u32::from_le_bytes([a, b, c, d]),
-                nsecs: u32::from_le_bytes([e, f, g, h]),
-            };
+        let Ok(schema) = sample.schema() else { return };
+        if let Some(time) = Stamps::of(&schema).first(&sample.bytes) {
             // Nobody waits any more.
             let _ = self.0.send(time);
         }

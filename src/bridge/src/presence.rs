@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 use ros::bus::{Message, WireType};
-use ros::codec::Time;
+use ros::codec::{self, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
+use serde_json::json;
 
 const COUNT: &str = "/client_count";
 const CLIENTS: &str = "/connected_clients";
@@ -73,24 +74,33 @@ impl Presence {
             .retain(|present| present.number != number);
     }
 
-    /// What the topic says now.
-    pub(crate) fn message(&self, topic: &str, message_type: &MessageType) -> Message {
-        let present = self.present.lock();
-        let count = present.len() as u32;
-        let mut bytes = count.to_le_bytes().to_vec();
-        if topic == CLIENTS {
-            for Present { name, since, .. } in present.iter() {
-                bytes.extend_from_slice(&(name.len() as u32).to_le_bytes());
-                bytes.extend_from_slice(name.as_bytes());
-                bytes.extend_from_slice(&since.secs.to_le_bytes());
-                bytes.extend_from_slice(&since.nsecs.to_le_bytes());
+    /// What the topic says now, where its type has room for that.
+    pub(crate) fn message(&self, topic: &str, message_type: &MessageType) -> Option<Message> {
+        let said = {
+            let present = self.present.lock();
+            let client = |Present { name, since, .. }: &Present| {
+                let Time { secs, nsecs } = *since;
+                json!({ "ip_address": name, "connection_time": { "secs": secs, "nsecs": nsecs } })
+            };
+            match topic {
+                CLIENTS => json!({ "clients": present.iter().map(client).collect::<Vec<_>>() }),
+                _ => json!({ "data": present.len() }),
             }
-        }
-        Message {
+        };
+        let mut bytes = Vec::new();
+        let options = FillOptions::default();
+        codec::from_json(
+            message_type,
+            said.to_string().as_bytes(),
+            &mut bytes,
+            &options,
+        )
+        .ok()?;
+        Some(Message {
             bytes: bytes.into(),
             wire_type: Arc::new(WireType::of(message_type)),
             publisher: "/rosbridge_websocket".into(),
             latching: true,
-        }
+        })
     }
 }

@@ -244,6 +244,11 @@ impl Sample {
         })
     }
 
+    /// The type of its bytes; the reason where that cannot be known.
+    pub(crate) fn schema(&self) -> Result<Arc<MessageType>, Arc<str>> {
+        self.types.find(&self.wire_type)
+    }
+
     /// Its bytes, where they have a permit of their own.
     pub(crate) fn big(&self) -> usize {
         match self.bytes.len() {

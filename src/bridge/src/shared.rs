@@ -133,7 +133,7 @@ impl Shared {
             Some(own) => {
                 let hub = Hub::internal(self, topic);
                 if presence::type_name(topic).is_some() {
-                    hub.deliver(self.presence.message(topic, &own), true);
+                    self.tell_presence_to(&hub, &own);
                 }
                 hub
             }
@@ -162,8 +162,14 @@ impl Shared {
             let hub = self.live_hub(topic).filter(|hub| hub.is_internal());
             let own = presence::type_name(topic).and_then(|name| self.registry.message(name).ok());
             if let (Some(hub), Some(own)) = (hub, own) {
-                hub.deliver(self.presence.message(topic, &own), true);
+                self.tell_presence_to(&hub, &own);
             }
+        }
+    }
+
+    fn tell_presence_to(&self, hub: &Hub, of: &MessageType) {
+        if let Some(message) = self.presence.message(&hub.topic, of) {
+            hub.deliver(message, true);
         }
     }
 

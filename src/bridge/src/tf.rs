@@ -12,8 +12,9 @@ mod transform;
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
-use ros::codec::Time;
-use ros::schema::Registry;
+use ros::codec::{self, CodecError, FillOptions, Time};
+use ros::schema::{MessageType, Registry};
+use serde_json::json;
 
 use buffer::Buffer;
 pub(crate) use republish::{
@@ -81,24 +82,26 @@ impl SharedBuffer {
     }
 }
 
-/// Serialized `geometry_msgs/TransformStamped[]`: parent, child, transform, when it was so.
+/// A message whose field `transforms` holds these: parent, child, transform, when it was so.
 fn write_transforms<'t>(
+    of: &MessageType,
     transforms: impl IntoIterator<Item = (&'t str, &'t str, Transform, Time)>,
-) -> Vec<u8> {
-    let (mut out, mut count) = (vec![0; 4], 0u32);
-    for (parent, child, transform, time) in transforms {
-        count += 1;
-        for word in [0, time.secs, time.nsecs] {
-            out.extend_from_slice(&word.to_le_bytes());
-        }
-        for name in [parent, child] {
-            out.extend_from_slice(&(name.len() as u32).to_le_bytes());
-            out.extend_from_slice(name.as_bytes());
-        }
-        for number in transform.translation.iter().chain(&transform.rotation) {
-            out.extend_from_slice(&number.to_le_bytes());
-        }
-    }
-    out[..4].copy_from_slice(&count.to_le_bytes());
-    out
+) -> Result<Vec<u8>, CodecError> {
+    let stamped = transforms.into_iter().map(|(parent, child, transform, time)| {
+        let [x, y, z] = transform.translation;
+        let [rx, ry, rz, rw] = transform.rotation;
+        json!({
+            "header": { "stamp": { "secs": time.secs, "nsecs": time.nsecs }, "frame_id": parent },
+            "child_frame_id": child,
+            "transform": {
+                "translation": { "x": x, "y": y, "z": z },
+                "rotation": { "x": rx, "y": ry, "z": rz, "w": rw },
+            },
+        })
+    });
+    let said = json!({ "transforms": stamped.collect::<Vec<_>>() });
+    let mut bytes = Vec::new();
+    let options = FillOptions::default();
+    codec::from_json(of, said.to_string().as_bytes(), &mut bytes, &options)?;
+    Ok(bytes)
 }

@@ -24,4 +24,4 @@ pub use lender::took_too_long;
 pub use original::{Interface, Original, Setting};
 pub use place::Registered;
 pub use process::Program;
-pub use stamp::{is_of_action, is_stamped};
+pub use stamp::is_stamped;

@@ -29,7 +29,6 @@ pub mod packing;
 pub mod record;
 pub mod session;
 pub mod skew;
-pub mod stamps;
 mod values;
 
 pub use drops::Dropped;

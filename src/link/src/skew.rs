@@ -14,7 +14,7 @@ use bytes::{Bytes, BytesMut};
 use parking_lot::Mutex;
 
 use crate::clock::Sample;
-use crate::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// A difference smaller than this, beyond what the measurement leaves open, is none: 1 ms.
 const NOTICED: i64 = 1_000_000;

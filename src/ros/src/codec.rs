@@ -25,7 +25,9 @@ mod json_out;
 mod json_text;
 mod number;
 pub(crate) mod plan;
+mod stamps;
 mod typed_array;
+mod value;
 mod walk;
 
 #[cfg(test)]
@@ -38,6 +40,8 @@ use crate::schema::MessageType;
 pub use cbor_item::cbor_item_len;
 pub use fault::{CodecError, CodecErrorKind};
 pub use json_text::json_value_len;
+pub use stamps::Stamps;
+pub use value::Value;
 
 /// Output beyond which a conversion is given up, unless options say otherwise: 256 MiB.
 pub const DEFAULT_MAX_BYTES: usize = 256 << 20;

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::codec::Time;
+use ros::codec::{Time, Value};
+use ros::schema::MessageType;
 
 use super::transform::Transform;
 use crate::hub::{Listener, Listening};
@@ -53,7 +54,9 @@ struct Ear {
 
 impl Listener for Ear {
     fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
-        self.frames.hear(&sample.bytes, self.fixed);
+        if let Ok(schema) = sample.schema() {
+            self.frames.hear(&schema, &sample.bytes, self.fixed);
+        }
     }
 
     fn failed(&self, reason: &str) {
@@ -82,14 +85,14 @@ impl Buffer {
 }
 
 impl Frames {
-    /// Takes a `tf2_msgs/TFMessage` (or `tf/tfMessage`, which is the same); a torn one as far as it goes.
-    fn hear(&self, bytes: &[u8], fixed: bool) {
-        let mut reader = Reader { bytes };
-        let count = reader.word().unwrap_or(0);
+    /// Takes a `tf2_msgs/TFMessage` (or `tf/tfMessage`, which is the same).
+    fn hear(&self, schema: &MessageType, bytes: &[u8], fixed: bool) {
+        let said = Value::read(schema, bytes);
+        let transforms = said.as_ref().and_then(|said| said.field("transforms"));
         let mut links = self.links.lock();
-        for _ in 0..count {
-            let Some((child, mut link)) = reader.link() else {
-                return;
+        for stamped in transforms.map(Value::items).unwrap_or_default() {
+            let Some((child, mut link)) = read(stamped) else {
+                continue;
             };
             let Some(transform) = link.transform.normalized() else {
                 continue;
@@ -164,59 +167,37 @@ pub(super) fn plain(frame: &str) -> &str {
     frame.trim_start_matches('/')
 }
 
-struct Reader<'b> {
-    bytes: &'b [u8],
-}
-
-impl Reader<'_> {
-    fn take(&mut self, count: usize) -> Option<&[u8]> {
-        let (taken, rest) = self.bytes.split_at_checked(count)?;
-        self.bytes = rest;
-        Some(taken)
-    }
-
-    fn word(&mut self) -> Option<u32> {
-        self.take(4)?.try_into().ok().map(u32::from_le_bytes)
-    }
-
-    fn number(&mut self) -> Option<f64> {
-        self.take(8)?.try_into().ok().map(f64::from_le_bytes)
-    }
-
-    fn frame(&mut self) -> Option<String> {
-        let length = self.word()? as usize;
-        let text = String::from_utf8_lossy(self.take(length)?);
-        Some(plain(&text).to_owned())
-    }
-
-    /// A `geometry_msgs/TransformStamped`: the child, and where it is.
-    fn link(&mut self) -> Option<(String, Link)> {
-        self.word()?;
-        let time = Time {
-            secs: self.word()?,
-            nsecs: self.word()?,
-        };
-        let (parent, child) = (self.frame()?, self.frame()?);
-        let mut numbers = [0.0; 7];
-        for number in &mut numbers {
-            *number = self.number()?;
-        }
-        let [x, y, z, rx, ry, rz, rw] = numbers;
-        let transform = Transform {
-            translation: [x, y, z],
-            rotation: [rx, ry, rz, rw],
-        };
-        let link = Link {
-            parent,
-            transform,
-            time: Some(time),
-        };
-        Some((child, link))
-    }
+/// Child and place of a `geometry_msgs/TransformStamped`.
+fn read(stamped: &Value<'_>) -> Option<(String, Link)> {
+    let header = stamped.field("header")?;
+    let moved = stamped.field("transform")?;
+    let number = |of: &str, axis: &str| moved.field(of)?.field(axis)?.number();
+    let frame = |name: &Value<'_>| Some(plain(&name.text()?).to_owned());
+    let transform = Transform {
+        translation: [
+            number("translation", "x")?,
+            number("translation", "y")?,
+            number("translation", "z")?,
+        ],
+        rotation: [
+            number("rotation", "x")?,
+            number("rotation", "y")?,
+            number("rotation", "z")?,
+            number("rotation", "w")?,
+        ],
+    };
+    let link = Link {
+        parent: frame(header.field("frame_id")?)?,
+        transform,
+        time: header.field("stamp")?.time(),
+    };
+    Some((frame(stamped.field("child_frame_id")?)?, link))
 }
 
 #[cfg(test)]
 mod tests {
+    use ros::schema::Registry;
+
     use super::*;
     use crate::tf::write_transforms;
 
@@ -231,11 +212,23 @@ mod tests {
         Time { secs, nsecs: 0 }
     }
 
+    /// The same as `tf2_msgs/TFMessage`.
+    fn schema() -> Arc<MessageType> {
+        let registry = Registry::new();
+        crate::tf::define(&registry);
+        registry.message("tf2_web_republisher/TFArray").unwrap()
+    }
+
     fn said(links: &[(&str, &str, f64, u32)]) -> Vec<u8> {
         let links = links.iter();
-        write_transforms(
-            links.map(|(parent, child, x, secs)| (*parent, *child, step(*x), at(*secs))),
-        )
+        let links = links.map(|(parent, child, x, secs)| (*parent, *child, step(*x), at(*secs)));
+        write_transforms(&schema(), links).unwrap()
+    }
+
+    impl Frames {
+        fn hears(&self, bytes: &[u8], fixed: bool) {
+            self.hear(&schema(), bytes, fixed);
+        }
     }
 
     #[test]
@@ -246,20 +239,20 @@ mod tests {
             ("base", "arm", 2.0, 1),
             ("map", "dock", 10.0, 1),
         ]);
-        frames.hear(&message, false);
+        frames.hears(&message, false);
         let x = |target, source| Some(frames.find(target, source)?.transform.translation[0]);
         assert_eq!(x("dock", "arm"), Some(-7.0));
         assert_eq!(x("arm", "map"), Some(-3.0));
         assert_eq!(x("map", "map"), Some(0.0));
         assert_eq!(x("map", "nowhere"), None);
-        frames.hear(&said(&[("base", "arm", 5.0, 2)]), false);
+        frames.hears(&said(&[("base", "arm", 5.0, 2)]), false);
         assert_eq!(x("base", "arm"), Some(5.0));
     }
 
     #[test]
     fn a_transform_is_as_old_as_the_oldest_that_it_is_made_of() {
         let frames = Frames::default();
-        frames.hear(
+        frames.hears(
             &said(&[
                 ("earth", "map", 1.0, 3),
                 ("map", "base", 1.0, 7),
@@ -267,7 +260,7 @@ mod tests {
             ]),
             false,
         );
-        frames.hear(
+        frames.hears(
             &said(&[("base", "laser", 1.0, 1), ("laser", "dot", 1.0, 1)]),
             true,
         );
@@ -284,13 +277,13 @@ mod tests {
     #[test]
     fn nonsense_does_no_harm() {
         let frames = Frames::default();
-        frames.hear(&said(&[("a", "b", 1.0, 1), ("b", "a", 1.0, 1)]), false);
+        frames.hears(&said(&[("a", "b", 1.0, 1), ("b", "a", 1.0, 1)]), false);
         assert_eq!(frames.find("a", "b"), None);
         let whole = said(&[("map", "base", 1.0, 1)]);
         for end in 0..whole.len() {
-            frames.hear(&whole[..end], false);
+            frames.hears(&whole[..end], false);
         }
         assert_eq!(frames.find("map", "base"), None);
-        frames.hear(&[0xff; 64], false);
+        frames.hears(&[0xff; 64], false);
     }
 }

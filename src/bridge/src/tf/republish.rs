@@ -137,6 +137,7 @@ impl Republisher {
         );
         let message_type = message_type.map_err(|error| error.to_string())?;
         let mut heard = Instant::now();
+        let of = message_type.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
             if let Some(hub) = shared.live_hub(&name) {
                 heard = Instant::now();
@@ -155,7 +156,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            topic.clone(),
+            (topic.clone(), of),
             stop,
             deliver,
         ));
@@ -221,6 +222,7 @@ impl Republisher {
         self.goals
             .lock()
             .insert(goal.id.clone(), stop.clone().drop_guard());
+        let of = action.feedback.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
             if let (Some(hub), Some(transforms)) = (shared.live_hub(FEEDBACK_TOPIC), transforms) {
                 let bytes =
@@ -238,7 +240,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            FEEDBACK_TOPIC.to_owned(),
+            (FEEDBACK_TOPIC.to_owned(), of),
             stop,
             deliver,
         ));
@@ -341,7 +343,7 @@ async fn send(
     shared: Weak<Shared>,
     buffer: Arc<Buffer>,
     wanted: Wanted,
-    topic: String,
+    (topic, of): (String, Arc<MessageType>),
     stop: CancellationToken,
     mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
 ) {
@@ -410,7 +412,10 @@ async fn send(
                 (target, source, transform, time.unwrap_or(now))
             })
             .collect();
-        let transforms = (!changed.is_empty()).then(|| write_transforms(changed));
+        let transforms = match changed.is_empty() {
+            true => None,
+            false => write_transforms(&of, changed).ok(),
+        };
         if !deliver(&shared, transforms) {
             return;
         }

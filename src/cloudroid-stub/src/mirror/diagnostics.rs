@@ -3,11 +3,13 @@
 //! A node of its own publishes it, `NODE_cloudroid`: the stub's node looks like the original's.
 
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
 
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::Bytes;
 use qos::{Local, LocalState, Report};
 use ros::bus::{Bus, BusError, Publisher, Qos, WireType};
+use ros::codec::{self, FillOptions, Time};
+use ros::schema::MessageType;
+use serde_json::json;
 
 const TOPIC: &str = "/diagnostics";
 /// DiagnosticStatus' levels.
@@ -48,33 +50,36 @@ pub struct Diagnostics {
     /// The robot's id.
     robot: String,
     sequence: u32,
+    schema: Arc<MessageType>,
 }
 
 impl Diagnostics {
     /// Advertises it on `bus`, for the node of this name.
     pub async fn new(bus: &Arc<dyn Bus>, node: &str, robot: &str) -> Result<Self, BusError> {
+        let schema = schema();
+        let of = WireType::of(&schema);
         Ok(Self {
-            publisher: bus.advertise(TOPIC, wire_type(), Qos::keep_last(2)).await?,
+            publisher: bus.advertise(TOPIC, of, Qos::keep_last(2)).await?,
             name: format!("{}: cloudroid", node.trim_start_matches('/')),
             robot: robot.to_owned(),
             sequence: 0,
+            schema,
         })
     }
 
     /// Publishes the state of the promise.
     pub fn publish(&mut self, report: &Report) {
         self.sequence = self.sequence.wrapping_add(1);
-        let bytes = array(self.sequence, &self.name, &self.robot, report);
+        let bytes = array(&self.schema, self.sequence, &self.name, &self.robot, report);
         self.publisher.publish(bytes);
     }
 }
 
-fn wire_type() -> WireType {
-    WireType::new(
-        "diagnostic_msgs/DiagnosticArray",
-        "60810da900de1dd6ddd437c3503511da",
-        DEFINITION,
-    )
+fn schema() -> Arc<MessageType> {
+    match MessageType::from_full_text("diagnostic_msgs/DiagnosticArray", DEFINITION) {
+        Ok(schema) => schema,
+        Err(error) => unreachable!("the definition is ours: {error}"),
+    }
 }
 
 /// How bad it is: nobody answers; somebody does, but not as wished for; the cloud keeps its promise.
@@ -142,54 +147,47 @@ fn values(report: &Report) -> Vec<(String, String)> {
     values
 }
 
-fn array(sequence: u32, name: &str, robot: &str, report: &Report) -> Bytes {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    let since = since.unwrap_or_default();
-    let mut out = BytesMut::with_capacity(1024);
-    out.put_u32_le(sequence);
-    // ROS's time ends in 2106.
-    out.put_u32_le(u32::try_from(since.as_secs()).unwrap_or(u32::MAX));
-    out.put_u32_le(since.subsec_nanos());
-    string(&mut out, "");
-    out.put_u32_le(1);
-    out.put_u8(level(report));
-    string(&mut out, name);
-    string(&mut out, &report.summary);
-    string(&mut out, robot);
-    let values = values(report);
-    length(&mut out, values.len());
-    for (key, value) in values {
-        string(&mut out, &key);
-        string(&mut out, &value);
+fn array(of: &MessageType, sequence: u32, name: &str, robot: &str, report: &Report) -> Bytes {
+    let Time { secs, nsecs } = Time::now();
+    let value = |(key, value)| json!({ "key": key, "value": value });
+    let said = json!({
+        "header": { "seq": sequence, "stamp": { "secs": secs, "nsecs": nsecs } },
+        "status": [{
+            "level": level(report),
+            "name": name,
+            "message": report.summary,
+            "hardware_id": robot,
+            "values": values(report).into_iter().map(value).collect::<Vec<_>>(),
+        }],
+    });
+    let mut out = Vec::new();
+    let options = FillOptions::default();
+    if let Err(error) = codec::from_json(of, said.to_string().as_bytes(), &mut out, &options) {
+        unreachable!("the definition is ours: {error}");
     }
-    out.freeze()
-}
-
-fn length(out: &mut BytesMut, length: usize) {
-    out.put_u32_le(u32::try_from(length).unwrap_or(u32::MAX));
-}
-
-fn string(out: &mut BytesMut, text: &str) {
-    length(out, text.len());
-    out.put_slice(text.as_bytes());
+    out.into()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use qos::{Governor, Limits, Sla};
-    use ros::schema::MessageType;
     use std::time::Instant;
 
     #[test]
     fn the_array_is_what_its_definition_says() {
-        let wire_type = wire_type();
-        let known = MessageType::from_full_text(&wire_type.name, DEFINITION).unwrap();
-        assert_eq!(wire_type.digest, known.md5());
+        let known = schema();
+        assert_eq!(known.md5(), "60810da900de1dd6ddd437c3503511da");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
         let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
         let now = Instant::now();
-        let down = array(7, "detect: cloudroid", "rover1", &governor.report(now));
+        let down = array(
+            &known,
+            7,
+            "detect: cloudroid",
+            "rover1",
+            &governor.report(now),
+        );
         let mut json = Vec::new();
         ros::codec::to_json(&known, &down, &mut json, &Default::default()).unwrap();
         let json: serde_json::Value = serde_json::from_slice(&json).unwrap();

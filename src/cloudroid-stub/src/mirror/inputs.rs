@@ -11,10 +11,10 @@ use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use ros::bus::{Digest, Matched, Message, PeerId, Qos, WireType};
+use ros::ros1::actions;
 use tokio::task::AbortHandle;
 
 use super::Mirror;
-use crate::local;
 
 /// Messages that the bus keeps while the link is busy.
 const QUEUE: usize = 256;
@@ -106,8 +106,8 @@ impl Inputs {
             channels.of(mirror, topic, message)
         };
         // Goals and what cancels them are no stream of which the newest would do.
-        let of_action = local::is_of_action(&message.wire_type.name)
-            || message.wire_type.name == "actionlib_msgs/GoalID";
+        let of = &message.wire_type.name;
+        let of_action = actions::carries_goal_id(of) || actions::commands(of);
         let quality = if message.latching || of_action {
             Quality::Each
         } else {

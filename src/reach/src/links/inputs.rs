@@ -14,7 +14,7 @@ use link::control::Input;
 use link::drops::{Cause, Drops};
 use link::record::{Answered, Data};
 use link::skew::{Skew, Way};
-use link::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 256;

@@ -25,7 +25,7 @@ use super::Hub;
 use super::node_link::NodeLink;
 use link::control::{FromCloud, Served};
 use link::skew::Way;
-use link::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
 const PATIENCE: Duration = Duration::from_millis(1200);

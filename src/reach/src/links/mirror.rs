@@ -8,7 +8,7 @@ use ros::bus::{Digest, ServiceType, WireType};
 use super::Hub;
 use super::node_link::{NodeLink, Service};
 use link::control::{FromCloud, Graph, Output, Served, Wanted};
-use link::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// What was told so far.
 #[derive(Default)]

@@ -22,7 +22,7 @@ use link::drops::{Drop, Drops, Teller};
 use link::record::Record;
 use link::session::{CloudSession, Handler, SessionOptions};
 use link::skew::Way;
-use link::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;

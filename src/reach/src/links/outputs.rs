@@ -20,7 +20,7 @@ use link::clock::now;
 use link::drops::Cause;
 use link::record::{Answered, Data};
 use link::skew::Way;
-use link::stamps::Stamps;
+use ros::codec::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;

@@ -18,6 +18,17 @@ pub(super) use server::Server;
 /// What follows an action's name in the names of its topics.
 const PARTS: [&str; 5] = ["goal", "cancel", "status", "feedback", "result"];
 
+/// Whether messages of this type carry a goal's id: goals, results and feedback.
+pub fn carries_goal_id(type_name: &str) -> bool {
+    let ends = ["ActionGoal", "ActionResult", "ActionFeedback"];
+    ends.iter().any(|end| type_name.ends_with(end))
+}
+
+/// Whether a message of this type makes a server begin or stop something.
+pub fn commands(type_name: &str) -> bool {
+    type_name.ends_with("ActionGoal") || type_name == "actionlib_msgs/GoalID"
+}
+
 /// The actions that these topics make.
 pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<String, ActionNodes> {
     let mut found = BTreeMap::new();

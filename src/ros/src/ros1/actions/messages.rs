@@ -89,6 +89,13 @@ pub fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
     Some((state, bytes.slice(reader.at..)))
 }
 
+/// The goal's id in a `…ActionGoal`, `…ActionResult` or `…ActionFeedback`.
+pub fn goal_id(bytes: &[u8]) -> Option<String> {
+    let mut reader = Reader { bytes, at: 0 };
+    reader.header()?;
+    Some(reader.goal_id()?.id)
+}
+
 /// Reads an `actionlib_msgs/GoalID`: a request to cancel.
 pub fn read_cancel(bytes: &[u8]) -> Option<GoalId> {
     Reader { bytes, at: 0 }.goal_id()
@@ -289,6 +296,7 @@ mod tests {
     #[test]
     fn torn_messages_are_refused() {
         let whole = write_state(Time::default(), &state(), b"");
+        assert_eq!(goal_id(&whole).as_deref(), Some("g-1"));
         for end in 0..whole.len() {
             assert_eq!(read_state(&whole.slice(..end)), None, "{end}");
         }

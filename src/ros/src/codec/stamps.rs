@@ -1,10 +1,11 @@
-//! Where in a serialized ROS 1 message the stamps stand: every `time` field, nested ones and those in arrays, by the
+//! Where in a serialized message the stamps stand: every `time` field, nested ones and those in arrays, by the
 //! message's definition. The rest is skipped, not decoded, and what follows the last stamp is not looked at.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use ros::schema::{Arity, Base, Field, MessageType, Primitive};
+use crate::codec::Time;
+use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// A `time`: seconds and nanoseconds, four bytes each.
 const TIME: usize = 8;
@@ -58,6 +59,20 @@ impl Stamps {
         };
         walk.steps(&self.steps)?;
         Some(walk.found)
+    }
+
+    /// The first stamp: of a message that begins with a header, the header's.
+    pub fn first(&self, message: &[u8]) -> Option<Time> {
+        let at = *self.find(message)?.first()?;
+        let word = |at: usize| {
+            Some(u32::from_le_bytes(
+                message.get(at..at + 4)?.try_into().ok()?,
+            ))
+        };
+        Some(Time {
+            secs: word(at)?,
+            nsecs: word(at + 4)?,
+        })
     }
 }
 

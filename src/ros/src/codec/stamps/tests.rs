@@ -1,6 +1,6 @@
 use std::sync::Arc;
 
-use ros::schema::{MessageType, Registry};
+use crate::schema::{MessageType, Registry};
 
 use super::Stamps;
 

@@ -1,0 +1,187 @@
+//! A message as values by name, for the few that are looked into here rather than passed on.
+
+use crate::codec::Time;
+use crate::schema::{Arity, Base, Field, MessageType, Primitive};
+
+/// A value in a serialized message.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Value<'a> {
+    /// Any number, and `bool` as 0 or 1. Integers beyond 2^53 are rounded.
+    Number(f64),
+    /// A string's bytes.
+    Text(&'a [u8]),
+    /// A `time`, or a `duration` by its bits.
+    Time(Time),
+    /// An array.
+    List(Vec<Value<'a>>),
+    /// Another message: its fields by name.
+    Message(Vec<(&'a str, Value<'a>)>),
+}
+
+impl<'a> Value<'a> {
+    /// Reads one message; none where the bytes are no such message.
+    pub fn read(of: &'a MessageType, bytes: &'a [u8]) -> Option<Self> {
+        let mut reader = Reader { rest: bytes };
+        let read = reader.message(of)?;
+        reader.rest.is_empty().then_some(read)
+    }
+
+    /// A field of a message.
+    pub fn field(&self, name: &str) -> Option<&Value<'a>> {
+        match self {
+            Value::Message(fields) => fields
+                .iter()
+                .find(|(field, _)| *field == name)
+                .map(|(_, value)| value),
+            _ => None,
+        }
+    }
+
+    /// A number.
+    pub fn number(&self) -> Option<f64> {
+        match self {
+            Value::Number(number) => Some(*number),
+            _ => None,
+        }
+    }
+
+    /// A string; what is no UTF-8 is replaced.
+    pub fn text(&self) -> Option<String> {
+        match self {
+            Value::Text(bytes) => Some(String::from_utf8_lossy(bytes).into_owned()),
+            _ => None,
+        }
+    }
+
+    /// A `time`.
+    pub fn time(&self) -> Option<Time> {
+        match self {
+            Value::Time(time) => Some(*time),
+            _ => None,
+        }
+    }
+
+    /// The items of an array; none of anything else.
+    pub fn items(&self) -> &[Value<'a>] {
+        match self {
+            Value::List(items) => items,
+            _ => &[],
+        }
+    }
+}
+
+struct Reader<'a> {
+    rest: &'a [u8],
+}
+
+impl<'a> Reader<'a> {
+    fn take(&mut self, count: usize) -> Option<&'a [u8]> {
+        let (taken, rest) = self.rest.split_at_checked(count)?;
+        self.rest = rest;
+        Some(taken)
+    }
+
+    fn bytes<const N: usize>(&mut self) -> Option<[u8; N]> {
+        self.take(N)?.try_into().ok()
+    }
+
+    fn length(&mut self) -> Option<usize> {
+        usize::try_from(u32::from_le_bytes(self.bytes()?)).ok()
+    }
+
+    fn message(&mut self, of: &'a MessageType) -> Option<Value<'a>> {
+        let fields = of.fields().iter();
+        let values = fields.map(|field| Some((field.name.as_str(), self.field(field)?)));
+        values.collect::<Option<_>>().map(Value::Message)
+    }
+
+    fn field(&mut self, field: &'a Field) -> Option<Value<'a>> {
+        let count = match field.arity {
+            Arity::One => return self.one(&field.base),
+            Arity::Fixed(count) => count as usize,
+            Arity::Variable => self.length()?,
+        };
+        // Items without any bytes cost nothing, so their number is bounded here.
+        if count > self.rest.len() {
+            return None;
+        }
+        let items = (0..count).map(|_| self.one(&field.base));
+        items.collect::<Option<_>>().map(Value::List)
+    }
+
+    fn one(&mut self, base: &'a Base) -> Option<Value<'a>> {
+        let primitive = match base {
+            Base::Message(message) => return self.message(message),
+            Base::Primitive(primitive) => primitive,
+        };
+        Some(Value::Number(match primitive {
+            Primitive::Bool | Primitive::Uint8 => u8::from_le_bytes(self.bytes()?).into(),
+            Primitive::Int8 => i8::from_le_bytes(self.bytes()?).into(),
+            Primitive::Uint16 => u16::from_le_bytes(self.bytes()?).into(),
+            Primitive::Int16 => i16::from_le_bytes(self.bytes()?).into(),
+            Primitive::Uint32 => u32::from_le_bytes(self.bytes()?).into(),
+            Primitive::Int32 => i32::from_le_bytes(self.bytes()?).into(),
+            Primitive::Uint64 => u64::from_le_bytes(self.bytes()?) as f64,
+            Primitive::Int64 => i64::from_le_bytes(self.bytes()?) as f64,
+            Primitive::Float32 => f32::from_le_bytes(self.bytes()?).into(),
+            Primitive::Float64 => f64::from_le_bytes(self.bytes()?),
+            Primitive::String => {
+                let length = self.length()?;
+                return self.take(length).map(Value::Text);
+            }
+            Primitive::Time | Primitive::Duration => {
+                return Some(Value::Time(Time {
+                    secs: u32::from_le_bytes(self.bytes()?),
+                    nsecs: u32::from_le_bytes(self.bytes()?),
+                }));
+            }
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::from_json;
+    use crate::schema::Registry;
+
+    #[test]
+    fn values_are_found_by_name_and_torn_messages_are_none() {
+        let registry = Registry::new();
+        let definitions = [
+            (
+                "x/msg/Pair",
+                "Header header\nInner[] more\nint8[2] both\nbool ok\n",
+            ),
+            ("x/msg/Inner", "float64 wide\nstring name\n"),
+        ];
+        for (key, text) in definitions {
+            registry.insert(key, text).unwrap();
+        }
+        let pair = registry.message("x/Pair").unwrap();
+        let json = br#"{"header": {"stamp": {"secs": 7, "nsecs": 8}, "frame_id": "map"},
+            "more": [{"wide": 0.1, "name": "a"}, {"wide": -2.5, "name": ""}], "both": [-1, 2], "ok": true}"#;
+        let mut bytes = Vec::new();
+        from_json(&pair, json, &mut bytes, &Default::default()).unwrap();
+        let read = Value::read(&pair, &bytes).unwrap();
+        let header = read.field("header").unwrap();
+        let stamp = header.field("stamp").and_then(Value::time);
+        assert_eq!(stamp, Some(Time { secs: 7, nsecs: 8 }));
+        assert_eq!(
+            header.field("frame_id").and_then(Value::text).unwrap(),
+            "map"
+        );
+        let more = read.field("more").unwrap().items();
+        let wide: Vec<_> = more.iter().map(|it| it.field("wide")?.number()).collect();
+        assert_eq!(wide, [Some(0.1), Some(-2.5)]);
+        let both = read.field("both").unwrap().items();
+        assert_eq!(both, [Value::Number(-1.0), Value::Number(2.0)]);
+        assert_eq!(read.field("ok"), Some(&Value::Number(1.0)));
+        assert_eq!(read.field("nothing"), None);
+        for end in 0..bytes.len() {
+            assert_eq!(Value::read(&pair, &bytes[..end]), None, "{end}");
+        }
+        bytes.push(0);
+        assert_eq!(Value::read(&pair, &bytes), None, "more than one message");
+    }
+}
