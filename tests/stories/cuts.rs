@@ -222,7 +222,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> T
     );
     // Each answered call has told its sum on a topic, too: it was heard once, or is told as dropped.
     let all_known = support::until("each answered call's sum, heard or told as dropped", || {
-        let here = sums.dropped.load(Ordering::Relaxed);
+        let here = sums.dropped.get();
         let dropped = here + told_as_dropped(&daemon, "cut-adder_py", "/sums")?;
         let known = executed as u64 + dropped;
         let told = format!(

@@ -253,7 +253,7 @@ async fn pump(
         // From an action of another client.
         let local = message.publisher.node() == own;
         hub.deliver(message, local);
-        let now_dropped = subscription.dropped.load(Ordering::Relaxed);
+        let now_dropped = subscription.dropped.get();
         if now_dropped > dropped {
             metrics.bus_dropped.add(now_dropped - dropped);
             dropped = now_dropped;

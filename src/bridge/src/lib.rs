@@ -50,6 +50,7 @@ mod session;
 mod shared;
 mod tf;
 mod topic_queue;
+mod topics;
 mod waiting;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};

@@ -3,6 +3,8 @@
 use std::fmt::Write;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use ros::ring::Lost;
+
 /// A number that only grows.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
@@ -78,6 +80,14 @@ metrics! {
 }
 
 impl Metrics {
+    /// Counts messages that were dropped because a client read too slowly.
+    pub(crate) fn lost(&self, lost: Lost) {
+        if lost.messages > 0 {
+            self.dropped.add(lost.messages);
+            self.dropped_bytes.add(lost.bytes);
+        }
+    }
+
     /// Appends all counters in Prometheus's text format; `labels` is what stands between the braces
     /// (`service="opencv_apps",robot="r1"`), already escaped.
     pub fn prometheus(&self, out: &mut String, labels: &str) {

@@ -2,22 +2,21 @@
 //!
 //! It outlives the socket, so that what happened while the client was away is there when it comes back.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::task::Waker;
 use std::time::Instant;
 
 use budget::{Budget, Exceeded, Permit};
 use parking_lot::Mutex;
+use ros::ring::{Bounds, Held, Ring};
 use rosbridge::Compression;
 use tokio::sync::watch;
 
 use crate::sample::{Frame, Sample};
-use crate::topic_queue::{Pushed, QueueLimits, TopicQueue, Wishes};
+use crate::topic_queue::{TopicQueue, Wishes};
+pub(crate) use crate::topics::TopicKey;
+use crate::topics::Topics;
 use crate::{BridgeOptions, Metrics};
-
-/// Names one topic of one client.
-pub(crate) type TopicKey = u64;
 
 /// An answer, a status, a call: small or not, none may be lost.
 #[derive(Debug, Clone)]
@@ -57,30 +56,20 @@ pub(crate) struct Outbox {
 }
 
 struct Limits {
-    control_messages: usize,
-    control_bytes: usize,
+    control: Bounds,
     session_bytes: usize,
-    topic: QueueLimits,
+    topic: Bounds,
 }
 
 struct Queues {
-    control: VecDeque<Control>,
-    control_bytes: usize,
-    /// Of those, bytes of frames that have no permit of their own.
+    control: Ring<Control>,
+    /// Bytes of its frames that have no permit of their own.
     control_small: usize,
+    topics: Topics,
     /// For small frames and samples.
     small: Permit,
     /// For big samples, which count for the daemon by themselves: in the client's budget alone.
     big: Permit,
-    topics: HashMap<TopicKey, TopicQueue>,
-    next_key: TopicKey,
-    /// Topics with something to send, in turn.
-    ready: VecDeque<TopicKey>,
-    /// Topics whose throttle rate holds them back, by when.
-    later: BTreeSet<(Instant, TopicKey)>,
-    bytes: usize,
-    /// Of those, bytes of big samples.
-    big_bytes: usize,
     goodbye: Option<Goodbye>,
     /// Which socket sends, and how to wake it.
     socket: u64,
@@ -91,10 +80,12 @@ impl Outbox {
     /// For a client with this budget.
     pub(crate) fn new(options: &BridgeOptions, metrics: Arc<Metrics>, budget: &Budget) -> Self {
         let limits = Limits {
-            control_messages: options.control_messages,
-            control_bytes: options.control_bytes,
+            control: Bounds {
+                messages: options.control_messages,
+                bytes: options.control_bytes,
+            },
             session_bytes: options.session_bytes,
-            topic: QueueLimits {
+            topic: Bounds {
                 messages: options.topic_messages.max(1),
                 bytes: options.topic_bytes,
             },
@@ -146,19 +137,18 @@ impl Outbox {
 
     pub(crate) fn control(&self, control: Control) {
         let mut queues = self.queues.lock();
-        let length = queues.control_bytes + control.frame.bytes.len();
-        let full = queues.control.len() >= self.limits.control_messages
-            || (length > self.limits.control_bytes && !queues.control.is_empty());
+        let (waiting, limit) = (&queues.control, self.limits.control);
+        let full = waiting.len() >= limit.messages
+            || (!waiting.is_empty() && waiting.bytes() + control.held() > limit.bytes);
         if full {
-            let waiting = queues.control.len();
+            let waiting = waiting.len();
             queues.goodbye.get_or_insert_with(|| Goodbye {
                 code: 1008,
                 reason: format!("{waiting} answers wait and none is read"),
             });
         } else {
-            queues.control_bytes = length;
             queues.control_small += control.small();
-            queues.control.push_back(control);
+            queues.control.append(control);
             queues.count_control();
         }
         queues.wake();
@@ -168,9 +158,8 @@ impl Outbox {
     pub(crate) fn again(&self, controls: impl DoubleEndedIterator<Item = Control>) {
         let mut queues = self.queues.lock();
         for control in controls.rev() {
-            queues.control_bytes += control.frame.bytes.len();
             queues.control_small += control.small();
-            queues.control.push_front(control);
+            queues.control.put_back(control);
         }
         queues.count_control();
         queues.wake();
@@ -192,154 +181,86 @@ impl Outbox {
     }
 
     pub(crate) fn add_topic(&self, topic: Arc<str>, wishes: Wishes) -> TopicKey {
-        let mut queues = self.queues.lock();
-        queues.next_key += 1;
-        let key = queues.next_key;
-        queues
-            .topics
-            .insert(key, TopicQueue::new(topic, wishes, self.limits.topic));
-        key
+        let queue = TopicQueue::new(topic, wishes, self.limits.topic);
+        self.queues.lock().topics.add(queue)
     }
 
     pub(crate) fn change_topic(&self, key: TopicKey, wishes: Wishes) {
         let mut queues = self.queues.lock();
-        let queues = &mut *queues;
-        if let Some(queue) = queues.topics.get_mut(&key) {
-            queue.wishes = wishes;
-            if queue.scheduled {
-                queues.later.retain(|(_, other)| *other != key);
-                queues.ready.retain(|other| *other != key);
-                queue.scheduled = false;
-            }
-            queues.schedule(key, Instant::now());
-            queues.wake();
-        }
+        queues.topics.change(key, |queue| queue.wishes = wishes);
+        queues.topics.reschedule(key, Instant::now());
+        queues.wake();
     }
 
     pub(crate) fn remove_topic(&self, key: TopicKey) {
         let mut queues = self.queues.lock();
-        if let Some(queue) = queues.topics.remove(&key) {
-            queues.bytes -= queue.bytes;
-            queues.big_bytes -= queue.big;
-            let _ = queues.count();
-            queues.ready.retain(|other| *other != key);
-            queues.later.retain(|(_, other)| *other != key);
-        }
+        queues.topics.remove(key);
+        let _ = queues.count();
     }
 
     pub(crate) fn sample(&self, key: TopicKey, sample: Arc<Sample>, replay: bool) {
         let now = Instant::now();
         let mut queues = self.queues.lock();
         let queues = &mut *queues;
-        let Some(queue) = queues.topics.get_mut(&key) else {
-            return;
+        let push = |queue: &mut TopicQueue| queue.push(sample, replay, now);
+        let mut lost = match queues.topics.change(key, push) {
+            Some(Some(lost)) => lost,
+            Some(None) => return self.metrics.throttled.add(1),
+            None => return,
         };
-        let before = (queue.bytes, queue.big);
-        let Pushed {
-            throttled,
-            mut dropped,
-            mut dropped_bytes,
-        } = queue.push(sample, replay, now);
-        if throttled {
-            self.metrics.throttled.add(1);
-            return;
-        }
-        queues.bytes = queues.bytes + queue.bytes - before.0;
-        queues.big_bytes = queues.big_bytes + queue.big - before.1;
         // The client's own messages give way to each other, beyond its queues' limits and beyond its budget.
-        while let Some(lost) = queues.give_way(self.limits.session_bytes) {
-            dropped += 1;
-            dropped_bytes += lost;
+        while let Some(one) = queues.topics.give_way(self.limits.session_bytes) {
+            lost += one;
         }
         while queues.count().is_err() {
-            let Some(lost) = queues.drop_largest(|_| true) else {
+            let Some(one) = queues.topics.drop_largest(|_| true) else {
                 break;
             };
-            dropped += 1;
-            dropped_bytes += lost;
+            lost += one;
         }
-        if dropped > 0 {
-            self.metrics.dropped.add(dropped);
-            self.metrics.dropped_bytes.add(dropped_bytes as u64);
-        }
-        queues.schedule(key, now);
+        self.metrics.lost(lost);
+        queues.topics.schedule(key, now);
         queues.wake();
     }
 
     /// A message of that topic has been sent to its last fragment.
     pub(crate) fn fragments_sent(&self, key: TopicKey) {
-        let mut queues = self.queues.lock();
-        if let Some(queue) = queues.topics.get_mut(&key) {
-            queue.busy = false;
-            queues.schedule(key, Instant::now());
-        }
+        self.queues.lock().topics.release(key, Instant::now());
     }
 
     /// No message of that topic is to be given out before [`fragments_sent`](Self::fragments_sent).
     pub(crate) fn sending_fragments(&self, key: TopicKey) {
-        let mut queues = self.queues.lock();
-        let queues = &mut *queues;
-        if let Some(queue) = queues.topics.get_mut(&key) {
-            queue.busy = true;
-            if queue.scheduled {
-                queue.scheduled = false;
-                queues.ready.retain(|other| *other != key);
-                queues.later.retain(|(_, other)| *other != key);
-            }
-        }
+        self.queues.lock().topics.hold(key);
     }
 
     /// A topic's messages cannot be sent; gives whether it is time to say so again.
     pub(crate) fn may_complain(&self, key: TopicKey, now: Instant) -> bool {
+        let may = |queue: &mut TopicQueue| queue.may_complain(now);
         let mut queues = self.queues.lock();
-        let Some(queue) = queues.topics.get_mut(&key) else {
-            return false;
-        };
-        let due = queue
-            .complained
-            .is_none_or(|at| now.saturating_duration_since(at).as_secs() >= 5);
-        if due {
-            queue.complained = Some(now);
-        }
-        due
+        queues.topics.change(key, may).unwrap_or(false)
     }
 
     pub(crate) fn next(&self, now: Instant) -> Option<Outgoing> {
         let mut queues = self.queues.lock();
-        let queues = &mut *queues;
         if let Some(control) = queues.pop_control() {
             return Some(Outgoing::Control(control));
         }
-        queues.wake_up_later(now);
-        loop {
-            let key = queues.ready.pop_front()?;
-            let Some(queue) = queues.topics.get_mut(&key) else {
-                continue;
-            };
-            queue.scheduled = false;
-            let before = (queue.bytes, queue.big);
-            let Some(sample) = queue.pop(now) else {
-                continue;
-            };
-            queues.bytes -= before.0 - queue.bytes;
-            queues.big_bytes -= before.1 - queue.big;
-            let Wishes {
-                compression,
-                fragment_size,
-                ..
-            } = queue.wishes;
-            let topic = queue.topic.clone();
-            queues.schedule(key, now);
-            // Less always fits.
-            let _ = queues.count();
-            return Some(Outgoing::Sample {
-                key,
-                sample,
-                topic,
-                compression,
-                fragment_size,
-            });
-        }
+        let (key, sample, queue) = queues.topics.next(now)?;
+        let Wishes {
+            compression,
+            fragment_size,
+            ..
+        } = queue.wishes;
+        let topic = queue.topic.clone();
+        // Less always fits.
+        let _ = queues.count();
+        Some(Outgoing::Sample {
+            key,
+            sample,
+            topic,
+            compression,
+            fragment_size,
+        })
     }
 
     /// The next control message only: for the last words before goodbye.
@@ -358,7 +279,7 @@ impl Outbox {
 
     /// When a throttle rate lets something through that now waits.
     pub(crate) fn next_due(&self) -> Option<Instant> {
-        self.queues.lock().later.first().map(|(at, _)| *at)
+        self.queues.lock().topics.next_due()
     }
 }
 
@@ -372,20 +293,20 @@ impl Control {
     }
 }
 
+impl Held for Control {
+    fn held(&self) -> usize {
+        self.frame.bytes.len()
+    }
+}
+
 impl Queues {
     fn new(budget: &Budget) -> Self {
         Self {
-            control: VecDeque::new(),
-            control_bytes: 0,
+            control: Ring::unbounded(),
             control_small: 0,
+            topics: Topics::default(),
             small: budget.permit(),
             big: budget.alone().permit(),
-            topics: HashMap::new(),
-            next_key: 0,
-            ready: VecDeque::new(),
-            later: BTreeSet::new(),
-            bytes: 0,
-            big_bytes: 0,
             goodbye: None,
             socket: 0,
             waker: None,
@@ -394,9 +315,9 @@ impl Queues {
 
     /// Counts what waits in the client's budget.
     fn count(&mut self) -> Result<(), Exceeded> {
-        self.big.count(self.big_bytes)?;
-        let small = self.control_small + self.bytes - self.big_bytes;
-        self.small.count(small)
+        let load = self.topics.load();
+        self.big.count(load.big)?;
+        self.small.count(self.control_small + load.bytes - load.big)
     }
 
     /// The same after a control message came, of which none may be dropped.
@@ -411,8 +332,7 @@ impl Queues {
     }
 
     fn pop_control(&mut self) -> Option<Control> {
-        let control = self.control.pop_front()?;
-        self.control_bytes -= control.frame.bytes.len();
+        let control = self.control.pop()?;
         self.control_small -= control.small();
         // Less always fits.
         let _ = self.count();
@@ -422,59 +342,6 @@ impl Queues {
     fn wake(&mut self) {
         if let Some(waker) = self.waker.take() {
             waker.wake();
-        }
-    }
-
-    /// Drops a sample of the topic that holds most while there is more than `limit` in all. A topic's only message
-    /// is spared up to four times that: a map larger than the limit must get through, too.
-    fn give_way(&mut self, limit: usize) -> Option<usize> {
-        if self.bytes <= limit {
-            return None;
-        }
-        let spare_only =
-            self.bytes <= limit.saturating_mul(4) || self.bytes == self.largest_bytes();
-        self.drop_largest(|queue| !(spare_only && queue.has_one()))
-    }
-
-    /// Drops a sample of the topic that holds most, of those that `may` lose one; gives its bytes.
-    fn drop_largest(&mut self, may: impl Fn(&TopicQueue) -> bool) -> Option<usize> {
-        let candidates = self.topics.values_mut().filter(|queue| may(queue));
-        let queue = candidates.max_by_key(|queue| queue.bytes)?;
-        let before = queue.big;
-        let lost = queue.drop_one()?;
-        self.big_bytes -= before - queue.big;
-        self.bytes -= lost;
-        Some(lost)
-    }
-
-    fn largest_bytes(&self) -> usize {
-        self.topics
-            .values()
-            .map(|queue| queue.bytes)
-            .max()
-            .unwrap_or(0)
-    }
-
-    fn schedule(&mut self, key: TopicKey, now: Instant) {
-        let Some(queue) = self.topics.get_mut(&key) else {
-            return;
-        };
-        if queue.scheduled {
-            return;
-        }
-        let Some(due) = queue.due(now) else { return };
-        queue.scheduled = true;
-        if due <= now {
-            self.ready.push_back(key);
-        } else {
-            self.later.insert((due, key));
-        }
-    }
-
-    fn wake_up_later(&mut self, now: Instant) {
-        while let Some((at, key)) = self.later.first().copied().filter(|(at, _)| *at <= now) {
-            self.later.remove(&(at, key));
-            self.ready.push_back(key);
         }
     }
 }

@@ -1,21 +1,24 @@
 //! A topic that a client publishes on.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{Matched, Message, PeerId, Publisher, Qos, WireType};
+use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
 use crate::shared::Shared;
 
-/// Messages kept while the topic is being advertised, and their bytes.
-const WARM_MESSAGES: usize = 256;
-const WARM_BYTES: usize = 16 << 20;
+/// Kept while the topic is being advertised.
+const WARM: Bounds = Bounds {
+    messages: 256,
+    bytes: 16 << 20,
+};
 
 /// One client's advertisement of one topic.
 pub(crate) struct Outlet {
@@ -40,8 +43,7 @@ enum State {
     /// Not yet advertised, or a node that the Master names as subscriber has not connected yet: messages wait a
     /// moment, since clients publish right behind their `advertise`, or as soon as rosapi names a subscriber.
     Warming {
-        waiting: VecDeque<Bytes>,
-        bytes: usize,
+        waiting: Ring<Bytes>,
         publisher: Option<Box<dyn Publisher>>,
     },
     Live {
@@ -55,8 +57,7 @@ enum State {
 impl State {
     fn warming(publisher: Option<Box<dyn Publisher>>) -> State {
         State::Warming {
-            waiting: VecDeque::new(),
-            bytes: 0,
+            waiting: Ring::new(WARM),
             publisher,
         }
     }
@@ -115,22 +116,7 @@ impl Outlet {
         match &mut *state {
             State::Live { publisher, .. } => publisher.publish(bytes),
             State::Failed => {}
-            State::Warming {
-                waiting,
-                bytes: held,
-                ..
-            } => {
-                *held += bytes.len();
-                waiting.push_back(bytes);
-                while waiting.len() > WARM_MESSAGES || (*held > WARM_BYTES && waiting.len() > 1) {
-                    let Some(lost) = waiting.pop_front() else {
-                        break;
-                    };
-                    *held -= lost.len();
-                    self.shared.metrics.dropped.add(1);
-                    self.shared.metrics.dropped_bytes.add(lost.len() as u64);
-                }
-            }
+            State::Warming { waiting, .. } => self.shared.metrics.lost(waiting.push(bytes)),
         }
     }
 
@@ -203,7 +189,7 @@ impl Outlet {
         let Some(publisher) = publisher.take() else {
             return;
         };
-        for bytes in waiting.drain(..) {
+        for bytes in waiting {
             publisher.publish(bytes);
         }
         *state = State::Live { publisher, settled };

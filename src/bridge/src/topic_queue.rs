@@ -1,10 +1,11 @@
 //! What waits for one client on one topic: newest wins, bounded in messages and bytes, no faster than asked for.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros::bus::PeerId;
+use ros::ring::{Bounds, Held, Lost, Ring};
 use rosbridge::{Compression, Id};
 
 use crate::sample::Sample;
@@ -40,27 +41,32 @@ impl Wishes {
 /// The subscriptions of one client to one topic, by id.
 pub(crate) type Subscriptions = HashMap<Option<Id<'static>>, Wishes>;
 
-/// Bounds that the operator sets.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct QueueLimits {
-    pub(crate) messages: usize,
-    pub(crate) bytes: usize,
-}
-
-/// What became of a sample that was pushed.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Pushed {
-    /// Left out because of the throttle rate.
-    pub(crate) throttled: bool,
-    /// Samples dropped to make room, and their bytes.
-    pub(crate) dropped: u64,
-    pub(crate) dropped_bytes: usize,
-}
-
 struct Waiting {
     sample: Arc<Sample>,
     /// No throttle rate holds it back: what a latching publisher last said, for a newcomer.
     first: bool,
+}
+
+impl Held for Waiting {
+    fn held(&self) -> usize {
+        self.sample.bytes.len()
+    }
+}
+
+/// Bytes of samples that wait.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Load {
+    pub(crate) bytes: usize,
+    /// Of those, bytes of samples that count for the daemon by themselves.
+    pub(crate) big: usize,
+}
+
+impl Load {
+    /// A part of it has changed.
+    pub(crate) fn replace(&mut self, before: Load, after: Load) {
+        self.bytes = self.bytes - before.bytes + after.bytes;
+        self.big = self.big - before.big + after.big;
+    }
 }
 
 /// The queue.
@@ -68,37 +74,29 @@ pub(crate) struct TopicQueue {
     /// The topic as the client wrote it.
     pub(crate) topic: Arc<str>,
     pub(crate) wishes: Wishes,
-    limits: QueueLimits,
-    samples: VecDeque<Waiting>,
+    limits: Bounds,
+    samples: Ring<Waiting>,
     /// Latching publishers whose first message has been queued.
     met: HashSet<PeerId>,
-    pub(crate) bytes: usize,
-    /// Of those, bytes of samples that count for the daemon by themselves.
-    pub(crate) big: usize,
+    /// Bytes of samples that count for the daemon by themselves.
+    big: usize,
     /// When the throttle rate lets the next one through.
     next_at: Option<Instant>,
     /// When something was last said about messages that cannot be sent.
-    pub(crate) complained: Option<Instant>,
-    /// In the ring of topics that have something to send, or among those that will.
-    pub(crate) scheduled: bool,
-    /// A message is being sent in fragments; the next waits.
-    pub(crate) busy: bool,
+    complained: Option<Instant>,
 }
 
 impl TopicQueue {
-    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: QueueLimits) -> Self {
+    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: Bounds) -> Self {
         Self {
             topic,
             wishes,
             limits,
-            samples: VecDeque::new(),
+            samples: Ring::unbounded(),
             met: HashSet::new(),
-            bytes: 0,
             big: 0,
             next_at: None,
             complained: None,
-            scheduled: false,
-            busy: false,
         }
     }
 
@@ -106,38 +104,42 @@ impl TopicQueue {
         self.samples.len() <= 1
     }
 
-    /// Queues a sample. `replay`: it is an old one for a newcomer.
-    pub(crate) fn push(&mut self, sample: Arc<Sample>, replay: bool, now: Instant) -> Pushed {
+    pub(crate) fn load(&self) -> Load {
+        Load {
+            bytes: self.samples.bytes(),
+            big: self.big,
+        }
+    }
+
+    /// Queues a sample, for which others may be dropped; none if it is left out because of the throttle rate. `replay`:
+    /// it is an old one for a newcomer.
+    pub(crate) fn push(&mut self, sample: Arc<Sample>, replay: bool, now: Instant) -> Option<Lost> {
         let first = self.is_first(&sample, replay);
         let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
         if throttles && !first {
             if self.next_at.is_some_and(|at| now < at) {
-                return Pushed {
-                    throttled: true,
-                    ..Pushed::default()
-                };
+                return None;
             }
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
-        self.bytes += sample.bytes.len();
         self.big += sample.big();
-        if first {
-            let at = self
-                .samples
-                .iter()
-                .take_while(|waiting| waiting.first)
-                .count();
-            self.samples.insert(at, Waiting { sample, first });
-        } else {
-            self.samples.push_back(Waiting { sample, first });
-        }
-        let mut pushed = Pushed::default();
+        let at = match first {
+            true => self.firsts(),
+            false => self.samples.len(),
+        };
+        self.samples.insert(at, Waiting { sample, first });
+        let mut lost = Lost::default();
         while self.is_over() {
-            let Some(lost) = self.drop_one() else { break };
-            pushed.dropped += 1;
-            pushed.dropped_bytes += lost;
+            let Some(one) = self.drop_one() else { break };
+            lost += one;
         }
-        pushed
+        Some(lost)
+    }
+
+    /// How many are first messages of latching publishers; they come before all others.
+    fn firsts(&self) -> usize {
+        let waiting = self.samples.iter();
+        waiting.take_while(|waiting| waiting.first).count()
     }
 
     fn is_first(&mut self, sample: &Sample, replay: bool) -> bool {
@@ -152,38 +154,41 @@ impl TopicQueue {
     }
 
     fn is_over(&self) -> bool {
-        if self.bytes > self.limits.bytes && self.samples.len() > 1 {
-            return true;
-        }
-        // What latching publishers said first does not count: it may never come again.
-        let firsts = self
-            .samples
-            .iter()
-            .take_while(|waiting| waiting.first)
-            .count();
         let asked = match self.wishes.queue_length {
             0 => self.limits.messages,
             length => length.min(self.limits.messages),
         };
-        self.samples.len() - firsts > asked || self.samples.len() > self.limits.messages
+        // What latching publishers said first does not count: it may never come again.
+        self.samples.exceeds(self.limits) || self.samples.len() - self.firsts() > asked
     }
 
-    /// Drops the oldest sample that can be spared; gives its size.
-    pub(crate) fn drop_one(&mut self) -> Option<usize> {
-        let spare = (0..self.samples.len()).find(|&at| {
-            let sample = &self.samples[at].sample;
-            let newer = |later: &Waiting| later.sample.publisher == sample.publisher;
-            !sample.latching || self.samples.range(at + 1..).any(newer)
+    /// Drops the oldest sample that can be spared.
+    pub(crate) fn drop_one(&mut self) -> Option<Lost> {
+        let waiting = self.samples.iter().enumerate();
+        let spare = waiting.clone().find(|(at, Waiting { sample, .. })| {
+            let newer = |(_, later): (_, &Waiting)| later.sample.publisher == sample.publisher;
+            !sample.latching || waiting.clone().skip(at + 1).any(newer)
         });
-        let lost = self.samples.remove(spare.unwrap_or(0))?.sample;
-        self.bytes -= lost.bytes.len();
-        self.big -= lost.big();
-        Some(lost.bytes.len())
+        let spare = spare.map_or(0, |(at, _)| at);
+        drop(waiting);
+        let gone = self.samples.remove(spare)?;
+        self.big -= gone.sample.big();
+        Some(Lost::one(&gone))
+    }
+
+    /// Its messages cannot be sent; gives whether it is time to say so again.
+    pub(crate) fn may_complain(&mut self, now: Instant) -> bool {
+        let recently = |at| now.saturating_duration_since(at).as_secs() < 5;
+        let due = !self.complained.is_some_and(recently);
+        if due {
+            self.complained = Some(now);
+        }
+        due
     }
 
     /// When the next sample may be sent; `None` while there is none.
     pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
-        let next = self.samples.front().filter(|_| !self.busy)?;
+        let next = self.samples.front()?;
         let held_back =
             !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
         Some(
@@ -195,8 +200,7 @@ impl TopicQueue {
 
     /// The next sample to send.
     pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<Sample>> {
-        let Waiting { sample, first } = self.samples.pop_front()?;
-        self.bytes -= sample.bytes.len();
+        let Waiting { sample, first } = self.samples.pop()?;
         self.big -= sample.big();
         if self.wishes.queue_length > 0 && !first {
             self.next_at = now.checked_add(self.wishes.throttle_rate);

@@ -31,7 +31,7 @@ fn queue(throttle: u64, length: usize) -> TopicQueue {
     TopicQueue::new(
         "/x".into(),
         wishes(throttle, length),
-        QueueLimits {
+        Bounds {
             messages: 5,
             bytes: 1000,
         },
@@ -51,22 +51,22 @@ fn the_newest_win_within_messages_and_bytes() {
     let now = Instant::now();
     let mut messages = queue(0, 0);
     for size in 1..=7 {
-        messages.push(sample("/p", false, size), false, now);
+        let _ = messages.push(sample("/p", false, size), false, now);
     }
     assert_eq!(sizes(&messages), [3, 4, 5, 6, 7]);
-    assert_eq!(messages.bytes, 25);
+    assert_eq!(messages.load().bytes, 25);
     let mut bytes = queue(0, 0);
-    bytes.push(sample("/p", false, 600), false, now);
-    let pushed = bytes.push(sample("/p", false, 601), false, now);
+    let _ = bytes.push(sample("/p", false, 600), false, now);
+    let lost = bytes.push(sample("/p", false, 601), false, now).unwrap();
     assert_eq!(
-        (pushed.dropped, pushed.dropped_bytes, sizes(&bytes)),
+        (lost.messages, lost.bytes, sizes(&bytes)),
         (1, 600, vec![601])
     );
-    bytes.push(sample("/p", false, 5000), false, now);
+    let _ = bytes.push(sample("/p", false, 5000), false, now);
     assert_eq!(sizes(&bytes), [5000], "one message is always kept");
     let mut asked = queue(0, 2);
     for size in 1..=4 {
-        asked.push(sample("/p", false, size), false, now);
+        let _ = asked.push(sample("/p", false, size), false, now);
     }
     assert_eq!(sizes(&asked), [3, 4]);
 }
@@ -75,22 +75,12 @@ fn the_newest_win_within_messages_and_bytes() {
 fn without_a_queue_a_throttle_leaves_messages_out() {
     let (now, ms) = (Instant::now(), Duration::from_millis(1));
     let mut queue = queue(100, 0);
-    assert!(!queue.push(sample("/p", false, 1), false, now).throttled);
-    assert!(
-        queue
-            .push(sample("/p", false, 2), false, now + 99 * ms)
-            .throttled
-    );
-    assert!(
-        !queue
-            .push(sample("/p", false, 3), true, now + 99 * ms)
-            .throttled
-    );
-    assert!(
-        !queue
-            .push(sample("/p", false, 4), false, now + 100 * ms)
-            .throttled
-    );
+    let mut is_throttled =
+        |size, replay, at| queue.push(sample("/p", false, size), replay, at).is_none();
+    assert!(!is_throttled(1, false, now));
+    assert!(is_throttled(2, false, now + 99 * ms));
+    assert!(!is_throttled(3, true, now + 99 * ms));
+    assert!(!is_throttled(4, false, now + 100 * ms));
     assert_eq!(sizes(&queue), [3, 1, 4]);
     assert_eq!(queue.due(now), Some(now));
 }
@@ -100,7 +90,7 @@ fn with_a_queue_a_throttle_spreads_messages() {
     let (now, ms) = (Instant::now(), Duration::from_millis(1));
     let mut queue = queue(100, 2);
     for size in 1..=3 {
-        queue.push(sample("/p", false, size), false, now);
+        let _ = queue.push(sample("/p", false, size), false, now);
     }
     assert_eq!(queue.due(now), Some(now));
     assert_eq!(queue.pop(now).unwrap().bytes.len(), 2);
@@ -113,14 +103,15 @@ fn with_a_queue_a_throttle_spreads_messages() {
 fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
     let now = Instant::now();
     let mut queue = queue(60_000, 1);
+    let mut dropped = |publisher, size| {
+        let lost = queue.push(sample(publisher, true, size), false, now);
+        lost.map(|lost| lost.messages)
+    };
     for publisher in ["/a", "/b", "/c"] {
-        assert_eq!(
-            queue.push(sample(publisher, true, 1), false, now).dropped,
-            0
-        );
+        assert_eq!(dropped(publisher, 1), Some(0));
     }
-    assert_eq!(queue.push(sample("/b", true, 2), false, now).dropped, 0);
-    assert_eq!(queue.push(sample("/b", true, 3), false, now).dropped, 2);
+    assert_eq!(dropped("/b", 2), Some(0));
+    assert_eq!(dropped("/b", 3), Some(2));
     assert_eq!(
         sizes(&queue),
         [1, 1, 3],
@@ -130,7 +121,7 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
         assert_eq!(queue.due(now), Some(now));
         queue.pop(now);
     }
-    queue.push(sample("/b", true, 4), false, now);
+    let _ = queue.push(sample("/b", true, 4), false, now);
     assert_eq!(queue.due(now), Some(now + Duration::from_secs(60)));
 }
 

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use parking_lot::Mutex;
+use ros::ring::DropCount;
 use serde::{Deserialize, Serialize};
 
 /// Why a message was dropped.
@@ -102,27 +102,77 @@ struct Watched {
     counter: Counter,
 }
 
+/// How many messages were dropped, by what `K` names (a topic, a channel) and by cause.
+#[derive(Debug, Clone)]
+pub(crate) struct Tally<K>(BTreeMap<(K, Cause), u64>);
+
+impl<K> Default for Tally<K> {
+    fn default() -> Self {
+        Self(BTreeMap::new())
+    }
+}
+
+impl<K: Ord> Tally<K> {
+    pub(crate) fn add(&mut self, of: K, cause: Cause, count: u64) {
+        if count > 0 {
+            *self.0.entry((of, cause)).or_default() += count;
+        }
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&K, Cause, u64)> {
+        let all = self.0.iter();
+        all.map(|((of, cause), count)| (of, *cause, *count))
+    }
+
+    /// All that were dropped for this cause.
+    pub(crate) fn because_of(&self, cause: Cause) -> u64 {
+        let all = self.iter().filter(|(_, why, _)| *why == cause);
+        all.map(|(_, _, count)| count).sum()
+    }
+
+    /// Forgets what counts for `of`; gives that.
+    pub(crate) fn take(&mut self, of: &K) -> Vec<(Cause, u64)> {
+        let mut taken = Vec::new();
+        self.0.retain(|(known, cause), count| {
+            if known == of {
+                taken.push((*cause, *count));
+            }
+            known != of
+        });
+        taken
+    }
+}
+
+impl Tally<String> {
+    /// By topic.
+    pub(crate) fn drops(&self) -> Vec<Drop> {
+        let all = self.iter().map(|(topic, cause, count)| Drop {
+            topic: topic.clone(),
+            cause,
+            count,
+        });
+        all.collect()
+    }
+}
+
 /// All drops of one end of a link.
 #[derive(Default)]
 pub struct Drops {
-    counts: Mutex<BTreeMap<(String, Cause), u64>>,
+    counts: Mutex<Tally<String>>,
     watched: Mutex<Vec<Watched>>,
 }
 
 impl Drops {
     /// So many more.
     pub fn add(&self, topic: &str, cause: Cause, count: u64) {
-        if count > 0 {
-            let mut counts = self.counts.lock();
-            *counts.entry((topic.to_owned(), cause)).or_default() += count;
-        }
+        self.counts.lock().add(topic.to_owned(), cause, count);
     }
 
     /// Counts what this counter counts, until its owner lets go of it.
-    pub fn watch(&self, topic: &str, cause: Cause, counter: Arc<AtomicU64>) {
+    pub fn watch(&self, topic: &str, cause: Cause, counter: Arc<DropCount>) {
         self.ask(topic, cause, move || {
             let owned = Arc::strong_count(&counter) > 1;
-            (counter.load(Ordering::Relaxed), !owned)
+            (counter.get(), !owned)
         });
     }
 
@@ -153,14 +203,7 @@ impl Drops {
             watched.seen = count.max(watched.seen);
             !over
         });
-        let counts = self.counts.lock();
-        let all = counts.iter();
-        all.map(|((topic, cause), count)| Drop {
-            topic: topic.clone(),
-            cause: *cause,
-            count: *count,
-        })
-        .collect()
+        self.counts.lock().drops()
     }
 }
 
@@ -190,12 +233,16 @@ impl Teller {
 
 #[cfg(test)]
 mod tests {
+    use ros::ring::Lost;
+
     use super::*;
 
     #[test]
     fn drops_are_counted_for_good_and_told_now_and_then() {
         let (drops, mut teller) = (Drops::default(), Teller::default());
-        let counter = Arc::new(AtomicU64::new(2));
+        let counter = Arc::new(DropCount::default());
+        let lost = |messages| Lost { messages, bytes: 0 };
+        counter.add(lost(2));
         drops.watch("/scan", Cause::Busy, counter.clone());
         drops.add("/image", Cause::Replaced, 1);
         let told: Vec<String> = teller
@@ -215,7 +262,7 @@ mod tests {
             teller.news(&drops.all()).is_empty(),
             "9 are few more than 1"
         );
-        counter.store(25, Ordering::Relaxed);
+        counter.add(lost(23));
         drop(counter);
         drops.add("/image", Cause::Replaced, 1);
         let told: Vec<u64> = teller

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 use crate::Error;
 use crate::clock::{Clock, Sample, now};
 use crate::control::{Between, FromCloud, FromRobot, Order};
-use crate::drops::{Cause, Drop, Dropped};
+use crate::drops::{Cause, Drop, Dropped, Tally};
 use crate::frame::Received;
 use crate::incoming::Incoming;
 use crate::outgoing::{Outgoing, Quality};
@@ -129,7 +129,7 @@ struct State {
     /// What this side's channels stand for, until the peer knows that they are gone.
     topics: BTreeMap<u32, String>,
     /// What was dropped of those that are gone.
-    dropped: BTreeMap<(String, Cause), u64>,
+    dropped: Tally<String>,
 }
 
 impl State {
@@ -140,13 +140,9 @@ impl State {
             let Some(topic) = self.topics.remove(&channel) else {
                 continue;
             };
-            self.out.dropped.retain(|(of, cause), count| {
-                if *of == channel {
-                    let all = self.dropped.entry((topic.clone(), *cause)).or_default();
-                    *all += *count;
-                }
-                *of != channel
-            });
+            for (cause, count) in self.out.dropped.take(&channel) {
+                self.dropped.add(topic.clone(), cause, count);
+            }
         }
     }
 }
@@ -168,7 +164,7 @@ impl<O: Order> Session<O> {
                 throughput: Throughput::default(),
                 ending: None,
                 topics: BTreeMap::new(),
-                dropped: BTreeMap::new(),
+                dropped: Tally::default(),
             }),
             wake: Notify::new(),
             up: watch::Sender::new(false),
@@ -211,14 +207,7 @@ impl<O: Order> Session<O> {
     /// Messages not sent so far, since newer ones had come or they were too old.
     pub fn dropped(&self) -> Dropped {
         let state = self.state.lock();
-        let of = |cause| {
-            let dropped = state.out.dropped.iter();
-            let of = dropped.filter(|((_, why), _)| *why == cause);
-            let gone = state.dropped.iter();
-            let gone = gone.filter(|((_, why), _)| *why == cause);
-            let now: u64 = of.map(|(_, count)| count).sum();
-            now + gone.map(|(_, count)| count).sum::<u64>()
-        };
+        let of = |cause| state.out.dropped.because_of(cause) + state.dropped.because_of(cause);
         Dropped {
             replaced: of(Cause::Replaced),
             stale: of(Cause::Stale),
@@ -229,18 +218,12 @@ impl<O: Order> Session<O> {
     pub fn drops(&self) -> Vec<Drop> {
         let state = self.state.lock();
         let mut all = state.dropped.clone();
-        for ((channel, cause), count) in &state.out.dropped {
+        for (channel, cause, count) in state.out.dropped.iter() {
             if let Some(topic) = state.topics.get(channel) {
-                *all.entry((topic.clone(), *cause)).or_default() += count;
+                all.add(topic.clone(), cause, count);
             }
         }
-        let all = all.into_iter();
-        all.map(|((topic, cause), count)| Drop {
-            topic,
-            cause,
-            count,
-        })
-        .collect()
+        all.drops()
     }
 
     /// Bytes of records sent so far, and that came.
@@ -298,7 +281,7 @@ impl<O: Order> Session<O> {
         let mut state = self.state.lock();
         state.topics.insert(channel, topic.to_owned());
         state.packing.add(channel, schema);
-        state.out.set_packable(channel);
+        state.out.encoding.add(channel);
     }
 
     /// Quality of JPEG pictures, 1 to 100; 80 where absent.
@@ -311,7 +294,7 @@ impl<O: Order> Session<O> {
         let mut state = self.state.lock();
         state.packing.peer_decodes(codecs);
         let pays = state.packing.pays(state.throughput.known());
-        state.out.set_packs(pays);
+        state.out.encoding.set_pays(pays);
     }
 
     fn push(&self, record: &Record, quality: Quality) {
@@ -373,7 +356,7 @@ impl<O: Order> Session<O> {
         if let Some(rate) = state.throughput.told(told) {
             state.out.set_throughput(rate);
             let pays = state.packing.pays(Some(rate));
-            state.out.set_packs(pays);
+            state.out.encoding.set_pays(pays);
         }
     }
 }

@@ -5,13 +5,13 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use tokio::sync::watch;
 
+use crate::ring::DropCount;
 use crate::schema::ActionDef;
 
 mod actions;
@@ -71,7 +71,7 @@ pub struct Subscription {
     /// Messages in the order received per publisher. What this bus itself published is not among them.
     pub messages: MessageReceiver,
     /// Messages dropped so far because `messages` was full.
-    pub dropped: Arc<AtomicU64>,
+    pub dropped: Arc<DropCount>,
     /// The publishers, now and later.
     pub matched: watch::Receiver<Matched>,
     /// Keeps the subscription alive.

@@ -13,5 +13,6 @@ pub mod net;
 pub mod ring;
 pub mod ros1;
 pub mod schema;
+pub mod turns;
 
 pub use connect::{JoinOptions, connect};

@@ -85,9 +85,9 @@ impl Latched {
     /// Keeps a message of a publisher that latches.
     pub fn keep(&self, topic: &Arc<str>, message: &Message) {
         self.due.add(topic, &message.publisher, |news| {
-            let dropped = news.messages.push(message.clone());
-            if dropped > 0 {
-                tracing::debug!(%topic, dropped, "newer latched messages took the place of older ones");
+            let lost = news.messages.push(message.clone());
+            if lost.messages > 0 {
+                tracing::debug!(%topic, dropped = lost.messages, "newer latched messages took the place of older ones");
             }
         });
     }

@@ -103,11 +103,11 @@ impl Topic {
         match &mut latched.advertised {
             Advertised::Kept(publisher) => publisher.publish(message),
             Advertised::Asked(waiting) => {
-                latched.dropped += waiting.push(message);
+                latched.dropped += waiting.push(message).messages;
             }
             Advertised::Not if latching => {
                 let mut waiting = Ring::new(Bounds::messages(QUEUE));
-                latched.dropped += waiting.push(message);
+                latched.dropped += waiting.push(message).messages;
                 latched.become_advertised(Advertised::Asked(waiting));
                 self.news.notify_one();
             }

@@ -2,11 +2,10 @@
 //! within the limit not dropped in favour of newer ones; of urgent records; and of everything, in the budget of the session's
 //! owner.
 
-use std::collections::VecDeque;
-
 use ::budget::{Exceeded, UNCOUNTED};
+use ros::ring::{Held, Ring};
 
-use super::{MAX_URGENT, MAX_URGENT_BYTES, Out, Outgoing, count};
+use super::{MAX_URGENT, MAX_URGENT_BYTES, Out, Outgoing};
 use crate::drops::Cause;
 
 /// Bytes of such messages that may wait, over all topics, beside the last one; and that are kept until they are acknowledged.
@@ -20,7 +19,7 @@ pub(super) fn has_room(kept: usize, out: &Out) -> bool {
 }
 
 /// How many of them wait on a topic, and their bytes.
-fn load(waiting: &VecDeque<Out>) -> (usize, usize) {
+fn load(waiting: &Ring<Out>) -> (usize, usize) {
     let all = waiting.iter().filter(|out| out.counts());
     all.fold((0, 0), |(count, bytes), out| {
         (count + 1, bytes + out.held())
@@ -45,8 +44,8 @@ impl Outgoing {
         let (started, started_bytes) = sending.fold((0, 0), |(count, sum), one| {
             (count + 1, sum + one.out.held())
         });
-        let count = self.urgent.len() + self.kept_urgent + started;
-        let sum = self.urgent_bytes + self.kept_bytes + started_bytes;
+        let count = self.urgent.len() + self.kept.urgent + started;
+        let sum = self.urgent.bytes() + self.kept.bytes + started_bytes;
         let too_much = count >= MAX_URGENT || (count > 0 && sum + bytes > MAX_URGENT_BYTES);
         self.full = match self.count_more(bytes) {
             _ if too_much => Some(format!(
@@ -71,21 +70,20 @@ impl Outgoing {
                 waiting.remove(at)
             });
             if replaced.is_none() {
-                count(&mut self.dropped, channel, Cause::Full);
+                self.dropped.add(channel, Cause::Full, 1);
                 return false;
             }
-            count(&mut self.dropped, channel, Cause::Replaced);
+            self.dropped.add(channel, Cause::Replaced, 1);
         }
     }
 
     /// Bytes that wait, are under way, and are kept.
     fn held(&self) -> usize {
-        let topics = self.topics.values().flatten();
+        let topics: usize = self.topics.values().map(Ring::bytes).sum();
         let sending = self.sending.iter().map(|sending| &sending.out);
-        let packing = self.packing.iter().map(|(out, _)| out);
-        let all = topics.chain(sending).chain(packing).chain(&self.packed);
-        let bytes: usize = all.map(Out::held).sum();
-        bytes + self.urgent_bytes + self.kept_bytes + self.kept_big
+        let under_way = sending.chain(self.encoding.messages());
+        let under_way: usize = under_way.map(Held::held).sum();
+        self.urgent.bytes() + topics + under_way + self.kept.bytes + self.kept.big
     }
 
     /// Counts `bytes` more. The sum is made only when enough has come together.
@@ -115,8 +113,8 @@ impl Outgoing {
             let topics = self.topics.iter().map(|(of, waiting)| (*of, load(waiting)));
             let topics: Vec<(u32, (usize, usize))> = topics.collect();
             let all: usize = topics.iter().map(|(_, (_, bytes))| bytes).sum();
-            let last = self.topics.get(&channel).and_then(VecDeque::back);
-            if all - last.map_or(0, Out::held).min(all) <= EACH {
+            let last = self.topics.get(&channel).and_then(Ring::back);
+            if all - last.map_or(0, Held::held).min(all) <= EACH {
                 return;
             }
             let size = |&&(_, (_, bytes)): &&(u32, (usize, usize))| bytes;
@@ -136,9 +134,9 @@ impl Outgoing {
                 return;
             }
             if waiting.is_empty() {
-                self.turns.retain(|turn| *turn != of);
+                self.turns.withdraw(of);
             }
-            count(&mut self.dropped, of, Cause::Full);
+            self.dropped.add(of, Cause::Full, 1);
         }
     }
 }

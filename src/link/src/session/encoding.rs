@@ -19,9 +19,9 @@ impl<O: Order> Session<O> {
             throughput,
             ..
         } = &mut *state;
-        let (channel, message, alone) = out.take_to_pack()?;
+        let (channel, message, alone) = out.encoding.take()?;
         let Some(job) = packing.job(channel, message, alone, throughput.known()) else {
-            out.packed(None);
+            out.encoding.finish(None);
             self.wake.notify_one();
             return None;
         };
@@ -34,7 +34,7 @@ impl<O: Order> Session<O> {
             let took = packed.took;
             (state.packing.done(packed), took)
         });
-        state.out.packed(frame);
+        state.out.encoding.finish(frame);
     }
 
     /// A message as it was before it was encoded; where that cannot be told, what the peer is to be told at once.

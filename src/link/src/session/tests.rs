@@ -394,7 +394,7 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
     robot.opens(1, "/map", codec::Schema::OccupancyGrid);
     open(&robot, &cloud);
     // As over a slow link.
-    robot.state.lock().out.set_packs(true);
+    robot.state.lock().out.encoding.set_pays(true);
     let (near, mut damaging) = duplex(1 << 16);
     let (mut beyond, far) = duplex(1 << 16);
     let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);

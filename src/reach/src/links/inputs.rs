@@ -1,11 +1,12 @@
 //! Topics of the robot that the node listens to: published in the servant as the robot's publishers publish them.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{Publisher, Qos, WireType, reaches};
+use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
 
 use super::Hub;
@@ -18,8 +19,11 @@ use ros::codec::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 256;
-/// Messages, and bytes, that wait until the topic is advertised and the node connected.
-const WAITING: (usize, usize) = (256, 32 << 20);
+/// What waits until the topic is advertised and the node connected.
+const WAITING: Bounds = Bounds {
+    messages: 256,
+    bytes: 32 << 20,
+};
 
 /// Where types that begin with a header have their stamp. Those that do not have something there, too; it tells no
 /// worse than nothing which input an output answers.
@@ -45,7 +49,7 @@ struct Channel {
 
 enum State {
     /// Not advertised yet, or the node has not connected.
-    Waiting(VecDeque<Bytes>),
+    Waiting(Ring<Bytes>),
     Open(Arc<dyn Publisher>),
 }
 
@@ -55,7 +59,7 @@ impl Inputs {
         let fresh = Channel {
             topic: input.topic.clone(),
             stamps: stamps(input),
-            state: State::Waiting(VecDeque::new()),
+            state: State::Waiting(Ring::new(WAITING)),
         };
         self.channels.lock().insert(input.channel, fresh);
     }
@@ -76,12 +80,8 @@ impl Inputs {
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
             State::Waiting(waiting) => {
-                waiting.push_back(message);
-                let mut bytes: usize = waiting.iter().map(Bytes::len).sum();
-                while waiting.len() > WAITING.0 || (waiting.len() > 1 && bytes > WAITING.1) {
-                    bytes -= waiting.pop_front().map_or(0, |oldest| oldest.len());
-                    drops.add(&channel.topic, Cause::Early, 1);
-                }
+                let lost = waiting.push(message);
+                drops.add(&channel.topic, Cause::Early, lost.messages);
             }
         }
         let answered = Answered {
@@ -121,7 +121,7 @@ impl Inputs {
         let mut channels = self.channels.lock();
         if let Some(channel) = channels.get_mut(&input.channel) {
             if let State::Waiting(waiting) = &mut channel.state {
-                for message in waiting.drain(..) {
+                for message in waiting {
                     publisher.publish(message);
                 }
             }

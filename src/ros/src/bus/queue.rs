@@ -2,13 +2,12 @@
 
 use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::Message;
-use crate::ring::{Bounds, Ring};
+use crate::ring::{Bounds, DropCount, Ring};
 
 /// Makes the two ends of a queue for at most `capacity` messages (0 counts as 1).
 ///
@@ -21,7 +20,7 @@ pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
             receiver_gone: false,
         }),
         ready: Notify::new(),
-        dropped: Arc::new(AtomicU64::new(0)),
+        dropped: Arc::default(),
     });
     (
         MessageSender {
@@ -40,7 +39,7 @@ struct State {
 struct Shared {
     state: Mutex<State>,
     ready: Notify,
-    dropped: Arc<AtomicU64>,
+    dropped: Arc<DropCount>,
 }
 
 /// Where messages go in. There is one; dropping it ends the queue once it has been read empty.
@@ -58,9 +57,7 @@ impl MessageSender {
             }
             state.ring.push(message)
         };
-        if lost > 0 {
-            self.shared.dropped.fetch_add(lost, Ordering::Relaxed);
-        }
+        self.shared.dropped.add(lost);
         self.shared.ready.notify_one();
     }
 
@@ -117,7 +114,7 @@ impl MessageReceiver {
     }
 
     /// The counter of messages dropped for want of room; it lives on after the queue.
-    pub fn dropped(&self) -> Arc<AtomicU64> {
+    pub fn dropped(&self) -> Arc<DropCount> {
         self.shared.dropped.clone()
     }
 }
@@ -171,7 +168,7 @@ mod tests {
         for n in 0..5u8 {
             sender.send(message(Bytes::copy_from_slice(&[n])));
         }
-        assert_eq!(dropped.load(Ordering::Relaxed), 3);
+        assert_eq!(dropped.get(), 3);
         assert_eq!(receiver.recv().await.unwrap().bytes[0], 3);
         assert_eq!(receiver.try_recv().unwrap().bytes[0], 4);
         assert!(receiver.try_recv().is_none());

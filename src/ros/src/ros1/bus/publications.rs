@@ -11,6 +11,7 @@ use tokio::sync::{mpsc, watch};
 use super::registrar::Kind;
 use super::{End, Inner, subscriptions};
 use crate::bus::{BusError, Matched, Message, Peer, PeerId, Publisher, Qos, WireType};
+use crate::ring::{DropCount, Lost};
 use crate::ros1::tcpros::Outbox;
 
 /// One topic with everyone here who publishes it, and every subscriber.
@@ -18,7 +19,7 @@ use crate::ros1::tcpros::Outbox;
 pub(super) struct TopicOut {
     state: Mutex<State>,
     matched: watch::Sender<Matched>,
-    dropped: AtomicU64,
+    dropped: DropCount,
 }
 
 #[derive(Default)]
@@ -227,16 +228,14 @@ impl TopicOut {
         if local.qos.is_latching() {
             local.last = Some(message.clone());
         }
-        let mut lost = 0;
+        let mut lost = Lost::default();
         let size = message.len() as u64;
         for subscriber in &state.subscribers {
             subscriber.messages.fetch_add(1, Ordering::Relaxed);
             subscriber.bytes.fetch_add(size, Ordering::Relaxed);
             lost += subscriber.outbox.push(message.clone());
         }
-        if lost > 0 {
-            self.dropped.fetch_add(lost, Ordering::Relaxed);
-        }
+        self.dropped.add(lost);
         !state.actions.is_empty()
     }
 
@@ -338,7 +337,7 @@ impl Publisher for Handle {
     }
 
     fn dropped(&self) -> u64 {
-        self.topic.dropped.load(Ordering::Relaxed)
+        self.topic.dropped.get()
     }
 }
 

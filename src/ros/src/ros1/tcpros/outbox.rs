@@ -7,7 +7,7 @@ use parking_lot::Mutex;
 use tokio::io::{AsyncWrite, AsyncWriteExt as _};
 use tokio::sync::Notify;
 
-use crate::ring::{Bounds, Ring};
+use crate::ring::{Bounds, Lost, Ring};
 
 /// Messages and bytes taken from the queue for one round of writing.
 const BATCH: usize = 256;
@@ -41,12 +41,12 @@ impl Outbox {
         }
     }
 
-    /// Queues a message; returns how many older ones were dropped for it.
-    pub fn push(&self, message: Bytes) -> u64 {
+    /// Queues a message; older ones may be dropped for it.
+    pub fn push(&self, message: Bytes) -> Lost {
         let lost = {
             let mut state = self.state.lock();
             if state.closed {
-                return 0;
+                return Lost::default();
             }
             state.ring.push(message)
         };
@@ -149,8 +149,11 @@ mod tests {
     #[tokio::test]
     async fn newest_win() {
         let outbox = Outbox::new(2, []);
-        let lost: u64 = (0..5).map(|n| outbox.push(message(n, 10))).sum();
-        assert_eq!(lost, 3);
+        let mut lost = Lost::default();
+        for n in 0..5 {
+            lost += outbox.push(message(n, 10));
+        }
+        assert_eq!(lost.messages, 3);
         assert_eq!(sent(&outbox).await, [message(3, 10), message(4, 10)]);
     }
 
@@ -159,7 +162,7 @@ mod tests {
         let all: Vec<Bytes> = (0..=255).map(|n| message(n, usize::from(n) * 50)).collect();
         let outbox = Outbox::new(1000, []);
         for one in all.iter().chain(&all) {
-            assert_eq!(outbox.push(one.clone()), 0);
+            assert_eq!(outbox.push(one.clone()).messages, 0);
         }
         assert_eq!(sent(&outbox).await, [all.clone(), all].concat());
     }

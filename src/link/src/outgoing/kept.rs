@@ -1,0 +1,120 @@
+//! The retransmit buffer: what the peer was sent and has not said to have.
+
+use std::collections::VecDeque;
+
+use ros::ring::{Bounds, Held};
+
+use super::budget;
+use super::out::Out;
+use crate::record::{ENCODED, FLAGS_AT};
+
+/// Records kept in case they are lost. Messages beyond are not sent again.
+const KEPT: Bounds = Bounds {
+    messages: 2048,
+    bytes: 4 << 20,
+};
+
+/// What becomes of a record if the connection is lost.
+#[derive(Debug)]
+pub(super) enum Sent {
+    /// It is sent again.
+    Again(Out),
+    /// It is not: too much was kept already, or a newer one will come. Of this channel.
+    Once(u32),
+}
+
+/// Records by number.
+#[derive(Debug, Default)]
+pub(super) struct Kept {
+    records: VecDeque<(u64, Sent)>,
+    /// Bytes of those that are sent again, but for `big`.
+    pub(super) bytes: usize,
+    /// How many of them are urgent.
+    pub(super) urgent: usize,
+    /// Bytes of big messages that count one by one.
+    pub(super) big: usize,
+}
+
+impl Kept {
+    pub(super) fn len(&self) -> usize {
+        self.records.len()
+    }
+
+    /// Whether a record that is about to be sent is to be kept in order to be sent again.
+    pub(super) fn takes(&self, out: &Out) -> bool {
+        let few = self.len() < KEPT.messages;
+        let wanted = if out.is_big() {
+            out.each && few && budget::has_room(self.big, out)
+        } else {
+            few && self.bytes + out.held() <= KEPT.bytes
+        };
+        out.channel.is_none() || out.closes || wanted
+    }
+
+    /// A record was sent under this number (0: none); `again`: as [`takes`](Self::takes) said.
+    pub(super) fn add(&mut self, number: u64, again: bool, out: Out) {
+        if number == 0 {
+            return;
+        }
+        let sent = match out.channel {
+            Some(channel) if !again => Sent::Once(channel),
+            channel => {
+                *self.counted(&out) += out.held();
+                self.urgent += usize::from(channel.is_none());
+                Sent::Again(out)
+            }
+        };
+        let at = self.records.partition_point(|(kept, _)| *kept < number);
+        self.records.insert(at, (number, sent));
+    }
+
+    /// Where its bytes are counted.
+    fn counted(&mut self, out: &Out) -> &mut usize {
+        if out.channel.is_some() && out.is_big() {
+            &mut self.big
+        } else {
+            &mut self.bytes
+        }
+    }
+
+    /// Lets go of the next record that would have been sent again, of those that the peer has: all up to this number.
+    pub(super) fn acknowledged(&mut self, number: u64) -> Option<Out> {
+        while self
+            .records
+            .front()
+            .is_some_and(|(kept, _)| *kept <= number)
+        {
+            if let Some((_, Sent::Again(out))) = self.records.pop_front() {
+                *self.counted(&out) -= out.held();
+                self.urgent -= usize::from(out.channel.is_none());
+                return Some(out);
+            }
+        }
+        None
+    }
+
+    /// The message of this channel that was born then, as it was before it was encoded: unless it is not the last one
+    /// of its channel, or was given out before.
+    pub(super) fn damaged(&mut self, channel: u32, born: i64) -> Option<Out> {
+        let mut sent = self.records.iter_mut().rev();
+        let last = sent.find_map(|(_, sent)| match sent {
+            Sent::Again(out) if out.channel == Some(channel) => Some(out),
+            _ => None,
+        });
+        let out = last.filter(|out| out.born == born)?;
+        let payload = out.plain.take()?;
+        let mut head = out.head.clone();
+        head[FLAGS_AT] &= !ENCODED;
+        Some(Out {
+            head,
+            payload,
+            plain: None,
+            ..*out
+        })
+    }
+
+    /// All records, by number.
+    pub(super) fn into_records(self) -> impl DoubleEndedIterator<Item = (u64, Sent)> {
+        self.records.into_iter()
+    }
+}

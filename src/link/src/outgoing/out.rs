@@ -1,0 +1,78 @@
+//! A record on its way out, in the pieces in which it goes.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use ros::ring::Held;
+
+use super::{Quality, SMALL};
+use crate::record::Record;
+
+#[derive(Debug, Clone)]
+pub(crate) struct Out {
+    pub(super) head: BytesMut,
+    pub(super) payload: Bytes,
+    pub(super) born: i64,
+    pub(super) each: bool,
+    /// The topic's channel; none: urgent.
+    pub(super) channel: Option<u32>,
+    /// The message before it was encoded, where each one counts: it may come damaged.
+    pub(super) plain: Option<Bytes>,
+    /// No message: the last record of its channel, which tells that there will be no more.
+    pub(super) closes: bool,
+}
+
+impl Held for Out {
+    /// With the message before it was encoded.
+    fn held(&self) -> usize {
+        self.len() + self.plain.as_ref().map_or(0, Bytes::len)
+    }
+}
+
+impl Out {
+    pub(super) fn of(record: &Record, quality: Quality) -> Self {
+        let (head, payload) = record.parts();
+        let (channel, born) = match record {
+            Record::Data(data) => (Some(data.channel), data.born),
+            _ => (None, 0),
+        };
+        Self {
+            head,
+            payload,
+            born,
+            each: quality == Quality::Each,
+            channel,
+            plain: None,
+            closes: false,
+        }
+    }
+
+    /// The last record of this channel.
+    pub(super) fn closing(channel: u32, record: &Record) -> Self {
+        Self {
+            channel: Some(channel),
+            closes: true,
+            ..Self::of(record, Quality::Each)
+        }
+    }
+
+    /// Bytes of the record.
+    pub(super) fn len(&self) -> usize {
+        self.head.len() + self.payload.len()
+    }
+
+    pub(super) fn is_big(&self) -> bool {
+        self.held() > SMALL
+    }
+
+    /// Bytes from `at` on, at most `length`.
+    pub(super) fn piece(&self, at: usize, length: usize) -> Bytes {
+        let end = (at + length).min(self.len());
+        let head = self.head.len();
+        if at >= head {
+            return self.payload.slice(at - head..end - head);
+        }
+        let mut piece = BytesMut::with_capacity(end - at);
+        piece.put_slice(&self.head[at..end.min(head)]);
+        piece.put_slice(&self.payload[..end.saturating_sub(head)]);
+        piece.freeze()
+    }
+}
