@@ -102,6 +102,8 @@ impl Outbox {
     pub(crate) fn attach(&self) -> u64 {
         let mut queues = self.queues.lock();
         queues.socket += 1;
+        // What another socket has begun to send in fragments ends with it.
+        queues.topics.release_all(Instant::now());
         queues.wake();
         self.attached.send_replace(queues.socket);
         queues.socket
@@ -223,14 +225,20 @@ impl Outbox {
         queues.wake();
     }
 
-    /// A message of that topic has been sent to its last fragment.
-    pub(crate) fn fragments_sent(&self, key: TopicKey) {
-        self.queues.lock().topics.release(key, Instant::now());
+    /// That socket has sent a message of that topic to its last fragment.
+    pub(crate) fn fragments_sent(&self, socket: u64, key: TopicKey) {
+        let mut queues = self.queues.lock();
+        if queues.socket == socket {
+            queues.topics.release(key, Instant::now());
+        }
     }
 
     /// No message of that topic is to be given out before [`fragments_sent`](Self::fragments_sent).
-    pub(crate) fn sending_fragments(&self, key: TopicKey) {
-        self.queues.lock().topics.hold(key);
+    pub(crate) fn sending_fragments(&self, socket: u64, key: TopicKey) {
+        let mut queues = self.queues.lock();
+        if queues.socket == socket {
+            queues.topics.hold(key);
+        }
     }
 
     /// A topic's messages cannot be sent; gives whether it is time to say so again.

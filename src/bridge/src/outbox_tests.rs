@@ -94,12 +94,36 @@ fn a_topic_in_fragments_waits_and_others_do_not() {
     outbox.sample(a, sample(2), false);
     let now = Instant::now();
     assert!(matches!(outbox.next(now), Some(Outgoing::Sample { key, .. }) if key == a));
-    outbox.sending_fragments(a);
+    outbox.sending_fragments(0, a);
     outbox.sample(b, sample(3), false);
     outbox.sample(a, sample(4), false);
     assert_eq!(drain(&outbox, now), ["/b3"]);
-    outbox.fragments_sent(a);
+    outbox.fragments_sent(0, a);
     assert_eq!(drain(&outbox, Instant::now()), ["/a2", "/a4"]);
+}
+
+#[test]
+fn a_topic_whose_fragments_went_down_with_a_socket_goes_on_over_the_next() {
+    let (outbox, _) = outbox(BridgeOptions::default());
+    let key = outbox.add_topic("/a".into(), wishes());
+    let old = outbox.attach();
+    for size in 1..=3 {
+        outbox.sample(key, sample(size), false);
+    }
+    let now = Instant::now();
+    assert!(outbox.next(now).is_some());
+    outbox.sending_fragments(old, key);
+    let new = outbox.attach();
+    assert!(
+        matches!(outbox.next(now), Some(Outgoing::Sample { sample, .. }) if sample.bytes.len() == 2)
+    );
+    // The old one, which has not noticed yet, changes nothing.
+    outbox.sending_fragments(old, key);
+    outbox.sending_fragments(new, key);
+    outbox.fragments_sent(old, key);
+    assert!(outbox.next(now).is_none());
+    outbox.fragments_sent(new, key);
+    assert_eq!(drain(&outbox, now), ["/a3"]);
 }
 
 #[test]

@@ -163,7 +163,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
                         .as_ref()
                         .is_some_and(|frame| self.cuts.cut(frame, fragment_size, Some(key)));
                     if cut {
-                        self.client.outbox.sending_fragments(key);
+                        self.client.outbox.sending_fragments(self.number, key);
                     }
                     frame.filter(|_| !cut)
                 }
@@ -180,7 +180,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
             return Ok(None);
         };
         if let Some(key) = done {
-            self.client.outbox.fragments_sent(key);
+            self.client.outbox.fragments_sent(self.number, key);
         }
         // A copy of a part of the message.
         if bytes.len() > UNCOUNTED {

@@ -80,6 +80,13 @@ impl Topics {
         self.schedule(key, now);
     }
 
+    pub(crate) fn release_all(&mut self, now: Instant) {
+        let keys: Vec<TopicKey> = self.queues.keys().copied().collect();
+        for key in keys {
+            self.release(key, now);
+        }
+    }
+
     /// The next sample of the topic whose turn it is.
     pub(crate) fn next(&mut self, now: Instant) -> Option<(TopicKey, Arc<Sample>, &TopicQueue)> {
         self.turns.wake(now);
