@@ -96,21 +96,29 @@ impl Kept {
     /// The message of this channel that was born then, as it was before it was encoded: unless it is not the last one
     /// of its channel, or was given out before.
     pub(super) fn damaged(&mut self, channel: u32, born: i64) -> Option<Out> {
-        let mut sent = self.records.iter_mut().rev();
-        let last = sent.find_map(|(_, sent)| match sent {
-            Sent::Again(out) if out.channel == Some(channel) => Some(out),
-            _ => None,
-        });
-        let out = last.filter(|out| out.born == born)?;
-        let payload = out.plain.take()?;
-        let mut head = out.head.clone();
-        head[FLAGS_AT] &= !ENCODED;
-        Some(Out {
-            head,
-            payload,
-            plain: None,
-            ..*out
-        })
+        let of_channel =
+            |sent: &Sent| matches!(sent, Sent::Again(out) if out.channel == Some(channel));
+        let at = self
+            .records
+            .iter()
+            .rposition(|(_, sent)| of_channel(sent))?;
+        let (number, sent) = self.records.remove(at)?;
+        let Sent::Again(mut out) = sent else {
+            return None;
+        };
+        // What is kept is smaller without it, and may be counted elsewhere then.
+        *self.counted(&out) -= out.held();
+        let plain = if out.born == born {
+            out.plain.take()
+        } else {
+            None
+        };
+        let mut again = out.clone();
+        *self.counted(&out) += out.held();
+        self.records.insert(at, (number, Sent::Again(out)));
+        again.payload = plain?;
+        again.head[FLAGS_AT] &= !ENCODED;
+        Some(again)
     }
 
     /// All records, by number.

@@ -288,6 +288,30 @@ fn what_is_encoded_is_the_newest() {
 }
 
 #[test]
+fn a_message_that_came_damaged_goes_once_more_and_leaves_nothing() {
+    // Big before it was encoded, small after.
+    let mut out = packs();
+    out.push(&data(1, 1, 2 * SMALL), Quality::Each);
+    assert_eq!(out.next(0), None);
+    out.encoding.take().unwrap();
+    out.encoding
+        .finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
+    assert!(out.next(0).is_some());
+    assert!(out.again(1, 1) && !out.again(1, 1));
+    out.encoding.set_pays(false);
+    let mut incoming = Incoming::default();
+    incoming.reconnect(2);
+    let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).collect();
+    let mut came = frames
+        .into_iter()
+        .map(|frame| deliver(&mut incoming, frame));
+    assert_eq!(came.find_map(born), Some(1));
+    out.acknowledge(out.next_number() - 1);
+    let kept = &out.kept;
+    assert_eq!((kept.len(), kept.bytes, kept.big), (0, 0, 0));
+}
+
+#[test]
 fn a_message_that_was_being_encoded_when_the_connection_was_lost_is_not() {
     let (mut out, mut incoming) = (packs(), Incoming::default());
     out.push(&data(1, 1, 50_000), Quality::Each);
