@@ -164,14 +164,14 @@ impl Mirror {
     }
 }
 
-impl Handler for Mirror {
+impl Handler<FromCloud> for Mirror {
     fn undecodable(&self, channel: u32) {
         if let Some(topic) = self.outputs.topic_of(channel) {
             self.drops.add(&topic, Cause::Undecodable, 1);
         }
     }
 
-    fn record(&self, record: Record, arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, arrived: i64) {
         match record {
             Record::Data(data) => self.outputs.take(self, data, arrived),
             Record::Answer {
@@ -188,13 +188,10 @@ impl Handler for Mirror {
                 service,
                 request,
             } => self.lent.call(self, service, request, (id, arrived)),
-            Record::Control(json) => match serde_json::from_slice(&json) {
-                Ok(FromCloud::Line { error: true, text }) => eprintln!("{text}"),
-                Ok(FromCloud::Line { text, .. }) => println!("{text}"),
-                Ok(FromCloud::Lookup { service }) => self.lent.look_up(self, service),
-                Ok(control) => drop(self.orders.send(control)),
-                Err(error) => tracing::debug!(%error, "the cloud tells something unknown"),
-            },
+            Record::Control(FromCloud::Line { error: true, text }) => eprintln!("{text}"),
+            Record::Control(FromCloud::Line { text, .. }) => println!("{text}"),
+            Record::Control(FromCloud::Lookup { service }) => self.lent.look_up(self, service),
+            Record::Control(order) => drop(self.orders.send(order)),
         }
     }
 }

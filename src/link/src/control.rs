@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use ros::bus::ParamValue;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::drops::Drop;
@@ -229,11 +230,39 @@ pub(crate) enum Between {
     },
 }
 
-/// The end of a link that a session is of: which orders it gives.
-pub trait Order: Serialize + Send + Sync + 'static {}
+/// A control record.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Told<O> {
+    /// For whoever uses the session.
+    Order(O),
+    /// For the session itself.
+    Between(Between),
+}
 
-impl Order for FromRobot {}
-impl Order for FromCloud {}
+impl<O: DeserializeOwned> Told<O> {
+    /// Reads a control record of an end that gives orders `O`.
+    pub(crate) fn read(json: &[u8]) -> serde_json::Result<Self> {
+        // What is told begins with its name, so an order is known for none of these at once.
+        match serde_json::from_slice(json) {
+            Ok(between) => Ok(Self::Between(between)),
+            Err(_) => serde_json::from_slice(json).map(Self::Order),
+        }
+    }
+}
+
+/// The end of a link that a session is of: which orders it gives.
+pub trait Order: Serialize + DeserializeOwned + Send + Sync + 'static {
+    /// Those that the other end gives.
+    type OfPeer: Order;
+}
+
+impl Order for FromRobot {
+    type OfPeer = FromCloud;
+}
+
+impl Order for FromCloud {
+    type OfPeer = FromRobot;
+}
 
 /// A decision about the local original.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -416,7 +445,7 @@ mod tests {
     }
 
     /// An order that is read and written again says the same: nothing was left out for want of understanding.
-    fn says_the_same<O: Serialize + serde::de::DeserializeOwned>(told: &str) {
+    fn says_the_same<O: Serialize + DeserializeOwned>(told: &str) {
         let order: O = serde_json::from_str(told).expect(told);
         let again = serde_json::to_value(&order).unwrap();
         let told: serde_json::Value = serde_json::from_str(told).unwrap();
@@ -429,6 +458,23 @@ mod tests {
         assert!(serde_json::from_str::<FromCloud>(&order).is_err());
         let order = r#"{"line":{"error":false,"text":"t"}}"#;
         assert!(serde_json::from_str::<FromRobot>(order).is_err());
+    }
+
+    #[test]
+    fn what_is_meant_for_the_session_is_told_from_orders() {
+        let asked = Told::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
+        assert_eq!(asked, Told::Between(Between::Keyframe { channel: 7 }));
+        // However it is written.
+        let asked = Told::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
+        assert_eq!(asked, Told::Between(Between::Keyframe { channel: 7 }));
+        let order = Told::read(br#"{"signal":{"signal":9}}"#).unwrap();
+        assert_eq!(order, Told::Order(FromRobot::Signal { signal: 9 }));
+        for unknown in [r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
+            assert!(
+                Told::<FromRobot>::read(unknown.as_bytes()).is_err(),
+                "{unknown}"
+            );
+        }
     }
 
     /// Where `whole` lacks something of `part`.

@@ -25,11 +25,11 @@ pub(crate) const LEFT_AT: usize = 14;
 pub(crate) const FLAGS_AT: usize = 5;
 pub(crate) const SERIALISE_AT: usize = 22;
 
-/// One thing told.
+/// One thing told. `C` is what control records hold: JSON on the wire, what the peer orders behind its session.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Record {
-    /// JSON.
-    Control(Bytes),
+pub enum Record<C = Bytes> {
+    /// JSON, or the order that it is.
+    Control(C),
     /// A message of a topic.
     Data(Data),
     /// A service call.
@@ -91,6 +91,34 @@ pub struct Answered {
 }
 
 impl Record {
+    /// The same with the order that `read` makes of its JSON; none where that makes none.
+    pub(crate) fn read<C>(self, read: impl FnOnce(Bytes) -> Option<C>) -> Option<Record<C>> {
+        Some(match self {
+            Record::Control(json) => Record::Control(read(json)?),
+            Record::Data(data) => Record::Data(data),
+            Record::Call {
+                id,
+                service,
+                request,
+            } => Record::Call {
+                id,
+                service,
+                request,
+            },
+            Record::Answer {
+                id,
+                taken,
+                given,
+                response,
+            } => Record::Answer {
+                id,
+                taken,
+                given,
+                response,
+            },
+        })
+    }
+
     /// Head and payload, in this order on the wire.
     pub fn parts(&self) -> (BytesMut, Bytes) {
         let mut head = BytesMut::with_capacity(64);

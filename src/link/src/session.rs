@@ -90,10 +90,10 @@ pub enum Lost {
     Full(String),
 }
 
-/// Takes what comes.
-pub trait Handler: Sync {
+/// Takes what comes from an end that gives orders `O`.
+pub trait Handler<O>: Sync {
     /// A record, and when it had come as a whole (nanoseconds since 1970). Must not block.
-    fn record(&self, record: Record, arrived: i64);
+    fn record(&self, record: Record<O>, arrived: i64);
     /// A message of this channel came that cannot be decoded.
     fn undecodable(&self, channel: u32) {
         let _ = channel;

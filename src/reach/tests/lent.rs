@@ -86,18 +86,15 @@ enum Told {
 
 struct Ear(mpsc::UnboundedSender<Told>);
 
-impl Handler for Ear {
-    fn record(&self, record: Record, _arrived: i64) {
+impl Handler<FromCloud> for Ear {
+    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
         let told = match record {
             Record::Call {
                 id,
                 service,
                 request,
             } => Told::Call(id, service, request),
-            Record::Control(json) => match serde_json::from_slice(&json) {
-                Ok(FromCloud::Lookup { service }) => Told::Lookup(service),
-                _ => return,
-            },
+            Record::Control(FromCloud::Lookup { service }) => Told::Lookup(service),
             _ => return,
         };
         let _ = self.0.send(told);

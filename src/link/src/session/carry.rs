@@ -33,7 +33,7 @@ impl<O: Order> Session<O> {
     pub async fn run<S, H>(&self, socket: &mut WebSocket<S>, handler: &H) -> Lost
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler + ?Sized,
+        H: Handler<O::OfPeer> + ?Sized,
     {
         let lost = match self.carry(socket, handler).await {
             Ok(never) => match never {},
@@ -62,7 +62,7 @@ impl<O: Order> Session<O> {
     ) -> Result<std::convert::Infallible, Lost>
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler + ?Sized,
+        H: Handler<O::OfPeer> + ?Sized,
     {
         let mut connection = Connection::new();
         let mut job: Option<JoinHandle<Packed>> = None;
@@ -182,7 +182,7 @@ impl<O: Order> Session<O> {
     ) -> Result<(), Error>
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler + ?Sized,
+        H: Handler<O::OfPeer> + ?Sized,
     {
         let arrived = now();
         let record = match Frame::decode(bytes)? {
@@ -251,22 +251,25 @@ impl<O: Order> Session<O> {
             Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
         };
         if let Some(record) = record {
-            match Record::decode(record)? {
+            let understood = match Record::decode(record)? {
                 Record::Data(data) => {
                     let channel = data.channel;
                     match self.unpacked(data) {
-                        Ok(data) => handler.record(Record::Data(data), arrived),
+                        Ok(data) => Some(Record::Data(data)),
                         Err(told) => {
                             handler.undecodable(channel);
                             // Before an acknowledgement can make the peer forget the message.
                             if let Some(frame) = told {
                                 socket.queue(opcode::BINARY, frame.encode());
                             }
+                            None
                         }
                     }
                 }
-                Record::Control(json) if self.is_answer(&json) => {}
-                record => handler.record(record, arrived),
+                record => record.read(|json| self.understood(&json)),
+            };
+            if let Some(record) = understood {
+                handler.record(record, arrived);
             }
         }
         let come = self.state.lock().incoming.received().bytes;

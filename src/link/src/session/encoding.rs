@@ -4,7 +4,7 @@ use codec::Answer;
 use tokio::task::JoinHandle;
 
 use super::{Session, State};
-use crate::control::{Between, Order};
+use crate::control::{Between, Order, Told};
 use crate::frame::Frame;
 use crate::packing::Packed;
 use crate::record::Data;
@@ -81,16 +81,16 @@ impl<O: Order> Session<O> {
         tracing::warn!(topic, "a message came damaged at the other end{then}");
     }
 
-    /// What the peer says of frames that it was sent; others are the handler's.
-    pub(super) fn is_answer(&self, json: &[u8]) -> bool {
-        if !json.starts_with(b"{\"keyframe\"") {
-            return false;
+    /// What the peer orders, unless its session tells this one something.
+    pub(super) fn understood(&self, json: &[u8]) -> Option<O::OfPeer> {
+        match Told::read(json) {
+            Ok(Told::Order(order)) => return Some(order),
+            Ok(Told::Between(Between::Keyframe { channel })) => {
+                let packing = &mut self.state.lock().packing;
+                packing.answered(channel, Answer::Keyframe);
+            }
+            Err(error) => tracing::debug!(%error, "the other end tells something unknown"),
         }
-        let Ok(Between::Keyframe { channel }) = serde_json::from_slice(json) else {
-            return false;
-        };
-        let packing = &mut self.state.lock().packing;
-        packing.answered(channel, Answer::Keyframe);
-        true
+        None
     }
 }

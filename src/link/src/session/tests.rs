@@ -12,10 +12,10 @@ use crate::{MAX_FRAME, MAX_RECORD};
 /// Either end: which orders it gives does not matter here.
 type Session = RobotSession;
 
-struct To(mpsc::UnboundedSender<Record>);
+struct To(mpsc::UnboundedSender<Record<FromCloud>>);
 
-impl Handler for To {
-    fn record(&self, record: Record, _arrived: i64) {
+impl Handler<FromCloud> for To {
+    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
         let _ = self.0.send(record);
     }
 }
@@ -374,12 +374,12 @@ fn map() -> Bytes {
 
 /// Counts what it is told of, and keeps what comes.
 struct Counting(
-    mpsc::UnboundedSender<Record>,
+    mpsc::UnboundedSender<Record<FromCloud>>,
     std::sync::atomic::AtomicUsize,
 );
 
-impl Handler for Counting {
-    fn record(&self, record: Record, _arrived: i64) {
+impl Handler<FromCloud> for Counting {
+    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
         let _ = self.0.send(record);
     }
     fn undecodable(&self, _channel: u32) {

@@ -1,13 +1,15 @@
 //! Messages and calls that come while an output is being subscribed to wait until it is: whoever listens on the robot
 //! is connected to the stub already, and shall hear what the node answers.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
 
 use super::node_link::NodeLink;
+use link::control::FromRobot;
 use link::record::Record;
+use ros::ring::{self, Ring};
 
 /// More do not wait, and bytes of messages.
 const MOST: (usize, usize) = (256, 32 << 20);
@@ -18,46 +20,63 @@ pub(super) struct Held {
     state: Mutex<State>,
 }
 
-#[derive(Default)]
 struct State {
     /// The things that are waited for, by number.
     holds: BTreeSet<u64>,
     next: u64,
-    bytes: usize,
-    records: VecDeque<(Record, i64)>,
+    records: Ring<Waiting>,
     /// Someone passes on what had waited: others queue up behind.
     passing: bool,
 }
 
-/// Bytes that it takes while it waits.
-fn size(record: &Record) -> usize {
-    match record {
-        Record::Data(data) => data.message.len(),
-        Record::Call { request, .. } => request.len(),
-        _ => 0,
+impl Default for State {
+    fn default() -> Self {
+        Self {
+            holds: BTreeSet::new(),
+            next: 0,
+            // None is dropped: beyond what may wait, the oldest pass.
+            records: Ring::unbounded(),
+            passing: false,
+        }
+    }
+}
+
+/// A record, and when it came.
+struct Waiting(Record<FromRobot>, i64);
+
+impl ring::Held for Waiting {
+    fn held(&self) -> usize {
+        match &self.0 {
+            Record::Data(data) => data.message.len(),
+            Record::Call { request, .. } => request.len(),
+            _ => 0,
+        }
     }
 }
 
 impl State {
     fn is_due(&self) -> bool {
-        self.holds.is_empty() || self.records.len() >= MOST.0 || self.bytes >= MOST.1
+        self.holds.is_empty() || self.records.len() >= MOST.0 || self.records.bytes() >= MOST.1
     }
 }
 
 impl Held {
     /// Takes a record that must wait; gives back one that need not.
-    pub(super) fn take(&self, record: Record, arrived: i64) -> Option<(Record, i64)> {
+    pub(super) fn take(
+        &self,
+        record: Record<FromRobot>,
+        arrived: i64,
+    ) -> Option<(Record<FromRobot>, i64)> {
         let mut state = self.state.lock();
         if state.holds.is_empty() && !state.passing && state.records.is_empty() {
             return Some((record, arrived));
         }
-        state.bytes += size(&record);
-        state.records.push_back((record, arrived));
+        state.records.append(Waiting(record, arrived));
         None
     }
 
     /// Passes on what need not wait any longer, in order.
-    pub(super) fn pass(&self, mut to: impl FnMut(Record, i64)) {
+    pub(super) fn pass(&self, mut to: impl FnMut(Record<FromRobot>, i64)) {
         let mut state = self.state.lock();
         if state.passing {
             return;
@@ -65,10 +84,9 @@ impl Held {
         state.passing = true;
         // Not while locked: `to` may take its time.
         while state.is_due() {
-            let Some((record, arrived)) = state.records.pop_front() else {
+            let Some(Waiting(record, arrived)) = state.records.pop() else {
                 break;
             };
-            state.bytes -= size(&record);
             drop(state);
             to(record, arrived);
             state = self.state.lock();
@@ -130,7 +148,7 @@ mod tests {
 
     use super::*;
 
-    fn call(id: u32, size: usize) -> Record {
+    fn call(id: u32, size: usize) -> Record<FromRobot> {
         Record::Call {
             id,
             service: 1,

@@ -252,12 +252,12 @@ impl NodeLink {
     }
 }
 
-impl Handler for NodeLink {
+impl Handler<FromRobot> for NodeLink {
     fn undecodable(&self, channel: u32) {
         self.inputs.undecodable(&self.drops, channel);
     }
 
-    fn record(&self, record: Record, arrived: i64) {
+    fn record(&self, record: Record<FromRobot>, arrived: i64) {
         // The hub holds every link by an Arc; one that it let go of hears no more.
         let Some(hub) = self.hub.upgrade() else {
             return;
@@ -276,54 +276,44 @@ impl Handler for NodeLink {
 }
 
 impl NodeLink {
-    fn take(&self, this: &Arc<Self>, record: Record, arrived: i64) {
+    fn take(&self, this: &Arc<Self>, record: Record<FromRobot>, arrived: i64) {
         match record {
-            Record::Data(_) | Record::Call { .. } => {
+            Record::Answer { id, response, .. } => self.lent.answered(id, response),
+            // A call that waits for it must not wait for other orders.
+            Record::Control(FromRobot::Lent { service, of }) => this.lends(service, of),
+            Record::Control(FromRobot::Signal { signal }) => {
+                let _ = self.signals.send(signal);
+            }
+            // A channel is closed after the messages before it.
+            Record::Data(_) | Record::Call { .. } | Record::Control(FromRobot::Close { .. }) => {
                 match self.held.take(record, arrived) {
                     Some((record, arrived)) => this.give(record, arrived),
                     // There may be too much by now.
                     None => this.pass_held(),
                 }
             }
-            Record::Answer { id, response, .. } => self.lent.answered(id, response),
-            Record::Control(json) => match serde_json::from_slice(&json) {
-                // A call that waits for it must not wait for other orders.
-                Ok(FromRobot::Lent { service, of }) => this.lends(service, of),
-                Ok(FromRobot::Signal { signal }) => {
-                    let _ = self.signals.send(signal);
-                }
-                // After the messages before it.
-                Ok(FromRobot::Close { .. }) => match self.held.take(Record::Control(json), arrived)
-                {
-                    Some((record, arrived)) => this.give(record, arrived),
-                    None => this.pass_held(),
-                },
-                Ok(control) => {
-                    // Data may follow in the same breath.
-                    let hold = match &control {
-                        FromRobot::Open(input) => {
-                            self.inputs.expect(input);
-                            None
-                        }
-                        FromRobot::Listeners { channel, count } => {
-                            let begin = self.outputs.expect(*channel, *count);
-                            begin.then(|| Hold::new(this))
-                        }
-                        _ => None,
-                    };
-                    let _ = self.orders.send((control, hold));
-                }
-                Err(error) => {
-                    tracing::debug!(node = self.node, %error, "the robot tells something unknown");
-                }
-            },
+            Record::Control(order) => {
+                // Data may follow in the same breath.
+                let hold = match &order {
+                    FromRobot::Open(input) => {
+                        self.inputs.expect(input);
+                        None
+                    }
+                    FromRobot::Listeners { channel, count } => {
+                        let begin = self.outputs.expect(*channel, *count);
+                        begin.then(|| Hold::new(this))
+                    }
+                    _ => None,
+                };
+                let _ = self.orders.send((order, hold));
+            }
         }
     }
 }
 
 impl NodeLink {
     /// Gives a message or a call to the node.
-    fn give(self: &Arc<Self>, record: Record, arrived: i64) {
+    fn give(self: &Arc<Self>, record: Record<FromRobot>, arrived: i64) {
         match record {
             Record::Data(data) => {
                 let Some(hub) = self.hub.upgrade() else {
@@ -340,10 +330,8 @@ impl NodeLink {
                 service,
                 request,
             } => self.call(id, service, request, arrived),
-            Record::Control(json) => {
-                if let Ok(control) = serde_json::from_slice(&json) {
-                    let _ = self.orders.send((control, None));
-                }
+            Record::Control(order) => {
+                let _ = self.orders.send((order, None));
             }
             Record::Answer { .. } => {}
         }

@@ -266,11 +266,8 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     .await;
     let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let tell = |order: &FromRobot| {
-        let json = serde_json::to_vec(order).unwrap();
-        link::Handler::record(&*link, Record::Control(json.into()), 0);
-    };
-    tell(&FromRobot::Open(Input {
+    let tell = |order| link::Handler::record(&*link, Record::Control(order), 0);
+    tell(FromRobot::Open(Input {
         channel: 1,
         topic: "/image".into(),
         type_name: "std_msgs/Empty".into(),
@@ -278,7 +275,7 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
         ..Input::default()
     }));
     for signal in [2, 15] {
-        tell(&FromRobot::Signal { signal });
+        tell(FromRobot::Signal { signal });
     }
     let mut signals = nodes.signals.subscribe();
     let both = signals.wait_for(|signals| signals.len() == 2);
