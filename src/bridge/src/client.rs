@@ -2,21 +2,22 @@
 
 mod actions;
 mod calls;
+mod inbox;
 mod publishing;
 mod serving;
 mod subscribing;
+mod under_way;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
-use std::time::Instant;
 
-use budget::{Budget, Exceeded, Permit};
+use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::schema::MessageType;
 use rosbridge::{
-    Compression, Error, Format, Fragment, Fragments, Frame as Incoming, GoalStatus, Id, Level, Op,
-    Payload, Png, Status, Writer,
+    Compression, Error, Format, Frame as Incoming, GoalStatus, Id, Level, Op, Payload, Status,
+    Writer,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -24,9 +25,9 @@ use crate::SessionOptions;
 use crate::outbox::{Control, Goodbye, Outbox};
 use crate::sample::Frame;
 use crate::shared::Shared;
+pub(crate) use inbox::Inbox;
+use under_way::UnderWay;
 
-/// Messages packed in pictures in fragments in pictures: nobody needs more.
-const MAX_WRAPPING: usize = 4;
 /// Characters of a strange field's name that its sender is told.
 const SHOWN: usize = 48;
 
@@ -56,30 +57,6 @@ pub(crate) struct Client {
 pub(crate) struct Reply {
     pub(crate) id: Option<Id<'static>>,
     pub(crate) format: Format,
-}
-
-/// What one connection has to remember besides: messages not yet complete.
-pub(crate) struct Inbox {
-    fragments: Fragments,
-    pictures: Fragments,
-    permit: Permit,
-}
-
-impl Inbox {
-    pub(crate) fn new(shared: &Shared, budget: &Budget) -> Self {
-        let limits = shared.options.fragments;
-        Self {
-            fragments: Fragments::new(limits),
-            pictures: Fragments::new(limits),
-            permit: budget.permit(),
-        }
-    }
-
-    /// Counts unfinished messages of the client in its budget.
-    pub(crate) fn count(&mut self) -> Result<(), Exceeded> {
-        let held = self.fragments.bytes() + self.pictures.bytes();
-        self.permit.resize(held)
-    }
 }
 
 impl Client {
@@ -215,58 +192,6 @@ impl Client {
                 Ok(())
             }
         }
-    }
-
-    fn fragment(
-        self: &Arc<Self>,
-        inbox: &mut Inbox,
-        op: &Fragment<'_>,
-        wrapping: usize,
-    ) -> Result<(), String> {
-        let whole = inbox
-            .fragments
-            .add(op, Instant::now())
-            .map_err(|error| error.to_string())?;
-        if let Some(text) = whole {
-            self.unwrapped(inbox, &text, wrapping)?;
-        }
-        Ok(())
-    }
-
-    fn png(
-        self: &Arc<Self>,
-        inbox: &mut Inbox,
-        op: &Png<'_>,
-        wrapping: usize,
-    ) -> Result<(), String> {
-        let whole = match op.fragment() {
-            None => Some(op.data.to_string()),
-            Some(part) => inbox
-                .pictures
-                .add(&part, Instant::now())
-                .map_err(|error| error.to_string())?,
-        };
-        if let Some(data) = whole {
-            let text = rosbridge::decode_png(&data, self.shared.options.max_png)
-                .map_err(|error| error.to_string())?;
-            self.unwrapped(inbox, &text, wrapping)?;
-        }
-        Ok(())
-    }
-
-    fn unwrapped(
-        self: &Arc<Self>,
-        inbox: &mut Inbox,
-        text: &str,
-        wrapping: usize,
-    ) -> Result<(), String> {
-        if wrapping == MAX_WRAPPING {
-            return Err(format!(
-                "messages within messages go {MAX_WRAPPING} deep at most"
-            ));
-        }
-        self.frame(inbox, Incoming::Text(text), None, wrapping + 1);
-        Ok(())
     }
 
     /// Tells that a message cannot be read; where somebody would wait for ever because of it, that its call has failed.
@@ -422,47 +347,6 @@ impl Client {
             );
             self.warn(reply, &text);
         }
-    }
-
-    /// Counts a call or goal with these arguments as under way until the guard is dropped.
-    fn begin(self: &Arc<Self>, args: Option<Payload<'_>>) -> Result<UnderWay, String> {
-        let options = &self.shared.options;
-        let limit = options.max_calls;
-        let bytes = args.map_or(0, |args| args.bytes.len());
-        let before = self.under_way.fetch_add(1, Ordering::Relaxed);
-        let bytes_before = self.under_way_bytes.fetch_add(bytes, Ordering::Relaxed);
-        let guard = UnderWay {
-            client: self.clone(),
-            bytes,
-        };
-        if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
-            return Err(format!(
-                "field \"args\" has {bytes} bytes, with those of calls and goals under way more than {}; wait for some to end",
-                options.max_call_bytes
-            ));
-        }
-        if before >= limit {
-            return Err(format!(
-                "{limit} calls and goals of this client are under way already; wait for some to end"
-            ));
-        }
-        Ok(guard)
-    }
-}
-
-/// One call or goal under way.
-struct UnderWay {
-    client: Arc<Client>,
-    /// Of its arguments.
-    bytes: usize,
-}
-
-impl Drop for UnderWay {
-    fn drop(&mut self) {
-        self.client.under_way.fetch_sub(1, Ordering::Relaxed);
-        self.client
-            .under_way_bytes
-            .fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 

@@ -6,11 +6,13 @@ use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
+use rosbridge::Compression;
 use tokio::io::DuplexStream;
 use tokio::net::TcpListener;
 
 use super::*;
 use crate::sample::TopicTypes;
+use crate::sample::{Frame, Sample};
 use crate::shared::Shared;
 use crate::topic_queue::Wishes;
 use crate::{BridgeOptions, SessionOptions};
