@@ -1,12 +1,13 @@
 //! rosbridge's `auth` operation, for clients that cannot put a token into the address: it must be the first message.
 //!
-//! That one frame is read here, by hand, because the bridge takes the connection from its first byte on and a
-//! WebSocket library would have read ahead of it. (RFC 6455, section 5.2.)
+//! It is read as a frame of its own, not as a message of a `WebSocket`: the bridge takes the connection from the next
+//! byte on, with what was read ahead.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytes::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt};
+use ws::frame::{Header, TEXT, unmask};
 
 use crate::tokens::{AuthMessage, TokenHash, Tokens};
 
@@ -63,36 +64,25 @@ fn recognise(payload: &[u8], tokens: &Tokens, now: f64) -> Result<TokenHash, Str
 }
 
 /// The payload of one whole text frame, taken out of `buffer`; none while it is not complete.
-fn take_frame(buffer: &mut BytesMut) -> Result<Option<Vec<u8>>, String> {
-    if buffer.len() < 2 {
+fn take_frame(buffer: &mut BytesMut) -> Result<Option<BytesMut>, String> {
+    let header = Header::parse(buffer).map_err(|error| error.to_string())?;
+    let Some((header, size)) = header else {
         return Ok(None);
-    }
-    let (first, second) = (buffer[0], buffer[1]);
-    if first != 0x81 || second & 0x80 == 0 {
-        return Err("the first message must be one text frame, an auth operation".to_owned());
-    }
-    let (header, length) = match second & 0x7f {
-        126 if buffer.len() < 4 => return Ok(None),
-        126 => (4, usize::from(u16::from_be_bytes([buffer[2], buffer[3]]))),
-        127 => (10, usize::MAX),
-        short => (2, usize::from(short)),
     };
-    if length > LONGEST {
+    let Some(mask) = header.mask.filter(|_| header.last && header.opcode == TEXT) else {
+        return Err("the first message must be one text frame, an auth operation".to_owned());
+    };
+    if header.length > LONGEST as u64 {
         return Err(format!("an auth message has at most {LONGEST} bytes"));
     }
-    if buffer.len() < header + 4 + length {
+    let length = header.length as usize;
+    if buffer.len() < size + length {
         return Ok(None);
     }
-    buffer.advance(header);
-    let mask = buffer.split_to(4);
-    let masked = buffer.split_to(length);
-    Ok(Some(
-        masked
-            .iter()
-            .zip(mask.iter().cycle())
-            .map(|(byte, mask)| byte ^ mask)
-            .collect(),
-    ))
+    buffer.advance(size);
+    let mut payload = buffer.split_to(length);
+    unmask(&mut payload, mask);
+    Ok(Some(payload))
 }
 
 #[cfg(test)]
@@ -149,7 +139,10 @@ mod tests {
             ),
             (frame("hello"), "must be an auth operation"),
             (vec![0x82, 0x80, 0, 0, 0, 0], "one text frame"),
-            (vec![0x81, 0xff, 0, 0, 0, 0, 0, 0, 0, 0], "at most"),
+            (
+                [&[0x81, 0xff, 0, 0, 0, 0, 0, 1, 0, 0], &[0; 4][..]].concat(),
+                "at most",
+            ),
             (
                 frame(r#"{"op":"auth","mac":"open sesame"}"#)[..10].to_vec(),
                 "ended before",
