@@ -23,10 +23,11 @@ use ros::net::{LoopbackSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
-use servant::engine::{Engine, Servant};
-use servant::local::{LocalEngine, LocalEngineConfig};
+use servant::container::{ContainerSpec, Profile};
+use servant::engine::{LogStart, Servant};
+use servant::local::{LocalEngine, LocalEngineConfig, LocalServant};
 use servant::shim::{Resident, ResidentContext, ResidentError};
-use servant::spec::{Limits, Profile, Spec};
+use servant::spec::Limits;
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -193,7 +194,6 @@ async fn run() -> Result<(), Failure> {
         command,
         init,
     ))?;
-    let engine: Arc<dyn Engine> = Arc::new(engine);
     let store = Arc::new(image::Store::open(
         &wish.home.join("images"),
         &wish.home.join("layers"),
@@ -205,7 +205,7 @@ async fn run() -> Result<(), Failure> {
         logs_dir: wish.home.join("logs"),
         sources: Sources::Automatic,
         store: store.clone(),
-        engine: engine.clone(),
+        sandbox: Arc::new(engine.clone()),
         limits: servant::spec::Limits::default(),
     })?;
     if let Some(path) = &wish.path {
@@ -271,7 +271,7 @@ async fn run() -> Result<(), Failure> {
     );
     if wish.probe {
         let begun = Instant::now();
-        look(&wish, &outcome, &store, &*engine).await?;
+        look(&wish, &outcome, &store, &engine).await?;
         println!("probed in {:.2} s", begun.elapsed().as_secs_f64());
     }
     Ok(())
@@ -298,7 +298,7 @@ async fn look(
     wish: &Wish,
     outcome: &BuildOutcome,
     store: &image::Store,
-    engine: &dyn Engine,
+    engine: &LocalEngine,
 ) -> Result<(), Failure> {
     let mut environment = outcome.environment.clone();
     environment.extend(outcome.flavour.environment("/root"));
@@ -308,7 +308,7 @@ async fn look(
         .map(|layer| store.extracted(&layer.info.diff_id))
         .collect::<Result<_, _>>()?;
     let servant = engine
-        .start(Spec {
+        .start_container(ContainerSpec {
             id: format!("{}-probe", wish.request.id),
             layers,
             writable: None,
@@ -327,7 +327,7 @@ async fn look(
             resident: serde_json::to_value(&outcome.plan.parameters)?,
         })
         .await?;
-    let mut log = servant.follow_log(true);
+    let mut log = servant.follow(LogStart::First);
     let printer = tokio::spawn(async move {
         while let Some(line) = log.recv().await {
             println!("        {}: {}", line.node, line.line);
@@ -376,10 +376,10 @@ async fn look(
 
 async fn watch(
     outcome: &BuildOutcome,
-    servant: &Arc<dyn Servant>,
+    servant: &Arc<LocalServant>,
 ) -> Result<rootfs_builder::probe::Found, Failure> {
     let bus = Ros1Bus::connect(
-        Arc::new(Inside(servant.endpoint().netns)),
+        Arc::new(Inside(Arc::clone(servant.network()))),
         MASTER.parse()?,
         OWN_NAME,
     )

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use image::{Digest, Store};
 use package::workspace::Pushed;
-use servant::engine::Engine;
+use servant::sandbox::Sandbox;
 use servant::spec::Limits;
 use tokio::sync::mpsc;
 
@@ -47,8 +47,8 @@ pub struct Config {
     pub sources: Sources,
     /// Where images go.
     pub store: Arc<Store>,
-    /// What runs sandboxes.
-    pub engine: Arc<dyn Engine>,
+    /// What runs programs of builds.
+    pub sandbox: Arc<dyn Sandbox>,
     /// Limits of each sandbox. By default half of the machine's memory, 4096 processes and threads, and the cores that
     /// servants leave.
     pub limits: Limits,
@@ -119,7 +119,7 @@ impl Builder {
         let site = Site::new(
             &self.config.build_dir,
             &request.id,
-            self.config.engine.clone(),
+            self.config.sandbox.clone(),
             self.config.limits.or(&sandbox::default_limits()),
             self.removals.clone(),
         )?;

@@ -9,7 +9,7 @@ use foreign::Visit;
 use image::TreeOptions;
 use rustix::fs::{AtFlags, FileType, Mode};
 use serde::Serialize;
-use servant::spec::{Mount, Profile};
+use servant::container::{Mount, Profile};
 
 use crate::base::Base;
 use crate::blocking;

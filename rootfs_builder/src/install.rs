@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, TreeOptions};
-use servant::spec::{Mount, Profile};
+use servant::container::{Mount, Profile};
 
 use crate::apt::Deb;
 use crate::archive::Archive;

@@ -7,7 +7,8 @@ use std::path::PathBuf;
 use ros::bus::ParamValue;
 use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
-use servant::spec::{Mount, NodeSpec, Profile};
+use servant::container::{Mount, Profile};
+use servant::spec::NodeSpec;
 
 use crate::error::{Error, IoAt};
 use crate::install::{lay_out, set_mode};

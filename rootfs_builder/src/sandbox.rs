@@ -6,8 +6,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use servant::engine::{Engine, NodeExit};
-use servant::spec::{Limits, Mount, NodeSpec, Profile, Spec};
+use servant::container::{ContainerSpec, Mount, Profile};
+use servant::engine::{LogStart, NodeExit};
+use servant::sandbox::{Sandbox, Sandboxed};
+use servant::spec::{Limits, NodeSpec};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
@@ -19,7 +21,7 @@ use crate::removal::Removals;
 pub(crate) struct Site {
     id: String,
     directory: PathBuf,
-    engine: Arc<dyn Engine>,
+    sandbox: Arc<dyn Sandbox>,
     limits: Limits,
     removals: Removals,
     running: Arc<Mutex<Vec<JoinHandle<()>>>>,
@@ -87,7 +89,7 @@ impl Site {
     pub(crate) fn new(
         root: &Path,
         id: &str,
-        engine: Arc<dyn Engine>,
+        sandbox: Arc<dyn Sandbox>,
         limits: Limits,
         removals: Removals,
     ) -> Result<Self, Error> {
@@ -98,7 +100,7 @@ impl Site {
         Ok(Self {
             id: id.to_owned(),
             directory,
-            engine,
+            sandbox,
             limits,
             removals,
             running: Arc::default(),
@@ -131,7 +133,7 @@ impl Site {
         run: Run,
         mut on_line: impl FnMut(&str),
     ) -> Result<Finished, Error> {
-        let spec = Spec {
+        let spec = ContainerSpec {
             id: format!("{}-{}", self.id, run.name),
             layers: run.layers,
             writable: run.writable,
@@ -157,7 +159,7 @@ impl Site {
         // Held by this future alone: when it is dropped, the task below sees it and ends the container.
         let (_alive, cancelled) = oneshot::channel::<()>();
         let task = tokio::spawn(to_its_end(
-            self.engine.clone(),
+            self.sandbox.clone(),
             spec,
             run.name,
             line,
@@ -191,22 +193,25 @@ impl Site {
 type Outcome = Result<(NodeExit, u32), servant::Error>;
 
 async fn to_its_end(
-    engine: Arc<dyn Engine>,
-    spec: Spec,
+    sandbox: Arc<dyn Sandbox>,
+    spec: ContainerSpec,
     node: &'static str,
     line: mpsc::Sender<String>,
     cancelled: oneshot::Receiver<()>,
     result: oneshot::Sender<Outcome>,
 ) {
     // Starting is not interrupted: a container half-started would have no handle to end it by.
-    let servant = match engine.start(spec).await {
-        Ok(servant) => servant,
+    let Sandboxed {
+        servant,
+        uid_offset,
+    } = match sandbox.sandbox(spec).await {
+        Ok(sandboxed) => sandboxed,
         Err(error) => {
             let _ = result.send(Err(error));
             return;
         }
     };
-    let mut log = servant.follow_log(true);
+    let mut log = servant.follow(LogStart::First);
     let listener = async {
         while let Some(entry) = log.recv().await {
             // A listener that went away must not stop the reading: the program would block on a full pipe.
@@ -220,7 +225,7 @@ async fn to_its_end(
         };
         let stopped = servant.stop().await;
         let exit = exit?;
-        stopped.map(|()| (exit, servant.uid_range().0))
+        stopped.map(|()| (exit, uid_offset))
     };
     let (_, outcome) = tokio::join!(listener, work);
     let _ = result.send(outcome);

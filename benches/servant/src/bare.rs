@@ -13,15 +13,15 @@ use libcontainer::syscall::syscall::SyscallType;
 use nix::sys::signal::{Signal, kill};
 use nix::sys::wait::waitpid;
 use nix::unistd::Pid;
+use servant::container::ContainerSpec;
 use servant::local::DEFAULT_UID_BASE;
 use servant::rootfs::{Rootfs, make_skeleton};
-use servant::spec::Spec;
 use servant::uids;
 
 use crate::bundle::{self, Bundle};
 
 /// With limits, in a process of its own; from the call of libcontainer to its return.
-pub(crate) fn limited(place: &Path, spec: &Spec) -> Result<Duration> {
+pub(crate) fn limited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
     let bundle = Bundle::make(place, spec, |_| {})?;
     let took = time(place, "limited", spec);
     drop(bundle);
@@ -30,14 +30,14 @@ pub(crate) fn limited(place: &Path, spec: &Spec) -> Result<Duration> {
 }
 
 /// The same without limits, and without any cgroup in sight.
-pub(crate) fn unlimited(place: &Path, spec: &Spec) -> Result<Duration> {
+pub(crate) fn unlimited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
     fs::create_dir_all(place)?;
     let took = time(place, "unlimited", spec);
     fs::remove_dir_all(place)?;
     took
 }
 
-fn time(place: &Path, how: &str, spec: &Spec) -> Result<Duration> {
+fn time(place: &Path, how: &str, spec: &ContainerSpec) -> Result<Duration> {
     fs::write(place.join("spec.json"), serde_json::to_vec(spec)?)?;
     let mut command = Command::new(std::env::current_exe()?);
     let output = command.args(["bare", how]).arg(place).output()?;
@@ -49,7 +49,7 @@ fn time(place: &Path, how: &str, spec: &Spec) -> Result<Duration> {
 
 /// The process: prints the seconds.
 pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
-    let spec: Spec = serde_json::from_slice(&fs::read(place.join("spec.json"))?)?;
+    let spec: ContainerSpec = serde_json::from_slice(&fs::read(place.join("spec.json"))?)?;
     if how == "unlimited" {
         stage(place, &spec)?;
     }
@@ -78,7 +78,7 @@ pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
 }
 
 /// Root and configuration as our own creator makes them. From here on no cgroup of the host is seen.
-fn stage(place: &Path, spec: &Spec) -> Result<()> {
+fn stage(place: &Path, spec: &ContainerSpec) -> Result<()> {
     let uid_range = (DEFAULT_UID_BASE, uids::RANGE);
     let skeleton = place.join("skeleton");
     make_skeleton(&skeleton, &spec.id, &spec.layers, &spec.mounts, &spec.hosts)?;

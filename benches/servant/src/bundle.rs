@@ -6,9 +6,9 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
+use servant::container::ContainerSpec;
 use servant::local::DEFAULT_UID_BASE;
 use servant::rootfs::Staged;
-use servant::spec::Spec;
 use servant::uids;
 
 use crate::cgroups::Cgroups;
@@ -27,7 +27,11 @@ pub(crate) struct Bundle {
 
 impl Bundle {
     /// In `place`, which is made.
-    pub(crate) fn make(place: &Path, spec: &Spec, seccomp: fn(&mut Value)) -> Result<Self> {
+    pub(crate) fn make(
+        place: &Path,
+        spec: &ContainerSpec,
+        seccomp: fn(&mut Value),
+    ) -> Result<Self> {
         fs::create_dir_all(place)?;
         let (root, cgroups) = (Root::mount(place, spec)?, Cgroups::place()?);
         let staged = Staged {
@@ -53,7 +57,11 @@ impl Bundle {
 }
 
 /// A servant's configuration, with a network namespace.
-pub(crate) fn configuration(spec: &Spec, staged: &Staged, uid_range: (u32, u32)) -> Result<Value> {
+pub(crate) fn configuration(
+    spec: &ContainerSpec,
+    staged: &Staged,
+    uid_range: (u32, u32),
+) -> Result<Value> {
     let mut config = serde_json::to_value(servant::bundle::config(spec, staged, uid_range)?)?;
     config["process"]["args"] = json!(PROGRAM);
     config["process"]["env"] = json!(["PATH=/usr/bin:/bin", "HOME=/"]);

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use bench_servant::binary;
-use servant::engine::Engine;
+use servant::container::ContainerSpec;
+use servant::engine::Servant;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
-use servant::spec::Spec;
 use tokio::runtime::Handle;
 
 /// An engine of this program.
@@ -29,10 +29,10 @@ impl<'a> Ours<'a> {
     }
 
     /// Starts one, and ends it.
-    pub(crate) fn time(&self, spec: Spec) -> Result<Duration> {
+    pub(crate) fn time(&self, spec: ContainerSpec) -> Result<Duration> {
         self.runtime.block_on(async {
             let begun = Instant::now();
-            let servant = self.engine.start(spec).await?;
+            let servant = self.engine.start_container(spec).await?;
             let took = begun.elapsed();
             servant.stop().await?;
             Ok(took)

@@ -3,8 +3,9 @@
 use anyhow::{Context, Result};
 use package::interface::{Direction, Interface};
 use ros::bus::Graph;
+use servant::container::ContainerSpec;
 use servant::launch::{self, Launch};
-use servant::spec::{NodeSpec, Spec};
+use servant::spec::NodeSpec;
 
 use bench_servant::Daemon;
 
@@ -15,7 +16,7 @@ pub(crate) struct Image {
     /// Its name.
     pub(crate) service: String,
     /// The spec of its servants: layers, environment, node, limits.
-    pub(crate) spec: Spec,
+    pub(crate) spec: ContainerSpec,
     /// What its node registers.
     interface: Interface,
 }

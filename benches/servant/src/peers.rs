@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use serde_json::Value;
-use servant::spec::Spec;
+use servant::container::ContainerSpec;
 
 use crate::bundle::Bundle;
 
@@ -35,7 +35,7 @@ impl Peer {
     }
 
     /// From the first command to the end of the second; the bundle is in `place`.
-    pub(crate) fn time(&self, place: &Path, spec: &Spec) -> Result<Duration> {
+    pub(crate) fn time(&self, place: &Path, spec: &ContainerSpec) -> Result<Duration> {
         let bundle = Bundle::make(place, spec, put_operands_right)?;
         let path = place.to_str().context("UTF-8")?;
         let begun = Instant::now();

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
+use servant::container::ContainerSpec;
 use servant::rootfs::make_skeleton;
-use servant::spec::Spec;
 
 /// A mounted root; unmounted when dropped.
 pub(crate) struct Root {
@@ -16,7 +16,7 @@ pub(crate) struct Root {
 
 impl Root {
     /// Mounts it below `place`, read-only.
-    pub(crate) fn mount(place: &Path, spec: &Spec) -> Result<Self> {
+    pub(crate) fn mount(place: &Path, spec: &ContainerSpec) -> Result<Self> {
         let (skeleton, path) = (place.join("skeleton"), place.join("root"));
         fs::create_dir_all(&path)?;
         make_skeleton(&skeleton, &spec.id, &[], &[], &[])?;

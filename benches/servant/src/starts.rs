@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use bench_report::{Report, Target, Times};
 use bench_servant::{Daemon, full};
-use servant::spec::Spec;
+use servant::container::ContainerSpec;
 use tokio::runtime::Handle;
 
 use crate::bare;
@@ -50,7 +50,7 @@ pub(crate) fn median(times: &Times) -> f64 {
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// Starts something once, and ends it.
-type Start<'a> = Box<dyn Fn(&Spec) -> Result<Duration> + 'a>;
+type Start<'a> = Box<dyn Fn(&ContainerSpec) -> Result<Duration> + 'a>;
 
 /// One way to start something.
 struct Contestant<'a> {
@@ -62,7 +62,7 @@ struct Contestant<'a> {
 }
 
 impl<'a> Contestant<'a> {
-    fn ours(name: &'static str, start: impl Fn(&Spec) -> Result<Duration> + 'a) -> Self {
+    fn ours(name: &'static str, start: impl Fn(&ContainerSpec) -> Result<Duration> + 'a) -> Self {
         Self {
             name,
             optional: false,
@@ -71,7 +71,7 @@ impl<'a> Contestant<'a> {
         }
     }
 
-    fn peer(name: &'static str, start: impl Fn(&Spec) -> Result<Duration> + 'a) -> Self {
+    fn peer(name: &'static str, start: impl Fn(&ContainerSpec) -> Result<Duration> + 'a) -> Self {
         Self {
             optional: true,
             ..Self::ours(name, start)
@@ -119,7 +119,7 @@ pub(crate) fn measure(
         eprintln!("starts: round {round} of {rounds}");
         for index in (0..contestants.len()).rev() {
             let one = &mut contestants[index];
-            let spec = Spec {
+            let spec = ContainerSpec {
                 id: format!("bench-{}-{round}-{index}", std::process::id()),
                 nodes: Vec::new(),
                 ..image.spec.clone()

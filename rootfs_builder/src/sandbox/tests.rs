@@ -1,142 +1,73 @@
-//! What a site does with an engine, told by an engine that only writes down what is asked of it. Real containers are
-//! run by the stories.
+//! What a site does with containers, told with an engine in memory. Real containers are run by the stories.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::SystemTime;
 
 use async_trait::async_trait;
-use servant::endpoint::Endpoint;
-use servant::engine::{Adopted, ContainerState, Enforced, LogLine, NodeEvent, Servant, Usage};
-use tokio::sync::{Notify, broadcast, watch};
+use in_memory::MemoryEngine;
+use servant::engine::Engine;
+use servant::spec::Spec;
+use tokio::sync::Notify;
 
 use super::*;
 
-/// Its one container prints a line and then runs until it is stopped, or ends by itself with `code`.
+/// Its program prints a line and then runs until it is stopped, or ends by itself with `code`.
 #[derive(Default)]
 struct Pretended {
     code: Option<i32>,
-    started: Notify,
+    engine: MemoryEngine,
+    started: Arc<Notify>,
+    /// The build's directory, and whether it was still there when the program had ended.
+    saw: Arc<Mutex<Option<(PathBuf, bool)>>>,
     stopped: Arc<AtomicBool>,
-    /// Whether the build's directory was still there when the container was stopped.
+}
+
+/// What a program leaves behind.
+struct Last {
+    stopped: Arc<AtomicBool>,
     saw: Arc<Mutex<Option<(PathBuf, bool)>>>,
 }
 
-struct Container {
-    code: Option<i32>,
-    stopped: Arc<AtomicBool>,
-    saw: Arc<Mutex<Option<(PathBuf, bool)>>>,
-    over: Notify,
-}
-
-#[async_trait]
-impl Engine for Pretended {
-    async fn start(&self, _spec: Spec) -> Result<Arc<dyn Servant>, servant::Error> {
-        self.started.notify_one();
-        Ok(Arc::new(Container {
-            code: self.code,
-            stopped: self.stopped.clone(),
-            saw: self.saw.clone(),
-            over: Notify::new(),
-        }))
-    }
-
-    async fn adopt(&self) -> Result<Adopted, servant::Error> {
-        Ok(Adopted::default())
-    }
-}
-
-#[async_trait]
-impl Servant for Container {
-    fn id(&self) -> &str {
-        "pretended"
-    }
-
-    fn state(&self) -> watch::Receiver<ContainerState> {
-        watch::channel(ContainerState::Creating).1
-    }
-
-    fn events(&self) -> broadcast::Receiver<NodeEvent> {
-        broadcast::channel(1).1
-    }
-
-    fn endpoint(&self) -> Endpoint {
-        nobody_asks()
-    }
-
-    fn enforced(&self) -> Enforced {
-        Enforced::default()
-    }
-
-    async fn processes(&self) -> Result<Vec<i32>, servant::Error> {
-        Ok(Vec::new())
-    }
-
-    async fn usage(&self) -> Result<Usage, servant::Error> {
-        Ok(Usage::default())
-    }
-
-    async fn set_limits(&self, _limits: Limits) -> Result<Enforced, servant::Error> {
-        Ok(Enforced::default())
-    }
-
-    async fn start_node(&self, _node: NodeSpec) -> Result<(), servant::Error> {
-        Ok(())
-    }
-
-    async fn signal_node(&self, _node: &str, _signal: i32) -> Result<(), servant::Error> {
-        Ok(())
-    }
-
-    async fn wait_node(&self, _node: &str) -> Result<NodeExit, servant::Error> {
-        let Some(code) = self.code else {
-            std::future::pending().await
-        };
-        Ok(NodeExit {
-            code: Some(code),
-            signal: None,
-            out_of_memory: false,
-            exec_error: None,
-        })
-    }
-
-    fn follow_log(&self, _from_start: bool) -> mpsc::Receiver<LogLine> {
-        let (sender, receiver) = mpsc::channel(1);
-        let line = LogLine {
-            number: None,
-            time: SystemTime::UNIX_EPOCH,
-            node: "x".into(),
-            stream: "stdout".into(),
-            line: "hello".into(),
-        };
-        sender.try_send(line).expect("there is room");
-        receiver
-    }
-
-    fn uid_range(&self) -> (u32, u32) {
-        (700_000, 65_536)
-    }
-
-    fn log_path(&self) -> PathBuf {
-        PathBuf::new()
-    }
-
-    async fn stop(&self) -> Result<(), servant::Error> {
-        // Ending a container takes its time.
-        for _ in 0..50 {
-            tokio::task::yield_now().await;
-        }
-        let mut saw = self.saw.lock().expect("not poisoned");
-        if let Some((directory, there)) = saw.as_mut() {
+impl Drop for Last {
+    fn drop(&mut self) {
+        if let Some((directory, there)) = self.saw.lock().expect("not poisoned").as_mut() {
             *there = directory.exists();
         }
         self.stopped.store(true, Ordering::SeqCst);
-        self.over.notify_waiters();
-        Ok(())
     }
 }
 
-fn nobody_asks() -> ! {
-    panic!("a build needs no endpoint")
+#[async_trait]
+impl Sandbox for Pretended {
+    async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, servant::Error> {
+        let (code, started) = (self.code, Arc::clone(&self.started));
+        let (stopped, saw) = (Arc::clone(&self.stopped), Arc::clone(&self.saw));
+        self.engine.program("/bin/true", move |process| {
+            let (stopped, saw) = (Arc::clone(&stopped), Arc::clone(&saw));
+            let last = Last { stopped, saw };
+            process.print("hello");
+            started.notify_one();
+            async move {
+                let _last = last;
+                match code {
+                    Some(code) => code,
+                    None => std::future::pending().await,
+                }
+            }
+        });
+        let spec = Spec {
+            id: spec.id,
+            image: String::new(),
+            limits: spec.limits,
+            environment: spec.environment,
+            nodes: spec.nodes,
+            grants: Default::default(),
+            resident: spec.resident,
+        };
+        Ok(Sandboxed {
+            servant: self.engine.start(spec).await?,
+            uid_offset: 700_000,
+        })
+    }
 }
 
 fn run() -> Run {

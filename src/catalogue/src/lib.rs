@@ -81,9 +81,9 @@ impl Catalogue {
         })
     }
 
-    /// The extracted layers of a revision's image, lowest first.
-    pub async fn layers(&self, revision: &RevisionRecord) -> Result<Vec<PathBuf>, Error> {
-        let (images, digest) = (Arc::clone(&self.images), revision.image.clone());
+    /// The extracted layers of an image, lowest first.
+    pub async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Error> {
+        let (images, digest) = (Arc::clone(&self.images), image.to_owned());
         blocking("extracting layers", move || {
             inventory::layers(&images, &digest)
         })

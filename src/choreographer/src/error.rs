@@ -1,5 +1,4 @@
 use crate::decide::admission::Refused;
-use crate::grants::GrantError;
 
 /// Why a servant cannot be had, used or changed.
 #[derive(Debug, thiserror::Error)]
@@ -12,9 +11,6 @@ pub enum Error {
         /// What there is.
         exists: Vec<String>,
     },
-    /// Something is asked for that is not granted.
-    #[error(transparent)]
-    Grant(#[from] GrantError),
     /// There is no room.
     #[error(transparent)]
     Full(#[from] Refused),
@@ -42,6 +38,9 @@ pub enum Error {
     /// The engine.
     #[error(transparent)]
     Engine(#[from] servant::Error),
+    /// Reaching a servant.
+    #[error(transparent)]
+    Reach(#[from] reach::Error),
     /// A task of the daemon broke.
     #[error("the daemon failed at {0}; its log says more")]
     Internal(&'static str),

@@ -89,7 +89,7 @@ pub struct Handle {
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
-    reach: Mutex<Option<Arc<Reach>>>,
+    reach: Mutex<Option<Arc<dyn Reach>>>,
 }
 
 impl Handle {
@@ -199,7 +199,7 @@ impl Handle {
     }
 
     /// Its ROS and its bridge, once reached.
-    pub fn reach(&self) -> Option<Arc<Reach>> {
+    pub fn reach(&self) -> Option<Arc<dyn Reach>> {
         self.reach.lock().clone()
     }
 
@@ -251,12 +251,12 @@ impl Handle {
         let _ = self.container.set(container);
     }
 
-    pub(crate) fn set_reach(&self, reach: Arc<Reach>) {
+    pub(crate) fn set_reach(&self, reach: Arc<dyn Reach>) {
         *self.reach.lock() = Some(reach);
     }
 
     /// Nobody reaches its ROS from here on; gives what was there.
-    pub(crate) fn take_reach(&self) -> Option<Arc<Reach>> {
+    pub(crate) fn take_reach(&self) -> Option<Arc<dyn Reach>> {
         self.reach.lock().take()
     }
 
@@ -328,7 +328,7 @@ impl Lease {
     }
 
     /// Waits until the servant's interface is there.
-    pub async fn ready(&self) -> Result<Arc<Reach>, Error> {
+    pub async fn ready(&self) -> Result<Arc<dyn Reach>, Error> {
         self.reached(Phase::Ready).await?;
         self.handle
             .reach()

@@ -36,13 +36,11 @@
 
 mod decide;
 mod error;
-pub mod grants;
 mod handle;
 pub mod limits;
 mod lives;
 mod memory;
 mod options;
-mod tail;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -52,8 +50,7 @@ use api::Phase;
 use bridge::BridgeOptions;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
-use reach::RequestTimes;
-use reach::egress::Way;
+use reach::{Material, Opener, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 
@@ -65,11 +62,9 @@ pub use limits::engine_limits;
 pub use lives::waiting::{Admission, Permit};
 pub use memory::{Memory, MemoryOptions};
 pub use options::Options;
-pub use tail::{is_after, last as last_log_lines, read as read_log, record as log_record};
 
 use decide::admission::Class;
 use decide::placement::Placement;
-use grants::Granted;
 use lives::Inner;
 use lives::driver::{self, Beginning};
 use lives::spares::{self, Spares};
@@ -81,12 +76,13 @@ pub struct Choreographer {
 }
 
 impl Choreographer {
-    /// One that starts servants by `engine`.
+    /// One that starts servants by `engine` and reaches them by `opener`.
     pub fn new(
         options: Options,
         state: Arc<State>,
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
+        opener: Arc<dyn Opener>,
         admission: Admission,
     ) -> Choreographer {
         let journal = Journal::new(Arc::clone(&state));
@@ -98,6 +94,7 @@ impl Choreographer {
             journal,
             catalogue,
             engine,
+            opener,
             admission,
             request_times: Arc::default(),
             servants: Mutex::default(),
@@ -285,14 +282,26 @@ impl Choreographer {
         &self.inner.options.bridge
     }
 
-    /// What a push asks for beyond a container, if it is allowed and there.
-    pub fn grant(&self, asked: &api::Grants) -> Result<Granted, Error> {
-        Ok(grants::resolve(asked, &self.inner.options.allow)?)
+    /// Refuses what a push asks for beyond a container if it is not allowed or not there; answers, in words, what of it
+    /// servants will lack.
+    pub fn check_grants(&self, asked: &api::Grants) -> Result<Vec<String>, Error> {
+        Ok(self.inner.engine.check(asked)?)
     }
 
-    /// Hosts that a push may connect to, of those that it asks for.
-    pub fn ways_out(&self, asked: &api::Grants) -> Result<Vec<Way>, Error> {
-        Ok(grants::ways_out(asked, &self.inner.options.allow)?)
+    /// Tries the current revision of a service, with a servant that is there for the trial alone.
+    pub async fn trial(
+        &self,
+        service: &str,
+        material: Material,
+    ) -> Result<api::trial::Trial, Error> {
+        let robot = format!("~try-{}", names::random(6));
+        let lease = self.ensure(service, &robot, true)?;
+        lease.admitted().await?;
+        let (reach, handle) = (lease.ready().await?, lease.handle());
+        let interface = &handle.revision.interface;
+        let trial = reach.trial(service, interface, material).await;
+        handle.end("its trial is over");
+        Ok(trial?)
     }
 
     /// Refuses limits that would never be admitted.
@@ -321,13 +330,11 @@ pub async fn describe(handle: &Handle) -> api::Servant {
     let running = matches!(life.phase, Phase::Created | Phase::Starting | Phase::Ready);
     let container = handle.container().filter(|_| running);
     let enforced = container.as_ref().map(|container| container.enforced());
-    let (usage, pids) = match &container {
-        Some(container) => (
-            container.usage().await.ok(),
-            container.processes().await.unwrap_or_default(),
-        ),
-        None => (None, Vec::new()),
+    let usage = match &container {
+        Some(container) => container.usage().await.ok(),
+        None => None,
     };
+    let pids = reach.as_ref().filter(|_| running);
     api::Servant {
         id: handle.id.clone(),
         service: handle.service().to_owned(),
@@ -355,7 +362,7 @@ pub async fn describe(handle: &Handle) -> api::Servant {
                 io: pressure.io,
             }),
         }),
-        pids,
+        pids: pids.map_or_else(Vec::new, |reach| reach.processes()),
         dropped: reach.map_or(0, |reach| reach.dropped()),
     }
 }

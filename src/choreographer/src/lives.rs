@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use catalogue::Catalogue;
 use parking_lot::Mutex;
-use reach::RequestTimes;
+use reach::{Opener, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 
@@ -36,6 +36,7 @@ pub(crate) struct Inner {
     pub(crate) journal: Journal,
     pub(crate) catalogue: Arc<Catalogue>,
     pub(crate) engine: Arc<dyn Engine>,
+    pub(crate) opener: Arc<dyn Opener>,
     pub(crate) admission: Admission,
     pub(crate) request_times: Arc<RequestTimes>,
     pub(crate) memory: SharedMemory,

@@ -3,7 +3,6 @@ use std::time::Duration;
 use api::Limits;
 use bridge::BridgeOptions;
 
-use crate::grants::Allow;
 use crate::memory::MemoryOptions;
 
 /// What the operator decides of servants.
@@ -25,8 +24,6 @@ pub struct Options {
     pub anonymous_grace: Duration,
     /// Most containers made ahead, without nodes.
     pub spares: usize,
-    /// What pushes may ask for beyond a container.
-    pub allow: Allow,
     /// Sessions of rosbridge before each servant.
     pub bridge: BridgeOptions,
     /// Memory held for clients and servants.

@@ -1,28 +1,11 @@
 use std::time::Duration;
 
-use async_trait::async_trait;
-use servant::engine::{Adopted, Servant};
-use servant::spec::Spec;
+use in_memory::MemoryEngine;
 
 use super::*;
 use store::{Plan, RevisionRecord, State};
 
-/// No servant is started here.
-struct NoEngine;
-
-#[async_trait]
-impl Engine for NoEngine {
-    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, servant::Error> {
-        Err(servant::Error::Start {
-            id: spec.id,
-            reason: "there is no engine".to_owned(),
-        })
-    }
-
-    async fn adopt(&self) -> Result<Adopted, servant::Error> {
-        Ok(Adopted::default())
-    }
-}
+mod servants;
 
 fn revision(image: &str, cpus: f64) -> RevisionRecord {
     RevisionRecord {
@@ -56,7 +39,6 @@ fn options() -> Options {
         grace: Duration::from_secs(60),
         anonymous_grace: Duration::ZERO,
         spares: 8,
-        allow: grants::Allow::default(),
         bridge: BridgeOptions::default(),
         memory: MemoryOptions {
             daemon: memory,
@@ -74,11 +56,13 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let state = Arc::new(state);
     let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
         .expect("a store");
+    let engine = Arc::new(MemoryEngine::default());
     let choreographer = Choreographer::new(
         options(),
         Arc::clone(&state),
         Arc::new(Catalogue::new(state, Arc::new(store))),
-        Arc::new(NoEngine),
+        engine.clone(),
+        engine,
         Admission::new(Amount::new(2.0, 0), 16),
     );
     (home, choreographer)

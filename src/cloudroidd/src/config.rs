@@ -10,10 +10,10 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use api::{Limits, Size};
-use choreographer::grants::Allow;
 use choreographer::limits::check as check_limits;
 use portal::Tokens;
 use serde::{Deserialize, Deserializer};
+use servant::local::grants::Allow;
 
 /// Everything that can be configured.
 #[derive(Debug, Clone, PartialEq, Deserialize)]

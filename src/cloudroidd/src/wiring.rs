@@ -1,17 +1,20 @@
 //! Makes the daemon's parts and gives each what it needs of the others; ends them in the opposite order.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Context;
+use async_trait::async_trait;
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
 use portal::{App, Machine, Tokens};
 use push::Pusher;
+use reach::{LocalOpener, Opener};
 use rootfs_builder::Builder;
 use servant::engine::Engine;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
+use servant::sandbox::Sandbox;
 use store::{Journal, State};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -19,6 +22,9 @@ use tokio_util::task::TaskTracker;
 use crate::config::{self, Config, IsolationMode};
 use crate::home::Home;
 use crate::{bases, doctor, supervision};
+
+/// Why something is not to be had.
+type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
 /// The daemon with all its parts; nothing runs yet but the watch over the database.
 pub fn build(
@@ -34,7 +40,13 @@ pub fn build(
     state.release_robots(tokens.hashes())?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
-    let engine: Arc<dyn Engine> = Arc::new(LocalEngine::new(engine_config(config, home)?)?);
+    let resources = Resources {
+        catalogue: Arc::clone(&catalogue),
+        egress: config.allow.egress.clone(),
+    };
+    let local = LocalEngine::new(engine_config(config, home)?)?.with(Arc::new(resources));
+    let engine: Arc<dyn Engine> = Arc::new(local.clone());
+    let opener = Arc::new(LocalOpener::new(local.clone(), config.allow.egress.clone()));
     let promised = &config.capacity;
     let memory = promised
         .memory
@@ -45,16 +57,24 @@ pub fn build(
         Arc::clone(&state),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
+        Arc::clone(&opener) as Arc<dyn Opener>,
         Admission::new(capacity, promised.queue),
     );
     let definitions = bases::directory(config, home)?;
-    let builder = builder(config, home, definitions, catalogue.images(), &engine)?;
+    let builder = builder(
+        config,
+        home,
+        definitions,
+        catalogue.images(),
+        Arc::new(local),
+    )?;
     let pusher = Pusher::new(
         config.push(),
         home.path().to_owned(),
         builder,
         Arc::clone(&catalogue),
         engine,
+        opener,
         choreographer.clone(),
         Journal::new(Arc::clone(&state)),
     );
@@ -76,13 +96,31 @@ pub fn build(
     }))
 }
 
+/// What the engine of this host asks the rest of the daemon.
+struct Resources {
+    catalogue: Arc<Catalogue>,
+    /// `egress` of what the operator allows.
+    egress: Vec<String>,
+}
+
+#[async_trait]
+impl servant::local::Resources for Resources {
+    async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, BoxError> {
+        Ok(self.catalogue.layers(image).await?)
+    }
+
+    fn hosts(&self, egress: &[String]) -> Result<Vec<(IpAddr, String)>, BoxError> {
+        Ok(reach::egress::hosts(egress, &self.egress)?)
+    }
+}
+
 /// What makes images of pushes.
 fn builder(
     config: &Config,
     home: &Home,
     bases_dir: PathBuf,
     images: &Arc<image::Store>,
-    engine: &Arc<dyn Engine>,
+    sandbox: Arc<dyn Sandbox>,
 ) -> anyhow::Result<Builder> {
     let cache = home.cache();
     // What was compiled lies there, too.
@@ -96,7 +134,7 @@ fn builder(
         logs_dir: home.path().join("logs"),
         sources: rootfs_builder::Sources::default(),
         store: Arc::clone(images),
-        engine: Arc::clone(engine),
+        sandbox,
         limits: config.push.limits(),
     })
     .context("cannot prepare for building images")
@@ -113,6 +151,7 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
         memory: Some(config.memory.shim.0),
         ..servant::spec::Limits::default()
     };
+    engine.allow = config.allow.clone();
     engine.isolation = match config.isolation {
         IsolationMode::Require => Isolation::Require,
         IsolationMode::BestEffort => Isolation::BestEffort,
@@ -132,9 +171,7 @@ pub async fn drain(app: &App, keep_servants: bool) {
         );
         for handle in app.choreographer.servants() {
             if let Some(reach) = handle.reach() {
-                reach
-                    .bridge
-                    .close("the daemon is being restarted; connect again");
+                reach.close_sessions("the daemon is being restarted; connect again");
             }
         }
     } else {

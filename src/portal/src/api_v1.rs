@@ -9,14 +9,15 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use futures_util::StreamExt;
+use reach::{Material, Picture};
 use serde::Deserialize;
+use servant::engine::LogStart;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::body::{self, Held};
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
-use crate::trial::Material;
 use crate::views;
 use choreographer::describe;
 
@@ -169,15 +170,17 @@ pub async fn trial(
         error => error,
     })?;
     let material = tokio::task::spawn_blocking(move || match with.kind {
-        Kind::Image => crate::trial::Picture::read(&bytes).map(Material::Picture),
-        Kind::Bag => ros::bag::read(&bytes, crate::trial::RECORDED)
+        Kind::Image => Picture::read(&bytes)
+            .map(Material::Picture)
+            .map_err(|error| Error::BadRequest(error.to_string())),
+        Kind::Bag => ros::bag::read(&bytes, reach::RECORDED)
             .map(Material::Bag)
             .map_err(|error| Error::BadRequest(error.to_string())),
     });
     let material = material
         .await
         .map_err(|_| Error::Internal("reading what a service is tried with"))??;
-    let trial = crate::trial::run(&app.catalogue, &app.choreographer, &name, material).await;
+    let trial = app.choreographer.trial(&name, material).await;
     // Messages of a recording were cut from the body.
     drop(permit);
     Ok(Json(trial?))
@@ -272,28 +275,15 @@ pub async fn logs(
     let Some(container) = handle.container() else {
         return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
     };
-    // Following begins before the past is read, so that no line falls between. One may come twice instead, and is known by
-    // its place: the clock may have been set back.
-    let following = part.follow.then(|| container.follow_log(false));
     let count = part.tail.unwrap_or(LOG_LINES);
-    let past = choreographer::last_log_lines(container.log_path(), count, None).await;
-    let last = past.last().and_then(|line| line.number);
-    let past = futures_util::stream::iter(past).map(choreographer::log_record);
-    match following {
-        Some(future) => {
-            let new = move |line: &servant::engine::LogLine| {
-                std::future::ready(choreographer::is_after(line, last))
-            };
-            let future = ReceiverStream::new(future).filter(new);
-            // A follower must not keep the daemon from ending.
-            let ending = app.ending.clone().cancelled_owned();
-            Ok(lines(
-                past.chain(future.map(choreographer::log_record))
-                    .take_until(ending),
-            ))
-        }
-        None => Ok(lines(past)),
+    if part.follow {
+        let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
+        // A follower must not keep the daemon from ending.
+        let ending = app.ending.clone().cancelled_owned();
+        return Ok(lines(printed.map(views::log_line).take_until(ending)));
     }
+    let past = container.logs(count, None).await;
+    Ok(lines(futures_util::stream::iter(past).map(views::log_line)))
 }
 
 /// A stream of values as JSON lines.

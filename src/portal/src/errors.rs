@@ -273,10 +273,11 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::Full(Refused::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
         C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
-        C::Grant(_) => (S::FORBIDDEN, "not-granted", "not granted"),
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
+        C::Reach(reach::Error::Trial(_)) => (S::BAD_REQUEST, "bad-request", "bad request"),
+        C::Reach(_) => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
         C::State(_) | C::Internal(_) => INTERNAL,
     }
 }
@@ -299,6 +300,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
 
 fn kind_of_engine(error: &servant::Error) -> Kind {
     match error {
+        servant::Error::Grant(_) => (StatusCode::FORBIDDEN, "not-granted", "not granted"),
         servant::Error::Refused { .. } => (StatusCode::CONFLICT, "refused", "the servant refused"),
         _ => INTERNAL,
     }

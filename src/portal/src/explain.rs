@@ -82,7 +82,7 @@ async fn served(handle: &Handle) -> Served {
 
 /// The links to a servant, if it has got that far.
 fn links(handle: &Handle) -> Vec<Link> {
-    let status = handle.reach().map(|reach| reach.hub.status());
+    let status = handle.reach().map(|reach| reach.links());
     status.unwrap_or_default().into_iter().map(link).collect()
 }
 

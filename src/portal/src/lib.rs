@@ -27,7 +27,6 @@ mod robots;
 mod routes;
 mod stubs;
 mod tokens;
-mod trial;
 mod views;
 
 use std::convert::Infallible;

@@ -110,7 +110,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         .filter_map(|handle| Some((labels_of(handle), handle.reach()?)))
         .collect();
     let messages = bridges.iter().flat_map(|(of, reach)| {
-        let metrics = reach.bridge.metrics();
+        let metrics = reach.metrics();
         [
             (
                 format!("{of},direction=\"in\""),
@@ -141,7 +141,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     );
     Metrics::prometheus_help(out);
     for (of, reach) in &bridges {
-        reach.bridge.metrics().prometheus(out, of);
+        reach.metrics().prometheus(out, of);
     }
 }
 

@@ -14,8 +14,8 @@ use bytes::BytesMut;
 use catalogue::names;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use hyper_util::rt::TokioIo;
-use reach::Reach;
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
+use reach::{Reach, Stream};
+use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
 
 use super::guard::{self, Caller, Peer};
@@ -270,56 +270,24 @@ async fn upgraded_to(
     upgraded: Upgraded,
 ) {
     // Without hyper's wrapping around them, reads and writes go straight to the socket.
-    let upgraded = match upgraded.downcast::<TokioIo<TcpStream>>() {
-        Ok(parts) => {
-            return session(
-                app,
-                asked,
-                caller,
-                lease,
-                parts.io.into_inner(),
-                parts.read_buf,
-            )
-            .await;
-        }
-        Err(upgraded) => upgraded,
+    let (io, read_ahead): (Stream, _) = match upgraded.downcast::<TokioIo<TcpStream>>() {
+        Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
+        Err(upgraded) => match upgraded.downcast::<TokioIo<UnixStream>>() {
+            Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
+            Err(upgraded) => (Box::new(TokioIo::new(upgraded)), bytes::Bytes::new()),
+        },
     };
-    match upgraded.downcast::<TokioIo<UnixStream>>() {
-        Ok(parts) => {
-            session(
-                app,
-                asked,
-                caller,
-                lease,
-                parts.io.into_inner(),
-                parts.read_buf,
-            )
-            .await
-        }
-        Err(upgraded) => {
-            session(
-                app,
-                asked,
-                caller,
-                lease,
-                TokioIo::new(upgraded),
-                bytes::Bytes::new(),
-            )
-            .await
-        }
-    }
+    session(app, asked, caller, lease, io, read_ahead).await
 }
 
-async fn session<S>(
+async fn session(
     app: Arc<App>,
     asked: Asked,
     mut caller: Caller,
     lease: Option<Lease>,
-    mut io: S,
+    mut io: Stream,
     mut read_ahead: bytes::Bytes,
-) where
-    S: AsyncRead + AsyncWrite + Unpin + Send,
-{
+) {
     if asked.link {
         return linked(&app, &asked, lease, io, read_ahead).await;
     }
@@ -362,7 +330,7 @@ async fn session<S>(
         resume: asked.bound_resume(&caller),
         ..SessionOptions::default()
     };
-    let end = reach.bridge.serve_waiting(waiting, options).await;
+    let end = reach.serve_rosbridge(waiting, options).await;
     let handle = lease.handle();
     match end {
         SessionEnd::Client { code, .. } => {
@@ -387,7 +355,7 @@ async fn servant(
     asked: &Asked,
     caller: &Caller,
     lease: Option<Lease>,
-) -> Result<(Lease, Arc<Reach>), Error> {
+) -> Result<(Lease, Arc<dyn Reach>), Error> {
     let lease = match lease {
         Some(lease) => lease,
         None => {
@@ -401,15 +369,13 @@ async fn servant(
 }
 
 /// A connection of a robot's stub.
-async fn linked<S>(
+async fn linked(
     app: &App,
     asked: &Asked,
     lease: Option<Lease>,
-    mut io: S,
+    mut io: Stream,
     read_ahead: bytes::Bytes,
-) where
-    S: AsyncRead + AsyncWrite + Unpin + Send,
-{
+) {
     let Some(lease) = lease else {
         let error = Error::Internal("taking a servant");
         return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
@@ -431,7 +397,7 @@ async fn linked<S>(
     };
     let robot = asked.robot.as_deref().unwrap_or_default();
     let lost = tokio::select! {
-        lost = reach.hub.serve(io, &read_ahead) => lost.to_string(),
+        lost = reach.serve_link(io, &read_ahead) => lost.to_string(),
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
     };
     tracing::info!(

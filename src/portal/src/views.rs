@@ -175,6 +175,16 @@ async fn used(servants: &[Arc<Handle>]) -> api::Usage {
     sum
 }
 
+/// A line of a servant's log.
+pub fn log_line(line: servant::engine::LogLine) -> api::LogLine {
+    api::LogLine {
+        time: store::millis(line.time),
+        node: line.node,
+        stream: line.stream,
+        line: line.line,
+    }
+}
+
 /// How much the whole machine waits; none where its kernel does not tell (PSI).
 fn machine_pressure() -> Option<api::Pressure> {
     servant::host::pressure().map(|some| api::Pressure {

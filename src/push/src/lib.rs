@@ -32,6 +32,7 @@ use std::time::{Duration, Instant};
 use api::{PushEvent, PushOptions};
 use catalogue::{Catalogue, names};
 use choreographer::Choreographer;
+use reach::Opener;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
@@ -61,6 +62,7 @@ pub struct Pusher {
     home: PathBuf,
     catalogue: Arc<Catalogue>,
     engine: Arc<dyn Engine>,
+    opener: Arc<dyn Opener>,
     choreographer: Choreographer,
     builder: Builder,
     journal: Journal,
@@ -79,6 +81,7 @@ impl Pusher {
         builder: Builder,
         catalogue: Arc<Catalogue>,
         engine: Arc<dyn Engine>,
+        opener: Arc<dyn Opener>,
         choreographer: Choreographer,
         journal: Journal,
     ) -> Pusher {
@@ -89,6 +92,7 @@ impl Pusher {
             journal,
             catalogue,
             engine,
+            opener,
             choreographer,
             builder,
             published: AtomicU64::new(0),
@@ -187,8 +191,7 @@ impl Pusher {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         tell.step("starting it once to find its interface").await;
         let mut plan = plan_of(&built, options);
-        let granted = self.choreographer.grant(&plan.grants)?;
-        for warning in granted.unfulfilled {
+        for warning in self.choreographer.check_grants(&plan.grants)? {
             tell.warning(warning).await;
         }
         let found = probe::interface(self, id, &built, &mut plan, options, tell).await?;

@@ -11,10 +11,8 @@ use std::time::Duration;
 use api::PushOptions;
 use package::interface::Interface;
 use package::names::is_graph_name;
-use reach::{ServantSockets, master};
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
-use ros::JoinOptions;
 use ros::bus::{Graph, RosVersion};
 use ros::flavour::Flavour;
 use servant::engine::Servant;
@@ -56,7 +54,7 @@ pub(super) async fn settle(
             node
         })
         .collect();
-    let mut spec = probe::spec(pusher, id, built, &alone, options).await?;
+    let mut spec = probe::spec(pusher, id, built, &alone, options);
     spec.id = format!("{id}-names");
     let (servant, trial) = probe::start(pusher, spec).await?;
     let ros = built.flavour.ros.bus();
@@ -81,11 +79,12 @@ async fn look(
     };
     // A container is a host of that name.
     let host = servant.id();
-    let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-    let bus = ros::connect(ros, sockets, JoinOptions::new(master::ADDRESS, NODE))
+    let opener = &pusher.opener;
+    let looked = opener
+        .look(servant, ros, NODE, &[])
         .await
         .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
-    let mut graph = bus.graph();
+    let mut graph = looked.bus.graph();
     let seen = graph.clone();
     let patience = pusher.options.probe;
     let all_there = |graph: &Arc<Graph>| names(graph, unnamed, host).len() == unnamed.len();
@@ -101,8 +100,11 @@ async fn look(
             Err(_) => Err(never_registered(alone, patience)),
         },
     };
-    bus.close().await;
-    registered.map_err(|error| probe::explained(error, servant))
+    looked.bus.close().await;
+    match registered {
+        Ok(names) => Ok(names),
+        Err(error) => Err(probe::explained(error, servant).await),
+    }
 }
 
 fn never_registered(alone: &Plan, after: Duration) -> Error {

@@ -6,15 +6,12 @@ use std::time::Duration;
 use api::PushOptions;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
-use reach::egress::Relays;
-use reach::{ServantSockets, how_it_ended, master};
+use reach::{how_it_ended, master};
+use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
-use rootfs_builder::{BuildOutcome, blocking};
-use ros::JoinOptions;
-use ros::bus::Bus;
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, Servant};
-use servant::spec::{Profile, Spec};
+use servant::spec::Spec;
 use tokio_util::task::TaskTracker;
 
 use super::request::Tell;
@@ -40,15 +37,8 @@ pub(super) async fn interface(
     let _room = room(pusher, options, tell).await?;
     naming::settle(pusher, id, built, plan, options).await?;
     let plan = &*plan;
-    let spec = self::spec(pusher, id, built, plan, options).await?;
+    let spec = self::spec(pusher, id, built, plan, options);
     let (servant, trial) = start(pusher, spec).await?;
-    let endpoint = servant.endpoint();
-    // Refused already where one is not allowed.
-    let ways_out = pusher
-        .choreographer
-        .ways_out(&plan.grants)
-        .unwrap_or_default();
-    let _ways_out = Relays::open(&endpoint, &ways_out).await;
     let unmet = servant
         .enforced()
         .unmet(&choreographer::engine_limits(&options.limits));
@@ -132,17 +122,17 @@ async fn look(
         )
     };
     let looking = async {
-        let sockets = Arc::new(ServantSockets::new(&servant.endpoint()));
-        let bus: Arc<dyn Bus> = tokio::select! {
+        let opener = &pusher.opener;
+        let looked = tokio::select! {
             // First: of a node that ended, nothing else is worth saying.
             biased;
             words = ended(servant, plan) => return Err(failed(words)),
-            bus = ros::connect(built.flavour.ros.bus(), sockets, JoinOptions::new(master::ADDRESS, NODE)) => {
-                bus.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
+            looked = opener.look(servant, built.flavour.ros.bus(), NODE, &plan.grants.egress) => {
+                looked.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
             }
         };
         rootfs_builder::probe::probe(
-            &*bus,
+            &*looked.bus,
             &registry,
             &built.inventory.definitions,
             &options,
@@ -151,7 +141,10 @@ async fn look(
         .await
         .map_err(|error| failed(error.to_string()))
     };
-    looking.await.map_err(|error| explained(error, servant))
+    match looking.await {
+        Ok(found) => Ok(found),
+        Err(error) => Err(explained(error, servant).await),
+    }
 }
 
 /// With the option that adds what the nodes say is missing.
@@ -178,27 +171,10 @@ async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
 
 async fn worked(servant: Arc<dyn Servant>) -> Option<Worked> {
     let usage = servant.usage().await.ok()?;
-    let processes = servant.processes().await.unwrap_or_default();
-    let waited = tokio::task::spawn_blocking(move || processes.into_iter().map(waited).sum());
     Some(Worked {
         ran: Duration::from_micros(usage.cpu_usec),
-        waited: waited.await.unwrap_or_default(),
+        waited: servant.waited().await,
     })
-}
-
-/// How long the threads of a process could have run and others had the cores; nothing where the kernel does not count it
-/// (Documentation/scheduler/sched-stats.rst: nanoseconds on a core, nanoseconds waiting, slices).
-fn waited(pid: i32) -> Duration {
-    let threads = std::fs::read_dir(format!("/proc/{pid}/task"));
-    let waited = threads
-        .into_iter()
-        .flatten()
-        .flatten()
-        .filter_map(|thread| {
-            let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
-            text.split_whitespace().nth(1)?.parse::<u64>().ok()
-        });
-    Duration::from_nanos(waited.sum())
 }
 
 /// Comes back when a node ends that should not, or the container does, with what is to be said about it.
@@ -227,12 +203,7 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
         std::future::pending().await
     };
     let mut states = servant.state();
-    let over = states.wait_for(|state| {
-        matches!(
-            state,
-            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-        )
-    });
+    let over = states.wait_for(ContainerState::is_over);
     tokio::select! {
         biased;
         words = node_ended => words,
@@ -246,10 +217,10 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
 }
 
 /// With the last lines that the nodes printed.
-pub(super) fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
+pub(super) async fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
     match error {
         Error::Failed { message, next, log } if log.is_empty() => {
-            let lines = choreographer::read_log(&servant.log_path(), LOG_LINES, None);
+            let lines = servant.logs(LOG_LINES, None).await;
             let log = lines
                 .into_iter()
                 .map(|line| format!("{}: {}", line.node, line.line))
@@ -260,40 +231,24 @@ pub(super) fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
     }
 }
 
-pub(super) async fn spec(
+pub(super) fn spec(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
     plan: &Plan,
     options: &PushOptions,
-) -> Result<Spec, Error> {
-    let store = Arc::clone(pusher.catalogue.images());
-    let infos: Vec<_> = built.layers.iter().map(|layer| layer.info).collect();
-    let extracted = blocking::spawn(move || {
-        infos
-            .iter()
-            .map(|layer| store.extracted(&layer.diff_id))
-            .collect::<Result<_, _>>()
-    });
-    let layers = extracted
-        .await
-        .map_err(|_| Error::Internal("extracting layers"))??;
-    let granted = pusher.choreographer.grant(&plan.grants)?;
-    Ok(Spec {
+) -> Spec {
+    Spec {
         id: format!("{id}-probe"),
-        layers,
-        writable: None,
-        profile: Profile::Servant,
+        image: built.image.to_string(),
         limits: choreographer::engine_limits(
             &options.limits.or(pusher.choreographer.default_limits()),
         ),
-        environment: granted.environment_over(&plan.environment),
+        environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
-        owned_directories: Vec::new(),
-        mounts: granted.mounts,
-        hosts: granted.hosts,
+        grants: plan.grants.clone(),
         resident: master::resident_config(&built.flavour, &plan.parameters),
-    })
+    }
 }
 
 /// A servant that ends with this value.

@@ -91,7 +91,7 @@ impl Pusher {
         }
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
-        self.choreographer.grant(&options.grants)?;
+        self.choreographer.check_grants(&options.grants)?;
         Ok(self.choreographer.check_limits(&options.limits)?)
     }
 

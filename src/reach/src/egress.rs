@@ -249,6 +249,16 @@ pub fn ways_out(asked: &[String], allowed: &[String]) -> Result<Vec<Way>, Refuse
     Ok(ways)
 }
 
+/// Names of the hosts `asked` for, if they are `allowed`, each with the address inside that stands for it.
+pub fn hosts(asked: &[String], allowed: &[String]) -> Result<Vec<(IpAddr, String)>, Refused> {
+    let ways = ways_out(asked, allowed)?.into_iter();
+    // What is an address already has no name.
+    let named = ways.filter(|way| way.host.parse::<IpAddr>().is_err());
+    Ok(named
+        .map(|way| (IpAddr::V4(way.inside), way.host))
+        .collect())
+}
+
 fn way(
     name: &str,
     host: &str,

@@ -7,44 +7,51 @@
 //!  hosts outside ◀─ relays ◀─ loopback addresses inside
 //! ```
 //!
-//! It knows one servant at a time, and of the rest of the daemon what [`Observer`] and [`Tenant`] show.
+//! It knows one servant at a time, and of the rest of the daemon what [`Observer`] and [`Tenant`] show. The rest of the daemon
+//! knows it as a [`Reach`], which an [`Opener`] gives for a servant of its engine; [`LocalOpener`] is that of this host.
 
 #![forbid(unsafe_code)]
 
 pub mod egress;
 mod ends;
 pub mod links;
+mod local;
 pub mod master;
 mod nodes;
 pub mod readiness;
 mod request_times;
 mod sockets;
+mod trial;
 
 use std::collections::BTreeMap;
-use std::future::Future;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use bridge::{Bridge, BridgeOptions};
+use api::trial::Trial;
+use async_trait::async_trait;
+use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use budget::Budget;
+use futures_util::future::BoxFuture;
 use link::control::Request;
+use link::session::Lost;
+use package::interface::Interface;
 use package::inventory::Inventory;
-use ros::JoinOptions;
-use ros::bus::{Bus, BusError, ParamValue, RosVersion};
+use ros::bus::{Bus, BusError, Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use ros::schema::Registry;
+use servant::engine::Servant;
 use servant::spec::NodeSpec;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::watch;
 
-use egress::{Relays, Way};
-use links::{Hub, HubOptions};
+use egress::Relays;
+use links::LinkStatus;
 
 pub use ends::how_it_ended;
-pub use nodes::{LinkedNodes, has_none_of};
+pub use local::LocalOpener;
+pub use nodes::LinkedNodes;
 pub use request_times::RequestTimes;
-pub use sockets::ServantSockets;
-
-/// The name of our node in every servant's graph.
-const NODE: &str = "/cloudroid_bridge";
+pub use trial::{Material, Picture, RECORDED};
 
 /// What is recorded of the revision that a servant was started from.
 #[derive(Debug, Clone)]
@@ -65,8 +72,8 @@ pub struct Recorded {
     pub inventory: Arc<Inventory>,
     /// Message definitions.
     pub registry: Arc<Registry>,
-    /// Hosts that its nodes may connect to.
-    pub ways_out: Vec<Way>,
+    /// `HOST:PORT`s that its nodes were granted.
+    pub egress: Vec<String>,
 }
 
 /// The daemon, as one servant's reach sees it.
@@ -104,68 +111,90 @@ pub struct ReachOptions {
     pub unfinished: Duration,
 }
 
-/// ROS, sessions, links and ways out of one servant.
-pub struct Reach {
+/// A connection behind its upgrade.
+pub type Stream = Box<dyn Io>;
+
+/// What a [`Stream`] can do.
+pub trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
+
+/// What a running servant is to robots, wherever it runs: in this process over its namespace, or beside it in a pod, to which
+/// all this is forwarded.
+#[async_trait]
+pub trait Reach: Send + Sync + 'static {
+    /// Nodes, topics and services as they are registered, now and later.
+    fn graph(&self) -> watch::Receiver<Arc<Graph>>;
+    /// Speaks rosbridge with a client that has waited for the servant, until it ends.
+    async fn serve_rosbridge(&self, client: Waiting<Stream>, options: SessionOptions)
+    -> SessionEnd;
+    /// Serves a stub's connection behind its upgrade, until it ends; `read_ahead` was read from it already.
+    async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
+    /// How its links are doing, by node.
+    fn links(&self) -> Vec<LinkStatus>;
+    /// What was counted of its rosbridge sessions.
+    fn metrics(&self) -> &Metrics;
+    /// Messages dropped because a client or the bridge was slow.
+    fn dropped(&self) -> u64 {
+        let metrics = self.metrics();
+        metrics.dropped.get() + metrics.bus_dropped.get()
+    }
+    /// Pids of its processes, as whoever looks at the machine sees them.
+    fn processes(&self) -> Vec<i32>;
+    /// Gives it material, and tells what it answers and when.
+    async fn trial(
+        &self,
+        service: &str,
+        interface: &Interface,
+        material: Material,
+    ) -> Result<Trial, Error>;
+    /// From now on it serves this one.
+    fn bind(&self, tenant: Weak<dyn Tenant>);
+    /// Ends every rosbridge session, and refuses new ones, with these words.
+    fn close_sessions(&self, reason: &str);
+    /// Ends every session and every link, and refuses new ones, with these words.
+    fn close(&self, reason: &str);
+}
+
+/// Reaches servants, wherever their engine has started them.
+#[async_trait]
+pub trait Opener: Send + Sync + 'static {
+    /// Connects to the ROS of a running servant and sets a bridge before it. `recorded` is awaited meanwhile.
+    async fn open(
+        &self,
+        servant: &Arc<dyn Servant>,
+        recorded: BoxFuture<'_, Recorded>,
+        options: ReachOptions,
+        observer: Arc<dyn Observer>,
+    ) -> Result<Arc<dyn Reach>, Error>;
+    /// Connects to the ROS of a running servant as the node `name`, to find out what its nodes do.
+    async fn look(
+        &self,
+        servant: &Arc<dyn Servant>,
+        ros: RosVersion,
+        name: &str,
+        egress: &[String],
+    ) -> Result<Look, Error>;
+}
+
+/// A bus of a servant that is looked at; hosts that its nodes connect to are reached for as long as this lives.
+pub struct Look {
     /// Its ROS.
     pub bus: Arc<dyn Bus>,
-    /// Before it, for rosbridge's clients.
-    pub bridge: Arc<Bridge>,
-    /// Before it, for the robot's stubs.
-    pub hub: Arc<Hub>,
-    /// What those have started.
-    pub nodes: Arc<LinkedNodes>,
     _relays: Relays,
 }
 
-impl Reach {
-    /// Connects to the Master of a running container and sets a bridge before it. `recorded` is awaited meanwhile.
-    pub async fn open(
-        container: &Arc<dyn servant::engine::Servant>,
-        recorded: impl Future<Output = Recorded>,
-        options: ReachOptions,
-        observer: Arc<dyn Observer>,
-    ) -> Result<Arc<Reach>, BusError> {
-        let sockets = Arc::new(ServantSockets::new(&container.endpoint()));
-        let joining = JoinOptions {
-            budget: options.budget.clone(),
-            unfinished: options.unfinished,
-            ..JoinOptions::new(master::ADDRESS, NODE)
-        };
-        let joined = ros::connect(options.ros, sockets, joining);
-        let (bus, recorded) = tokio::join!(joined, recorded);
-        let bus = bus?;
-        let registry = Arc::clone(&recorded.registry);
-        let relays = Relays::open(&container.endpoint(), &recorded.ways_out).await;
-        let nodes = Arc::new(LinkedNodes::new(recorded, container, observer));
-        let hub = Hub::new(
-            container.id(),
-            Arc::clone(&bus),
-            Arc::clone(&registry),
-            Arc::clone(&nodes) as Arc<dyn links::Nodes>,
-            HubOptions {
-                grace: options.grace,
-                budget: options.budget.clone(),
-                unfinished: options.unfinished,
-                ..HubOptions::default()
-            },
-        );
-        let options = BridgeOptions {
-            budget: options.budget,
-            ..options.bridge
-        };
-        let bridge = Bridge::new(Arc::clone(&bus), registry, options);
-        Ok(Arc::new(Reach {
-            bus,
-            bridge,
-            hub,
-            nodes,
-            _relays: relays,
-        }))
-    }
-
-    /// Messages dropped because a client or the bridge was slow.
-    pub fn dropped(&self) -> u64 {
-        let metrics = self.bridge.metrics();
-        metrics.dropped.get() + metrics.bus_dropped.get()
-    }
+/// Why a servant is not reached, or not tried.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// Its ROS does not answer.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// It is none of the engine's that this reaches.
+    #[error("servant {0} does not run here")]
+    Elsewhere(String),
+    /// It cannot be tried with what was given.
+    #[error("{0}")]
+    Trial(String),
 }

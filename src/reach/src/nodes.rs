@@ -12,7 +12,7 @@ use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request, Sla};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
-use servant::engine::{NodeExit, Servant};
+use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::NodeSpec;
 use tokio::sync::mpsc;
 
@@ -37,17 +37,6 @@ const KINDS: [&str; 6] = [
     "local-missing",
     "local-crashed",
 ];
-
-/// Whether none of `nodes` was ever started in a container: of a servant that an earlier daemon left, whether it runs
-/// for stubs.
-pub fn has_none_of(nodes: &[NodeSpec], container: &Arc<dyn Servant>) -> bool {
-    nodes.iter().all(|node| {
-        matches!(
-            container.wait_node(&node.name).now_or_never(),
-            Some(Err(servant::Error::NoNode { .. }))
-        )
-    })
-}
 
 /// The nodes of one servant.
 pub struct LinkedNodes {
@@ -269,7 +258,7 @@ impl Nodes for LinkedNodes {
     }
 
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
-        let mut all = self.container.follow_log(false);
+        let mut all = self.container.follow(LogStart::Now);
         let (sender, lines) = mpsc::channel(LINES);
         let node = node.to_owned();
         tokio::spawn(async move {
@@ -314,7 +303,7 @@ mod tests {
                 ..Inventory::default()
             }),
             registry: Default::default(),
-            ways_out: Vec::new(),
+            egress: Vec::new(),
         }
     }
 

@@ -5,7 +5,6 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use servant::endpoint::Endpoint;
 use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 
@@ -16,10 +15,10 @@ pub struct ServantSockets {
 }
 
 impl ServantSockets {
-    /// Of the servant at `endpoint`.
-    pub fn new(endpoint: &Endpoint) -> ServantSockets {
+    /// Of the servant with this namespace.
+    pub fn new(netns: &Arc<NetNs>) -> ServantSockets {
         ServantSockets {
-            netns: Arc::clone(&endpoint.netns),
+            netns: Arc::clone(netns),
         }
     }
 }

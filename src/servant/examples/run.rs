@@ -11,10 +11,11 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
-use servant::engine::Engine;
+use servant::container::{ContainerSpec, Profile};
+use servant::engine::{LogStart, Servant};
 use servant::local::{LocalEngine, LocalEngineConfig};
 use servant::shim::NoResident;
-use servant::spec::{NodeSpec, Profile, Spec};
+use servant::spec::NodeSpec;
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -100,7 +101,7 @@ async fn run(arguments: Vec<OsString>) -> Result<ExitCode, Failure> {
     );
     let node: NodeSpec =
         serde_json::from_value(serde_json::json!({ "name": "/node", "argv": wish.argv }))?;
-    let spec = Spec {
+    let spec = ContainerSpec {
         id: format!("run-{}", std::process::id()),
         layers: wish.layers,
         writable: None,
@@ -114,13 +115,13 @@ async fn run(arguments: Vec<OsString>) -> Result<ExitCode, Failure> {
         resident: serde_json::Value::Null,
     };
     let begun = Instant::now();
-    let servant = engine.start(spec).await?;
+    let servant = engine.start_container(spec).await?;
     eprintln!(
         "running after {:.1} ms; in force: {:?}",
         begun.elapsed().as_secs_f64() * 1e3,
         servant.enforced()
     );
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     let printer = tokio::spawn(async move {
         while let Some(line) = lines.recv().await {
             println!("{}", line.line);
@@ -129,7 +130,7 @@ async fn run(arguments: Vec<OsString>) -> Result<ExitCode, Failure> {
     if wish.hold {
         eprintln!(
             "processes {:?}, {:?}; Enter ends it",
-            servant.processes().await?,
+            servant.processes()?,
             servant.usage().await?
         );
         tokio::task::spawn_blocking(|| std::io::stdin().read_line(&mut String::new())).await??;

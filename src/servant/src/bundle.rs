@@ -10,9 +10,9 @@ use oci_spec::runtime::{
     SpecBuilder, UserBuilder,
 };
 
+use crate::container::{ContainerSpec, Profile};
 use crate::rootfs::{COMPILE_USER, Staged};
 use crate::seccomp;
-use crate::spec::{Profile, Spec};
 
 /// Open files of one process; more only slows down programs that close every number they might have open.
 const OPEN_FILES: u64 = 16_384;
@@ -43,7 +43,11 @@ const READ_ONLY: [&str; 5] = [
 /// The configuration of the container whose root and volumes are staged. There is no network namespace in it: the creating
 /// process is in the servant's already and the container inherits it. Limits are not in it either: the cgroup is
 /// made, set and read back before.
-pub fn config(spec: &Spec, staged: &Staged, uid: (u32, u32)) -> Result<OciSpec, OciSpecError> {
+pub fn config(
+    spec: &ContainerSpec,
+    staged: &Staged,
+    uid: (u32, u32),
+) -> Result<OciSpec, OciSpecError> {
     let mapping = LinuxIdMappingBuilder::default()
         .container_id(0_u32)
         .host_id(uid.0)
@@ -102,7 +106,7 @@ fn oom_score(profile: Profile) -> i32 {
     inherited.trim().parse().unwrap_or(0).max(least)
 }
 
-fn process(spec: &Spec) -> Result<Process, OciSpecError> {
+fn process(spec: &ContainerSpec) -> Result<Process, OciSpecError> {
     let user = if spec.profile == Profile::Compile {
         COMPILE_USER
     } else {
@@ -160,7 +164,7 @@ fn rlimit(kind: PosixRlimitType, wanted: u64) -> Result<PosixRlimit, OciSpecErro
         .build()
 }
 
-fn mounts(spec: &Spec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSpecError> {
+fn mounts(spec: &ContainerSpec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSpecError> {
     let scratch = spec.limits.memory.map_or(SCRATCH, |bytes| bytes / 2);
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
@@ -245,8 +249,8 @@ mod tests {
     use super::*;
     use crate::spec::Limits;
 
-    fn spec(profile: Profile) -> Spec {
-        Spec {
+    fn spec(profile: Profile) -> ContainerSpec {
+        ContainerSpec {
             id: "x".into(),
             layers: vec![],
             writable: None,

@@ -21,8 +21,9 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
+use crate::container::ContainerSpec;
 use crate::engine::{Enforced, Usage};
-use crate::spec::{Limits, Spec};
+use crate::spec::Limits;
 
 mod cores;
 mod disk;
@@ -60,7 +61,7 @@ struct Leaf {
 
 impl Cgroup {
     /// Where the cgroup of a servant is, or would be.
-    pub fn planned(parent: &Parent, spec: &Spec) -> Self {
+    pub fn planned(parent: &Parent, spec: &ContainerSpec) -> Self {
         let asked = |hierarchy: &&hosts::Below| {
             let limits = &spec.limits;
             let asked = |controller: &str| match controller {

@@ -1,13 +1,13 @@
-//! The seam to whoever starts servants.
+//! The seam to whoever starts servants. It speaks of servants alone: no pid, user id, path or namespace of a host.
 
-use std::path::PathBuf;
-use std::time::SystemTime;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
 
+use api::Grants;
 use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
 
-use crate::endpoint::Endpoint;
 use crate::spec::{Limits, NodeSpec, Spec};
 
 /// Where a servant's container is in its life. (Admission and readiness, which need more knowledge than the
@@ -18,10 +18,7 @@ pub enum ContainerState {
     /// Directories, namespaces and cgroup are being made.
     Creating,
     /// Init runs; nodes are started or starting.
-    Running {
-        /// Init's pid on the host.
-        init_pid: i32,
-    },
+    Running,
     /// Ended as asked, or because its nodes did.
     Stopped {
         /// Why it ended.
@@ -34,6 +31,13 @@ pub enum ContainerState {
     },
 }
 
+impl ContainerState {
+    /// Whether nothing runs any more.
+    pub fn is_over(&self) -> bool {
+        matches!(self, Self::Stopped { .. } | Self::Failed { .. })
+    }
+}
+
 /// What happened to one process of a servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "event")]
@@ -42,8 +46,6 @@ pub enum NodeEvent {
     Started {
         /// The node's name.
         node: String,
-        /// Pid on the host.
-        pid: i32,
     },
     /// Its program could not be executed.
     ExecFailed {
@@ -146,6 +148,17 @@ pub struct LogLine {
     pub line: String,
 }
 
+/// Where in a log to begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogStart {
+    /// At the first line that is still there.
+    First,
+    /// So many lines back.
+    Last(usize),
+    /// Behind what was printed before.
+    Now,
+}
+
 /// A servant that an engine runs. Cheap to share; dropping it does not end the servant.
 #[async_trait]
 pub trait Servant: Send + Sync + 'static {
@@ -155,16 +168,19 @@ pub trait Servant: Send + Sync + 'static {
     fn state(&self) -> watch::Receiver<ContainerState>;
     /// Node events from now on.
     fn events(&self) -> broadcast::Receiver<NodeEvent>;
-    /// How to reach it; valid while it runs.
-    fn endpoint(&self) -> Endpoint;
     /// Limits read back from the kernel.
     fn enforced(&self) -> Enforced;
     /// Changes the limits that are given and leaves the others; answers what is in force then.
     async fn set_limits(&self, limits: Limits) -> Result<Enforced, crate::Error>;
-    /// Host pids of the node processes and all their children (not of init).
-    async fn processes(&self) -> Result<Vec<i32>, crate::Error>;
     /// Usage now.
     async fn usage(&self) -> Result<Usage, crate::Error>;
+    /// How long threads of its nodes could have run so far and others had the cores, summed up; nothing where that is not
+    /// counted.
+    async fn waited(&self) -> Duration {
+        Duration::ZERO
+    }
+    /// Names of the nodes that were ever started in it, or are about to be.
+    fn nodes(&self) -> Vec<String>;
     /// Starts one more node; returns when its program is executed, or with the reason why it could not be.
     async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
     /// Sends a signal to a node.
@@ -176,22 +192,31 @@ pub trait Servant: Send + Sync + 'static {
     }
     /// Waits for a node to end and tells how; answers at once when it has ended already.
     async fn wait_node(&self, node: &str) -> Result<NodeExit, crate::Error>;
-    /// Every line printed, from the first or from now on, none lost; ends when the container has ended.
-    fn follow_log(&self, from_start: bool) -> mpsc::Receiver<LogLine>;
-    /// First host uid (= gid) of its range and how many; uid 0 inside is the first.
-    fn uid_range(&self) -> (u32, u32);
-    /// Where its log is: JSON lines of [`LogLine`], rotated once to `.1`.
-    fn log_path(&self) -> PathBuf;
+    /// The last lines printed, at most so many, oldest first; of one node alone where one is named.
+    async fn logs(&self, last: usize, node: Option<&str>) -> Vec<LogLine>;
+    /// Every line printed, each once, none lost; ends when the container has ended.
+    fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine>;
     /// Ends it: SIGINT to the nodes, SIGTERM, then SIGKILL to all; returns when nothing is left
     /// (process, mount, cgroup, directory).
     async fn stop(&self) -> Result<(), crate::Error>;
 }
 
-/// What an engine found of an earlier daemon's.
+/// A servant that ended while no daemon watched.
+#[derive(Debug, Clone)]
+pub struct Ended {
+    /// The spec's id.
+    pub id: String,
+    /// How it ended; none where nothing was left to tell.
+    pub state: Option<ContainerState>,
+}
+
+/// What an engine found of an earlier daemon's: each servant is in one of the three.
 #[derive(Default)]
 pub struct Adopted {
     /// Servants that run.
-    pub running: Vec<std::sync::Arc<dyn Servant>>,
+    pub running: Vec<Arc<dyn Servant>>,
+    /// Servants that have ended; nothing is left of them.
+    pub ended: Vec<Ended>,
     /// Leftovers that could not be removed, each with the reason. Nothing of them is in anybody's way.
     pub failures: Vec<crate::Error>,
 }
@@ -199,9 +224,11 @@ pub struct Adopted {
 /// Starts and finds servants.
 #[async_trait]
 pub trait Engine: Send + Sync + 'static {
-    /// Starts one; returns once its init runs and its endpoint can be used.
-    async fn start(&self, spec: Spec) -> Result<std::sync::Arc<dyn Servant>, crate::Error>;
-    /// Those that an earlier daemon left running, adopted one by one; leftovers of dead ones are swept. Fails only where
-    /// nothing can be looked at.
+    /// Starts one; returns once its container runs and its nodes are started or starting.
+    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, crate::Error>;
+    /// Those that an earlier daemon left, one by one: adopted where they run, else removed. Fails only where nothing can
+    /// be looked at.
     async fn adopt(&self) -> Result<Adopted, crate::Error>;
+    /// Refuses grants that are not allowed or not there; answers, in words, what of them servants will lack.
+    fn check(&self, grants: &Grants) -> Result<Vec<String>, crate::Error>;
 }

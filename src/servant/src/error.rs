@@ -118,6 +118,17 @@ pub enum Error {
         /// How many ranges there are.
         ranges: u32,
     },
+    /// Something is asked for that is not granted.
+    #[error(transparent)]
+    Grant(#[from] crate::local::grants::GrantError),
+    /// The layers of an image cannot be had.
+    #[error("image {image} cannot be used: {source}")]
+    Image {
+        /// Its digest.
+        image: String,
+        /// Why not.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// Something that was written by another process is not what it should be.
     #[error("{path} holds something unexpected: {reason}")]
     Malformed {

@@ -20,11 +20,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::cgroup::{Cgroup, Parent};
+use crate::container::ContainerSpec;
 use crate::engine::ContainerState;
 use crate::local::{Grace, Isolation};
 use crate::process::Identity;
 use crate::protocol::NodeStatus;
-use crate::spec::{Limits, Spec};
+use crate::spec::Limits;
 
 /// [`Launch`]'s file.
 pub const SPEC: &str = "spec.json";
@@ -44,7 +45,7 @@ const SHIM_CPUS: f64 = 0.1;
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Launch {
     /// With the engine's default limits filled in.
-    pub spec: Spec,
+    pub spec: ContainerSpec,
     /// First host uid and how many.
     pub uid_range: (u32, u32),
     /// Where its cgroup is made.

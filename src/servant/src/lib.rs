@@ -1,5 +1,6 @@
-//! Starts servants. In: a [`spec::Spec`]. Out: a [`endpoint::Endpoint`] to reach its nodes by, and a watch
-//! channel of states. Knows nothing of ROS and nothing of robots.
+//! Starts servants. The seam is [`engine`]: an engine is given a [`spec::Spec`] and gives a [`engine::Servant`], whose states,
+//! nodes and log can be watched. All other modules are of the engine of this host ([`local::LocalEngine`]); what it alone
+//! offers (pids, network namespaces, [`sandbox`]es for builds) is on its own types. Knows nothing of ROS and nothing of robots.
 //!
 //! ```text
 //!   daemon                     shim (one per servant, outlives the daemon)        container
@@ -12,7 +13,7 @@
 
 pub mod bundle;
 pub mod cgroup;
-pub mod endpoint;
+pub mod container;
 pub mod engine;
 mod error;
 pub mod host;
@@ -24,6 +25,7 @@ pub mod netns;
 pub mod process;
 pub mod protocol;
 pub mod rootfs;
+pub mod sandbox;
 pub mod seccomp;
 pub mod shim;
 pub mod spec;

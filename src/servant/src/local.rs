@@ -1,20 +1,27 @@
 //! The engine of this host: one shim process and one directory for each servant.
 
+use std::collections::HashMap;
+use std::error::Error as StdError;
 use std::ffi::OsString;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
+
+use api::Grants;
 
 use async_trait::async_trait;
 use tokio::sync::oneshot;
 
 use crate::Error;
 use crate::cgroup::Parent;
-use crate::engine::{Adopted, Engine, Servant};
+use crate::container::{ContainerSpec, Profile};
+use crate::engine::{Adopted, Ended, Engine, Servant};
 use crate::launch::{self, Exit, Runtime};
 use crate::spec::{Limits, Spec};
 
 mod connection;
+pub mod grants;
 mod handle;
 mod pool;
 mod start;
@@ -37,6 +44,39 @@ pub enum Isolation {
     Require,
     /// Start, and say what is not in force.
     BestEffort,
+}
+
+/// What the engine of this host is told by those who know it.
+#[async_trait]
+pub trait Resources: Send + Sync + 'static {
+    /// The extracted layers of an image, lowest first.
+    async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Box<dyn StdError + Send + Sync>>;
+    /// Names of the hosts that `HOST:PORT`s lead to, each with the loopback address inside that stands for it; or which of
+    /// them is not allowed.
+    fn hosts(
+        &self,
+        egress: &[String],
+    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>>;
+}
+
+/// Knows no image and no host: for whoever starts containers of layers alone.
+struct NoResources;
+
+#[async_trait]
+impl Resources for NoResources {
+    async fn layers(&self, _image: &str) -> Result<Vec<PathBuf>, Box<dyn StdError + Send + Sync>> {
+        Err("this engine was given no images".into())
+    }
+
+    fn hosts(
+        &self,
+        egress: &[String],
+    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>> {
+        match egress.first() {
+            Some(name) => Err(format!("this engine gives no way out to {name}").into()),
+            None => Ok(Vec::new()),
+        }
+    }
 }
 
 /// Below which cgroup servants live.
@@ -90,6 +130,8 @@ pub struct LocalEngineConfig {
     pub isolation: Isolation,
     /// How long nodes have to end when the servant is stopped.
     pub grace: Grace,
+    /// What of this host services may be given.
+    pub allow: grants::Allow,
 }
 
 impl LocalEngineConfig {
@@ -114,41 +156,24 @@ impl LocalEngineConfig {
             cgroup_parent: CgroupParent::Auto,
             isolation: Isolation::Require,
             grace: Grace::default(),
+            allow: grants::Allow::default(),
         }
     }
 }
 
-/// A servant that ended while no daemon watched.
-#[derive(Debug, Clone)]
-pub struct Ended {
-    /// The servant's id.
-    pub id: String,
-    /// How it and its nodes ended; none when its shim was killed before it could say.
-    pub exit: Option<Exit>,
-}
-
-/// What an earlier daemon left.
-#[derive(Debug, Default)]
-pub struct Adoption {
-    /// Still running.
-    pub running: Vec<Arc<LocalServant>>,
-    /// Ended meanwhile; everything of them was removed.
-    pub ended: Vec<Ended>,
-    /// Could not be removed.
-    pub failures: Vec<Error>,
-}
-
 /// Starts and finds servants on this host. Cheap to clone.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct LocalEngine {
     shared: Arc<Shared>,
+    resources: Arc<dyn Resources>,
 }
 
-#[derive(Debug)]
 struct Shared {
     config: LocalEngineConfig,
     parent: Parent,
     networks: pool::Networks,
+    /// Those that somebody holds, by id.
+    servants: Mutex<HashMap<String, Weak<LocalServant>>>,
 }
 
 impl Drop for Shared {
@@ -158,7 +183,8 @@ impl Drop for Shared {
 }
 
 impl LocalEngine {
-    /// Looks at the host and makes the servants' directory. Needs root.
+    /// Looks at the host and makes the servants' directory. Needs root. It knows no images until it is told of
+    /// [`Resources`].
     pub fn new(config: LocalEngineConfig) -> Result<Self, Error> {
         if !nix::unistd::geteuid().is_root() {
             let source = std::io::Error::from(std::io::ErrorKind::PermissionDenied);
@@ -185,8 +211,22 @@ impl LocalEngine {
                 config,
                 parent,
                 networks,
+                servants: Mutex::default(),
             }),
+            resources: Arc::new(NoResources),
         })
+    }
+
+    /// The same engine, which asks `resources` what images and hosts are.
+    pub fn with(self, resources: Arc<dyn Resources>) -> Self {
+        Self { resources, ..self }
+    }
+
+    /// A servant of this engine that somebody holds.
+    pub fn servant(&self, id: &str) -> Option<Arc<LocalServant>> {
+        let servants = self.shared.servants.lock();
+        let servants = servants.unwrap_or_else(PoisonError::into_inner);
+        servants.get(id).and_then(Weak::upgrade)
     }
 
     /// What this host can limit: the cgroup version, the controllers, and what is amiss.
@@ -199,8 +239,36 @@ impl LocalEngine {
         self.shared.networks.refill();
     }
 
-    /// [`Engine::start`], with this engine's own type.
-    pub async fn start_local(&self, spec: Spec) -> Result<Arc<LocalServant>, Error> {
+    /// What a servant's container is on this host.
+    async fn resolve(&self, spec: Spec) -> Result<ContainerSpec, Error> {
+        let layers = self.resources.layers(&spec.image).await;
+        let layers = layers.map_err(|source| Error::Image {
+            image: spec.image,
+            source,
+        })?;
+        let granted = self.granted(&spec.grants)?;
+        Ok(ContainerSpec {
+            id: spec.id,
+            layers,
+            writable: None,
+            profile: Profile::Servant,
+            limits: spec.limits,
+            environment: granted.environment_over(&spec.environment),
+            nodes: spec.nodes,
+            owned_directories: Vec::new(),
+            mounts: granted.mounts,
+            hosts: granted.hosts,
+            resident: spec.resident,
+        })
+    }
+
+    fn granted(&self, grants: &Grants) -> Result<grants::Granted, Error> {
+        let allow = &self.shared.config.allow;
+        Ok(grants::resolve(grants, allow, &*self.resources)?)
+    }
+
+    /// [`Engine::start`] of a container that is described by what there is on this host.
+    pub async fn start_container(&self, spec: ContainerSpec) -> Result<Arc<LocalServant>, Error> {
         let (sender, receiver) = oneshot::channel();
         let shared = self.shared.clone();
         let id = spec.id.clone();
@@ -217,46 +285,9 @@ impl LocalEngine {
             id,
             reason: "the engine is shutting down".into(),
         };
-        receiver.await.map_err(gone)?
-    }
-
-    /// [`Engine::adopt`], and what was found besides.
-    pub async fn adopt_all(&self) -> Result<Adoption, Error> {
-        let home = &self.shared.config.home_servants_dir;
-        let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
-        let mut adoption = Adoption::default();
-        for entry in entries {
-            let entry = match entry.map_err(Error::file("read", home)) {
-                Ok(entry) => entry,
-                Err(error) => {
-                    adoption.failures.push(error);
-                    continue;
-                }
-            };
-            let directory = entry.path();
-            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-                // None of ours: it is left to whoever put it there.
-                adoption.failures.push(Error::Stray { path: directory });
-                continue;
-            }
-            let id = directory
-                .file_name()
-                .unwrap_or_default()
-                .to_string_lossy()
-                .into_owned();
-            match self.adopt_one(&id, &directory).await {
-                Ok(Some(servant)) => adoption.running.push(servant),
-                Ok(None) => {
-                    let exit = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
-                    match sweep::sweep(&id, &directory).await {
-                        Ok(()) => adoption.ended.push(Ended { id, exit }),
-                        Err(error) => adoption.failures.push(error),
-                    }
-                }
-                Err(error) => adoption.failures.push(error),
-            }
-        }
-        Ok(adoption)
+        let servant = receiver.await.map_err(gone)??;
+        self.shared.keep(&servant);
+        Ok(servant)
     }
 
     /// None when nothing of it runs.
@@ -279,7 +310,10 @@ impl LocalEngine {
             return Ok(None);
         };
         match handle::adopt(id, directory, &runtime, pidfd).await {
-            Ok(servant) => Ok(Some(servant)),
+            Ok(servant) => {
+                self.shared.keep(&servant);
+                Ok(Some(servant))
+            }
             Err(error) => {
                 tracing::warn!(%error, id, "a shim does not answer and is ended");
                 Ok(None)
@@ -288,21 +322,66 @@ impl LocalEngine {
     }
 }
 
+impl Shared {
+    /// So that it is found by its id while somebody holds it.
+    fn keep(&self, servant: &Arc<LocalServant>) {
+        let servants = self.servants.lock();
+        let mut servants = servants.unwrap_or_else(PoisonError::into_inner);
+        servants.retain(|_, held| held.strong_count() > 0);
+        servants.insert(servant.id().to_owned(), Arc::downgrade(servant));
+    }
+}
+
 #[async_trait]
 impl Engine for LocalEngine {
     async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, Error> {
-        Ok(self.start_local(spec).await?)
+        let spec = self.resolve(spec).await?;
+        Ok(self.start_container(spec).await?)
     }
 
     async fn adopt(&self) -> Result<Adopted, Error> {
-        let adoption = self.adopt_all().await?;
-        for ended in &adoption.ended {
-            tracing::info!(id = ended.id, exit = ?ended.exit, "a servant had ended; its leftovers are removed");
+        let home = &self.shared.config.home_servants_dir;
+        let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
+        let mut adoption = Adopted::default();
+        for entry in entries {
+            let entry = match entry.map_err(Error::file("read", home)) {
+                Ok(entry) => entry,
+                Err(error) => {
+                    adoption.failures.push(error);
+                    continue;
+                }
+            };
+            let directory = entry.path();
+            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                // None of ours: it is left to whoever put it there.
+                adoption.failures.push(Error::Stray { path: directory });
+                continue;
+            }
+            let id = directory
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned();
+            match self.adopt_one(&id, &directory).await {
+                Ok(Some(servant)) => adoption.running.push(servant),
+                Ok(None) => {
+                    let exit: Option<Exit> =
+                        launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+                    match sweep::sweep(&id, &directory).await {
+                        Ok(()) => adoption.ended.push(Ended {
+                            id,
+                            state: exit.map(|exit| exit.state),
+                        }),
+                        Err(error) => adoption.failures.push(error),
+                    }
+                }
+                Err(error) => adoption.failures.push(error),
+            }
         }
-        let running = adoption.running.into_iter();
-        Ok(Adopted {
-            running: running.map(|servant| servant as Arc<dyn Servant>).collect(),
-            failures: adoption.failures,
-        })
+        Ok(adoption)
+    }
+
+    fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {
+        Ok(self.granted(grants)?.unfulfilled)
     }
 }

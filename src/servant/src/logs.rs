@@ -1,7 +1,7 @@
 //! What nodes print: `log.jsonl` in the servant's directory, one JSON object a line ([`LogLine`] with its number), rotated
 //! once to `log.jsonl.1`.
 //!
-//! The shim writes ([`Writer`]), whoever wants reads ([`follow`]): neither waits for the other. Lines are numbered, so that
+//! The shim writes ([`Writer`]), whoever wants reads ([`follow`], [`last`]): neither waits for the other. Lines are numbered, so that
 //! a reader who was too slow for the rotation is told how many it missed instead of missing them silently.
 
 use std::fs::{self, File};
@@ -12,8 +12,10 @@ use std::time::SystemTime;
 use crate::engine::LogLine;
 
 mod follow;
+mod tail;
 
-pub use follow::follow;
+pub use follow::{follow, with_past};
+pub use tail::last;
 
 /// The file's name in the servant's directory.
 pub const FILE: &str = "log.jsonl";

@@ -28,6 +28,27 @@ impl NodeStatus {
     }
 }
 
+/// The container as its shim knows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    /// Where it is in its life.
+    #[serde(flatten)]
+    pub state: ContainerState,
+    /// Init's pid on the host while it runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init_pid: Option<i32>,
+}
+
+impl From<ContainerState> for State {
+    /// Of one without an init.
+    fn from(state: ContainerState) -> Self {
+        Self {
+            state,
+            init_pid: None,
+        }
+    }
+}
+
 /// From the shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "type")]
@@ -37,7 +58,7 @@ pub enum FromShim {
         /// Who speaks.
         shim: Identity,
         /// The container.
-        state: ContainerState,
+        state: State,
         /// Its nodes by name.
         nodes: BTreeMap<String, NodeStatus>,
         /// Limits in force.
@@ -46,7 +67,7 @@ pub enum FromShim {
     /// The container's state has changed.
     State {
         /// To this.
-        state: ContainerState,
+        state: State,
     },
     /// Something happened to a node.
     Node {
@@ -73,7 +94,7 @@ impl NodeEvent {
     /// Which node it is about.
     pub fn node(&self) -> &str {
         match self {
-            Self::Started { node, .. }
+            Self::Started { node }
             | Self::ExecFailed { node, .. }
             | Self::Exited { node, .. }
             | Self::Respawning { node } => node,
@@ -134,7 +155,10 @@ mod tests {
         };
         let messages = [
             FromShim::State {
-                state: ContainerState::Running { init_pid: 7 },
+                state: State {
+                    state: ContainerState::Running,
+                    init_pid: Some(7),
+                },
             },
             FromShim::Node {
                 event,
@@ -145,11 +169,20 @@ mod tests {
                 error: Some("no".into()),
             },
         ];
-        for message in messages {
-            let text = line(&message);
+        for message in &messages {
+            let text = line(message);
             assert_eq!(text.iter().filter(|byte| **byte == b'\n').count(), 1);
-            assert_eq!(serde_json::from_slice::<FromShim>(&text).unwrap(), message);
+            assert_eq!(serde_json::from_slice::<FromShim>(&text).unwrap(), *message);
         }
+        // As every version has written them: a daemon must understand the shims that an earlier one has started.
+        assert_eq!(
+            line(&messages[0]),
+            b"{\"type\":\"state\",\"state\":{\"state\":\"running\",\"init_pid\":7}}\n"
+        );
+        let earlier = r#"{"type":"node","event":{"event":"started","node":"/a","pid":9},"status":{"pid":9,"exit":null,"starts":1}}"#;
+        let read: FromShim = serde_json::from_str(earlier).unwrap();
+        let started = NodeEvent::Started { node: "/a".into() };
+        assert!(matches!(read, FromShim::Node { event, .. } if event == started));
         let request = Request {
             id: 3,
             command: Command::SignalNode {

@@ -14,7 +14,7 @@ use std::path::{Component, Path, PathBuf};
 use nix::mount::{MsFlags, mount};
 use nix::unistd::{Gid, Uid};
 
-use crate::spec::Mount;
+use crate::container::Mount;
 use crate::{Error, sys};
 
 mod skeleton;

@@ -10,7 +10,7 @@ use oci_spec::runtime::{
     LinuxSeccompBuilder, LinuxSeccompOperator, LinuxSyscall, LinuxSyscallBuilder,
 };
 
-use crate::spec::Profile;
+use crate::container::Profile;
 
 /// Allowed whatever their arguments.
 const ALLOWED: &[&str] = &[

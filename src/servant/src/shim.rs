@@ -37,7 +37,7 @@ mod streams;
 pub struct ResidentContext {
     /// The servant's id.
     pub id: String,
-    /// [`crate::spec::Spec::resident`], as it was given.
+    /// [`crate::container::ContainerSpec::resident`], as it was given.
     pub config: serde_json::Value,
     /// The servant's state directory on the host.
     pub directory: PathBuf,

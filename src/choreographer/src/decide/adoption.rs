@@ -7,7 +7,7 @@ pub struct Found {
     pub recorded: bool,
     /// The revision that it was started from is known.
     pub published: bool,
-    /// No process of a node runs in it; false where that cannot be told.
+    /// No node was ever started in it.
     pub empty: bool,
 }
 

@@ -4,6 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::driver::{self, Beginning};
+use servant::engine::ContainerState;
+
 use crate::Error;
 use crate::decide::adoption::{Fate, Found, fate};
 use crate::{Choreographer, Handle};
@@ -35,7 +37,7 @@ impl Choreographer {
             let fate = fate(Found {
                 recorded: record.is_some(),
                 published: revision.is_some(),
-                empty: servant.processes().await.is_ok_and(|all| all.is_empty()),
+                empty: servant.nodes().is_empty(),
             });
             match (fate, record.zip(revision)) {
                 (Fate::Kept, Some((record, revision))) => {
@@ -60,12 +62,23 @@ impl Choreographer {
                 }
             }
         }
+        let mut ends: HashMap<String, Option<ContainerState>> = found
+            .ended
+            .into_iter()
+            .map(|ended| (ended.id, ended.state))
+            .collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
+            let why = match ends.remove(&gone.id).flatten() {
+                Some(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
+                    format!(": {reason}")
+                }
+                _ => String::new(),
+            };
             inner.journal.warning(
                 "servant-lost",
                 &format!(
-                    "servant {} of {} for {} ended while no daemon ran",
+                    "servant {} of {} for {} ended while no daemon ran{why}",
                     gone.id, gone.service, gone.robot
                 ),
                 &NewEvent {
@@ -108,7 +121,10 @@ impl Choreographer {
             revision,
             record.created,
         ));
-        if reach::has_none_of(&handle.revision.plan.nodes, &servant) {
+        // One whose own nodes were never started works for stubs.
+        let started = servant.nodes();
+        let own = &handle.revision.plan.nodes;
+        if !own.iter().any(|node| started.contains(&node.name)) {
             handle.set_linked();
         }
         {

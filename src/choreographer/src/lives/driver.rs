@@ -17,7 +17,7 @@ use super::waiting::Permit;
 use super::{Inner, starting};
 use crate::decide::admission::Class;
 use crate::handle::{Failure, Handle};
-use crate::{tail, with_last_words};
+use crate::with_last_words;
 
 /// Lines of the log that explain a failure.
 const LOG_LINES: usize = 20;
@@ -42,8 +42,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     handle.set_over(&outcome);
     let farewell = tell_end(&inner, &handle, &outcome);
     if let Some(reach) = handle.take_reach() {
-        reach.hub.close(&farewell);
-        reach.bridge.close(&farewell);
+        reach.close(&farewell);
     }
     if let Some(container) = handle.container()
         && let Err(error) = container.stop().await
@@ -157,7 +156,7 @@ async fn run(
     inner: &Arc<Inner>,
     handle: &Arc<Handle>,
     container: &Arc<dyn Servant>,
-    reached: Option<Arc<Reach>>,
+    reached: Option<Arc<dyn Reach>>,
     nodes: &mut Nodes<'_>,
     fresh: bool,
 ) -> Result<Infallible, Failure> {
@@ -167,11 +166,11 @@ async fn run(
         None => starting::reach(inner, handle, container, deadline).await?,
     };
     let tenant: Weak<Handle> = Arc::downgrade(handle);
-    reach.nodes.bind(tenant);
+    reach.bind(tenant);
     handle.set_reach(Arc::clone(&reach));
     handle.set_phase(Phase::Starting);
     tokio::select! {
-        ready = interface_there(inner, handle, &reach, deadline, fresh), if !handle.is_linked() => ready?,
+        ready = interface_there(inner, handle, &*reach, deadline, fresh), if !handle.is_linked() => ready?,
         () = std::future::ready(()), if handle.is_linked() => {}
         failure = nodes.supervise() => return Err(failure),
     }
@@ -218,13 +217,7 @@ async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
 /// Comes back when the container has ended, which nobody asked for.
 async fn container_over(container: &Arc<dyn Servant>) -> Failure {
     let mut states = container.state();
-    let over = |state: &ContainerState| {
-        matches!(
-            state,
-            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-        )
-    };
-    match states.wait_for(over).await.as_deref() {
+    match states.wait_for(ContainerState::is_over).await.as_deref() {
         Ok(ContainerState::Stopped { reason }) => Failure::broken(format!("ended: {reason}")),
         Ok(ContainerState::Failed { reason }) => Failure::broken(format!("failed: {reason}")),
         _ => Failure::broken("was lost by the engine"),
@@ -234,7 +227,7 @@ async fn container_over(container: &Arc<dyn Servant>) -> Failure {
 async fn with_log(failure: Failure, handle: &Handle) -> Failure {
     match (failure, handle.container()) {
         (Failure::Broken { reason, log }, Some(container)) if log.is_empty() => {
-            let lines = tail::last(container.log_path(), LOG_LINES, None).await;
+            let lines = container.logs(LOG_LINES, None).await;
             let log = lines
                 .into_iter()
                 .map(|line| format!("{}: {}", line.node, line.line))

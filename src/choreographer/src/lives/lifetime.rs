@@ -17,13 +17,13 @@ use crate::handle::{Failure, Handle};
 pub(super) async fn interface_there(
     inner: &Inner,
     handle: &Handle,
-    reach: &Reach,
+    reach: &dyn Reach,
     deadline: Instant,
     fresh: bool,
 ) -> Result<(), Failure> {
     let interface: &Interface = &handle.revision.interface;
     let image = &handle.revision.image;
-    let mut graphs = reach.bus.graph();
+    let mut graphs = reach.graph();
     let mut changed = Instant::now();
     loop {
         let graph = graphs.borrow_and_update().clone();

@@ -16,7 +16,6 @@ use tokio::time::Instant;
 use super::Inner;
 use crate::decide::nodes::{Crew, Ended, Event, Next, after};
 use crate::handle::{Failure, Handle};
-use crate::tail;
 
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
@@ -227,8 +226,7 @@ impl<'a> Nodes<'a> {
     }
 
     async fn failure(&mut self, node: &NodeSpec, reason: String) -> Failure {
-        let (path, name) = (self.container.log_path(), node.name.clone());
-        let lines = tail::last(path, LOG_LINES, Some(name)).await;
+        let lines = self.container.logs(LOG_LINES, Some(&node.name)).await;
         Failure::Broken {
             reason,
             log: lines.into_iter().map(|line| line.line).collect(),

@@ -6,19 +6,17 @@ use api::Level;
 use catalogue::{Catalogue, Known};
 use link::control::Request;
 use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
-use ros::bus::BusError;
 use servant::engine::Servant;
 use store::{Journal, NewEvent, RevisionRecord};
 
 use super::Inner;
-use crate::grants;
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
     inner: &Inner,
     revision: &Arc<RevisionRecord>,
     container: &Arc<dyn Servant>,
-) -> Result<Arc<Reach>, BusError> {
+) -> Result<Arc<dyn Reach>, reach::Error> {
     let memory = &inner.memory;
     let options = ReachOptions {
         ros: revision.flavour.ros.bus(),
@@ -34,13 +32,11 @@ pub(crate) async fn open(
         journal: inner.journal.clone(),
         request_times: Arc::clone(&inner.request_times),
     };
-    Reach::open(
-        container,
-        recorded(inner, revision),
-        options,
-        Arc::new(told),
-    )
-    .await
+    let recorded = Box::pin(recorded(inner, revision));
+    let opener = &inner.opener;
+    opener
+        .open(container, recorded, options, Arc::new(told))
+        .await
 }
 
 async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
@@ -66,8 +62,7 @@ async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
         parameters: plan.parameters.clone(),
         inventory,
         registry,
-        // Not allowed any more: then the servant would not have been started either.
-        ways_out: grants::ways_out(&plan.grants, &inner.options.allow).unwrap_or_default(),
+        egress: plan.grants.egress.clone(),
     }
 }
 

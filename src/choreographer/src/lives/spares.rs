@@ -28,7 +28,7 @@ pub(crate) struct Spare {
     /// Its container.
     pub(crate) container: Arc<dyn Servant>,
     /// Its ROS and its bridge.
-    pub(crate) reach: Arc<Reach>,
+    pub(crate) reach: Arc<dyn Reach>,
     revision: Arc<RevisionRecord>,
 }
 
@@ -52,10 +52,7 @@ struct Kept {
 
 impl Spare {
     fn runs(&self) -> bool {
-        matches!(
-            *self.container.state().borrow(),
-            ContainerState::Running { .. }
-        )
+        *self.container.state().borrow() == ContainerState::Running
     }
 
     /// As decisions see it.
@@ -71,7 +68,7 @@ impl Spare {
 
     /// Ends it; nothing is left.
     pub(crate) async fn end(self) {
-        self.reach.bridge.close("the spare is not needed");
+        self.reach.close("the spare is not needed");
         if let Err(error) = self.container.stop().await {
             let id = self.container.id();
             tracing::warn!("spare {id} could not be cleaned up: {error}");
@@ -195,7 +192,7 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare, Error> {
     let id = names::servant_id(&revision.service);
     let limits = inner.asked(revision.plan.limits).limits();
-    let spec = starting::spec(inner, &id, &revision, &limits, Vec::new()).await?;
+    let spec = starting::spec(inner, &id, &revision, &limits, Vec::new())?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.options.start;
     let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;

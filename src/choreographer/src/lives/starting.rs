@@ -6,14 +6,14 @@ use futures_util::future::join_all;
 use reach::Reach;
 use reach::master::resident_config;
 use servant::engine::Servant;
-use servant::spec::{NodeSpec, Profile, Spec};
+use servant::spec::{NodeSpec, Spec};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::time::{Instant, timeout_at};
 
 use super::spares::Spare;
 use super::{Inner, reaching};
 use crate::handle::{Failure, Handle};
-use crate::{Error, engine_limits, grants};
+use crate::{Error, engine_limits};
 
 /// Writes down that the servant is, before it runs: a daemon killed now finds it again.
 pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
@@ -35,7 +35,7 @@ pub(super) async fn start(
     handle: &Arc<Handle>,
 ) -> Result<Arc<dyn Servant>, Failure> {
     let nodes = planned(handle);
-    let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes).await;
+    let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes);
     let started = inner.engine.start(spec.map_err(could_not_start)?).await;
     started.map_err(|error| could_not_start(error.into()))
 }
@@ -73,7 +73,7 @@ pub(super) async fn reach(
     handle: &Arc<Handle>,
     container: &Arc<dyn Servant>,
     deadline: Instant,
-) -> Result<Arc<Reach>, Failure> {
+) -> Result<Arc<dyn Reach>, Failure> {
     let late = |_| {
         let limit = inner.options.start.as_secs();
         Failure::broken(format!("did not start its ROS Master within {limit} s"))
@@ -85,17 +85,15 @@ pub(super) async fn reach(
 }
 
 /// What the engine is to make: a servant of this revision, with these nodes.
-pub(super) async fn spec(
-    inner: &Arc<Inner>,
+pub(super) fn spec(
+    inner: &Inner,
     id: &str,
     revision: &RevisionRecord,
     limits: &api::Limits,
     nodes: Vec<NodeSpec>,
 ) -> Result<Spec, Error> {
-    let layers = inner.catalogue.layers(revision).await?;
     let plan = &revision.plan;
-    let granted = grants::resolve(&plan.grants, &inner.options.allow)?;
-    for what in &granted.unfulfilled {
+    for what in inner.engine.check(&plan.grants)? {
         let about = NewEvent {
             service: Some(&revision.service),
             servant: Some(id),
@@ -106,15 +104,11 @@ pub(super) async fn spec(
     }
     Ok(Spec {
         id: id.to_owned(),
-        layers,
-        writable: None,
-        profile: Profile::Servant,
+        image: revision.image.clone(),
         limits: engine_limits(limits),
-        environment: granted.environment_over(&plan.environment),
+        environment: plan.environment.clone(),
         nodes,
-        owned_directories: Vec::new(),
-        mounts: granted.mounts,
-        hosts: granted.hosts,
+        grants: plan.grants.clone(),
         resident: resident_config(&revision.flavour, &plan.parameters),
     })
 }

@@ -26,7 +26,6 @@ impl Config {
             grace: servant.grace.0,
             anonymous_grace: servant.anonymous_grace.0,
             spares: servant.warm_pool,
-            allow: self.allow.clone(),
             bridge: bridge_options(self),
             memory: MemoryOptions {
                 daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use parking_lot::Mutex;
-use servant::endpoint::Endpoint;
+use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
@@ -27,11 +27,11 @@ pub struct Relays {
 
 impl Relays {
     /// Opens them. One that cannot be opened is told, and missing.
-    pub async fn open(endpoint: &Endpoint, ways_out: &[Way]) -> Relays {
+    pub async fn open(network: &NetNs, ways_out: &[Way]) -> Relays {
         let mut listeners = JoinSet::new();
         for way in ways_out {
             let inside = SocketAddr::from((way.inside, way.port));
-            match endpoint.netns.listen(inside).await {
+            match network.listen(inside).await {
                 Ok(listener) => {
                     listeners.spawn(pass_on(listener, way.clone()));
                 }

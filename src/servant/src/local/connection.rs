@@ -1,6 +1,7 @@
 //! The daemon's end of a connection to a shim: what the shim tells is kept and passed on, what is asked is sent.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
@@ -9,7 +10,7 @@ use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
 
 use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{self, Command, FromShim, NodeStatus, Request};
+use crate::protocol::{self, Command, FromShim, NodeStatus, Request, State};
 
 /// Events that a slow listener may be behind.
 const EVENTS: usize = 256;
@@ -18,6 +19,8 @@ const EVENTS: usize = 256;
 #[derive(Debug)]
 pub(super) struct Known {
     pub(super) state: watch::Sender<ContainerState>,
+    /// Init's pid on the host; 0: not known.
+    init: AtomicI32,
     pub(super) events: broadcast::Sender<NodeEvent>,
     pub(super) nodes: watch::Sender<BTreeMap<String, NodeStatus>>,
     pub(super) enforced: watch::Sender<Enforced>,
@@ -37,6 +40,7 @@ impl Default for Known {
     fn default() -> Self {
         Self {
             state: watch::Sender::new(ContainerState::Creating),
+            init: AtomicI32::new(0),
             events: broadcast::Sender::new(EVENTS),
             nodes: watch::Sender::default(),
             enforced: watch::Sender::default(),
@@ -73,11 +77,9 @@ impl Known {
             } => {
                 self.enforced.send_replace(enforced);
                 self.nodes.send_replace(nodes);
-                self.state.send_replace(state);
+                self.enter(state);
             }
-            FromShim::State { state } => {
-                self.state.send_replace(state);
-            }
+            FromShim::State { state } => self.enter(state),
             FromShim::Node { event, status } => {
                 self.nodes.send_modify(|nodes| {
                     nodes.insert(event.node().to_owned(), status);
@@ -100,6 +102,18 @@ impl Known {
                 }
             }
         }
+    }
+
+    fn enter(&self, told: State) {
+        if let Some(pid) = told.init_pid {
+            self.init.store(pid, Ordering::Release);
+        }
+        self.state.send_replace(told.state);
+    }
+
+    /// Init's pid on the host.
+    pub(super) fn init(&self) -> Option<i32> {
+        Some(self.init.load(Ordering::Acquire)).filter(|pid| *pid != 0)
     }
 
     /// A number for a request, and where its answer will come; none when the connection is closed.

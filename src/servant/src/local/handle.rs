@@ -17,8 +17,9 @@ use super::connection::{Known, Requests, Unfulfilled};
 use super::sweep;
 use crate::Error;
 use crate::cgroup::Cgroup;
-use crate::endpoint::Endpoint;
-use crate::engine::{ContainerState, Enforced, LogLine, NodeEvent, NodeExit, Servant, Usage};
+use crate::engine::{
+    ContainerState, Enforced, LogLine, LogStart, NodeEvent, NodeExit, Servant, Usage,
+};
 use crate::launch::{self, Exit, Launch, Runtime};
 use crate::local::Grace;
 use crate::netns::NetNs;
@@ -96,7 +97,7 @@ pub(super) async fn started(
     }
     let reached = state.borrow().clone();
     match reached {
-        ContainerState::Running { .. } => Ok(servant),
+        ContainerState::Running => Ok(servant),
         ContainerState::Creating => Err(ended()),
         ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
             Err(Error::Start {
@@ -203,10 +204,7 @@ async fn watch_over(
         tracing::warn!(%error, "a shim closed its connection and did not end");
     }
     let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
-    let over = matches!(
-        *known.state.borrow(),
-        ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-    );
+    let over = known.state.borrow().is_over();
     if !over {
         let lost = || ContainerState::Failed {
             reason: how_it_was_lost(&directory),
@@ -317,25 +315,61 @@ impl LocalServant {
         }
     }
 
-    /// Pid of init on the host.
-    fn init(&self) -> Result<i32, Error> {
+    fn check_runs(&self) -> Result<(), Error> {
         match *self.known.state.borrow() {
-            ContainerState::Running { init_pid } => Ok(init_pid),
+            ContainerState::Running => Ok(()),
             _ => Err(self.ended()),
         }
     }
+
+    fn log_path(&self) -> PathBuf {
+        self.directory.join(logs::FILE)
+    }
+
+    /// Its network namespace, to open sockets in; a namespace lives for as long as it is held, also after the servant.
+    pub fn network(&self) -> &Arc<NetNs> {
+        &self.network
+    }
+
+    /// First host uid (= gid) of its range and how many; uid 0 inside is the first.
+    pub fn uid_range(&self) -> (u32, u32) {
+        self.uid_range
+    }
+
+    /// Pid of init on this host.
+    pub fn init(&self) -> Result<i32, Error> {
+        self.check_runs()?;
+        self.known.init().ok_or_else(|| self.ended())
+    }
+
+    /// Pids on this host of the node processes and all their children (not of init).
+    pub fn processes(&self) -> Result<Vec<i32>, Error> {
+        let init = self.init()?;
+        let mut processes = self.cgroup.processes();
+        processes.retain(|pid| *pid != init);
+        Ok(processes)
+    }
+}
+
+/// How long the threads of a process could have run and others had the cores; nothing where the kernel does not count it
+/// (Documentation/scheduler/sched-stats.rst: nanoseconds on a core, nanoseconds waiting, slices).
+fn waited(pid: i32) -> Duration {
+    let threads = std::fs::read_dir(format!("/proc/{pid}/task"));
+    let waited = threads
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|thread| {
+            let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+            text.split_whitespace().nth(1)?.parse::<u64>().ok()
+        });
+    Duration::from_nanos(waited.sum())
 }
 
 /// Completes when the servant has ended and its log is complete.
 async fn ended(mut state: watch::Receiver<ContainerState>) {
-    let over = |state: &ContainerState| {
-        matches!(
-            state,
-            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-        )
-    };
     // The other side is gone with its handle: then nothing more is known either.
-    let _ = state.wait_for(over).await;
+    let _ = state.wait_for(ContainerState::is_over).await;
 }
 
 #[async_trait]
@@ -352,12 +386,6 @@ impl Servant for LocalServant {
         self.known.events.subscribe()
     }
 
-    fn endpoint(&self) -> Endpoint {
-        Endpoint {
-            netns: self.network.clone(),
-        }
-    }
-
     fn enforced(&self) -> Enforced {
         self.known.enforced.borrow().clone()
     }
@@ -367,19 +395,19 @@ impl Servant for LocalServant {
         Ok(self.enforced())
     }
 
-    async fn processes(&self) -> Result<Vec<i32>, Error> {
-        let init = self.init()?;
-        Ok(self
-            .cgroup
-            .processes()
-            .into_iter()
-            .filter(|pid| *pid != init)
-            .collect())
+    async fn usage(&self) -> Result<Usage, Error> {
+        self.check_runs()?;
+        Ok(self.cgroup.usage())
     }
 
-    async fn usage(&self) -> Result<Usage, Error> {
-        self.init()?;
-        Ok(self.cgroup.usage())
+    async fn waited(&self) -> Duration {
+        let processes = self.processes().unwrap_or_default();
+        let waited = tokio::task::spawn_blocking(move || processes.into_iter().map(waited).sum());
+        waited.await.unwrap_or_default()
+    }
+
+    fn nodes(&self) -> Vec<String> {
+        self.known.nodes.borrow().keys().cloned().collect()
     }
 
     async fn start_node(&self, node: NodeSpec) -> Result<(), Error> {
@@ -410,12 +438,6 @@ impl Servant for LocalServant {
             > = nodes.borrow();
             nodes.get(node).and_then(|status| status.ended().cloned())
         };
-        let over = |state: &ContainerState| {
-            matches!(
-                state,
-                ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-            )
-        };
         loop {
             if let Some(exit) = exit(&nodes) {
                 return Ok(exit);
@@ -423,26 +445,30 @@ impl Servant for LocalServant {
             tokio::select! {
                 biased;
                 _ = nodes.changed() => {}
-                _ = state.wait_for(over) => return exit(&nodes).ok_or_else(|| self.ended()),
+                _ = state.wait_for(ContainerState::is_over) => return exit(&nodes).ok_or_else(|| self.ended()),
             }
         }
     }
 
-    fn follow_log(&self, from_start: bool) -> mpsc::Receiver<LogLine> {
-        logs::follow(
-            self.log_path(),
-            from_start,
+    async fn logs(&self, last: usize, node: Option<&str>) -> Vec<LogLine> {
+        logs::last(self.log_path(), last, node.map(str::to_owned)).await
+    }
+
+    fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine> {
+        let path = self.log_path();
+        // Following begins before the past is read, so that no line falls between.
+        let lines = logs::follow(
+            path.clone(),
+            from == LogStart::First,
             ended(self.state()),
             self.followers.subscribe(),
-        )
-    }
-
-    fn uid_range(&self) -> (u32, u32) {
-        self.uid_range
-    }
-
-    fn log_path(&self) -> PathBuf {
-        self.directory.join(logs::FILE)
+        );
+        match from {
+            LogStart::Last(count) => {
+                logs::with_past(path, count, lines, self.followers.subscribe())
+            }
+            LogStart::First | LogStart::Now => lines,
+        }
     }
 
     async fn stop(&self) -> Result<(), Error> {

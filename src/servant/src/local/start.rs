@@ -13,13 +13,16 @@ use init::socket;
 
 use super::handle::{self, LocalServant};
 use super::{Shared, sweep, validate};
+use crate::container::{ContainerSpec, Mount};
 use crate::launch::{self, Launch};
 use crate::netns::NetNs;
 use crate::process::Identity;
-use crate::spec::{Mount, Spec};
 use crate::{Error, uids};
 
-pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalServant>, Error> {
+pub(super) async fn start(
+    shared: &Shared,
+    mut spec: ContainerSpec,
+) -> Result<Arc<LocalServant>, Error> {
     spec.limits = spec.limits.or(&shared.config.default_limits);
     validate::validate(&spec)?;
     let id = spec.id.clone();
@@ -41,7 +44,7 @@ pub(super) async fn start(shared: &Shared, mut spec: Spec) -> Result<Arc<LocalSe
 
 async fn start_in(
     shared: &Shared,
-    spec: Spec,
+    spec: ContainerSpec,
     directory: &Path,
 ) -> Result<Arc<LocalServant>, Error> {
     let network = shared.networks.take()?;

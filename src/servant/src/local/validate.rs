@@ -4,13 +4,13 @@ use std::collections::BTreeSet;
 use std::path::{Component, Path};
 
 use crate::Error;
-use crate::spec::{Profile, Spec};
+use crate::container::{ContainerSpec, Profile};
 
 /// Descriptors of as many are handed to the shim one by one.
 const MOUNTS: usize = 128;
 
 /// Says what is wrong with it, if anything.
-pub(super) fn validate(spec: &Spec) -> Result<(), Error> {
+pub(super) fn validate(spec: &ContainerSpec) -> Result<(), Error> {
     problem(spec).map_or(Ok(()), |reason| {
         Err(Error::InvalidSpec {
             id: spec.id.clone(),
@@ -19,7 +19,7 @@ pub(super) fn validate(spec: &Spec) -> Result<(), Error> {
     })
 }
 
-fn problem(spec: &Spec) -> Option<String> {
+fn problem(spec: &ContainerSpec) -> Option<String> {
     let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
     if spec.id.is_empty()
         || spec.id.len() > 48
@@ -148,10 +148,11 @@ fn plain(path: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spec::{Limits, Mount, NodeSpec};
+    use crate::container::Mount;
+    use crate::spec::{Limits, NodeSpec};
 
-    fn good() -> Spec {
-        Spec {
+    fn good() -> ContainerSpec {
+        ContainerSpec {
             id: "a-1".into(),
             layers: vec!["/usr".into()],
             writable: None,
@@ -182,56 +183,56 @@ mod tests {
         };
         let faults = [
             (
-                Spec {
+                ContainerSpec {
                     id: "A".into(),
                     ..good()
                 },
                 "an id has",
             ),
             (
-                Spec {
+                ContainerSpec {
                     id: "../x".into(),
                     ..good()
                 },
                 "an id has",
             ),
             (
-                Spec {
+                ContainerSpec {
                     layers: vec![],
                     ..good()
                 },
                 "no layers",
             ),
             (
-                Spec {
+                ContainerSpec {
                     layers: vec!["/nonexistent".into()],
                     ..good()
                 },
                 "/nonexistent",
             ),
             (
-                Spec {
+                ContainerSpec {
                     profile: Profile::Compile,
                     ..good()
                 },
                 "writable",
             ),
             (
-                Spec {
+                ContainerSpec {
                     mounts: vec![mount("/a/../b")],
                     ..good()
                 },
                 "/a/../b",
             ),
             (
-                Spec {
+                ContainerSpec {
                     mounts: vec![mount("/")],
                     ..good()
                 },
                 "mount target /",
             ),
             (
-                Spec {
+                ContainerSpec {
                     limits: Limits {
                         cpus: Some(f64::NAN),
                         ..Limits::default()
@@ -241,7 +242,7 @@ mod tests {
                 "cores",
             ),
             (
-                Spec {
+                ContainerSpec {
                     limits: Limits {
                         memory: Some(1),
                         ..Limits::default()
@@ -251,21 +252,21 @@ mod tests {
                 "4 MiB",
             ),
             (
-                Spec {
+                ContainerSpec {
                     nodes: vec![node("/a", "true")],
                     ..good()
                 },
                 "absolute path of its program",
             ),
             (
-                Spec {
+                ContainerSpec {
                     nodes: vec![node("/a", "/x"), node("/a", "/x")],
                     ..good()
                 },
                 "given twice",
             ),
             (
-                Spec {
+                ContainerSpec {
                     environment: [("A=B".into(), "".into())].into(),
                     ..good()
                 },

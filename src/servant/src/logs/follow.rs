@@ -16,7 +16,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::mpsc::error::TryRecvError;
 use tokio::sync::{mpsc, watch};
 
-use super::rotated;
+use super::{last, rotated};
 use crate::engine::LogLine;
 
 /// Lines that may wait for the receiver.
@@ -54,6 +54,43 @@ pub fn follow(
         }
     }
     receiver
+}
+
+/// `lines` of the log at `path`, which are followed from now on, behind its last `count` lines until now; none comes twice.
+/// From when `guard` is dropped on, the log may be removed.
+pub fn with_past(
+    path: PathBuf,
+    count: usize,
+    mut lines: mpsc::Receiver<LogLine>,
+    guard: impl Send + 'static,
+) -> mpsc::Receiver<LogLine> {
+    let (sender, receiver) = mpsc::channel(AHEAD);
+    tokio::spawn(async move {
+        let past = last(path, count, None).await;
+        drop(guard);
+        let newest = past.last().and_then(|line| line.number);
+        for line in past {
+            if sender.send(line).await.is_err() {
+                return;
+            }
+        }
+        loop {
+            let line = tokio::select! {
+                line = lines.recv() => line,
+                () = sender.closed() => return,
+            };
+            let Some(line) = line else { return };
+            if is_after(&line, newest) && sender.send(line).await.is_err() {
+                return;
+            }
+        }
+    });
+    receiver
+}
+
+/// Whether a line comes after the one with the number `newest`. Its time says nothing: clocks are set back.
+fn is_after(line: &LogLine, newest: Option<u64>) -> bool {
+    line.number.is_none() || line.number > newest
 }
 
 /// What nix lacks: its inotify has no raw descriptor to show.
@@ -318,6 +355,31 @@ mod tests {
         drop(home);
         end.send(()).unwrap();
         assert_eq!(all(lines).await, ["after"]);
+    }
+
+    #[tokio::test]
+    async fn the_past_and_what_follows_come_once_each_by_their_place_and_not_by_their_time() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("log.jsonl");
+        let mut writer = Writer::create(&path, 1 << 20).unwrap();
+        for number in 0..3 {
+            writer.append("/a", "stdout", &number.to_string());
+        }
+        let (sender, following) = mpsc::channel(4);
+        let lines = with_past(path, 2, following, ());
+        let line = |number, text: &str| LogLine {
+            number,
+            // The clock was set back.
+            time: SystemTime::UNIX_EPOCH,
+            line: text.into(),
+            ..note(String::new())
+        };
+        // Printed between the beginning of the following and the look back, and after it.
+        sender.send(line(Some(2), "2")).await.unwrap();
+        sender.send(line(Some(3), "3")).await.unwrap();
+        sender.send(line(None, "of the log itself")).await.unwrap();
+        drop(sender);
+        assert_eq!(all(lines).await, ["1", "2", "3", "of the log itself"]);
     }
 
     #[tokio::test]

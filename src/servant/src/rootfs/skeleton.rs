@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use super::{make_directory, normal};
 use crate::Error;
-use crate::spec::Mount;
+use crate::container::Mount;
 
 /// Makes the directories, files and links in an empty root.
 pub fn make_skeleton(

@@ -11,7 +11,7 @@ use nix::sys::wait::waitpid;
 use nix::unistd::ForkResult;
 
 use super::make_directory;
-use crate::spec::Mount;
+use crate::container::Mount;
 use crate::{Error, idmap, sys};
 
 /// A directory that every host has and every user can reach, and that must be covered anyway.
@@ -31,7 +31,7 @@ pub(super) fn enter() -> Result<PathBuf, Error> {
     let points = || {
         let table = fs::read_to_string("/proc/self/mountinfo")
             .map_err(Error::file("read", "/proc/self/mountinfo"))?;
-        Ok(cgroup_mounts(&table))
+        Ok::<_, Error>(cgroup_mounts(&table))
     };
     // The deepest first: a mount with others in it is busy.
     for point in points()?.into_iter().rev() {

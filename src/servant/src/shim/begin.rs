@@ -13,13 +13,13 @@ use nix::sys::stat::{Mode, umask};
 
 use super::create::{self, Creator};
 use crate::cgroup::{self, Cgroup};
+use crate::container::Opened;
 use crate::engine::{ContainerState, Enforced};
 use crate::launch::{self, Exit, Launch, Runtime};
 use crate::local::Isolation;
 use crate::netns::NetNs;
 use crate::process::Identity;
 use crate::protocol::{self, FromShim};
-use crate::spec::Opened;
 use crate::{Error, sys};
 
 /// How long a cgroup may take to become empty.
@@ -276,7 +276,7 @@ fn give_up(directory: &Path, cgroup: &Cgroup, shim: Identity, control: UnixStrea
     }
     let hello = FromShim::Hello {
         shim,
-        state,
+        state: state.into(),
         nodes: exit.nodes,
         enforced: Enforced::default(),
     };

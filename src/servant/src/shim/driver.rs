@@ -23,7 +23,7 @@ use super::link::Link;
 use super::nodes::Nodes;
 use super::streams::Streams;
 use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{Command, FromShim, Request};
+use crate::protocol::{Command, FromShim, Request, State};
 use crate::spec::Limits;
 use crate::{Error, cgroup, logs};
 
@@ -224,8 +224,18 @@ impl Driver {
     }
 
     fn set_state(&mut self, state: ContainerState) {
-        self.state = state.clone();
+        self.state = state;
+        let state = self.told();
         self.clients.tell(&FromShim::State { state });
+    }
+
+    fn told(&self) -> State {
+        let running = self.state == ContainerState::Running;
+        let init = self.init.as_ref().filter(|_| running);
+        State {
+            state: self.state.clone(),
+            init_pid: init.map(|(pid, _)| *pid),
+        }
     }
 
     fn tell_node(&self, event: NodeEvent) {
@@ -236,7 +246,7 @@ impl Driver {
     fn hello(&self) -> FromShim {
         FromShim::Hello {
             shim: self.begun.identity,
-            state: self.state.clone(),
+            state: self.told(),
             nodes: self.nodes.statuses(),
             enforced: Enforced {
                 ..self.begun.enforced.clone()

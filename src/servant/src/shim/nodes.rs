@@ -109,10 +109,7 @@ impl Nodes {
         node.inside = Some(inside);
         node.status.pid = Some(host);
         node.status.starts += 1;
-        Some(NodeEvent::Started {
-            node: name,
-            pid: host,
-        })
+        Some(NodeEvent::Started { node: name })
     }
 
     /// It could not be executed.

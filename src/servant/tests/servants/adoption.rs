@@ -1,6 +1,8 @@
 //! Servants outlive whoever started them.
 
-use servant::engine::{ContainerState, Engine};
+use std::sync::Arc;
+
+use servant::engine::{ContainerState, Engine, LogStart, Servant};
 
 use crate::support::*;
 
@@ -11,21 +13,16 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     spec.resident = serde_json::json!("same");
     let id = spec.id.clone();
     let first = world.start(spec).await;
-    let (uids, network) = (first.uid_range(), first.endpoint().netns);
+    let (uids, network) = (first.uid_range(), Arc::clone(first.network()));
     let enforced = first.enforced();
     let of_first = processes(&*first, 2).await;
     drop(first);
-    let engine = world.restarted();
-    let mut adopted = within(engine.adopt()).await.unwrap();
-    let second = adopted.running.pop().expect("one");
-    assert!(adopted.running.is_empty() && adopted.failures.is_empty());
+    let second = world.adopted(&world.restarted()).await;
     assert_eq!(second.id(), id);
-    assert!(matches!(
-        *second.state().borrow(),
-        ContainerState::Running { .. }
-    ));
+    assert_eq!(*second.state().borrow(), ContainerState::Running);
+    assert_eq!(second.nodes(), ["/goes", "/stays"]);
     assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
-    assert_eq!(second.endpoint().netns, network);
+    assert_eq!(*second.network(), network);
     assert_eq!(processes(&*second, 2).await, of_first, "the same");
     assert!(hear(&*second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
@@ -35,12 +32,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     );
     drop(second);
     // What happened meanwhile is known to the third.
-    let third = within(world.restarted().adopt())
-        .await
-        .unwrap()
-        .running
-        .pop()
-        .expect("one");
+    let third = world.adopted(&world.restarted()).await;
     assert_eq!(
         within(third.wait_node("/goes")).await.unwrap().signal,
         Some(libc::SIGTERM)
@@ -56,7 +48,8 @@ async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
     drop(servant);
     let stray = world.servant_directory("x");
     std::fs::write(&stray, "somebody's").unwrap();
-    let mut adopted = within(world.restarted().adopt()).await.unwrap();
+    let engine = world.restarted();
+    let mut adopted = within(engine.adopt()).await.unwrap();
     let told: Vec<_> = adopted.failures.iter().map(ToString::to_string).collect();
     assert!(
         told.len() == 1 && told[0].contains(&*stray.to_string_lossy()),
@@ -65,7 +58,7 @@ async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
     assert_eq!(std::fs::read_to_string(&stray).unwrap(), "somebody's");
     let servant = adopted.running.pop().expect("the servant beside it");
     assert_eq!(servant.id(), id);
-    world.stop(servant).await;
+    world.stop(engine.servant(&id).expect("it is held")).await;
 }
 
 #[tokio::test]
@@ -96,21 +89,17 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
         1,
         "the shim ends with its servant"
     );
-    let adoption = within(world.restarted().adopt_all()).await.unwrap();
-    assert!(
-        adoption.running.is_empty() && adoption.failures.is_empty(),
-        "{adoption:?}"
-    );
+    let adoption = within(world.restarted().adopt()).await.unwrap();
+    assert!(adoption.running.is_empty());
+    assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(adoption.ended[0].id, id);
-    let exit = adoption.ended[0].exit.as_ref().expect("it was written");
-    let ContainerState::Stopped { reason } = &exit.state else {
-        panic!("{exit:?}")
+    let Some(ContainerState::Stopped { reason }) = &adoption.ended[0].state else {
+        panic!("{:?}", adoption.ended)
     };
     assert!(
         reason.contains("/required was killed by signal 9"),
         "{reason}"
     );
-    assert_eq!(exit.nodes["/required"].ended().unwrap().signal, Some(9));
     world.assert_gone(&id, &runtime, &[pid]);
 }
 
@@ -120,7 +109,7 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     let spec = spec(vec![node("/stubborn", &["stubborn"])]);
     let id = spec.id.clone();
     let servant = world.start(spec).await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
     let processes = processes(&*servant, 2).await;
     let runtime = world.runtime(&id);
@@ -143,13 +132,13 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
         }
     })
     .await;
-    let adoption = within(world.restarted().adopt_all()).await.unwrap();
-    assert!(adoption.failures.is_empty(), "{adoption:?}");
+    let adoption = within(world.restarted().adopt()).await.unwrap();
+    assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(
         adoption
             .ended
             .iter()
-            .map(|ended| (ended.id.as_str(), ended.exit.is_some()))
+            .map(|ended| (ended.id.as_str(), ended.state.is_some()))
             .collect::<Vec<_>>(),
         [(id.as_str(), false)]
     );
@@ -165,7 +154,7 @@ async fn what_a_daemon_left_half_made_is_removed() {
         "{ \"half",
     )
     .unwrap();
-    let adoption = within(world.engine.adopt_all()).await.unwrap();
+    let adoption = within(world.engine.adopt()).await.unwrap();
     assert_eq!((adoption.ended.len(), adoption.failures.len()), (1, 0));
     assert!(!world.servant_directory("half").exists());
 }
@@ -191,7 +180,7 @@ async fn a_pid_that_now_belongs_to_another_is_left_alone() {
         &runtime,
     )
     .unwrap();
-    let adoption = within(world.engine.adopt_all()).await.unwrap();
+    let adoption = within(world.engine.adopt()).await.unwrap();
     assert_eq!(adoption.ended.len(), 1);
     assert!(bystander.try_wait().unwrap().is_none(), "it still runs");
     drop(bystander.stdin.take());

@@ -2,8 +2,9 @@
 
 use std::os::unix::fs::MetadataExt;
 
+use servant::container::Profile;
+use servant::engine::Servant;
 use servant::rootfs::work_directory;
-use servant::spec::Profile;
 
 use crate::support::*;
 

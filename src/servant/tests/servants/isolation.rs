@@ -1,6 +1,7 @@
 //! What a node cannot do.
 
-use servant::spec::{Mount, Opened, Profile};
+use servant::container::{Mount, Opened, Profile};
+use servant::engine::{LogStart, Servant};
 
 use crate::support::*;
 
@@ -13,7 +14,7 @@ async fn every_process_is_confined_as_seen_from_the_host() {
             node("/two", &["sleep"]),
         ]))
         .await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "family").await;
     let processes = processes(&*servant, 3).await;
     assert_eq!(processes.len(), 3, "two nodes and a child");
@@ -47,7 +48,7 @@ async fn every_process_is_confined_as_seen_from_the_host() {
 async fn no_way_out_is_open() {
     let world = World::new();
     let servant = world.start(spec(vec![node("/curious", &["calls"])])).await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
     assert!(told.len() > 40, "everything was tried: {told:?}");
     let allowed: Vec<_> = told
@@ -80,7 +81,7 @@ async fn builds_open_no_way_out_either() {
         spec.profile = profile;
         spec.writable = Some(world.path("upper"));
         let servant = world.start(spec).await;
-        let mut lines = servant.follow_log(true);
+        let mut lines = servant.follow(LogStart::First);
         let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
         let mut allowed = told
             .iter()
@@ -165,7 +166,7 @@ async fn two_servants_share_nothing_and_their_networks_are_apart() {
     assert!(hear(&*first, 11311).await.unwrap().contains("first"));
     assert!(hear(&*second, 11311).await.unwrap().contains("second"));
     assert_ne!(first.uid_range().0, second.uid_range().0);
-    assert_ne!(first.endpoint().netns, second.endpoint().netns);
+    assert_ne!(first.network(), second.network());
     world.stop(first).await;
     world.stop(second).await;
 }

@@ -2,9 +2,9 @@
 
 use std::os::fd::OwnedFd;
 
-use servant::engine::{ContainerState, Engine, NodeEvent};
+use servant::container::Mount;
+use servant::engine::{ContainerState, LogStart, NodeEvent, Servant};
 use servant::process::Identity;
-use servant::spec::Mount;
 
 use crate::support::*;
 
@@ -17,7 +17,7 @@ async fn stop_leaves_nothing_of_nodes_that_do_not_want_to_end() {
             node("/polite", &["sleep"]),
         ]))
         .await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
     assert_eq!(processes(&*servant, 3).await.len(), 3);
     let state = servant.state();
@@ -90,7 +90,7 @@ async fn exit_codes_signals_and_programs_that_are_not_there_are_told_apart() {
         .to_string();
     assert!(error.contains("/unheard-of"), "{error}");
     assert!(
-        matches!(*servant.state().borrow(), ContainerState::Running { .. }),
+        matches!(*servant.state().borrow(), ContainerState::Running),
         "no node was required"
     );
     world.stop(servant).await;
@@ -132,11 +132,10 @@ async fn a_respawning_node_comes_back_and_can_still_be_stopped() {
     let servant = world.start(spec(vec![again])).await;
     let mut events = servant.events();
     let three = within(async {
-        let mut pids = std::collections::BTreeSet::new();
-        let mut respawning = 0;
-        while pids.len() < 3 || respawning < 2 {
+        let (mut starts, mut respawning) = (0, 0);
+        while starts < 3 || respawning < 2 {
             match events.recv().await.unwrap() {
-                NodeEvent::Started { pid, .. } => drop(pids.insert(pid)),
+                NodeEvent::Started { .. } => starts += 1,
                 NodeEvent::Respawning { node } => {
                     assert_eq!(node, "/again");
                     respawning += 1;
@@ -167,11 +166,11 @@ async fn nodes_that_end_for_good_do_not_come_back_and_end_nothing_with_them() {
     loop {
         match within(events.recv()).await.unwrap() {
             NodeEvent::Respawning { node } => panic!("{node} comes back"),
-            NodeEvent::Started { node, .. } if node == "/last" => break,
+            NodeEvent::Started { node } if node == "/last" => break,
             _ => {}
         }
     }
-    let running = matches!(&*servant.state().borrow(), ContainerState::Running { .. });
+    let running = *servant.state().borrow() == ContainerState::Running;
     assert!(running, "it ended with its node");
     world.stop(servant).await;
 }
@@ -185,7 +184,7 @@ async fn nodes_have_their_environment_and_directory_and_a_name_once() {
     let servant = world
         .start(spec(vec![speaker, node("/stays", &["sleep"])]))
         .await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.node == "/speaker").await;
     assert_eq!(
         told.last().unwrap().line,
@@ -218,7 +217,7 @@ async fn orphans_are_reaped_and_the_resident_is_told_of_every_end() {
         }
     })
     .await;
-    assert_eq!(servant.processes().await.unwrap(), Vec::<i32>::new());
+    assert_eq!(servant.processes().unwrap(), Vec::<i32>::new());
     world.stop(servant).await;
 }
 
@@ -227,10 +226,7 @@ async fn a_killed_init_is_a_failure() {
     let world = World::new();
     let servant = world.start(spec(vec![])).await;
     servant.start_node(node("/a", &["sleep"])).await.unwrap();
-    let ContainerState::Running { init_pid } = *servant.state().borrow() else {
-        panic!("it runs")
-    };
-    let pidfd: OwnedFd = Identity::of(init_pid)
+    let pidfd: OwnedFd = Identity::of(servant.init().unwrap())
         .unwrap()
         .open()
         .unwrap()
@@ -264,7 +260,7 @@ async fn what_cannot_start_says_why_and_leaves_nothing() {
         let id = spec.id.clone();
         let error = world
             .engine
-            .start(spec)
+            .start_container(spec)
             .await
             .map(|_| ())
             .unwrap_err()
@@ -276,7 +272,7 @@ async fn what_cannot_start_says_why_and_leaves_nothing() {
     let servant = world.start(spec.clone()).await;
     let error = world
         .engine
-        .start(spec)
+        .start_container(spec)
         .await
         .map(|_| ())
         .unwrap_err()
@@ -304,7 +300,7 @@ async fn a_creation_that_libcontainer_fails_harms_nobody() {
     let id = spec.id.clone();
     let error = world
         .engine
-        .start(spec)
+        .start_container(spec)
         .await
         .map(|_| ())
         .unwrap_err()
@@ -326,7 +322,7 @@ async fn a_start_that_nobody_waits_for_any_more_is_undone() {
     let spec = spec(vec![node("/a", &["sleep"])]);
     let directory = world.servant_directory(&spec.id);
     let engine = world.engine.clone();
-    let start = tokio::spawn(async move { engine.start(spec).await.map(|_| ()) });
+    let start = tokio::spawn(async move { engine.start_container(spec).await.map(|_| ()) });
     within(async {
         while !directory.exists() {
             tokio::task::yield_now().await;
@@ -347,7 +343,11 @@ async fn twenty_start_at_once_from_a_program_with_many_threads() {
     let world = World::new();
     let starts = (0..20).map(|_| {
         let engine = world.engine.clone();
-        tokio::spawn(async move { engine.start(spec(vec![node("/a", &["sleep"])])).await })
+        tokio::spawn(async move {
+            engine
+                .start_container(spec(vec![node("/a", &["sleep"])]))
+                .await
+        })
     });
     let mut servants = Vec::new();
     for start in starts.collect::<Vec<_>>() {

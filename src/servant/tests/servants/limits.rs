@@ -1,6 +1,6 @@
 //! Limits that hold, are told, and can be changed.
 
-use servant::engine::{ContainerState, Engine, NodeEvent};
+use servant::engine::{ContainerState, LogStart, NodeEvent, Servant};
 use servant::local::Isolation;
 use servant::spec::Limits;
 
@@ -71,7 +71,7 @@ async fn the_pids_limit_stops_a_fork_bomb() {
     spec.limits.pids = Some(20);
     world.needs(&["pids"]);
     let servant = world.start(spec).await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.stream == "stdout").await;
     assert!(told[0].line.contains("temporarily unavailable"), "{told:?}");
     assert!(servant.usage().await.unwrap().pids <= 20);
@@ -205,7 +205,7 @@ async fn where_isolation_is_required_a_limit_that_does_not_hold_is_refused() {
         spec.id.clone(),
         world
             .engine
-            .start(spec)
+            .start_container(spec)
             .await
             .map(|_| ())
             .unwrap_err()
@@ -277,8 +277,7 @@ async fn the_shim_has_limits_of_its_own() {
     // The next daemon finds them as they are, and leaves nothing of them.
     let enforced = servant.enforced();
     drop(servant);
-    let mut adopted = within(world.restarted().adopt()).await.unwrap();
-    let servant = adopted.running.pop().expect("one");
+    let servant = world.adopted(&world.restarted()).await;
     assert_eq!(servant.enforced(), enforced);
     let own = world.runtime(&id).shim_cgroup.expect("it has one");
     assert!(own.exists());

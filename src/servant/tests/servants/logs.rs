@@ -1,5 +1,7 @@
 //! What nodes print arrives.
 
+use servant::engine::{LogStart, Servant};
+
 use crate::support::*;
 
 #[tokio::test]
@@ -9,7 +11,7 @@ async fn every_line_arrives_once_and_in_order() {
     let servant = world
         .start(spec(vec![node("/talks", &["print", &LINES.to_string()])]))
         .await;
-    let mut lines = servant.follow_log(true);
+    let mut lines = servant.follow(LogStart::First);
     let reader = tokio::spawn(async move {
         let mut expected = 0;
         while let Some(line) = lines.recv().await {
@@ -22,7 +24,10 @@ async fn every_line_arrives_once_and_in_order() {
         within(servant.wait_node("/talks")).await.unwrap().code,
         Some(0)
     );
-    assert!(servant.log_path().exists());
+    let log = world
+        .servant_directory(servant.id())
+        .join(servant::logs::FILE);
+    assert!(log.exists());
     world.stop(servant).await;
     assert_eq!(
         within(reader).await.unwrap(),
@@ -37,9 +42,9 @@ async fn a_follower_from_now_on_sees_only_what_comes() {
     let servant = world
         .start(spec(vec![node("/early", &["print", "10"])]))
         .await;
-    let mut all = servant.follow_log(true);
+    let mut all = servant.follow(LogStart::First);
     lines_until(&mut all, |line| line.line == "9").await;
-    let mut late = servant.follow_log(false);
+    let mut late = servant.follow(LogStart::Now);
     servant
         .start_node(node("/late", &["print", "2"]))
         .await

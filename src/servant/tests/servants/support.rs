@@ -12,11 +12,12 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
+use servant::container::{ContainerSpec, Profile};
 use servant::engine::{ContainerState, Engine, LogLine, Servant};
 use servant::launch::{self, Runtime};
-use servant::local::{Grace, Isolation, LocalEngine, LocalEngineConfig};
+use servant::local::{Grace, Isolation, LocalEngine, LocalEngineConfig, LocalServant};
 use servant::shim::{Resident, ResidentContext, ResidentError};
-use servant::spec::{Limits, NodeSpec, Profile, Spec};
+use servant::spec::{Limits, NodeSpec};
 
 /// Runs before `main`: a shim must have one thread, and the test harness makes more.
 #[used]
@@ -151,18 +152,26 @@ impl World {
             .expect("a shim writes it first")
     }
 
-    pub async fn start(&self, spec: Spec) -> Arc<dyn Servant> {
+    /// A servant that an engine on the same directory has adopted.
+    pub async fn adopted(&self, engine: &LocalEngine) -> Arc<LocalServant> {
+        let mut adopted = within(engine.adopt()).await.unwrap();
+        let servant = adopted.running.pop().expect("one");
+        assert!(adopted.running.is_empty() && adopted.failures.is_empty());
+        engine.servant(servant.id()).expect("it is held")
+    }
+
+    pub async fn start(&self, spec: ContainerSpec) -> Arc<LocalServant> {
         self.engine
-            .start(spec)
+            .start_container(spec)
             .await
             .unwrap_or_else(|error| panic!("{error}"))
     }
 
     /// Ends a servant and looks for what it left.
-    pub async fn stop(&self, servant: Arc<dyn Servant>) {
+    pub async fn stop(&self, servant: Arc<LocalServant>) {
         let id = servant.id().to_owned();
         let runtime = self.runtime(&id);
-        let processes = servant.processes().await.unwrap_or_default();
+        let processes = servant.processes().unwrap_or_default();
         servant
             .stop()
             .await
@@ -257,10 +266,10 @@ pub fn kill(pidfd: &std::os::fd::OwnedFd) {
 }
 
 /// A spec of the test layer; the id is unique on the host.
-pub fn spec(nodes: Vec<NodeSpec>) -> Spec {
+pub fn spec(nodes: Vec<NodeSpec>) -> ContainerSpec {
     static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
     let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-    Spec {
+    ContainerSpec {
         // Of one width: no id is the beginning of another.
         id: format!("test-{}-{number:04}", std::process::id()),
         layers: vec![layer()],
@@ -311,7 +320,7 @@ pub async fn lines_until(
 }
 
 /// The processes in a servant's PID namespace, once there are so many. What has made the container may still be in its cgroup.
-pub async fn processes(servant: &dyn Servant, count: usize) -> Vec<i32> {
+pub async fn processes(servant: &LocalServant, count: usize) -> Vec<i32> {
     let inside = |pid: &i32| {
         let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
         let numbers = status.lines().find_map(|line| line.strip_prefix("NSpid:"));
@@ -319,7 +328,7 @@ pub async fn processes(servant: &dyn Servant, count: usize) -> Vec<i32> {
     };
     within(async {
         loop {
-            let mut processes = servant.processes().await.unwrap();
+            let mut processes = servant.processes().unwrap();
             processes.retain(inside);
             if processes.len() >= count {
                 return processes;
@@ -333,13 +342,10 @@ pub async fn processes(servant: &dyn Servant, count: usize) -> Vec<i32> {
 /// The state in which a servant has ended.
 pub async fn ended(servant: &dyn Servant) -> ContainerState {
     let mut state = servant.state();
-    let over = |state: &ContainerState| {
-        matches!(
-            state,
-            ContainerState::Stopped { .. } | ContainerState::Failed { .. }
-        )
-    };
-    within(state.wait_for(over)).await.expect("a state").clone()
+    within(state.wait_for(ContainerState::is_over))
+        .await
+        .expect("a state")
+        .clone()
 }
 
 /// A test that waits for what never comes must fail, not hang.
@@ -350,11 +356,10 @@ pub async fn within<T>(future: impl Future<Output = T>) -> T {
 }
 
 /// What a socket says until it closes.
-pub async fn hear(servant: &dyn Servant, port: u16) -> std::io::Result<String> {
+pub async fn hear(servant: &LocalServant, port: u16) -> std::io::Result<String> {
     use tokio::io::AsyncReadExt;
     let mut stream = servant
-        .endpoint()
-        .netns
+        .network()
         .connect(([127, 0, 0, 1], port).into())
         .await?;
     let mut text = String::new();

@@ -31,7 +31,7 @@ impl Driver {
             let pidfd = sys::pidfd_open(pid).map_err(|error| format!("pidfd of init: {error}"))?;
             self.init = Some((pid, pidfd));
         }
-        let init = created?;
+        created?;
         resident.map_err(|error| format!("its resident did not start: {error}"))?;
         privileges::drop_all_but_kill().map_err(|error| error.to_string())?;
         let ready = tokio::time::timeout(CREATION, self.link.receive()).await;
@@ -47,7 +47,7 @@ impl Driver {
             }
         }
         self.listen_to_init();
-        self.set_state(ContainerState::Running { init_pid: init });
+        self.set_state(ContainerState::Running);
         for node in self.begun.launch.spec.nodes.clone() {
             let name = node.name.clone();
             self.nodes.add(node)?;

@@ -8,12 +8,12 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use servant::spec::Mount;
 
 use super::{GrantError, Granted};
+use crate::container::Mount;
 
 /// Where specifications lie, by the standard; the later overrides the earlier.
-pub fn directories() -> Vec<PathBuf> {
+pub(super) fn directories() -> Vec<PathBuf> {
     ["/etc/cdi", "/var/run/cdi"].map(PathBuf::from).into()
 }
 
@@ -68,7 +68,11 @@ struct Bind {
 }
 
 /// Adds what the device `name` needs.
-pub fn add(name: &str, directories: &[PathBuf], granted: &mut Granted) -> Result<(), GrantError> {
+pub(super) fn add(
+    name: &str,
+    directories: &[PathBuf],
+    granted: &mut Granted,
+) -> Result<(), GrantError> {
     let mut devices = BTreeMap::new();
     for path in files(directories) {
         let specification = read(&path)?;

@@ -1,11 +1,12 @@
-//! Reading a servant's log from its file: JSON lines, rotated once.
+//! The last lines of a log, read from the end of its files on.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use servant::engine::LogLine;
+use super::rotated;
+use crate::engine::LogLine;
 
 /// Bytes read at once, from the end of the file on.
 const BLOCK: usize = 64 * 1024;
@@ -18,7 +19,7 @@ pub async fn last(path: PathBuf, count: usize, node: Option<String>) -> Vec<LogL
 
 /// The last `count` lines of the log at `path`, oldest first; of one node alone where one is named. Lines that
 /// cannot be read are passed over. Of the files no more is read than it takes.
-pub fn read(path: &Path, count: usize, node: Option<&str>) -> Vec<LogLine> {
+fn read(path: &Path, count: usize, node: Option<&str>) -> Vec<LogLine> {
     let current = File::open(path).ok();
     let inode = |file: &File| file.metadata().map(|data| (data.dev(), data.ino())).ok();
     // Where the log was rotated in between it is the same file once more.
@@ -69,27 +70,6 @@ fn backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<
     Ok(())
 }
 
-/// Whether a line comes after the one with the number `last`. Its time says nothing: clocks are set back.
-pub fn is_after(line: &LogLine, last: Option<u64>) -> bool {
-    line.number.is_none() || line.number > last
-}
-
-/// A line as the API shows it.
-pub fn record(line: LogLine) -> api::LogLine {
-    api::LogLine {
-        time: store::millis(line.time),
-        node: line.node,
-        stream: line.stream,
-        line: line.line,
-    }
-}
-
-fn rotated(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".1");
-    name.into()
-}
-
 #[cfg(test)]
 mod tests {
     use std::time::SystemTime;
@@ -123,33 +103,6 @@ mod tests {
         assert_eq!(texts(2, None), ["2", "3"]);
         assert_eq!(texts(9, Some("/a")), ["1", "3"]);
         assert!(texts(0, None).is_empty());
-    }
-
-    #[test]
-    fn what_follows_is_known_by_its_place_and_not_by_its_time() {
-        let directory = tempfile::tempdir().expect("a directory");
-        let path = directory.path().join("log.jsonl");
-        let mut writer = servant::logs::Writer::create(&path, 1 << 20).expect("a log");
-        for number in 0..3 {
-            writer.append("/a", "stdout", &number.to_string());
-        }
-        let past = read(&path, 2, None);
-        let last = past.last().and_then(|line| line.number);
-        assert_eq!(last, Some(2));
-        // The clock was set back before the next line.
-        let next = LogLine {
-            number: Some(3),
-            time: SystemTime::UNIX_EPOCH,
-            ..past[1].clone()
-        };
-        assert!(is_after(&next, last));
-        assert!(!is_after(&past[1], last), "it was given already");
-        assert!(is_after(&past[0], None), "nothing was given");
-        let said = LogLine {
-            number: None,
-            ..next
-        };
-        assert!(is_after(&said, last), "of the log itself");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use bytes::Bytes;
 use png::{ColorType, Decoder, Limits, Transformations};
 
-use crate::errors::Error;
+use crate::Error;
 
 /// What becomes of it.
 pub const TYPE: &str = "sensor_msgs/Image";
@@ -24,7 +24,7 @@ impl Picture {
     /// Decodes a PNG file.
     pub fn read(file: &[u8]) -> Result<Picture, Error> {
         let bad = |error: png::DecodingError| {
-            Error::BadRequest(format!(
+            Error::Trial(format!(
                 "the picture cannot be read: {error}; give a PNG file (convert FILE picture.png makes one)"
             ))
         };
@@ -34,7 +34,7 @@ impl Picture {
         let mut reader = decoder.read_info().map_err(bad)?;
         let size = reader.output_buffer_size().unwrap_or(usize::MAX);
         if size > MAX_BYTES {
-            return Err(Error::BadRequest(format!(
+            return Err(Error::Trial(format!(
                 "the picture has more than {MAX_BYTES} bytes when decoded; make it smaller"
             )));
         }

@@ -7,15 +7,15 @@ use std::path::{Path, PathBuf};
 
 use nix::errno::Errno;
 use nix::fcntl::{OFlag, OpenHow, ResolveFlag, openat2};
-use servant::spec::{Mount, Opened};
 
 use super::{GrantError, not_allowed};
+use crate::container::{Mount, Opened};
 
 /// How often what is being renamed is looked at again.
 const AGAIN: u32 = 100;
 
 /// Opens a volume, if it lies in one of the places that are allowed.
-pub fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, GrantError> {
+pub(super) fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, GrantError> {
     let broken = |source| GrantError::Volume {
         path: volume.source.clone(),
         source,

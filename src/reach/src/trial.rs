@@ -8,8 +8,6 @@ use std::time::{Duration, Instant};
 
 use api::trial::{Fed, Heard, Times, Trial};
 use bytes::Bytes;
-use catalogue::{Catalogue, names};
-use choreographer::Choreographer;
 use package::interface::{Direction, Interface, Topic};
 use ros::bag::Recorded;
 use ros::bus::{Bus, Publisher, Qos, Subscription, WireType, reaches};
@@ -20,7 +18,7 @@ use tokio::time::timeout;
 
 pub use picture::Picture;
 
-use crate::errors::Error;
+use crate::Error;
 
 /// For the servant's nodes to listen, and for one answer.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -42,31 +40,15 @@ pub enum Material {
     Bag(Vec<Recorded>),
 }
 
-/// Tries the current revision of a service.
-pub async fn run(
-    catalogue: &Catalogue,
-    choreographer: &Choreographer,
-    service: &str,
-    material: Material,
-) -> Result<Trial, Error> {
-    let revision = catalogue.current(service)?;
-    let robot = format!("~try-{}", names::random(6));
-    let lease = choreographer.ensure(service, &robot, true)?;
-    lease.admitted().await?;
-    let reach = lease.ready().await?;
-    let trial = attempt(&reach.bus, service, &revision.interface, material).await;
-    lease.handle().end("its trial is over");
-    trial
-}
-
-async fn attempt(
+/// Gives `material` to a servant of the service `service`, which has this interface.
+pub(crate) async fn attempt(
     bus: &Arc<dyn Bus>,
     service: &str,
     interface: &Interface,
     material: Material,
 ) -> Result<Trial, Error> {
     let registry = Registry::from_definitions(&interface.definitions)
-        .map_err(|error| Error::BadRequest(format!("a definition of {service}: {error}")))?;
+        .map_err(|error| Error::Trial(format!("a definition of {service}: {error}")))?;
     let plan = Plan::new(interface, &registry, material)?;
     let mut ears = Ears::open(bus, interface).await?;
     let mut mouths = Vec::new();
@@ -77,7 +59,7 @@ async fn attempt(
             .map_err(failed)?;
         let listening = reaches(publisher.matched(), 1);
         if timeout(PATIENCE, listening).await.is_err() {
-            return Err(Error::BadRequest(format!(
+            return Err(Error::Trial(format!(
                 "no node of {service} listens to {topic}"
             )));
         }
@@ -125,7 +107,7 @@ async fn attempt(
 }
 
 fn failed(error: ros::bus::BusError) -> Error {
-    Error::BadRequest(format!("the trial's servant cannot be used: {error}"))
+    Error::Trial(format!("the trial's servant cannot be used: {error}"))
 }
 
 /// What is published where: the topics, and each message with the number of its topic. The first topic's are requests.
@@ -147,7 +129,7 @@ impl Plan {
                 .iter()
                 .map(|topic| format!("{} ({})", topic.name, topic.type_name))
                 .collect();
-            Error::BadRequest(format!(
+            Error::Trial(format!(
                 "{what}; its inputs are: {}",
                 if known.is_empty() {
                     "none".to_owned()
@@ -231,7 +213,7 @@ impl Plan {
         }
         let wire_type = wire_type(registry, input)?;
         if wire_type.digest != message.wire_type.digest {
-            return Err(Error::BadRequest(format!(
+            return Err(Error::Trial(format!(
                 "{} was recorded with another definition of {} ({}) than the service has ({})",
                 message.topic, wire_type.name, message.wire_type.digest, wire_type.digest
             )));
@@ -248,7 +230,7 @@ fn stamp(type_name: &str, bytes: &[u8], registry: &Registry) -> Option<Time> {
 
 fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
     let known = registry.message(&topic.type_name).map_err(|error| {
-        Error::BadRequest(format!("the type of {} is not known: {error}", topic.name))
+        Error::Trial(format!("the type of {} is not known: {error}", topic.name))
     })?;
     Ok(WireType::of(&known))
 }

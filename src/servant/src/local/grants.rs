@@ -1,5 +1,5 @@
-//! What a service is given beyond its container: devices, volumes, ways out. In: what its push asked for, and what the
-//! configuration allows. Out: mounts, environment and names for the engine, or who refused what.
+//! What a service is given of this host beyond its container: devices, volumes, ways out. In: names, as its push wrote them,
+//! and what the configuration allows. Out: mounts, environment and names of hosts, or who refused what.
 //!
 //! Looked at anew at each start: what is not allowed any more is not given any more.
 
@@ -11,9 +11,10 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use api::Grants;
-use reach::egress::{self, Way};
 use serde::Deserialize;
-use servant::spec::Mount;
+
+use super::Resources;
+use crate::container::Mount;
 
 /// What of this machine a service may be given; nothing by default.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
@@ -42,7 +43,7 @@ pub enum GrantError {
     },
     /// A way out.
     #[error(transparent)]
-    Egress(#[from] egress::Refused),
+    Egress(Box<dyn std::error::Error + Send + Sync>),
     /// A volume is not there.
     #[error("volume {path} cannot be used: {source}")]
     Volume {
@@ -71,9 +72,9 @@ pub enum GrantError {
     },
 }
 
-/// What the engine is told.
+/// What names mean on this host.
 #[derive(Debug, Default, PartialEq)]
-pub struct Granted {
+pub(super) struct Granted {
     /// Volumes and device nodes.
     pub mounts: Vec<Mount>,
     /// Names of hosts that are reached through a loopback address inside.
@@ -85,8 +86,11 @@ pub struct Granted {
 }
 
 impl Granted {
-    /// The plan's environment, with what the devices add.
-    pub fn environment_over(&self, plan: &BTreeMap<String, String>) -> BTreeMap<String, String> {
+    /// The spec's environment, with what the devices add.
+    pub(super) fn environment_over(
+        &self,
+        plan: &BTreeMap<String, String>,
+    ) -> BTreeMap<String, String> {
         let mut all = plan.clone();
         all.extend(self.environment.clone());
         all
@@ -94,8 +98,16 @@ impl Granted {
 }
 
 /// All that was asked for, if it is allowed and there.
-pub fn resolve(grants: &Grants, allow: &Allow) -> Result<Granted, GrantError> {
-    let mut granted = Granted::default();
+pub(super) fn resolve(
+    grants: &Grants,
+    allow: &Allow,
+    resources: &dyn Resources,
+) -> Result<Granted, GrantError> {
+    let hosts = resources.hosts(&grants.egress);
+    let mut granted = Granted {
+        hosts: hosts.map_err(GrantError::Egress)?,
+        ..Granted::default()
+    };
     for volume in &grants.volumes {
         granted.mounts.push(volume::open(volume, &allow.volumes)?);
     }
@@ -105,17 +117,7 @@ pub fn resolve(grants: &Grants, allow: &Allow) -> Result<Granted, GrantError> {
         }
         cdi::add(name, &cdi::directories(), &mut granted)?;
     }
-    for way in ways_out(grants, allow)? {
-        if way.host.parse::<IpAddr>().is_err() {
-            granted.hosts.push((IpAddr::V4(way.inside), way.host));
-        }
-    }
     Ok(granted)
-}
-
-/// Each host asked for, if it is allowed.
-pub fn ways_out(grants: &Grants, allow: &Allow) -> Result<Vec<Way>, GrantError> {
-    Ok(egress::ways_out(&grants.egress, &allow.egress)?)
 }
 
 fn not_allowed(kind: &'static str, name: &str) -> GrantError {

@@ -1,0 +1,338 @@
+//! Lives of servants from beginning to end, told with the engine in memory.
+
+use std::future::pending;
+
+use in_memory::Process;
+use servant::spec::NodeSpec;
+
+use super::*;
+
+/// A machine, and what outlives a daemon on it.
+struct World {
+    _home: tempfile::TempDir,
+    state: Arc<State>,
+    catalogue: Arc<Catalogue>,
+    engine: MemoryEngine,
+}
+
+impl World {
+    fn new() -> World {
+        let home = tempfile::tempdir().expect("a directory");
+        let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+        let state = Arc::new(state);
+        let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
+            .expect("a store");
+        let engine = MemoryEngine::default();
+        engine.program("/greet", |process| async move {
+            process.advertise("/greeting", "std_msgs/String");
+            pending().await
+        });
+        World {
+            _home: home,
+            catalogue: Arc::new(Catalogue::new(Arc::clone(&state), Arc::new(store))),
+            state,
+            engine,
+        }
+    }
+
+    /// A daemon on it, which promises a core to each servant and has two.
+    fn daemon(&self) -> Choreographer {
+        let options = Options {
+            reserve_cpus: 1.0,
+            reserve_memory: 0,
+            spares: 0,
+            ..options()
+        };
+        Choreographer::new(
+            options,
+            Arc::clone(&self.state),
+            Arc::clone(&self.catalogue),
+            Arc::new(self.engine.clone()),
+            Arc::new(self.engine.clone()),
+            Admission::new(Amount::new(2.0, 1 << 30), 16),
+        )
+    }
+
+    /// Publishes a service of one node, `/greeter`, that runs `program` and publishes a topic.
+    fn publish(&self, service: &str, program: &str, change: impl FnOnce(&mut RevisionRecord)) {
+        let mut record = revision(&format!("sha256:{service}"), 1.0);
+        record.service = service.to_owned();
+        record.plan.limits = api::Limits::default();
+        record.plan.nodes = vec![node(program)];
+        let greeting = serde_json::json!({
+            "name": "/greeting", "type": "std_msgs/String", "direction": "output", "nodes": ["/greeter"],
+        });
+        record.interface.topics = vec![serde_json::from_value(greeting).expect("a topic")];
+        change(&mut record);
+        let published = self.state.publish(&record, &Default::default());
+        published.expect("published");
+    }
+
+    /// Messages of events of a kind.
+    fn told(&self, kind: &str) -> Vec<String> {
+        let mut events = self.state.events(0, 1000).expect("events");
+        events.retain(|event| event.kind == kind);
+        events.into_iter().map(|event| event.message).collect()
+    }
+}
+
+fn node(program: &str) -> NodeSpec {
+    let node = serde_json::json!({ "name": "/greeter", "argv": [program] });
+    serde_json::from_value(node).expect("a node")
+}
+
+/// What keeps a servant from becoming ready, or ends it: the words, and its log.
+fn broken(error: Error) -> (String, Vec<String>) {
+    match error {
+        Error::Servant { reason, log, .. } => (reason, log),
+        other => panic!("{other}"),
+    }
+}
+
+async fn failure(lease: &Lease) -> String {
+    lease.handle().ended().await;
+    lease.handle().life().reason().expect("a reason")
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_away() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let reach = lease.ready().await.expect("ready");
+    assert!(reach.graph().borrow().nodes.contains_key("/greeter"));
+    let handle = Arc::clone(lease.handle());
+    let shown = describe(&handle).await;
+    assert_eq!((shown.phase, shown.connections), (Phase::Ready, 1));
+    assert_eq!(shown.usage.expect("it runs").pids, 1);
+    assert_eq!(world.engine.started()[0].image, "sha256:greet");
+    // Back within the grace time, and then not.
+    drop(lease);
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    assert!(Arc::ptr_eq(lease.handle(), &handle), "the same servant");
+    drop(lease);
+    handle.ended().await;
+    assert_eq!(handle.life().phase, Phase::Stopped);
+    assert!(world.engine.servants().is_empty(), "nothing is left");
+    assert_eq!(world.told("servant-stopped").len(), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
+    let world = World::new();
+    world.engine.program("/broken", |process| async move {
+        process.print("no model in /models");
+        3
+    });
+    world.publish("greet", "/broken", |_| {});
+    world.publish("other", "/missing", |_| {});
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let (reason, log) = broken(lease.ready().await.err().expect("it failed"));
+    assert!(reason.contains("/greeter exited with status 3"), "{reason}");
+    assert_eq!(log, ["no model in /models"]);
+    let lease = daemon.ensure("other", "r1", false).expect("a lease");
+    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    assert!(reason.contains("there is no program /missing"), "{reason}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    world.engine.breaks("sha256:greet", "the registry is away");
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    assert!(reason.ends_with("the registry is away"), "{reason}");
+    let camera = api::Grants {
+        devices: vec!["lab.org/camera=0".to_owned()],
+        ..api::Grants::default()
+    };
+    let refused = daemon.check_grants(&camera).expect_err("not allowed");
+    assert!(refused.to_string().contains("[allow]"), "{refused}");
+    world.publish("see", "/greet", |record| {
+        record.plan.grants = camera.clone()
+    });
+    let lease = daemon.ensure("see", "r1", false).expect("a lease");
+    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    assert!(reason.contains("lab.org/camera=0"), "{reason}");
+    world.engine.allow(camera.clone());
+    let lease = daemon.ensure("see", "r2", false).expect("a lease");
+    lease.ready().await.expect("ready");
+    let started = world.engine.started();
+    assert_eq!(started.last().expect("it was started").grants, camera);
+}
+
+/// Greets, fails once it was heard, and never recovers.
+async fn fails(process: Process, after: Duration) -> i32 {
+    process.advertise("/greeting", "std_msgs/String");
+    tokio::time::sleep(after).await;
+    1
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_failing_node_is_started_again_after_pauses_and_then_given_up() {
+    let world = World::new();
+    let program = |process| fails(process, Duration::from_secs(1));
+    world.engine.program("/fails", program);
+    world.publish("greet", "/fails", |record| record.plan.restart = true);
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    lease.ready().await.expect("ready");
+    let reason = failure(&lease).await;
+    assert!(reason.contains("gave /greeter up"), "{reason}");
+    let told = world.told("node-failed");
+    let pauses: Vec<_> = told
+        .iter()
+        .filter_map(|text| text.rsplit_once(" in "))
+        .map(|(_, pause)| pause)
+        .collect();
+    let expected = ["500", "1000", "2000", "4000", "8000", "16000"];
+    assert_eq!(pauses, expected.map(|pause| format!("{pause} ms")));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_respawning_node_is_the_engines_and_its_servant_lives_on() {
+    let world = World::new();
+    world.engine.program("/again", |process| async move {
+        process.advertise("/greeting", "std_msgs/String");
+        match process.start() {
+            1 => tokio::time::sleep(Duration::from_secs(1)).await,
+            _ => pending().await,
+        }
+        7
+    });
+    world.publish("greet", "/again", |record| {
+        record.plan.nodes[0].respawn = true;
+        record.plan.nodes[0].respawn_delay = 2.0;
+    });
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let reach = lease.ready().await.expect("ready");
+    let mut graph = reach.graph();
+    let there = |graph: &Arc<ros::bus::Graph>| graph.nodes.contains_key("/greeter");
+    graph
+        .wait_for(|graph| !there(graph))
+        .await
+        .expect("a graph");
+    graph.wait_for(there).await.expect("a graph");
+    let told = world.told("node-respawned");
+    assert!(
+        told[0].contains("exited with status 7") && told[0].contains("after 2 s"),
+        "{told:?}"
+    );
+    assert_eq!(lease.handle().life().phase, Phase::Ready);
+}
+
+#[tokio::test(start_paused = true)]
+async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it() {
+    let world = World::new();
+    let (sender, eats) = tokio::sync::watch::channel(0);
+    world.engine.program("/eats", move |process| {
+        let mut eats = eats.clone();
+        async move {
+            process.allocate(100 << 20).await;
+            process.advertise("/greeting", "std_msgs/String");
+            while eats.changed().await.is_ok() {
+                process.allocate(100 << 20).await;
+            }
+            0
+        }
+    });
+    let memory = |mib: u64| api::Limits {
+        memory: Some(api::Size(mib << 20)),
+        ..api::Limits::default()
+    };
+    world.publish("greet", "/eats", |record| record.plan.limits = memory(150));
+    let daemon = world.daemon();
+    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    lease.ready().await.expect("ready");
+    let id = lease.handle().id.clone();
+    let enforced = async || {
+        let shown = describe(lease.handle()).await;
+        shown.enforced.expect("it runs").memory
+    };
+    assert_eq!(enforced().await, Some(api::Size(150 << 20)));
+    let refused = daemon.set_limits(&id, memory(50)).await;
+    assert!(matches!(refused, Err(Error::Engine(_))), "it holds more");
+    assert_eq!(enforced().await, Some(api::Size(150 << 20)), "taken back");
+    daemon.set_limits(&id, memory(250)).await.expect("changed");
+    assert_eq!(enforced().await, Some(api::Size(250 << 20)));
+    sender.send_modify(|times| *times += 1);
+    tokio::task::yield_now().await;
+    assert_eq!(lease.handle().life().phase, Phase::Ready);
+    sender.send_modify(|times| *times += 1);
+    let reason = failure(&lease).await;
+    assert!(reason.contains("250"), "{reason}");
+    assert_eq!(world.told("out-of-memory").len(), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let ready = async |robot: &str| {
+        let lease = daemon.ensure("greet", robot, false).expect("a lease");
+        lease.ready().await.expect("ready");
+        lease
+    };
+    let (first, _second) = (ready("r1").await, ready("r2").await);
+    let third = daemon.ensure("greet", "r3", false).expect("a lease");
+    let waiting = tokio::time::timeout(Duration::from_secs(1), third.admitted());
+    waiting.await.expect_err("there are two cores");
+    let ended = Arc::clone(first.handle());
+    drop(first);
+    third.ready().await.expect("ready");
+    assert_eq!(ended.life().phase, Phase::Stopped);
+    // Nobody leaves this time.
+    let fourth = daemon.ensure("greet", "r4", false).expect("a lease");
+    let refused = fourth.ready().await.err().expect("no room");
+    assert!(matches!(refused, Error::Full(_)), "{refused}");
+}
+
+#[tokio::test]
+async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    // A daemon of its own runtime, which dies with all its tasks; the engine's nodes do not.
+    let daemon = world.daemon();
+    let died = tokio::task::spawn_blocking(move || {
+        let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+        let ids = runtime.block_on(async {
+            let mut ids = Vec::new();
+            for robot in ["r1", "r2"] {
+                let lease = daemon.ensure("greet", robot, false).expect("a lease");
+                lease.ready().await.expect("ready");
+                ids.push(lease.handle().id.clone());
+                // It dies before its robots leave.
+                std::mem::forget(lease);
+            }
+            ids
+        });
+        runtime.shutdown_background();
+        ids
+    });
+    let ids = died.await.expect("no panic");
+    let ended = world.engine.servant(&ids[1]).expect("it is there");
+    ended.fail("its node was killed");
+    world.engine.leave_behind("half-made");
+    let next = world.daemon();
+    assert_eq!(next.adopt().await.expect("it starts"), 1);
+    let left = world.told("servant-leftover");
+    assert!(left.len() == 1 && left[0].contains("half-made"), "{left:?}");
+    let lost = world.told("servant-lost");
+    assert!(
+        lost.len() == 1 && lost[0].contains(&ids[1]) && lost[0].ends_with("its node was killed"),
+        "{lost:?}"
+    );
+    // The robot finds its servant, and nothing was started for that.
+    let lease = next.ensure("greet", "r1", false).expect("a lease");
+    lease.ready().await.expect("ready");
+    assert_eq!(lease.handle().id, ids[0]);
+    assert_eq!(world.engine.started().len(), 2);
+    next.stop("the test is over", |_| true).await;
+    assert!(world.engine.servants().is_empty());
+}

@@ -1,0 +1,59 @@
+//! What a program of a node sees of the world.
+
+use std::sync::Arc;
+
+use ros::bus::{Graph, TopicNodes};
+use servant::spec::NodeSpec;
+
+use crate::servants::MemoryServant;
+
+/// One run of a node.
+pub struct Process {
+    pub(crate) servant: Arc<MemoryServant>,
+    pub(crate) node: NodeSpec,
+    /// From 1 on.
+    pub(crate) start: u32,
+}
+
+impl Process {
+    /// How often the node was started, this time included.
+    pub fn start(&self) -> u32 {
+        self.start
+    }
+
+    /// Prints a line on standard output.
+    pub fn print(&self, line: &str) {
+        self.servant.print(&self.node.name, line);
+    }
+
+    /// Registers the node as publisher of a topic.
+    pub fn advertise(&self, topic: &str, type_name: &str) {
+        let name = self.node.name.clone();
+        self.register(|graph| {
+            let ends = graph.topics.entry(topic.to_owned()).or_default();
+            *ends = TopicNodes {
+                type_name: type_name.to_owned(),
+                publishers: vec![name],
+                ..std::mem::take(ends)
+            };
+        });
+    }
+
+    /// Takes memory until the node ends. The node is killed where its servant has not so much left.
+    pub async fn allocate(&self, bytes: u64) {
+        if !self.servant.allocate(&self.node.name, bytes) {
+            std::future::pending::<()>().await;
+        }
+    }
+
+    fn register(&self, change: impl FnOnce(&mut Graph)) {
+        let name = self.node.name.clone();
+        self.servant.graph.send_modify(|graph| {
+            let mut next = Graph::clone(graph);
+            next.generation += 1;
+            next.nodes.insert(name, String::new());
+            change(&mut next);
+            *graph = Arc::new(next);
+        });
+    }
+}
