@@ -6,6 +6,26 @@ use servant::engine::{LogStart, Servant};
 use crate::support::*;
 
 #[tokio::test]
+async fn a_shim_may_end_processes_and_nothing_else() {
+    let world = World::new();
+    let servant = world.start(spec(vec![])).await;
+    let shim = world.runtime(servant.id()).shim.pid;
+    let kill = "0000000000000020";
+    let none = "0000000000000000";
+    for (name, value) in [
+        ("CapInh", none),
+        ("CapPrm", kill),
+        ("CapEff", kill),
+        ("CapBnd", kill),
+        ("CapAmb", none),
+        ("NoNewPrivs", "1"),
+    ] {
+        assert_eq!(status_field(shim, name), value, "{name}");
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
 async fn every_process_is_confined_as_seen_from_the_host() {
     let world = World::new();
     let servant = world
