@@ -327,13 +327,9 @@ impl Choreographer {
 pub async fn describe(handle: &Handle) -> api::Servant {
     let life = handle.life();
     let reach = handle.reach();
-    let running = matches!(life.phase, Phase::Created | Phase::Starting | Phase::Ready);
+    let running = runs(life.phase);
     let container = handle.container().filter(|_| running);
-    let enforced = container.as_ref().map(|container| container.enforced());
-    let usage = match &container {
-        Some(container) => container.usage().await.ok(),
-        None => None,
-    };
+    let enforced = container.map(|container| container.enforced());
     let pids = reach.as_ref().filter(|_| running);
     api::Servant {
         id: handle.id.clone(),
@@ -350,21 +346,33 @@ pub async fn describe(handle: &Handle) -> api::Servant {
             .as_ref()
             .map_or(0, |enforced| enforced.cgroup_version),
         enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
-        usage: usage.map(|usage| api::Usage {
-            cpu_usec: usage.cpu_usec,
-            memory: usage.memory,
-            pids: usage.pids,
-            oom_kills: usage.oom_kills,
-            throttled_usec: usage.throttled_usec,
-            pressure: usage.pressure.map(|pressure| api::Pressure {
-                cpu: pressure.cpu,
-                memory: pressure.memory,
-                io: pressure.io,
-            }),
-        }),
+        usage: usage(handle).await,
         pids: pids.map_or_else(Vec::new, |reach| reach.processes()),
         dropped: reach.map_or(0, |reach| reach.dropped()),
     }
+}
+
+/// What a servant uses, while it runs.
+pub async fn usage(handle: &Handle) -> Option<api::Usage> {
+    let container = handle.container().filter(|_| runs(handle.life().phase))?;
+    // One that has ended meanwhile uses nothing.
+    let usage = container.usage().await.ok()?;
+    Some(api::Usage {
+        cpu_usec: usage.cpu_usec,
+        memory: usage.memory,
+        pids: usage.pids,
+        oom_kills: usage.oom_kills,
+        throttled_usec: usage.throttled_usec,
+        pressure: usage.pressure.map(|pressure| api::Pressure {
+            cpu: pressure.cpu,
+            memory: pressure.memory,
+            io: pressure.io,
+        }),
+    })
+}
+
+fn runs(phase: Phase) -> bool {
+    matches!(phase, Phase::Created | Phase::Starting | Phase::Ready)
 }
 
 #[cfg(test)]

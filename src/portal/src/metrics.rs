@@ -12,7 +12,7 @@ use bridge::Metrics;
 
 use crate::app::App;
 use crate::errors::Error;
-use choreographer::{Choreographer, Handle, describe};
+use choreographer::{Choreographer, Handle};
 
 const PHASES: [Phase; 6] = [
     Phase::Requested,
@@ -178,7 +178,7 @@ fn room(out: &mut String, choreographer: &Choreographer) {
 async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
     let mut rows = Vec::new();
     for handle in handles {
-        if let Some(usage) = describe(handle).await.usage {
+        if let Some(usage) = choreographer::usage(handle).await {
             rows.push((labels_of(handle), usage));
         }
     }

@@ -162,9 +162,8 @@ async fn used(servants: &[Arc<Handle>]) -> api::Usage {
         pressure: machine_pressure(),
         ..api::Usage::default()
     };
-    for container in servants.iter().filter_map(|servant| servant.container()) {
-        // One that has ended meanwhile uses nothing.
-        if let Ok(usage) = container.usage().await {
+    for servant in servants {
+        if let Some(usage) = choreographer::usage(servant).await {
             sum.cpu_usec += usage.cpu_usec;
             sum.memory += usage.memory;
             sum.pids += usage.pids;
