@@ -4,7 +4,7 @@
 use std::process::ExitCode;
 
 use libtest_mimic::{Arguments, Trial};
-use support::Told;
+use support::Verdict;
 
 #[path = "stories/answer.rs"]
 mod answer;
@@ -56,10 +56,6 @@ mod readiness;
 mod refusals;
 #[path = "stories/shadowing.rs"]
 mod shadowing;
-#[path = "stories/spares.rs"]
-mod spares;
-#[path = "stories/strangers.rs"]
-mod strangers;
 #[path = "stories/survival.rs"]
 mod survival;
 #[path = "stories/tls.rs"]
@@ -68,9 +64,13 @@ mod tls;
 mod tokens;
 #[path = "stories/trying.rs"]
 mod trying;
+#[path = "stories/untrusted.rs"]
+mod untrusted;
+#[path = "stories/warm_pool.rs"]
+mod warm_pool;
 
 /// A story under its function's name.
-fn story(name: &str, tell: fn() -> Told) -> Trial {
+fn story(name: &str, tell: fn() -> Verdict) -> Trial {
     Trial::test(name, move || {
         tell().map_err(|error| format!("{error:#}").into())
     })
@@ -241,11 +241,11 @@ fn main() -> ExitCode {
             reserved_and_taken_names,
             a_disk_with_no_room,
         ],
-        stories![spares:
+        stories![warm_pool:
             a_robot_takes_the_container_made_ahead_and_another_is_made,
-            a_killed_daemons_spares_end_without_a_word,
+            a_killed_daemons_warm_pool_end_without_a_word,
         ],
-        stories![strangers:
+        stories![untrusted:
             who_dribbles_an_upgrade_is_let_go,
             rubbish_instead_of_an_upgrade_is_refused,
             two_sockets_of_one_robot_share_its_servant,

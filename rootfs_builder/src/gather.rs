@@ -93,9 +93,9 @@ pub(crate) async fn gather(
             .collect();
         let of_round = looked_into_each(archive, &debs, progress, deb::at_run_time).await?;
         for (deb, members) in debs.iter().zip(of_round) {
-            let told = tell(&members, base);
+            let report = report(&members, base);
             let itself = matches!(depth, Depth::Itself { .. });
-            for name in told.needed {
+            for name in report.needed {
                 match provided(archive, base, &name) {
                     Provided::Ros => {
                         next.insert(name);
@@ -108,8 +108,8 @@ pub(crate) async fn gather(
                     Provided::Debs(_) | Provided::Nothing => {}
                 }
             }
-            wanted.warnings.extend(told.warnings);
-            for library in told.plugins {
+            wanted.warnings.extend(report.warnings);
+            for library in report.plugins {
                 want_plugin(archive, &library, &members, &mut wanted);
             }
             if deb.name.ends_with("-dev") {
@@ -211,15 +211,15 @@ fn provided(archive: &Archive, base: &Base, name: &str) -> Provided {
 
 /// What the package.xml files and plugin lists among these members say.
 #[derive(Debug, Default, PartialEq)]
-struct Told {
+struct Report {
     /// ROS packages and rosdep keys.
     needed: BTreeSet<String>,
     plugins: BTreeSet<PluginLibrary>,
     warnings: Vec<String>,
 }
 
-fn tell(members: &[Member], base: &Base) -> Told {
-    let mut told = Told::default();
+fn report(members: &[Member], base: &Base) -> Report {
+    let mut report = Report::default();
     let texts: BTreeMap<&Path, &[u8]> = members
         .iter()
         .filter_map(|member| match &member.content {
@@ -235,15 +235,15 @@ fn tell(members: &[Member], base: &Base) -> Told {
             && path.components().count() == 4
         {
             match manifest::run_dependencies(text, path, base) {
-                Ok(names) => told.needed.extend(names),
-                Err(problem) => told.warnings.push(format!("in the archive: {problem}")),
+                Ok(names) => report.needed.extend(names),
+                Err(problem) => report.warnings.push(format!("in the archive: {problem}")),
             }
         } else if path.extension().is_some_and(|extension| extension == "xml") {
             // A plugin list may be exported by a package.xml of another Debian package; they all look alike.
-            told.plugins.extend(manifest::plugin_libraries(text));
+            report.plugins.extend(manifest::plugin_libraries(text));
         }
     }
-    told
+    report
 }
 
 /// A plugin list names `libx`; the file with that name is a link in a development package to `libx.so.1`, which is
@@ -325,16 +325,16 @@ mod tests {
             ),
             file("usr/share/x/launch/other.xml", "<launch/>"),
         ];
-        let told = tell(&members, &base);
+        let report = report(&members, &base);
         assert!(
-            told.needed.contains("nodelet") && !told.needed.contains("rostest"),
-            "{told:?}"
+            report.needed.contains("nodelet") && !report.needed.contains("rostest"),
+            "{report:?}"
         );
         let plugin = PluginLibrary {
             name: "libx_nodelets.so".to_owned(),
             in_directory: true,
         };
-        assert_eq!(told.plugins, [plugin].into());
+        assert_eq!(report.plugins, [plugin].into());
     }
 
     fn archive(directory: &Path, contents: &str, names: &[&str]) -> Archive {

@@ -5,9 +5,9 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use support::deployer::run;
 use support::world::{PEOPLE, world};
-use support::{Told, binaries};
+use support::{Verdict, binaries};
 
-pub fn a_robot_finds_people_in_real_pictures() -> Told {
+pub fn a_robot_finds_people_in_real_pictures() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let picture = daemon.home.join("people.png");
     let outcome = run(Command::new(binaries::python())
@@ -28,7 +28,7 @@ pub fn a_robot_finds_people_in_real_pictures() -> Told {
     Ok(())
 }
 
-pub fn the_interface_is_found_lazy_inputs_included() -> Told {
+pub fn the_interface_is_found_lazy_inputs_included() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let service = daemon.get_json("/api/v1/services/opencv_apps")?;
     let topics = service["interface"]["topics"]

@@ -11,7 +11,7 @@ use serde_json::json;
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::world::world;
-use support::{Told, leftovers, procfs};
+use support::{Verdict, leftovers, procfs};
 
 const GREETER: (&str, &[&str]) = ("greeter_cpp", &["--node", "greeter", "--param", "word=hi"]);
 
@@ -54,7 +54,7 @@ fn during<T>(
     push: &JoinHandle<T>,
     what: &str,
     mut is: impl FnMut() -> anyhow::Result<bool>,
-) -> Told {
+) -> Verdict {
     while !is()? {
         ensure!(!push.is_finished(), "the push ended without {what}");
         std::thread::sleep(LOOK_EVERY);
@@ -62,7 +62,7 @@ fn during<T>(
     Ok(())
 }
 
-pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Told {
+pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Verdict {
     let daemon = world()
         .own("bounds")
         .config("[push]\ndisk = \"8G\"\n")
@@ -91,7 +91,7 @@ pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Told {
     Ok(())
 }
 
-pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Told {
+pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Verdict {
     let daemon = world().own("cancelled").start()?;
     let place = world().directory("cancelled-packages")?;
     let sleeper = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
@@ -118,7 +118,7 @@ pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Told {
     Ok(())
 }
 
-pub fn a_second_signal_ends_the_daemon_at_once() -> Told {
+pub fn a_second_signal_ends_the_daemon_at_once() -> Verdict {
     let setup = world().own("impatient");
     let daemon = setup.start()?;
     daemon
@@ -154,7 +154,7 @@ fn parent(pid: i32) -> anyhow::Result<i32> {
     Ok(status.get("PPid").context("PPid")?.parse()?)
 }
 
-pub fn a_probe_waits_for_room_like_any_servant() -> Told {
+pub fn a_probe_waits_for_room_like_any_servant() -> Verdict {
     // Room for one servant whose push asked for nothing.
     let daemon = world()
         .own("probe-room")

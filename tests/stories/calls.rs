@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 use ros::bus::{Bus, ServiceHandler, ServiceType};
 use ros::ros1::Ros1Bus;
 use ros::schema::Registry;
-use support::Told;
+use support::Verdict;
 use support::cutter::Cutter;
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
@@ -163,7 +163,7 @@ fn is_sought(site: &Site, app: &Ros1Bus, service: &str, stub: &Running) -> anyho
 const THE_CROSSING: (&str, &str) = ("crossing_py", "crossing.py");
 const THE_CALLER: (&str, &str) = ("caller_cpp", "caller");
 
-pub fn a_python_node_calls_the_robot() -> Told {
+pub fn a_python_node_calls_the_robot() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -265,7 +265,7 @@ impl ServiceHandler for Scale {
     }
 }
 
-pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Told {
+pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     let daemon = world().with(CALLER)?;
     // It was seen at push that it waits.
     let service = daemon.get_json("/api/v1/services/caller_cpp")?;
@@ -339,7 +339,7 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Told {
     Ok(())
 }
 
-pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link() -> Told {
+pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link() -> Verdict {
     // Of its own: it is killed.
     let setup = world().own("calls-cut");
     let daemon = setup.start()?;
@@ -387,7 +387,7 @@ pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link() -> Told {
     Ok(())
 }
 
-pub fn siblings_come_first_and_other_robots_are_not_asked() -> Told {
+pub fn siblings_come_first_and_other_robots_are_not_asked() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let site = Site::new()?;
     let app = site.node("/app")?;

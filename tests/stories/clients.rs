@@ -7,22 +7,22 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
 use support::world::{FIXTURE, world};
-use support::{Told, binaries};
+use support::{Verdict, binaries};
 
-pub fn roslibpy_finds_nothing_missing() -> Told {
+pub fn roslibpy_finds_nothing_missing() -> Verdict {
     let mut command = Command::new(binaries::python());
     command.arg(program("with_roslibpy.py"));
     finds_nothing_missing(command, "roslibpy")
 }
 
-pub fn roslib_finds_nothing_missing() -> Told {
+pub fn roslib_finds_nothing_missing() -> Verdict {
     let mut command = Command::new("node");
     command.arg(program("with_roslib.cjs"));
     command.env("NODE_PATH", binaries::node_modules());
     finds_nothing_missing(command, "roslib")
 }
 
-pub fn roslibrust_finds_nothing_missing() -> Told {
+pub fn roslibrust_finds_nothing_missing() -> Verdict {
     finds_nothing_missing(
         Command::new(binaries::path("robot-with-roslibrust")),
         "roslibrust",
@@ -34,7 +34,7 @@ fn program(name: &str) -> PathBuf {
 }
 
 /// Runs a client's program for a robot of this name; when the program asks for it, ends the robot's servant.
-fn finds_nothing_missing(mut command: Command, robot: &str) -> Told {
+fn finds_nothing_missing(mut command: Command, robot: &str) -> Verdict {
     let daemon = world().with(FIXTURE)?;
     let mut child = command
         .arg(daemon.url(&format!("{}?robot={robot}", FIXTURE.name)))

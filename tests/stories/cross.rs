@@ -1,12 +1,12 @@
 //! Robots of other architectures. `make test-cross` builds their programs and tells these stories; qemu-user runs them.
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::site::{Site, registered, string};
 use support::world::{TELLER, world};
 
 /// A robot with this architecture's stub: its node is there, hears and speaks.
-fn works_on(architecture: &str, emulator: &str) -> Told {
+fn works_on(architecture: &str, emulator: &str) -> Verdict {
     let daemon = world().with(TELLER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -26,10 +26,10 @@ fn works_on(architecture: &str, emulator: &str) -> Told {
     Ok(())
 }
 
-pub fn an_aarch64_robot_works() -> Told {
+pub fn an_aarch64_robot_works() -> Verdict {
     works_on("aarch64", "qemu-aarch64")
 }
 
-pub fn an_armv7_robot_works() -> Told {
+pub fn an_armv7_robot_works() -> Verdict {
     works_on("armv7", "qemu-arm")
 }

@@ -9,7 +9,7 @@ use ros::bus::{
 };
 use ros::ros1::Ros1Bus;
 use ros::schema::{MessageType, Registry};
-use support::Told;
+use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
@@ -65,7 +65,7 @@ pub fn advertises(
 ) -> anyhow::Result<Box<dyn Publisher>> {
     Ok(site.runtime.block_on(node.advertise(
         topic,
-        WireType::of(&of),
+        WireType::of(of),
         Qos::keep_last(10).latching(latch),
     ))?)
 }
@@ -177,7 +177,7 @@ pub fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscr
     Ok(subscription)
 }
 
-pub fn stamps_mean_the_same_where_clocks_differ() -> Told {
+pub fn stamps_mean_the_same_where_clocks_differ() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let stamped = types.message("geometry_msgs/PointStamped")?;
@@ -209,7 +209,7 @@ pub fn stamps_mean_the_same_where_clocks_differ() -> Told {
     Ok(())
 }
 
-pub fn simulated_time_is_the_robot_s() -> Told {
+pub fn simulated_time_is_the_robot_s() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let site = Site::new()?;
@@ -247,7 +247,7 @@ pub fn simulated_time_is_the_robot_s() -> Told {
     Ok(())
 }
 
-pub fn transforms_of_all_publishers_arrive() -> Told {
+pub fn transforms_of_all_publishers_arrive() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let transforms = types.message("tf2_msgs/TFMessage")?;
@@ -288,7 +288,7 @@ pub fn transforms_of_all_publishers_arrive() -> Told {
     }
 }
 
-pub fn an_action_is_carried_out_in_the_cloud() -> Told {
+pub fn an_action_is_carried_out_in_the_cloud() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let action = types.action("actionlib/Test")?;
@@ -351,7 +351,7 @@ const LATE: Badness = Badness {
     limit: 10_000,
 };
 
-pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Told {
+pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let action = types.action("actionlib/Test")?;
@@ -387,7 +387,7 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Tol
         message.bytes.windows(told.len()).any(|part| part == told)
     };
     let mut all: Vec<Message> = Vec::new();
-    let mut hears = |id: &str| -> Told {
+    let mut hears = |id: &str| -> Verdict {
         while !all.iter().any(|result| is_of(result, id)) {
             let result = with_log(site.next(&mut results), &stub)?;
             all.push(result);
@@ -441,7 +441,7 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Tol
     Ok(())
 }
 
-pub fn explain_names_a_clock_and_a_queue() -> Told {
+pub fn explain_names_a_clock_and_a_queue() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let stamped = types.message("geometry_msgs/PointStamped")?;
@@ -488,7 +488,7 @@ pub fn explain_names_a_clock_and_a_queue() -> Told {
     Ok(())
 }
 
-pub fn settings_are_changed_through_dynamic_reconfigure() -> Told {
+pub fn settings_are_changed_through_dynamic_reconfigure() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let site = Site::new()?;
     let app: Arc<Ros1Bus> = site.node("/app")?;
@@ -542,7 +542,7 @@ fn picture(number: u32) -> Vec<u8> {
     picture.0
 }
 
-pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Told {
+pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
     let image = types.message("sensor_msgs/Image")?;

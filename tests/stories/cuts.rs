@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicI64, AtomicU32, AtomicUsize, Ordering};
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use ros::bus::{Bus, Graph};
-use support::Told;
+use support::Verdict;
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::robot::PATIENCE;
@@ -46,7 +46,7 @@ fn holds(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
     Ok((count("fd")?, count("task")?, resident.context("VmRSS")?))
 }
 
-pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> Told {
+pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> Verdict {
     // A thousand: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
     let cuts = std::env::var("CLOUDROID_CUTS")
         .ok()

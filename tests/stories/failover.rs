@@ -7,7 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use ros::bus::Subscription;
-use support::Told;
+use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
 use support::people::{self, Camera, picture};
@@ -78,7 +78,7 @@ impl Scene {
     }
 
     /// Waits until this picture is answered; others are noted.
-    fn hears(&mut self, number: u32) -> Told {
+    fn hears(&mut self, number: u32) -> Verdict {
         while !self.answers.contains_key(&number) {
             let message = self.site.next(&mut self.camera.found);
             let message = message.with_context(|| {
@@ -95,7 +95,7 @@ impl Scene {
     }
 
     /// Waits until the stub has said this so many times.
-    fn says(&self, words: &str, times: usize) -> Told {
+    fn says(&self, words: &str, times: usize) -> Verdict {
         self.stub.says_times(words, times)
     }
 
@@ -104,7 +104,7 @@ impl Scene {
     }
 
     /// Shows pictures, one after the other is answered, until the stub has said this so many times.
-    fn asks_until(&mut self, words: &str, times: usize) -> Told {
+    fn asks_until(&mut self, words: &str, times: usize) -> Verdict {
         let deadline = Instant::now() + PATIENCE;
         while self.count(words) < times {
             if Instant::now() > deadline {
@@ -117,7 +117,7 @@ impl Scene {
     }
 
     /// Waits until `explain` names this.
-    fn explains(&self, words: &str) -> Told {
+    fn explains(&self, words: &str) -> Verdict {
         let what = format!("an explanation that names {words:?}");
         self.daemon.awaits(&self.explanation(), &what, |explained| {
             explained["causes"]
@@ -128,7 +128,7 @@ impl Scene {
     }
 
     /// Waits until the last events of this robot about its local original are of these kinds.
-    fn happened(&self, kinds: &[&str]) -> Told {
+    fn happened(&self, kinds: &[&str]) -> Verdict {
         support::until(&format!("events that end with {kinds:?}"), || {
             let events = self.daemon.api("/api/v1/events?limit=10000")?;
             let mine = events.as_array().context("a list")?.iter();
@@ -146,7 +146,7 @@ impl Scene {
     }
 
     /// Waits until the robot's diagnostics say this.
-    fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Told {
+    fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Verdict {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let message = self.site.next(diagnostics)?;
@@ -162,7 +162,7 @@ impl Scene {
     }
 
     /// Waits until `explain` has this of the link.
-    fn explains_link(&self, key: &str, value: f64) -> Told {
+    fn explains_link(&self, key: &str, value: f64) -> Verdict {
         let what = format!("a link whose {key} is {value}");
         self.daemon.awaits(&self.explanation(), &what, |explained| {
             (explained["servants"][0]["links"][0][key] == value).then_some(())
@@ -179,7 +179,7 @@ impl Scene {
     }
 }
 
-pub fn a_slow_network_costs_few_requests() -> Told {
+pub fn a_slow_network_costs_few_requests() -> Verdict {
     let more = format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
     let mut scene = Scene::new("failover-slow", &more)?;
     for _ in 0..3 {
@@ -228,7 +228,7 @@ pub fn a_slow_network_costs_few_requests() -> Told {
     Ok(())
 }
 
-pub fn a_lost_link_hands_over_and_back() -> Told {
+pub fn a_lost_link_hands_over_and_back() -> Verdict {
     let (daemon, robot) = (world().shared()?, "failover-lost");
     let service = "people_stateful";
     let push = ["push", "--stateful", "--name", service];
@@ -283,7 +283,7 @@ pub fn a_lost_link_hands_over_and_back() -> Told {
     Ok(())
 }
 
-pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Told {
+pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Verdict {
     let rate = 1.0 / T_MAX;
     let more = format!(
         "local = \"cold\"\nframes_per_second = {rate}\n\
@@ -310,7 +310,7 @@ pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Told {
     scene.asks_until("the local original is stopped", 1)
 }
 
-pub fn outputs_that_become_too_old_wake_the_original() -> Told {
+pub fn outputs_that_become_too_old_wake_the_original() -> Verdict {
     let more = format!("local = \"cold\"\nage = {T_MAX:?}");
     let mut scene = Scene::new("failover-age", &more)?;
     scene.explains_link("age", T_MAX * 1e3)?;
@@ -328,7 +328,7 @@ pub fn outputs_that_become_too_old_wake_the_original() -> Told {
     scene.says("the local original answers, too", 2)
 }
 
-pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Told {
+pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Verdict {
     let more = format!("local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
     let mut scene = Scene::new("failover-sign", &more)?;
     let number = scene.asks();
@@ -359,7 +359,7 @@ pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Told {
     Ok(())
 }
 
-pub fn explain_says_why() -> Told {
+pub fn explain_says_why() -> Verdict {
     let more = format!("local = \"none\"\ndesire = 0.001\nmax = {T_MAX:?}");
     let mut scene = Scene::new("failover-why", &more)?;
     for _ in 0..3 {

@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use bytes::{BufMut, Bytes, BytesMut};
 use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
-use support::Told;
+use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
 use support::robot::PATIENCE;
@@ -169,7 +169,7 @@ impl Robot {
     }
 
     /// Shows scans of a cell until one is answered; the answer is right.
-    fn is_found(&mut self, cell: (usize, usize), stub: &Running) -> Told {
+    fn is_found(&mut self, cell: (usize, usize), stub: &Running) -> Verdict {
         let wanted = [cell.0, cell.1].map(|at| (at as f64 + 0.5) * f64::from(RESOLUTION));
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -200,12 +200,12 @@ impl Robot {
 }
 
 /// Waits until the stub has said this so many times.
-fn says(stub: &Running, words: &str, times: usize) -> Told {
+fn says(stub: &Running, words: &str, times: usize) -> Verdict {
     stub.says_times(words, times)
 }
 
 /// Waits until a topic's message has these words.
-fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Told {
+fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Verdict {
     let deadline = Instant::now() + PATIENCE;
     loop {
         let message = site.next(subscription)?;
@@ -217,7 +217,7 @@ fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Told {
     }
 }
 
-pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() -> Told {
+pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() -> Verdict {
     let daemon = world().with(LOCALISER)?;
     let cable = Cable::new(&daemon.address)?;
     let mut robot = Robot::new()?;
@@ -278,7 +278,7 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
     Ok(())
 }
 
-pub fn a_server_that_was_never_reached_is_stood_in_for() -> Told {
+pub fn a_server_that_was_never_reached_is_stood_in_for() -> Verdict {
     let daemon = world().with(LOCALISER)?;
     let mut robot = Robot::new()?;
     // Nobody listens there.
@@ -289,7 +289,7 @@ pub fn a_server_that_was_never_reached_is_stood_in_for() -> Told {
     Ok(())
 }
 
-pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone() -> Told {
+pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone() -> Verdict {
     let daemon = world().with(LOCALISER)?;
     let robot = Robot::new()?;
     let overlay = robot

@@ -3,12 +3,12 @@
 use std::net::TcpListener;
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::deployer::path_str;
 use support::grants::{INSIDE, KIND, Specification, are_there_and_no_more, lay_out};
 use support::world::{BURGLAR, world};
 
-pub fn a_service_is_given_what_its_operator_allows() -> Told {
+pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     let _specification = Specification::write(KIND)?;
     let place = tempfile::tempdir()?;
     let models = place.path().join("models");
@@ -51,7 +51,7 @@ pub fn a_service_is_given_what_its_operator_allows() -> Told {
     Ok(())
 }
 
-pub fn nothing_is_given_unasked_or_unallowed() -> Told {
+pub fn nothing_is_given_unasked_or_unallowed() -> Verdict {
     let daemon = world().with(BURGLAR)?;
     for (flag, value, kind) in [
         ("--volume", "/etc:/models", "volume /etc"),

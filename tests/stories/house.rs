@@ -12,9 +12,9 @@ use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
 use support::world::{PEOPLE, world};
-use support::{Told, binaries, leftovers};
+use support::{Verdict, binaries, leftovers};
 
-pub fn a_second_daemon_on_the_same_home_is_refused() -> Told {
+pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
     let daemon = world().own("one").start()?;
     let said = world().own("one").refuses_to_start()?;
     ensure!(
@@ -26,7 +26,7 @@ pub fn a_second_daemon_on_the_same_home_is_refused() -> Told {
 }
 
 /// What below a home others may read, write or enter, but for what layers hold: that has the rights of its image.
-fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Told {
+fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Verdict {
     let about = match path.symlink_metadata() {
         // Servants come and go.
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
@@ -49,7 +49,7 @@ fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Told {
     Ok(())
 }
 
-fn is_closed(home: &Path) -> Told {
+fn is_closed(home: &Path) -> Verdict {
     let mut found = Vec::new();
     open_to_others(home, &mut found)?;
     ensure!(found.is_empty(), "open to others: {found:#?}");
@@ -57,7 +57,7 @@ fn is_closed(home: &Path) -> Told {
 }
 
 /// As earlier versions left it.
-fn open_up(path: &Path) -> Told {
+fn open_up(path: &Path) -> Verdict {
     let about = path.symlink_metadata()?;
     if about.is_symlink()
         || ["skeleton", "layers"]
@@ -76,13 +76,13 @@ fn open_up(path: &Path) -> Told {
     Ok(())
 }
 
-pub fn the_state_is_closed_to_others() -> Told {
+pub fn the_state_is_closed_to_others() -> Verdict {
     let daemon = world().own("closed").start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
         .succeeded()?;
-    let adds = |daemon: &Daemon| -> Told {
+    let adds = |daemon: &Daemon| -> Verdict {
         let mut robot = daemon.robot("adder_py?robot=r1")?;
         let answer = robot.calls("/add_two", json!({"a": 1, "b": 2}))?;
         ensure!(answer["values"]["sum"] == 3, "{answer}");
@@ -113,7 +113,7 @@ pub fn the_state_is_closed_to_others() -> Told {
     adds(&daemon)
 }
 
-pub fn a_taken_port_is_named() -> Told {
+pub fn a_taken_port_is_named() -> Verdict {
     let daemon = world().own("port-owner").start()?;
     let said = world()
         .own("port-wanter")
@@ -126,7 +126,7 @@ pub fn a_taken_port_is_named() -> Told {
     Ok(())
 }
 
-pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Told {
+pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Verdict {
     // The demo's daemon fetches nothing that the shared one has not left in the cache.
     world().with(PEOPLE)?;
     let home = world().home("demo");
@@ -152,7 +152,7 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Told {
     Ok(())
 }
 
-pub fn doctor_names_each_need() -> Told {
+pub fn doctor_names_each_need() -> Verdict {
     let daemon = world().shared()?;
     let outcome = daemon.deployer().types(&["doctor"])?;
     for need in [
@@ -176,7 +176,7 @@ pub fn doctor_names_each_need() -> Told {
     Ok(())
 }
 
-pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Told {
+pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Verdict {
     let daemon = world()
         .own("impatient")
         .config("[servant]\ngrace = \"1s\"\n")

@@ -4,11 +4,11 @@ use std::process::Command;
 
 use anyhow::ensure;
 use serde_json::Value;
-use support::Told;
+use support::Verdict;
 use support::deployer::run;
 use support::world::{ADDER, world};
 
-pub fn skopeo_and_umoci_read_the_store() -> Told {
+pub fn skopeo_and_umoci_read_the_store() -> Verdict {
     let daemon = world().with(ADDER)?;
     let store = daemon.home.join("images");
     let inspected = run(Command::new("skopeo")
@@ -61,7 +61,7 @@ pub fn skopeo_and_umoci_read_the_store() -> Told {
     Ok(())
 }
 
-pub fn what_nobody_refers_to_is_collected() -> Told {
+pub fn what_nobody_refers_to_is_collected() -> Verdict {
     let daemon = world().with(ADDER)?;
     let deployer = daemon.deployer();
     deployer

@@ -4,7 +4,7 @@ use anyhow::{Context, ensure};
 use serde_json::json;
 use support::daemon::Daemon;
 use support::world::{ADDER, GREETER, PEOPLE, Service, world};
-use support::{Told, procfs};
+use support::{Verdict, procfs};
 
 /// The host pids of a robot's node processes.
 fn pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>> {
@@ -22,7 +22,7 @@ fn pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>>
     Ok(pids)
 }
 
-pub fn every_node_process_is_confined() -> Told {
+pub fn every_node_process_is_confined() -> Verdict {
     for service in [PEOPLE, GREETER, ADDER] {
         let daemon = world().with(service)?;
         let _robot = daemon
@@ -73,7 +73,7 @@ pub fn every_node_process_is_confined() -> Told {
     Ok(())
 }
 
-pub fn nothing_of_ours_but_init_runs_inside() -> Told {
+pub fn nothing_of_ours_but_init_runs_inside() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let _answer = daemon
         .robot("opencv_apps?robot=counted")?
@@ -106,7 +106,7 @@ pub fn nothing_of_ours_but_init_runs_inside() -> Told {
     Ok(())
 }
 
-pub fn limits_are_set_and_read_back() -> Told {
+pub fn limits_are_set_and_read_back() -> Verdict {
     let daemon = world().with(GREETER)?;
     let _answer = daemon
         .robot("greeter_cpp?robot=limited")?
@@ -153,7 +153,7 @@ pub fn limits_are_set_and_read_back() -> Told {
     Ok(())
 }
 
-pub fn limits_are_changed_while_it_works() -> Told {
+pub fn limits_are_changed_while_it_works() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=changed")?;
     robot.calls("/rosapi/get_time", json!({}))?;
@@ -215,7 +215,7 @@ const HOG: Service = Service {
     arguments: &["--node", "hog.py", "--memory", "128M"],
 };
 
-pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Told {
+pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Verdict {
     let daemon = world().with(HOG)?;
     let mut robot = daemon.robot("hog_py?robot=greedy")?;
     robot.says(json!({"op": "set_level", "level": "warning"}))?;
@@ -232,7 +232,7 @@ pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Told 
     Ok(())
 }
 
-pub fn two_robots_see_nothing_of_each_other() -> Told {
+pub fn two_robots_see_nothing_of_each_other() -> Verdict {
     let daemon = world().with(GREETER)?;
     let (mut anna, mut bert) = (
         daemon.robot("greeter_cpp?robot=anna")?,

@@ -1,7 +1,7 @@
 //! A robot launches as ever: the real roslaunch, with the original and with its stub.
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::machine::{Machine, free_port};
 use support::world::{TELLER, world};
 
@@ -102,7 +102,7 @@ has died [pid, exit code 5
 done
 ";
 
-pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Told {
+pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Verdict {
     for setup in ["", ". /opt/cloudroid/setup.sh"] {
         let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
         machine.has_teller()?;
@@ -119,7 +119,7 @@ pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Told {
     Ok(())
 }
 
-pub fn rosrun_gives_the_node_the_name_that_the_original_has() -> Told {
+pub fn rosrun_gives_the_node_the_name_that_the_original_has() -> Verdict {
     let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
     let script = format!(
         r#"{}
@@ -209,7 +209,7 @@ kill -INT $launched; wait $launched
 cat /root/log
 "#;
 
-pub fn a_launch_file_says_what_is_promised() -> Told {
+pub fn a_launch_file_says_what_is_promised() -> Verdict {
     let daemon = world().with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     let installs = "sh teller_py-stub/install.sh --robot launched-promises";

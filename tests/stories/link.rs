@@ -6,7 +6,7 @@ use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
 use ros::bus::{Bus, GlobalParameters, Graph, ParamValue};
 use ros::ros1::Ros1Bus;
-use support::Told;
+use support::Verdict;
 use support::freezer::Freezer;
 use support::robot::PATIENCE;
 use support::site::{Running, Site, registered, string};
@@ -30,7 +30,7 @@ fn with_log<T>(outcome: anyhow::Result<T>, node: &Running) -> anyhow::Result<T> 
     outcome.with_context(|| format!("the stub said:\n{}", node.said()))
 }
 
-pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Told {
+pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     let daemon = world().with(GREETER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -143,7 +143,7 @@ fn states(
     Ok(states)
 }
 
-pub fn the_robot_s_graph_is_the_original_s() -> Told {
+pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let argv = ["__name:=people_detect", "_debug_view:=false"];
     // What is always there, and the lazy input: so much is known of it without looking.
@@ -187,7 +187,7 @@ pub fn the_robot_s_graph_is_the_original_s() -> Told {
     Ok(())
 }
 
-pub fn two_nodes_share_a_servant() -> Told {
+pub fn two_nodes_share_a_servant() -> Verdict {
     let daemon = world().with(GREETER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -218,7 +218,7 @@ pub fn two_nodes_share_a_servant() -> Told {
     Ok(())
 }
 
-pub fn a_lost_link_is_taken_up_again() -> Told {
+pub fn a_lost_link_is_taken_up_again() -> Verdict {
     // Of its own: its end is the story.
     let home = world().home("link-restarted");
     let setup = world().own("link-restarted");
@@ -272,7 +272,7 @@ pub fn a_lost_link_is_taken_up_again() -> Told {
     Ok(())
 }
 
-pub fn what_a_stub_cannot_do_is_said() -> Told {
+pub fn what_a_stub_cannot_do_is_said() -> Verdict {
     let daemon = world().with(GREETER)?;
     world().with(ADDER)?;
     let site = Site::new()?;
@@ -337,7 +337,7 @@ pub fn what_a_stub_cannot_do_is_said() -> Told {
     Ok(())
 }
 
-pub fn the_robot_s_master_starts_again() -> Told {
+pub fn the_robot_s_master_starts_again() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut site = Site::new()?;
     let stub = site.stub(&daemon, THE_GREETER, "linked-master", &["__name:=greeter"])?;
@@ -367,7 +367,7 @@ pub fn the_robot_s_master_starts_again() -> Told {
     Ok(())
 }
 
-pub fn a_connection_that_falls_silent_is_replaced() -> Told {
+pub fn a_connection_that_falls_silent_is_replaced() -> Verdict {
     let daemon = world().with(GREETER)?;
     let freezer = Freezer::new(&daemon.address)?;
     let site = Site::new()?;
@@ -404,7 +404,7 @@ pub fn a_connection_that_falls_silent_is_replaced() -> Told {
     Ok(())
 }
 
-pub fn one_message_right_after_connecting_is_not_lost() -> Told {
+pub fn one_message_right_after_connecting_is_not_lost() -> Verdict {
     let daemon = world().with(GREETER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -437,7 +437,7 @@ pub fn one_message_right_after_connecting_is_not_lost() -> Told {
     Ok(())
 }
 
-pub fn who_has_just_connected_hears_what_the_node_answers() -> Told {
+pub fn who_has_just_connected_hears_what_the_node_answers() -> Verdict {
     let daemon = world().with(ADDER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;

@@ -5,7 +5,7 @@ use std::net::TcpStream;
 
 use anyhow::{Context, bail, ensure};
 use serde_json::json;
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::{PATIENCE, Robot};
 use support::world::world;
@@ -14,7 +14,7 @@ use tokio_tungstenite::tungstenite::protocol::frame::Frame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 
 /// Three megabytes of a message that goes on.
-fn begins(robot: &mut Robot) -> Told {
+fn begins(robot: &mut Robot) -> Verdict {
     let bytes = vec![7_u8; 3 << 20];
     let frame = Frame::message(bytes, OpCode::Data(Data::Binary), false);
     robot.sends(Message::Frame(frame))
@@ -35,7 +35,7 @@ fn begins_a_trial(daemon: &Daemon) -> anyhow::Result<TcpStream> {
     Ok(stream)
 }
 
-pub fn what_is_begun_and_never_ended_costs_its_owner() -> Told {
+pub fn what_is_begun_and_never_ended_costs_its_owner() -> Verdict {
     let daemon = world()
         .own("memory")
         .config("[memory]\nclient = \"8M\"\nunfinished = \"8s\"\n")
@@ -45,7 +45,7 @@ pub fn what_is_begun_and_never_ended_costs_its_owner() -> Told {
         .pushes("adder_py", &["--node", "adder.py"])?
         .succeeded()?;
     let mut polite = daemon.robot("adder_py?robot=polite")?;
-    let mut answered = |sum: i64| -> Told {
+    let mut answered = |sum: i64| -> Verdict {
         let answer = polite.calls("/add_two", json!({"a": sum - 1, "b": 1}))?;
         ensure!(answer["values"]["sum"] == sum, "{answer}");
         Ok(())

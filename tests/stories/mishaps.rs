@@ -1,7 +1,7 @@
 //! What goes wrong on a robot: each thing is named, with its reason and what to do.
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::binaries;
 use support::daemon::Daemon;
 use support::deployer::path_str;
@@ -10,7 +10,7 @@ use support::site::{Running, Site, string};
 use support::world::{GREETER, TELLER, world};
 
 /// The stub ends with status 1 and has said all of `words`.
-fn refused(mut stub: Running, words: &[&str]) -> Told {
+fn refused(mut stub: Running, words: &[&str]) -> Verdict {
     let status = stub.ends()?;
     let said = stub.said();
     ensure!(status.code() == Some(1), "{status}: {said}");
@@ -21,7 +21,7 @@ fn refused(mut stub: Running, words: &[&str]) -> Told {
 }
 
 /// Pushes a variant of the teller as service `teller_rev`.
-fn pushes(daemon: &Daemon, changes: &[(&str, &str)]) -> Told {
+fn pushes(daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
     let place = world().directory("teller")?;
     let original = binaries::package("teller_py");
     for name in ["package.xml", "CMakeLists.txt"] {
@@ -53,7 +53,7 @@ fn revision_of(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
     revision.with_context(|| format!("{servants:#}"))
 }
 
-pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs() -> Told {
+pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs() -> Verdict {
     let daemon = world().shared()?;
     pushes(&daemon, &[])?;
     let site = Site::new()?;
@@ -62,7 +62,7 @@ pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs() -> Told {
     let settings = format!("robot = \"{robot}\"\nlocal = \"none\"\n");
     let overlay = site.installs(&daemon, "teller_rev", &settings)?;
     let start = || site.runs(&overlay, "teller_py", "teller.py", &[]);
-    let speaks = |stub: &Running| -> Told {
+    let speaks = |stub: &Running| -> Verdict {
         let mut told = site.hears(&app, "/teller/told")?;
         let told = site.next(&mut told).context(stub.said())?;
         ensure!(told.wire_type.name == "std_msgs/String");
@@ -116,7 +116,7 @@ pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs() -> Told {
     speaks(&start()?)
 }
 
-pub fn another_version_of_the_protocol_is_named() -> Told {
+pub fn another_version_of_the_protocol_is_named() -> Verdict {
     let daemon = world().with(TELLER)?;
     // One of a stub that was installed before, and one that does not exist yet.
     for version in ["cloudroid-link.v1", "cloudroid-link.v9"] {
@@ -140,7 +140,7 @@ pub fn another_version_of_the_protocol_is_named() -> Told {
     Ok(())
 }
 
-pub fn a_wrong_token_is_named() -> Told {
+pub fn a_wrong_token_is_named() -> Verdict {
     let daemon = world()
         .own("mishap-token")
         .config("tokens = [\"open sesame\"]\n")
@@ -163,11 +163,11 @@ pub fn a_wrong_token_is_named() -> Told {
     refused(stub("token = \"open sesame\"\n")?, &["404", "any"])
 }
 
-pub fn two_robots_with_one_id_are_told() -> Told {
+pub fn two_robots_with_one_id_are_told() -> Verdict {
     let daemon = world().with(TELLER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let robot = "mishap-twins";
+    let robot = "mishap-duplicates";
     let of = ("teller_py", "teller_py", "teller.py");
     let stub = site.stub(&daemon, of, robot, &[])?;
     site.until(&app, "the node", |graph| {
@@ -207,13 +207,15 @@ exec timeout 60 rosrun teller_py teller.py"#
     let told = daemon.deployer().asks(&["explain", robot])?;
     let events = told["events"].as_array().context("events")?;
     ensure!(
-        events.iter().any(|event| event["kind"] == "robot-twins"),
+        events
+            .iter()
+            .any(|event| event["kind"] == "duplicate-robot"),
         "{told:#}"
     );
     Ok(())
 }
 
-pub fn parameters_that_cannot_be_carried_are_named_and_the_others_arrive() -> Told {
+pub fn parameters_that_cannot_be_carried_are_named_and_the_others_arrive() -> Verdict {
     let daemon = world().with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     let port = free_port()?;
@@ -264,7 +266,7 @@ cat said"#
     Ok(())
 }
 
-pub fn a_missing_original_is_said_once_and_the_cloud_goes_on() -> Told {
+pub fn a_missing_original_is_said_once_and_the_cloud_goes_on() -> Verdict {
     let daemon = world().with(GREETER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
@@ -317,7 +319,7 @@ grep 'the local original ended' log
 echo "crashes: $(grep -c 'the local original ended' log)"
 "#;
 
-pub fn a_local_original_that_crashes_is_told_and_started_again() -> Told {
+pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
     let daemon = world().with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     machine.has_teller()?;
@@ -342,7 +344,7 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Told {
     Ok(())
 }
 
-pub fn a_service_that_is_gone_leaves_the_local_original() -> Told {
+pub fn a_service_that_is_gone_leaves_the_local_original() -> Verdict {
     let daemon = world().with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     machine.has_teller()?;

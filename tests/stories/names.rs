@@ -1,7 +1,7 @@
 //! A robot finds its server by name: the stub's program is static, so it asks where the C library would.
 
 use anyhow::ensure;
-use support::Told;
+use support::Verdict;
 use support::machine::Machine;
 use support::world::{PEOPLE, world};
 
@@ -46,7 +46,7 @@ fn said(preparation: &str, names: &[&str]) -> anyhow::Result<String> {
         .said())
 }
 
-pub fn a_server_is_found_in_the_hosts_file_and_by_dns() -> Told {
+pub fn a_server_is_found_in_the_hosts_file_and_by_dns() -> Verdict {
     let dns = r#"
 echo '10.9.8.7 byhand' >> /etc/hosts
 rm -f /etc/resolv.conf
@@ -67,7 +67,7 @@ dnsmasq --no-resolv --no-hosts --local=/#/ --host-record=brain.lab.example,10.9.
     Ok(())
 }
 
-pub fn a_server_is_found_by_multicast_dns() -> Told {
+pub fn a_server_is_found_by_multicast_dns() -> Verdict {
     let avahi = r#"
 rm -f /etc/resolv.conf
 printf '[server]\nhost-name=brain\nallow-interfaces=lan0\nuse-ipv6=no\nenable-dbus=no\n[rlimits]\n' > /root/avahi.conf

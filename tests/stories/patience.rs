@@ -7,7 +7,7 @@ use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{Bus, ServiceHandler, ServiceType, reaches};
-use support::Told;
+use support::Verdict;
 use support::robot::PATIENCE;
 use support::site::Site;
 use support::world::world;
@@ -24,7 +24,7 @@ impl ServiceHandler for Answer {
     }
 }
 
-pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Told {
+pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
     let daemon = world().shared()?;
     // Its frame is known by nothing but what it complains of, its name only when it runs.
     let pushed = daemon

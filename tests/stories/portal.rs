@@ -2,12 +2,12 @@
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
-use support::Told;
+use support::Verdict;
 use support::robot::Robot;
 use support::world::{ADDER, GREETER, world};
 use tokio_tungstenite::tungstenite::{Bytes, Message};
 
-pub fn topics_and_services_cross_both_ways() -> Told {
+pub fn topics_and_services_cross_both_ways() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=crossing")?;
     robot.says(
@@ -43,7 +43,7 @@ pub fn topics_and_services_cross_both_ways() -> Told {
     Ok(())
 }
 
-pub fn cbor_is_spoken_too() -> Told {
+pub fn cbor_is_spoken_too() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=binary")?;
     robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
@@ -65,7 +65,7 @@ pub fn cbor_is_spoken_too() -> Told {
     }
 }
 
-pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Told {
+pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut server = daemon.robot("greeter_cpp?robot=server")?;
     server
@@ -103,7 +103,7 @@ pub fn a_robot_serves_and_a_node_side_caller_is_answered() -> Told {
     Ok(())
 }
 
-pub fn bad_frames_are_answered_by_status() -> Told {
+pub fn bad_frames_are_answered_by_status() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=clumsy")?;
     robot.sends(Message::text("{\"op\": \"publish\", "))?;
@@ -128,7 +128,7 @@ pub fn bad_frames_are_answered_by_status() -> Told {
     Ok(())
 }
 
-pub fn a_frame_over_the_limit_closes_with_1009() -> Told {
+pub fn a_frame_over_the_limit_closes_with_1009() -> Verdict {
     let daemon = world()
         .own("small-frames")
         .config("[portal]\nmax_message = \"64K\"\nmax_frame = \"64K\"\n")
@@ -150,7 +150,7 @@ pub fn a_frame_over_the_limit_closes_with_1009() -> Told {
     Ok(())
 }
 
-pub fn unknown_services_are_404_and_name_what_exists() -> Told {
+pub fn unknown_services_are_404_and_name_what_exists() -> Verdict {
     let daemon = world().with(ADDER)?;
     let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service")) else {
         anyhow::bail!("an unknown service accepted a robot")
@@ -163,7 +163,7 @@ pub fn unknown_services_are_404_and_name_what_exists() -> Told {
     Ok(())
 }
 
-pub fn beyond_loopback_only_with_a_token() -> Told {
+pub fn beyond_loopback_only_with_a_token() -> Verdict {
     let said = world().own("open").listen("0.0.0.0:0").refuses_to_start()?;
     ensure!(said.contains("token"), "{said}");
     let daemon = world()
@@ -189,7 +189,7 @@ pub fn beyond_loopback_only_with_a_token() -> Told {
     Ok(())
 }
 
-pub fn health_and_metrics_are_told() -> Told {
+pub fn health_and_metrics_are_told() -> Verdict {
     let daemon = world().with(ADDER)?;
     ensure!(daemon.get("/healthz")?.0 == 200);
     let mut robot = daemon.robot("adder_py?robot=measured")?;
@@ -211,7 +211,7 @@ pub fn health_and_metrics_are_told() -> Told {
     Ok(())
 }
 
-pub fn a_slash_behind_a_service_leads_to_the_same_service() -> Told {
+pub fn a_slash_behind_a_service_leads_to_the_same_service() -> Verdict {
     let daemon = world().with(ADDER)?;
     let mut robot = daemon.robot("adder_py/?robot=slashed")?;
     ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
@@ -233,7 +233,7 @@ pub fn a_slash_behind_a_service_leads_to_the_same_service() -> Told {
     Ok(())
 }
 
-pub fn a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong() -> Told {
+pub fn a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong() -> Verdict {
     let daemon = world().with(ADDER)?;
     let shake = |version, key| {
         let headers = [

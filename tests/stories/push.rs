@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{path_str, run};
 use support::world::{ADDER, GREETER, world};
-use support::{Told, binaries};
+use support::{Verdict, binaries};
 
 /// Asks the greeter of a service for a greeting.
 fn greeting(daemon: &Daemon, path: &str, input: &str, output: &str) -> anyhow::Result<Value> {
@@ -20,7 +20,7 @@ fn greeting(daemon: &Daemon, path: &str, input: &str, output: &str) -> anyhow::R
     robot.hears_on(output)
 }
 
-pub fn a_cpp_package_is_compiled_and_greets() -> Told {
+pub fn a_cpp_package_is_compiled_and_greets() -> Verdict {
     let daemon = world().with(GREETER)?;
     let heard = greeting(&daemon, "greeter_cpp", "/greeter/name", "/greeter/greeting")?;
     ensure!(heard["text"] == "hi Ada" && heard["count"] == 1, "{heard}");
@@ -34,7 +34,7 @@ pub fn a_cpp_package_is_compiled_and_greets() -> Told {
     Ok(())
 }
 
-pub fn a_python_package_adds() -> Told {
+pub fn a_python_package_adds() -> Verdict {
     let daemon = world().with(ADDER)?;
     let mut robot = daemon.robot("adder_py")?;
     robot.subscribes("/sums")?;
@@ -46,7 +46,7 @@ pub fn a_python_package_adds() -> Told {
     Ok(())
 }
 
-pub fn a_launch_file_is_resolved_by_roslaunch() -> Told {
+pub fn a_launch_file_is_resolved_by_roslaunch() -> Verdict {
     let daemon = world().shared()?;
     let deployer = daemon.deployer();
     deployer
@@ -87,7 +87,7 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Told {
     Ok(())
 }
 
-pub fn a_workspace_is_built_in_order() -> Told {
+pub fn a_workspace_is_built_in_order() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let source = place.path().join("lab_ws/src");
@@ -209,7 +209,7 @@ fn compiled(steps: &[String]) -> Vec<&str> {
     titles.filter_map(|rest| rest.split(' ').next()).collect()
 }
 
-pub fn what_was_compiled_before_a_failure_stays_compiled() -> Told {
+pub fn what_was_compiled_before_a_failure_stays_compiled() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
@@ -242,7 +242,7 @@ pub fn what_was_compiled_before_a_failure_stays_compiled() -> Told {
     Ok(())
 }
 
-pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Told {
+pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
@@ -258,7 +258,7 @@ pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Told {
     Ok(())
 }
 
-pub fn a_package_may_use_others_that_it_does_not_name() -> Told {
+pub fn a_package_may_use_others_that_it_does_not_name() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let workspace = workspace_of_two(place.path(), "")?;
@@ -280,7 +280,7 @@ pub fn a_package_may_use_others_that_it_does_not_name() -> Told {
     Ok(())
 }
 
-pub fn packages_with_the_same_libraries_share_their_layers() -> Told {
+pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
     let daemon = world().shared()?;
     let mut images = Vec::new();
     for package in ["image_proc", "stereo_image_proc"] {
@@ -318,7 +318,7 @@ pub fn packages_with_the_same_libraries_share_their_layers() -> Told {
     Ok(())
 }
 
-pub fn a_prebuilt_space_is_served() -> Told {
+pub fn a_prebuilt_space_is_served() -> Verdict {
     let daemon = world().with(ADDER)?;
     let place = tempfile::tempdir()?;
     // The install space that the push of the source package made, taken out of its image.
@@ -368,7 +368,7 @@ fn extract_install_space(
         .to_owned())
 }
 
-pub fn an_unchanged_push_builds_no_layer() -> Told {
+pub fn an_unchanged_push_builds_no_layer() -> Verdict {
     let daemon = world().with(GREETER)?;
     let outcome = daemon
         .deployer()
@@ -406,7 +406,7 @@ pub fn an_unchanged_push_builds_no_layer() -> Told {
     Ok(())
 }
 
-pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
+pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Verdict {
     let daemon = world().with(GREETER)?;
     let place = tempfile::tempdir()?;
     run(Command::new("cp")
@@ -440,7 +440,7 @@ pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Told {
     Ok(())
 }
 
-pub fn what_package_xml_forgot_is_named_and_added() -> Told {
+pub fn what_package_xml_forgot_is_named_and_added() -> Verdict {
     let daemon = world().shared()?;
     let deployer = daemon.deployer();
     let node = ["--node", "recorder", "--param", "file=/tmp/heard.bag"];
@@ -479,7 +479,7 @@ pub fn what_package_xml_forgot_is_named_and_added() -> Told {
     Ok(())
 }
 
-pub fn a_revision_is_rolled_back() -> Told {
+pub fn a_revision_is_rolled_back() -> Verdict {
     let daemon = world().with(ADDER)?;
     let deployer = daemon.deployer();
     deployer
@@ -519,7 +519,7 @@ pub fn a_revision_is_rolled_back() -> Told {
     Ok(())
 }
 
-pub fn five_packaged_nodes_answer() -> Told {
+pub fn five_packaged_nodes_answer() -> Verdict {
     let daemon = world().shared()?;
     let outcome = run(Command::new(binaries::python())
         .arg(binaries::checkout().join("tests/robots/packaged_nodes.py"))

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use serde_json::json;
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::{PATIENCE, Robot};
 use support::world::world;
@@ -54,7 +54,7 @@ fn registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
     Ok(node)
 }
 
-pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Told {
+pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Verdict {
     let (daemon, models) = slow("leaving")?;
     let mut robot = daemon.robot("slow_py")?;
     let _node = registered(&models)?;
@@ -89,7 +89,7 @@ pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Told {
     Ok(())
 }
 
-pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Told {
+pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdict {
     let (daemon, models) = slow("slow")?;
     let url = daemon.url("slow_py?robot=patient");
     let coming = std::thread::spawn(move || Robot::connect(&url));

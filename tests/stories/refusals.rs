@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use anyhow::ensure;
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::world::{ADDER, world};
 
 /// No service of this name, no build directory, no servant of it.
-fn nothing_half_made(daemon: &Daemon, service: &str) -> Told {
+fn nothing_half_made(daemon: &Daemon, service: &str) -> Verdict {
     ensure!(
         daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404,
         "{service} was published"
@@ -21,7 +21,7 @@ fn nothing_half_made(daemon: &Daemon, service: &str) -> Told {
     Ok(())
 }
 
-pub fn a_directory_without_a_package() -> Told {
+pub fn a_directory_without_a_package() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let empty = place.path().join("empty_thing");
@@ -38,7 +38,7 @@ pub fn a_directory_without_a_package() -> Told {
     nothing_half_made(&daemon, "empty_thing")
 }
 
-pub fn malformed_xml() -> Told {
+pub fn malformed_xml() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     let package = place.path().join("torn");
@@ -54,7 +54,7 @@ pub fn malformed_xml() -> Told {
     nothing_half_made(&daemon, "torn")
 }
 
-pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Told {
+pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Verdict {
     let daemon = world().shared()?;
     daemon
         .deployer()
@@ -63,7 +63,7 @@ pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Told {
     nothing_half_made(&daemon, "wants_the_impossible")
 }
 
-pub fn a_node_that_leaves_at_once() -> Told {
+pub fn a_node_that_leaves_at_once() -> Verdict {
     let daemon = world().shared()?;
     daemon
         .deployer()
@@ -106,7 +106,7 @@ fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, li
         .expect("into memory");
 }
 
-pub fn archives_that_reach_out_of_their_tree() -> Told {
+pub fn archives_that_reach_out_of_their_tree() -> Verdict {
     let daemon = world().shared()?;
     let place = tempfile::tempdir()?;
     use tar::EntryType;
@@ -133,7 +133,7 @@ pub fn archives_that_reach_out_of_their_tree() -> Told {
     nothing_half_made(&daemon, "sly")
 }
 
-pub fn reserved_and_taken_names() -> Told {
+pub fn reserved_and_taken_names() -> Verdict {
     let daemon = world().with(ADDER)?;
     for name in ["api", "v2", "stubs", "metrics", "healthz", "assets"] {
         daemon
@@ -155,7 +155,7 @@ pub fn reserved_and_taken_names() -> Told {
     Ok(())
 }
 
-pub fn a_disk_with_no_room() -> Told {
+pub fn a_disk_with_no_room() -> Verdict {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-stories-small-")
         .tempdir()?;

@@ -1,7 +1,7 @@
 //! A robot installs a stub, and its own tools find it in the original's place.
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::deployer::path_str;
 use support::machine::{Machine, free_port};
 use support::world::{PEOPLE, world};
@@ -57,7 +57,7 @@ fn installed() -> anyhow::Result<Machine> {
     Ok(machine)
 }
 
-pub fn on_debians_layout_every_tool_finds_the_stub() -> Told {
+pub fn on_debians_layout_every_tool_finds_the_stub() -> Verdict {
     let machine = installed()?;
     let before = machine.runs("sh", LOOK)?.succeeded()?;
     ensure!(before.stdout == found_in("/usr"), "{}", before.said());
@@ -78,7 +78,7 @@ pub fn on_debians_layout_every_tool_finds_the_stub() -> Told {
     Ok(())
 }
 
-pub fn what_is_not_outsourced_becomes_the_original() -> Told {
+pub fn what_is_not_outsourced_becomes_the_original() -> Verdict {
     let machine = installed()?;
     let script = format!(
         ". {OVERLAY}/setup.sh\n{OVERLAY}/lib/opencv_apps/face_detection __name:=y > /tmp/said 2>&1 &\n\
@@ -94,7 +94,7 @@ pub fn what_is_not_outsourced_becomes_the_original() -> Told {
     Ok(())
 }
 
-pub fn without_the_original_the_stub_stands_alone() -> Told {
+pub fn without_the_original_the_stub_stands_alone() -> Verdict {
     let machine = installed()?;
     machine
         .runs("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?
@@ -143,7 +143,7 @@ chmod +x $ros/_setup_util.py
 cp /usr/share/ros_environment/catkin_env_hook/1.ros_package_path.sh $ros/etc/catkin/profile.d/
 "#;
 
-pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Told {
+pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Verdict {
     let machine = installed()?;
     machine.runs("bash", OPT_ROS)?.succeeded()?;
     for (shell, setup) in SHELLS {
@@ -187,7 +187,7 @@ pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Told {
     Ok(())
 }
 
-pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Told {
+pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Verdict {
     let machine = installed()?;
     machine.runs("bash", OPT_ROS)?.succeeded()?;
     machine
@@ -225,7 +225,7 @@ pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Told
     Ok(())
 }
 
-pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Told {
+pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
     let machine = machine()?;
     let nobody = "sh opencv_apps-stub/install.sh --server ws://127.0.0.1:9";
     machine.runs("sh", nobody)?.failed_saying(&[
@@ -292,7 +292,7 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Told {
     Ok(())
 }
 
-pub fn its_nodelets_cannot_be_loaded_on_the_robot() -> Told {
+pub fn its_nodelets_cannot_be_loaded_on_the_robot() -> Verdict {
     let machine = installed()?;
     let port = free_port()?;
     let script = format!(
@@ -325,7 +325,7 @@ timeout 60 roslaunch load.launch || echo "roslaunch: $?""#
     Ok(())
 }
 
-pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Told {
+pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
     let daemon = world().with(PEOPLE)?;
     let (status, body) = daemon.get("/stubs/nobody.tar.gz")?;
     ensure!(

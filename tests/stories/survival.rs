@@ -13,7 +13,7 @@ use support::daemon::{Daemon, Setup};
 use support::deployer::run;
 use support::robot::{PATIENCE, Robot};
 use support::world::world;
-use support::{Told, leftovers, procfs};
+use support::{Verdict, leftovers, procfs};
 
 /// A daemon of one's own, whose servants outlive it, with these packages pushed.
 fn settled(name: &str, packages: &[(&str, &[&str])]) -> anyhow::Result<(Setup, Daemon)> {
@@ -26,7 +26,7 @@ fn settled(name: &str, packages: &[(&str, &[&str])]) -> anyhow::Result<(Setup, D
 }
 
 /// Nothing of it may be left once its servants were ended.
-fn nothing_is_left(daemon: Daemon) -> Told {
+fn nothing_is_left(daemon: Daemon) -> Verdict {
     daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
     let home = daemon.home.clone();
     daemon.ends()?;
@@ -56,7 +56,7 @@ const GREETER: (&str, &[&str]) = ("greeter_cpp", &["--node", "greeter", "--param
 const ADDER: (&str, &[&str]) = ("adder_py", &["--node", "adder.py"]);
 const BURGLAR: (&str, &[&str]) = ("burglar_cpp", &["--node", "burglar"]);
 
-pub fn what_cannot_be_removed_keeps_no_daemon_down() -> Told {
+pub fn what_cannot_be_removed_keeps_no_daemon_down() -> Verdict {
     let (setup, first) = settled("stray", &[ADDER])?;
     let mut robot = first.robot("adder_py?robot=r1")?;
     ensure!(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"] == 2);
@@ -72,7 +72,7 @@ pub fn what_cannot_be_removed_keeps_no_daemon_down() -> Told {
     nothing_is_left(second)
 }
 
-pub fn a_killed_daemon_loses_nothing() -> Told {
+pub fn a_killed_daemon_loses_nothing() -> Verdict {
     let (setup, first) = settled("killed", &[GREETER, ADDER, BURGLAR])?;
     let mut greeter = first.robot("greeter_cpp?robot=r1")?;
     let mut adder = first.robot("adder_py?robot=r1")?;
@@ -164,7 +164,7 @@ pub fn a_killed_daemon_loses_nothing() -> Told {
     nothing_is_left(second)
 }
 
-pub fn a_daemon_that_is_ended_says_why_and_keeps_its_servants() -> Told {
+pub fn a_daemon_that_is_ended_says_why_and_keeps_its_servants() -> Verdict {
     let (setup, first) = settled("ended", &[BURGLAR])?;
     let mut robot = first.robot("burglar_cpp?robot=r1")?;
     tries(&mut robot, "write", "/tmp/x y")?;
@@ -195,7 +195,7 @@ fn parent(pid: i32) -> anyhow::Result<i32> {
     Ok(status.get("PPid").context("PPid")?.parse()?)
 }
 
-pub fn a_killed_init_and_a_killed_shim_are_told() -> Told {
+pub fn a_killed_init_and_a_killed_shim_are_told() -> Verdict {
     let (_, daemon) = settled("orphans", &[GREETER])?;
     for (which, words) in [
         ("init", "its init was killed by signal 9"),
@@ -231,7 +231,7 @@ pub fn a_killed_init_and_a_killed_shim_are_told() -> Told {
     nothing_is_left(daemon)
 }
 
-pub fn nodes_end_as_ros_users_know_it() -> Told {
+pub fn nodes_end_as_ros_users_know_it() -> Verdict {
     let (_, daemon) = settled("ends", &[("burglar_cpp", &["--launch", "ends.launch"])])?;
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
     let id = daemon.servant_of("burglar_cpp", "r1")?["id"]
@@ -272,7 +272,7 @@ pub fn nodes_end_as_ros_users_know_it() -> Told {
 }
 
 /// Waits until phoenix is told to have come again for the `time`th time, and why.
-fn respawned(daemon: &Daemon, time: usize, how: &str) -> Told {
+fn respawned(daemon: &Daemon, time: usize, how: &str) -> Verdict {
     let event = support::until(&format!("a {time}th event"), || {
         let told = respawns(daemon)?;
         let event = told.get(time - 1).cloned();
@@ -291,7 +291,7 @@ fn respawns(daemon: &Daemon) -> anyhow::Result<Vec<Value>> {
 }
 
 /// Ends phoenix again when it is back, which it is not before its delay is over.
-fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Told {
+fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Verdict {
     let ended = respawns(daemon)?.last().context("its end")?["time"].clone();
     let deadline = Instant::now() + PATIENCE;
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
@@ -314,7 +314,7 @@ fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Told {
 }
 
 /// What `rosnode kill` does, by Python's own XML-RPC.
-fn rosnode_kills(daemon: &Daemon, node: &str) -> Told {
+fn rosnode_kills(daemon: &Daemon, node: &str) -> Verdict {
     let script = format!(
         "import time, xmlrpc.client as x\n\
          end = time.time() + 60\n\
@@ -344,7 +344,7 @@ fn warnings(daemon: &Daemon) -> anyhow::Result<String> {
 }
 
 /// Looks with another program than ours.
-fn is_in_the_database(daemon: &Daemon, event: &Value) -> Told {
+fn is_in_the_database(daemon: &Daemon, event: &Value) -> Verdict {
     let script = format!(
         "import sqlite3\nprint(*sqlite3.connect({:?}).execute('SELECT kind FROM events WHERE id = {}').fetchone())",
         daemon.home.join("cloudroid.db"),
@@ -359,7 +359,7 @@ fn is_in_the_database(daemon: &Daemon, event: &Value) -> Told {
     Ok(())
 }
 
-pub fn a_locked_database_is_named_and_waited_for() -> Told {
+pub fn a_locked_database_is_named_and_waited_for() -> Verdict {
     let (_, daemon) = settled("locked", &[GREETER])?;
     daemon
         .robot("greeter_cpp?robot=before")?
@@ -404,7 +404,7 @@ pub fn a_locked_database_is_named_and_waited_for() -> Told {
     nothing_is_left(daemon)
 }
 
-pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Told {
+pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Verdict {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-stories-full-")
         .tempdir()?;

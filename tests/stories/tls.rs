@@ -1,13 +1,13 @@
 //! A robot whose server is behind TLS, under an authority of its owner's.
 
 use anyhow::ensure;
-use support::Told;
+use support::Verdict;
 use support::machine::{Machine, free_port};
 use support::site::Site;
 use support::tls::Proxy;
 use support::world::{TELLER, world};
 
-pub fn a_robot_works_through_tls() -> Told {
+pub fn a_robot_works_through_tls() -> Verdict {
     let daemon = world().with(TELLER)?;
     let proxy = Proxy::of(&daemon.address)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
@@ -52,7 +52,7 @@ cat said"#
     Ok(())
 }
 
-pub fn what_stands_against_tls_is_said() -> Told {
+pub fn what_stands_against_tls_is_said() -> Verdict {
     let daemon = world().with(TELLER)?;
     let proxy = Proxy::of(&daemon.address)?;
     let site = Site::new()?;

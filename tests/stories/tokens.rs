@@ -2,7 +2,7 @@
 
 use anyhow::{Context, ensure};
 use serde_json::json;
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::Robot;
 use support::world::{ADDER, world};
@@ -45,7 +45,7 @@ const UPGRADE: [(&str, &str); 3] = [
     ("Sec-WebSocket-Version", "13"),
 ];
 
-pub fn no_route_answers_without_a_token() -> Told {
+pub fn no_route_answers_without_a_token() -> Verdict {
     let daemon = guarded("walked")?;
     let routes = routes()?;
     for known in [
@@ -102,7 +102,7 @@ pub fn no_route_answers_without_a_token() -> Told {
     Ok(())
 }
 
-pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Told {
+pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Verdict {
     let daemon = guarded("told")?;
     let server = format!("http://{}", daemon.address);
     let deployer = daemon.deployer();
@@ -126,7 +126,7 @@ pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Told {
     Ok(())
 }
 
-pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Told {
+pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Verdict {
     let daemon = world().with(ADDER)?;
     let (status, body) = daemon.request(
         "GET",
@@ -140,7 +140,7 @@ pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Told {
     Ok(())
 }
 
-pub fn services_are_told_to_those_who_have_shown_a_token() -> Told {
+pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
     let daemon = guarded("untold")?;
     daemon
         .deployer()
@@ -178,7 +178,7 @@ pub fn services_are_told_to_those_who_have_shown_a_token() -> Told {
     Ok(())
 }
 
-pub fn a_resume_token_is_no_way_into_another_s_servant() -> Told {
+pub fn a_resume_token_is_no_way_into_another_s_servant() -> Verdict {
     let daemon = world()
         .own("resumers")
         .config("tokens = [\"open sesame\", \"rosebuds\"]\n[servant]\nanonymous_grace = \"60s\"\n")

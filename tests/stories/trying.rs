@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use anyhow::{Context, ensure};
-use support::Told;
+use support::Verdict;
 use support::binaries;
 use support::daemon::Daemon;
 use support::deployer::{Outcome, path_str, run};
@@ -15,7 +15,7 @@ use support::world::{TELLER, world};
 const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
 /// Trials leave no service behind.
-fn nothing_is_left(daemon: &Daemon) -> Told {
+fn nothing_is_left(daemon: &Daemon) -> Verdict {
     let services = daemon.deployer().asks(&["services"])?;
     ensure!(
         services.as_array().is_some_and(Vec::is_empty),
@@ -24,7 +24,7 @@ fn nothing_is_left(daemon: &Daemon) -> Told {
     Ok(())
 }
 
-fn suggests(daemon: &Daemon, outcome: &Outcome) -> Told {
+fn suggests(daemon: &Daemon, outcome: &Outcome) -> Verdict {
     for words in ["requests answered", "to begin with: desire = ", ", max = "] {
         ensure!(
             outcome.stdout.contains(words),
@@ -35,7 +35,7 @@ fn suggests(daemon: &Daemon, outcome: &Outcome) -> Told {
     nothing_is_left(daemon)
 }
 
-pub fn a_packaged_node_is_tried_on_a_picture() -> Told {
+pub fn a_packaged_node_is_tried_on_a_picture() -> Verdict {
     let daemon = world().own("tried-picture").start()?;
     let place = world().directory("picture")?;
     let picture = place.path().join("people.png");
@@ -72,7 +72,7 @@ pub fn a_packaged_node_is_tried_on_a_picture() -> Told {
     suggests(&daemon, &outcome)
 }
 
-pub fn a_source_package_is_tried_on_a_recording() -> Told {
+pub fn a_source_package_is_tried_on_a_recording() -> Verdict {
     let daemon = world().own("tried-bag").start()?;
     let machine = Machine::new()?;
     let recorded = r#"
@@ -123,7 +123,7 @@ with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
     nothing_is_left(&daemon)
 }
 
-pub fn a_robot_is_explained() -> Told {
+pub fn a_robot_is_explained() -> Verdict {
     let daemon = world().with(TELLER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;

@@ -12,17 +12,17 @@ use crate::burglar::{breaks_out, tries};
 use crate::daemon::Daemon;
 use crate::deployer::run;
 use crate::robot::Robot;
-use crate::{Told, leftovers};
+use crate::{Verdict, leftovers};
 
 /// Tries something that must fail.
-fn fails(robot: &mut Robot, what: &str, argument: &str) -> Told {
+fn fails(robot: &mut Robot, what: &str, argument: &str) -> Verdict {
     let attempt = tries(robot, what, argument)?;
     ensure!(!attempt.succeeded, "{what} {argument}: {}", attempt.report);
     Ok(())
 }
 
 /// See its name.
-pub fn no_attempt_to_break_out_succeeds(daemon: &Daemon) -> Told {
+pub fn no_attempt_to_break_out_succeeds(daemon: &Daemon) -> Verdict {
     let mut robot = daemon.robot("burglar_cpp?robot=breaker")?;
     let before = std::fs::read_to_string("/proc/sys/kernel/core_pattern")?;
     let broken = breaks_out(&mut robot)?;
@@ -32,7 +32,7 @@ pub fn no_attempt_to_break_out_succeeds(daemon: &Daemon) -> Told {
 }
 
 /// See its name.
-pub fn nothing_of_the_host_is_reached(daemon: &Daemon) -> Told {
+pub fn nothing_of_the_host_is_reached(daemon: &Daemon) -> Verdict {
     let mut robot = daemon.robot("burglar_cpp?robot=reacher")?;
     // Each of these is there, and would be reached from the host.
     let tcp = TcpListener::bind("0.0.0.0:0")?;
@@ -102,7 +102,7 @@ pub fn nothing_of_the_host_is_reached(daemon: &Daemon) -> Told {
 }
 
 /// See its name.
-pub fn neighbours_are_not_reached(daemon: &Daemon) -> Told {
+pub fn neighbours_are_not_reached(daemon: &Daemon) -> Verdict {
     let (mut first, mut second) = (
         daemon.robot("burglar_cpp?robot=first")?,
         daemon.robot("burglar_cpp?robot=second")?,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 
-use crate::Told;
+use crate::Verdict;
 use crate::burglar::tries;
 use crate::robot::Robot;
 
@@ -47,7 +47,7 @@ impl Drop for Specification {
 }
 
 /// Makes the directory `models`, with a link in it that leads to something beside it that is nobody's business.
-pub fn lay_out(models: &Path) -> Told {
+pub fn lay_out(models: &Path) -> Verdict {
     std::fs::create_dir_all(models)?;
     std::fs::write(models.join("net.bin"), "weights")?;
     let secret = models.with_file_name("secret");
@@ -57,7 +57,7 @@ pub fn lay_out(models: &Path) -> Told {
 }
 
 /// The volume, the device and the way out are there, and no more than they. The way out is to this listener.
-pub fn are_there_and_no_more(robot: &mut Robot, listener: &TcpListener) -> Told {
+pub fn are_there_and_no_more(robot: &mut Robot, listener: &TcpListener) -> Verdict {
     let port = listener.local_addr()?.port();
     let other = TcpListener::bind("127.0.0.1:0")?;
     let mut can = |what: &str, argument: &str| -> anyhow::Result<bool> {

@@ -28,7 +28,7 @@ use anyhow::bail;
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// What a story ends with: an error is told with all its causes.
-pub type Told = anyhow::Result<()>;
+pub type Verdict = anyhow::Result<()>;
 
 /// Looks again and again, with a pause, until there is a value. What is found instead becomes the story's failure after
 /// [`robot::PATIENCE`].

@@ -11,7 +11,7 @@
 use std::process::ExitCode;
 use std::time::Instant;
 
-use support::Told;
+use support::Verdict;
 
 #[path = "stories/confinement.rs"]
 mod confinement;
@@ -28,16 +28,16 @@ mod restarts;
 /// A story under its function's name.
 struct Story {
     name: &'static str,
-    tell: fn() -> Told,
+    tell: fn() -> Verdict,
 }
 
 /// Something that a cut of the power comes into the middle of.
 struct Cut {
     name: &'static str,
     /// Comes back in the middle.
-    before: fn() -> Told,
+    before: fn() -> Verdict,
     /// At the next boot.
-    after: fn() -> Told,
+    after: fn() -> Verdict,
 }
 
 macro_rules! stories {
@@ -126,7 +126,7 @@ fn main() -> ExitCode {
 }
 
 /// Tells one and says how it went.
-fn told(name: &str, tell: impl FnOnce() -> Told) {
+fn told(name: &str, tell: impl FnOnce() -> Verdict) {
     let began = Instant::now();
     let outcome = tell();
     let took = began.elapsed().as_secs_f64();

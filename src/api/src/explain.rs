@@ -117,8 +117,8 @@ pub struct Link {
     #[serde(default)]
     pub unserved: Vec<String>,
     /// Other machines that are connected as the same robot.
-    #[serde(default)]
-    pub twins: Vec<String>,
+    #[serde(default, alias = "twins")]
+    pub duplicates: Vec<String>,
 }
 
 /// A part of the response time, over the last requests.

@@ -32,8 +32,8 @@ pub struct Status {
     /// Servants alive now.
     pub servants: usize,
     /// Containers made ahead, for robots to come.
-    #[serde(default)]
-    pub spares: usize,
+    #[serde(default, alias = "spares")]
+    pub warm_pool: usize,
     /// Connections of robots now.
     pub connections: usize,
     /// What the servants that live use together; the pressure is the whole machine's, none where the kernel does not

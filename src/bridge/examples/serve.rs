@@ -35,7 +35,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("{} definitions", registry.keys().len());
     let bus = Ros1Bus::connect(Arc::new(HostSockets), master, "/cloudroid_bridge").await?;
     let bridge = Bridge::new(bus, registry, BridgeOptions::default());
-    tokio::spawn(tell(bridge.clone()));
+    tokio::spawn(report(bridge.clone()));
     let listener = TcpListener::bind(listen).await?;
     println!("listening on ws://{}", listener.local_addr()?);
     loop {
@@ -76,7 +76,7 @@ async fn serve(
     Ok(bridge.serve(socket.into_inner(), options).await)
 }
 
-async fn tell(bridge: Arc<Bridge>) {
+async fn report(bridge: Arc<Bridge>) {
     let mut lines = BufReader::new(tokio::io::stdin()).lines();
     while let Ok(Some(_)) = lines.next_line().await {
         let mut text = String::new();

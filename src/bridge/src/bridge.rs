@@ -8,8 +8,8 @@ use rosbridge::{Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
+use crate::lease::Lease;
 use crate::outbox::Goodbye;
-use crate::seat::Seat;
 use crate::session::Session;
 use crate::shared::Shared;
 use crate::waiting::Waiting;
@@ -87,14 +87,14 @@ impl Bridge {
                 return SessionEnd::Closed { code: 1012, reason };
             }
         };
-        let seat = Seat::take(shared.clone(), client.clone(), options.resume);
+        let lease = Lease::take(shared.clone(), client.clone(), options.resume);
         tracing::debug!(client = %client.name, "session begins");
         let (socket, kept) = waiting.into_parts();
-        let end = Session::new(socket, kept, client.clone(), seat.socket, &options.budget)
+        let end = Session::new(socket, kept, client.clone(), lease.socket, &options.budget)
             .run()
             .await;
         tracing::debug!(client = %client.name, ?end, "session ends");
-        seat.leave(&end);
+        lease.leave(&end);
         end
     }
 

@@ -47,7 +47,7 @@ pub(crate) struct Client {
     under_way_bytes: AtomicUsize,
     ended: CancellationToken,
     subscriptions: Mutex<subscribing::Subscribed>,
-    outlets: Mutex<publishing::Outlets>,
+    topic_publishers: Mutex<publishing::Outlets>,
     services: Mutex<serving::Services>,
     actions: Mutex<actions::Actions>,
 }
@@ -76,7 +76,7 @@ impl Client {
             under_way_bytes: AtomicUsize::new(0),
             ended: CancellationToken::new(),
             subscriptions: Mutex::default(),
-            outlets: Mutex::default(),
+            topic_publishers: Mutex::default(),
             services: Mutex::default(),
             actions: Mutex::default(),
         })
@@ -87,7 +87,7 @@ impl Client {
         self.ended.cancel();
         // Dropped outside of the locks: what is dropped may want them.
         drop(std::mem::take(&mut *self.subscriptions.lock()));
-        drop(std::mem::take(&mut *self.outlets.lock()));
+        drop(std::mem::take(&mut *self.topic_publishers.lock()));
         drop(std::mem::take(&mut *self.services.lock()));
         drop(std::mem::take(&mut *self.actions.lock()));
     }
@@ -328,7 +328,7 @@ impl Client {
     }
 
     /// Warns of arguments that the type has no fields for.
-    fn tell_surplus(
+    fn report_surplus(
         &self,
         reply: &Reply,
         op: &str,

@@ -12,11 +12,11 @@ use tokio::sync::watch;
 use crate::bridge::SessionCount;
 use crate::client::Client;
 use crate::hub::Hub;
-use crate::outlet::Outlet;
 use crate::presence::{self, Presence};
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
 use crate::tf::{self, Republisher};
+use crate::topic_publisher::TopicPublisher;
 use crate::{BridgeOptions, Metrics, SessionOptions};
 
 /// What the bridge's parts need of it.
@@ -31,7 +31,7 @@ pub(crate) struct Shared {
     pub(crate) republisher: Republisher,
     hubs: Mutex<HashMap<String, Weak<Hub>>>,
     /// What clients publish on, by topic.
-    outlets: Mutex<HashMap<String, Vec<Weak<Outlet>>>>,
+    topic_publishers: Mutex<HashMap<String, Vec<Weak<TopicPublisher>>>>,
     clients: Mutex<Clients>,
     pub(crate) sessions: watch::Sender<SessionCount>,
     numbers: AtomicU64,
@@ -63,7 +63,7 @@ impl Shared {
             presence: Presence::default(),
             republisher: Republisher::default(),
             hubs: Mutex::default(),
-            outlets: Mutex::default(),
+            topic_publishers: Mutex::default(),
             clients: Mutex::default(),
             sessions: watch::Sender::default(),
             numbers: AtomicU64::new(1),
@@ -133,18 +133,21 @@ impl Shared {
             Some(own) => {
                 let hub = Hub::internal(self, topic);
                 if presence::type_name(topic).is_some() {
-                    self.tell_presence_to(&hub, &own);
+                    self.report_presence_to(&hub, &own);
                 }
                 hub
             }
             None => Hub::start(self, topic, message_type),
         };
-        let outlets = self.outlets_of(topic);
-        for message in outlets.iter().filter_map(|outlet| outlet.latched()) {
+        let topic_publishers = self.outlets_of(topic);
+        for message in topic_publishers
+            .iter()
+            .filter_map(|topic_publisher| topic_publisher.latched())
+        {
             hub.deliver(message, true);
         }
         hubs.insert(topic.to_owned(), Arc::downgrade(&hub));
-        // The last owner of an outlet must not drop it under the lock.
+        // The last owner of an topic_publisher must not drop it under the lock.
         drop(hubs);
         hub
     }
@@ -157,24 +160,24 @@ impl Shared {
     }
 
     /// Tells who listens that somebody has come or gone.
-    pub(crate) fn tell_presence(&self) {
+    pub(crate) fn report_presence(&self) {
         for topic in presence::TOPICS {
             let hub = self.live_hub(topic).filter(|hub| hub.is_internal());
             let own = presence::type_name(topic).and_then(|name| self.registry.message(name).ok());
             if let (Some(hub), Some(own)) = (hub, own) {
-                self.tell_presence_to(&hub, &own);
+                self.report_presence_to(&hub, &own);
             }
         }
     }
 
-    fn tell_presence_to(&self, hub: &Hub, of: &MessageType) {
+    fn report_presence_to(&self, hub: &Hub, of: &MessageType) {
         if let Some(message) = self.presence.message(&hub.topic, of) {
             hub.deliver(message, true);
         }
     }
 
-    fn outlets_of(&self, topic: &str) -> Vec<Arc<Outlet>> {
-        self.outlets
+    fn outlets_of(&self, topic: &str) -> Vec<Arc<TopicPublisher>> {
+        self.topic_publishers
             .lock()
             .get(topic)
             .into_iter()
@@ -185,38 +188,42 @@ impl Shared {
 
     /// Whether the client that published so still does.
     pub(crate) fn has_outlet(&self, topic: &str, id: &PeerId) -> bool {
-        self.outlets_of(topic).iter().any(|outlet| outlet.id == *id)
+        self.outlets_of(topic)
+            .iter()
+            .any(|topic_publisher| topic_publisher.id == *id)
     }
 
-    pub(crate) fn add_outlet(&self, outlet: &Arc<Outlet>) {
-        self.outlets
+    pub(crate) fn add_outlet(&self, topic_publisher: &Arc<TopicPublisher>) {
+        self.topic_publishers
             .lock()
-            .entry(outlet.topic.clone())
+            .entry(topic_publisher.topic.clone())
             .or_default()
-            .push(Arc::downgrade(outlet));
+            .push(Arc::downgrade(topic_publisher));
     }
 
-    /// Forgets an outlet that is being dropped, and what it latched.
-    pub(crate) fn forget_outlet(&self, outlet: &Outlet) {
-        let mut outlets = self.outlets.lock();
-        if let Some(others) = outlets.get_mut(&outlet.topic) {
+    /// Forgets an topic_publisher that is being dropped, and what it latched.
+    pub(crate) fn forget_outlet(&self, topic_publisher: &TopicPublisher) {
+        let mut topic_publishers = self.topic_publishers.lock();
+        if let Some(others) = topic_publishers.get_mut(&topic_publisher.topic) {
             others.retain(|other| other.strong_count() > 0);
             if others.is_empty() {
-                outlets.remove(&outlet.topic);
+                topic_publishers.remove(&topic_publisher.topic);
             }
         }
-        drop(outlets);
-        if outlet.latch
-            && let Some(hub) = self.live_hub(&outlet.topic)
+        drop(topic_publishers);
+        if topic_publisher.latch
+            && let Some(hub) = self.live_hub(&topic_publisher.topic)
         {
-            hub.forget(&outlet.id);
+            hub.forget(&topic_publisher.id);
         }
     }
 
     /// What clients of this bridge publish on a topic, known before the graph shows it.
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
-        let outlets = self.outlets_of(topic);
-        let known = outlets.first().map(|outlet| outlet.message_type.name());
+        let topic_publishers = self.outlets_of(topic);
+        let known = topic_publishers
+            .first()
+            .map(|topic_publisher| topic_publisher.message_type.name());
         known
             .or(presence::type_name(topic))
             .or_else(|| self.republisher.type_name(topic))

@@ -125,7 +125,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
         }
     }
 
-    fn tell(&mut self, level: Level, text: &str) {
+    fn report(&mut self, level: Level, text: &str) {
         let mut out = Vec::new();
         let status = Status {
             id: None,
@@ -137,7 +137,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
     }
 
     async fn say_goodbye(&mut self, code: u16, reason: &str, readable: bool) {
-        self.tell(Level::Error, reason);
+        self.report(Level::Error, reason);
         self.socket.queue_close(code, reason);
         // A client that does not take its leave in time, or is gone already, is left alone.
         let _ = timeout(self.close_timeout, self.socket.leave(readable)).await;
@@ -212,7 +212,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
             match message {
                 Message::Text(_) | Message::Binary(_) => match self.kept.take(message) {
                     Taken::Kept | Taken::LeftOut { first: false } => {}
-                    Taken::LeftOut { first: true } => self.tell(
+                    Taken::LeftOut { first: true } => self.report(
                         Level::Error,
                         "publish: too much waits for the servant to start; further messages are left out until it has",
                     ),

@@ -203,7 +203,7 @@ impl Budget {
     }
 
     /// Counts and reports a refusal. Budgets are compared by identity: two of them may have the same name.
-    fn tell(&self, full: Full) -> Exceeded {
+    fn report(&self, full: Full) -> Exceeded {
         full.at.refused.fetch_add(1, Ordering::Relaxed);
         // Those above are told even if nothing is counted there.
         let all = std::iter::successors(Some(self), |budget| budget.node.above.as_ref());
@@ -265,7 +265,7 @@ impl Permit {
     /// More bytes do not fit; it keeps its size. Fewer bytes always succeed.
     pub fn resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.try_resize(bytes)
-            .map_err(|full| self.budget.tell(full))
+            .map_err(|full| self.budget.report(full))
     }
 
     fn try_resize(&mut self, bytes: usize) -> Result<(), Full> {
@@ -330,7 +330,7 @@ impl Permit {
                 return Ok(());
             };
             if never || tokio::time::timeout_at(deadline, released).await.is_err() {
-                return Err(self.budget.tell(full));
+                return Err(self.budget.report(full));
             }
         }
     }

@@ -10,7 +10,7 @@
 //! | [`capacity`] | which idle servants end for those who wait | what they lack, all servants |
 //! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
 //! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
-//! | [`spares`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
+//! | [`warm_pool`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
 //! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
 //!
 //! What is decided under the choreographer's lock, or the queue's, is recorded under the same lock.
@@ -23,7 +23,7 @@ pub(crate) mod demand;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;
 pub(crate) mod placement;
-pub(crate) mod spares;
+pub(crate) mod warm_pool;
 
 #[cfg(test)]
 mod properties;

@@ -67,7 +67,7 @@ use decide::admission::Class;
 use decide::placement::Placement;
 use lives::Inner;
 use lives::driver::{self, Beginning};
-use lives::spares::{self, Spares};
+use lives::warm_pool::{self, WarmPool};
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]
@@ -98,7 +98,7 @@ impl Choreographer {
             admission,
             request_times: Arc::default(),
             servants: Mutex::default(),
-            spares: Spares::default(),
+            warm_pool: WarmPool::default(),
             incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
         };
@@ -127,7 +127,7 @@ impl Choreographer {
     ) -> Result<Lease, Error> {
         let inner = &self.inner;
         let key = (service.to_owned(), robot.to_owned());
-        let (handle, lease, spare) = {
+        let (handle, lease, warm) = {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
             // followed by one of the revision before.
@@ -136,12 +136,12 @@ impl Choreographer {
                 return Err(Error::Ending);
             }
             let has = servants.given.get(&key).map(|handle| inner.facts(handle));
-            let (placement, spare) = inner.spares.place(has.as_ref(), &revision);
+            let (placement, warm) = inner.warm_pool.place(has.as_ref(), &revision);
             match placement {
                 Placement::Keep(id) => return Ok(Lease::new(Arc::clone(&servants.all[id]))),
                 Placement::Start { ends, .. } => servants.end(ends),
             }
-            let id = spare.as_ref().map(|spare| spare.container.id().to_owned());
+            let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
             let handle = Arc::new(Handle::new(
                 id.unwrap_or_else(|| names::servant_id(service)),
                 robot.to_owned(),
@@ -156,9 +156,9 @@ impl Choreographer {
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
             let lease = Lease::new(Arc::clone(&handle));
-            (handle, lease, spare)
+            (handle, lease, warm)
         };
-        let beginning = Beginning::Asked(spare);
+        let beginning = Beginning::Asked(warm);
         tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
         Ok(lease)
     }
@@ -213,25 +213,25 @@ impl Choreographer {
         self.inner.ending.store(true, Ordering::SeqCst);
     }
 
-    /// Keeps spare containers from now on; comes back at once.
-    pub fn keep_spares(&self) {
-        tokio::spawn(spares::keep(Arc::clone(&self.inner)));
-        self.inner.spares.look();
+    /// Keeps the warm pool from now on; comes back at once.
+    pub fn keep_warm_pool(&self) {
+        tokio::spawn(warm_pool::keep(Arc::clone(&self.inner)));
+        self.inner.warm_pool.look();
     }
 
-    /// Has spares made for what is published now.
-    pub fn look_at_spares(&self) {
-        self.inner.spares.look();
+    /// Has warm containers made for what is published now.
+    pub fn refill_warm_pool(&self) {
+        self.inner.warm_pool.look();
     }
 
-    /// Ends the spares of what is not published any more.
-    pub async fn end_stale_spares(&self) -> Result<(), Error> {
-        spares::tidy(&self.inner, false).await
+    /// Ends the warm containers of what is not published any more.
+    pub async fn end_stale_warm(&self) -> Result<(), Error> {
+        warm_pool::tidy(&self.inner, false).await
     }
 
-    /// Ends all spares and makes no more.
-    pub async fn end_spares(&self) {
-        spares::end_all(&self.inner).await;
+    /// Ends all warm containers and makes no more.
+    pub async fn end_warm_pool(&self) {
+        warm_pool::end_all(&self.inner).await;
     }
 
     /// How long requests of robots take.
@@ -239,9 +239,9 @@ impl Choreographer {
         &self.inner.request_times
     }
 
-    /// Spare containers that there are.
-    pub fn spares(&self) -> usize {
-        self.inner.spares.count()
+    /// Containers of the warm pool.
+    pub fn warm_pool(&self) -> usize {
+        self.inner.warm_pool.count()
     }
 
     /// What may be held for clients and servants.
@@ -309,9 +309,9 @@ impl Choreographer {
         Ok(self.inner.admission.check(self.inner.promised(limits))?)
     }
 
-    /// Images that live servants and spares were started from; they must stay.
+    /// Images that live servants and warm containers were started from; they must stay.
     pub fn images_in_use(&self) -> Vec<String> {
-        let mut images = self.inner.spares.images();
+        let mut images = self.inner.warm_pool.images();
         let servants = self.inner.servants.lock();
         images.extend(
             servants

@@ -1,5 +1,5 @@
 //! The tasks that carry out what was decided: one for each servant ([`driver`]), which alone changes its state, and one that
-//! keeps the warm pool ([`spares`]). Servants of an earlier daemon are taken over here ([`adoption`]).
+//! keeps the warm pool ([`warm_pool`]). Servants of an earlier daemon are taken over here ([`adoption`]).
 
 mod adoption;
 pub(crate) mod driver;
@@ -7,9 +7,9 @@ mod lifetime;
 mod limits;
 mod nodes;
 mod reaching;
-pub(crate) mod spares;
 mod starting;
 pub(crate) mod waiting;
+pub(crate) mod warm_pool;
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -26,8 +26,8 @@ use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
-use spares::Spares;
 use waiting::Admission;
+use warm_pool::WarmPool;
 
 /// What the choreographer and its tasks share.
 pub(crate) struct Inner {
@@ -41,7 +41,7 @@ pub(crate) struct Inner {
     pub(crate) request_times: Arc<RequestTimes>,
     pub(crate) memory: SharedMemory,
     pub(crate) servants: Mutex<Servants>,
-    pub(crate) spares: Spares,
+    pub(crate) warm_pool: WarmPool,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,

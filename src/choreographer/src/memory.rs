@@ -64,7 +64,7 @@ impl Memory {
             if told.len() < REMEMBERED {
                 told.insert(who.to_owned(), Instant::now());
                 drop(told);
-                tell(&journal, who, full);
+                report(&journal, who, full);
             }
         };
         let whole = Budget::observed("the daemon", bytes(options.daemon), Box::new(observer));
@@ -98,7 +98,7 @@ impl Memory {
     }
 }
 
-fn tell(journal: &Journal, who: &str, full: &Exceeded) {
+fn report(journal: &Journal, who: &str, full: &Exceeded) {
     let journal = journal.clone();
     let servant = who.strip_prefix("servant ").map(str::to_owned);
     let message = format!(

@@ -23,7 +23,7 @@ pub struct Options {
     /// The same for connections that named no robot.
     pub anonymous_grace: Duration,
     /// Most containers made ahead, without nodes.
-    pub spares: usize,
+    pub warm_pool: usize,
     /// Sessions of rosbridge before each servant.
     pub bridge: BridgeOptions,
     /// Memory held for clients and servants.

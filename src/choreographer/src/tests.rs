@@ -38,7 +38,7 @@ fn options() -> Options {
         start: Duration::from_secs(30),
         grace: Duration::from_secs(60),
         anonymous_grace: Duration::ZERO,
-        spares: 8,
+        warm_pool: 8,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions {
             daemon: memory,

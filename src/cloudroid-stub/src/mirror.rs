@@ -103,7 +103,7 @@ impl Mirror {
         });
         tokio::spawn(obey(Arc::downgrade(&mirror), taken));
         tokio::spawn(lent::follow(Arc::downgrade(&mirror)));
-        tokio::spawn(dropped::tell(Arc::downgrade(&mirror)));
+        tokio::spawn(dropped::report(Arc::downgrade(&mirror)));
         mirror
     }
 

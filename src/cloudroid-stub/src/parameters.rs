@@ -30,7 +30,7 @@ fn without_nothing(tree: &mut BTreeMap<String, ParamValue>, above: &str) {
     tree.retain(|name, value| {
         let name = format!("{above}/{name}");
         if is_nothing(value) {
-            tell(&name, &"it is nothing");
+            report(&name, &"it is nothing");
             return false;
         }
         if let ParamValue::Map(below) = value {
@@ -53,7 +53,7 @@ pub fn can_be_carried(name: &str, value: &mut Option<ParamValue>) -> bool {
     match value {
         Some(ParamValue::Map(below)) => without_nothing(below, name),
         Some(value) if is_nothing(value) => {
-            tell(name, &"it is nothing");
+            report(name, &"it is nothing");
             return false;
         }
         _ => {}
@@ -61,7 +61,7 @@ pub fn can_be_carried(name: &str, value: &mut Option<ParamValue>) -> bool {
     true
 }
 
-fn tell(name: &str, reason: &dyn std::fmt::Display) {
+fn report(name: &str, reason: &dyn std::fmt::Display) {
     if TOLD.lock().insert(name.to_owned()) {
         tracing::warn!(
             "parameter {name} has a value that XML-RPC cannot carry ({reason}): the node in the cloud does not get it; set it otherwise, or remove it with: rosparam delete {name}"
@@ -85,7 +85,7 @@ async fn one_by_one(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusEr
             // Deleted meanwhile.
             Err(BusError::NoParam(_)) => {}
             Err(error) if is_of_values(&error) => {
-                tell(&name, &error);
+                report(&name, &error);
             }
             Err(error) => return Err(error),
         }

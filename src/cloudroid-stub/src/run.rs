@@ -131,7 +131,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
                 if let Some(keeper) = mirror.keeper() {
                     keeper.end();
                 }
-                mirror.session().tell(&FromRobot::Signal { signal });
+                mirror.session().report(&FromRobot::Signal { signal });
                 let up = *mirror.session().up().borrow();
                 let patience = if up { FAREWELL } else { Duration::ZERO };
                 let mut exit = mirror.exit();

@@ -65,8 +65,8 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         (
             "servants",
             format!(
-                "{} with {} connections; {} spare containers",
-                status.servants, status.connections, status.spares
+                "{} with {} connections; {} warm containers",
+                status.servants, status.connections, status.warm_pool
             ),
         ),
         (

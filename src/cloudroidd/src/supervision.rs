@@ -32,7 +32,7 @@ pub fn end_asked(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<Can
 
 /// Tells systemd that requests are answered, and keeps its watchdog quiet from now on.
 pub fn ready() {
-    tell(&[NotifyState::Ready]);
+    report(&[NotifyState::Ready]);
     let mut microseconds = 0;
     if sd_notify::watchdog_enabled(false, &mut microseconds) {
         let interval = Duration::from_micros(microseconds / 2);
@@ -40,7 +40,7 @@ pub fn ready() {
             let mut ticks = tokio::time::interval(interval);
             loop {
                 ticks.tick().await;
-                tell(&[NotifyState::Watchdog]);
+                report(&[NotifyState::Watchdog]);
             }
         });
     }
@@ -48,10 +48,10 @@ pub fn ready() {
 
 /// Tells systemd that the daemon is ending.
 pub fn stopping() {
-    tell(&[NotifyState::Stopping]);
+    report(&[NotifyState::Stopping]);
 }
 
-fn tell(state: &[NotifyState<'_>]) {
+fn report(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(false, state) {
         tracing::debug!("systemd was not told: {error}");
     }

@@ -68,16 +68,15 @@ pub fn build(
         catalogue.images(),
         Arc::new(local),
     )?;
-    let pusher = Pusher::new(
-        config.push(),
-        home.path().to_owned(),
+    let parts = push::Parts {
         builder,
-        Arc::clone(&catalogue),
+        catalogue: Arc::clone(&catalogue),
         engine,
         opener,
-        choreographer.clone(),
-        Journal::new(Arc::clone(&state)),
-    );
+        choreographer: choreographer.clone(),
+        journal: Journal::new(Arc::clone(&state)),
+    };
+    let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
     Ok(Arc::new(App {
         tokens,
@@ -163,7 +162,7 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
 pub async fn drain(app: &App, keep_servants: bool) {
     app.choreographer.close();
     app.pusher.cancel_all(app.options.drain).await;
-    app.choreographer.end_spares().await;
+    app.choreographer.end_warm_pool().await;
     if keep_servants {
         tracing::info!(
             "ending; {} servants go on",

@@ -159,7 +159,7 @@ pub enum FromRobot {
     },
     /// How a request went, for the cloud's statistics.
     Requests(Vec<Request>),
-    /// What it has under that name. Told as an answer, and when what was there is gone.
+    /// What it has under that name. Control as an answer, and when what was there is gone.
     Lent {
         /// The name.
         service: String,
@@ -232,14 +232,14 @@ pub(crate) enum Between {
 
 /// A control record.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Told<O> {
+pub(crate) enum Control<O> {
     /// For whoever uses the session.
     Order(O),
     /// For the session itself.
     Between(Between),
 }
 
-impl<O: DeserializeOwned> Told<O> {
+impl<O: DeserializeOwned> Control<O> {
     /// Reads a control record of an end that gives orders `O`.
     pub(crate) fn read(json: &[u8]) -> serde_json::Result<Self> {
         // What is told begins with its name, so an order is known for none of these at once.
@@ -462,16 +462,16 @@ mod tests {
 
     #[test]
     fn what_is_meant_for_the_session_is_told_from_orders() {
-        let asked = Told::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
-        assert_eq!(asked, Told::Between(Between::Keyframe { channel: 7 }));
+        let asked = Control::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
+        assert_eq!(asked, Control::Between(Between::Keyframe { channel: 7 }));
         // However it is written.
-        let asked = Told::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
-        assert_eq!(asked, Told::Between(Between::Keyframe { channel: 7 }));
-        let order = Told::read(br#"{"signal":{"signal":9}}"#).unwrap();
-        assert_eq!(order, Told::Order(FromRobot::Signal { signal: 9 }));
+        let asked = Control::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
+        assert_eq!(asked, Control::Between(Between::Keyframe { channel: 7 }));
+        let order = Control::read(br#"{"signal":{"signal":9}}"#).unwrap();
+        assert_eq!(order, Control::Order(FromRobot::Signal { signal: 9 }));
         for unknown in [r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
             assert!(
-                Told::<FromRobot>::read(unknown.as_bytes()).is_err(),
+                Control::<FromRobot>::read(unknown.as_bytes()).is_err(),
                 "{unknown}"
             );
         }

@@ -209,11 +209,11 @@ impl Drops {
 
 /// What of all drops is worth telling: those that are new, and those that have grown tenfold since they were told.
 #[derive(Debug, Default)]
-pub struct Teller {
+pub struct Reporter {
     told: BTreeMap<(String, Cause), u64>,
 }
 
-impl Teller {
+impl Reporter {
     /// Those to tell now.
     pub fn news(&mut self, all: &[Drop]) -> Vec<Drop> {
         let mut news = Vec::new();
@@ -239,13 +239,13 @@ mod tests {
 
     #[test]
     fn drops_are_counted_for_good_and_told_now_and_then() {
-        let (drops, mut teller) = (Drops::default(), Teller::default());
+        let (drops, mut reporter) = (Drops::default(), Reporter::default());
         let counter = Arc::new(DropCount::default());
         let lost = |messages| Lost { messages, bytes: 0 };
         counter.add(lost(2));
         drops.watch("/scan", Cause::Busy, counter.clone());
         drops.add("/image", Cause::Replaced, 1);
-        let told: Vec<String> = teller
+        let told: Vec<String> = reporter
             .news(&drops.all())
             .iter()
             .map(Drop::to_string)
@@ -259,13 +259,13 @@ mod tests {
         );
         drops.add("/image", Cause::Replaced, 8);
         assert!(
-            teller.news(&drops.all()).is_empty(),
+            reporter.news(&drops.all()).is_empty(),
             "9 are few more than 1"
         );
         counter.add(lost(23));
         drop(counter);
         drops.add("/image", Cause::Replaced, 1);
-        let told: Vec<u64> = teller
+        let told: Vec<u64> = reporter
             .news(&drops.all())
             .iter()
             .map(|drop| drop.count)

@@ -11,8 +11,8 @@
 
 mod budget;
 mod encoding;
-mod kept;
 mod out;
+mod retransmit;
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -24,8 +24,8 @@ use crate::drops::{Cause, Tally};
 use crate::frame::Frame;
 use crate::record::{LEFT_AT, Record};
 use encoding::Encoding;
-use kept::{Kept, Sent};
 use out::Out;
+use retransmit::{Retransmit, Sent};
 
 /// Records up to this size go in one piece, and are kept until the peer has them.
 pub(crate) const SMALL: usize = 32 * 1024;
@@ -79,7 +79,7 @@ pub(crate) struct Outgoing {
     /// Topics with something to send; one with a big message under way, or one that is being encoded, is held.
     turns: Turns<u32>,
     sending: VecDeque<Sending>,
-    kept: Kept,
+    retransmit: Retransmit,
     /// For all that waits and is kept, but for the last `uncounted` bytes.
     permit: Permit,
     uncounted: usize,
@@ -106,7 +106,7 @@ impl Outgoing {
             topics: BTreeMap::new(),
             turns: Turns::default(),
             sending: VecDeque::new(),
-            kept: Kept::default(),
+            retransmit: Retransmit::default(),
             permit: Budget::unlimited().permit(),
             uncounted: 0,
             full: None,
@@ -266,8 +266,8 @@ impl Outgoing {
             out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
         }
         let length = out.len();
-        let again = self.kept.takes(&out);
-        let number = if again || self.kept.len() < MAX_URGENT {
+        let again = self.retransmit.takes(&out);
+        let number = if again || self.retransmit.len() < MAX_URGENT {
             self.next_number += 1;
             self.next_number - 1
         } else {
@@ -277,7 +277,7 @@ impl Outgoing {
             self.turn_after(&out);
             self.sent += length as u64;
             let record = out.piece(0, length);
-            self.kept.add(number, again, out);
+            self.retransmit.add(number, again, out);
             return Frame::Whole { number, record };
         }
         // The topic waits until it is through.
@@ -316,14 +316,15 @@ impl Outgoing {
             self.sending.push_back(sending);
         } else {
             self.turn_after(&sending.out);
-            self.kept.add(sending.number, sending.again, sending.out);
+            self.retransmit
+                .add(sending.number, sending.again, sending.out);
         }
         Some(Frame::More { stream, bytes })
     }
 
     /// The peer has all numbers up to this one.
     pub(crate) fn acknowledge(&mut self, number: u64) {
-        while let Some(out) = self.kept.acknowledged(number) {
+        while let Some(out) = self.retransmit.acknowledged(number) {
             // All that went before it has come, too.
             if let Some(channel) = out.channel.filter(|_| out.closes) {
                 self.topics.remove(&channel);
@@ -338,7 +339,7 @@ impl Outgoing {
     /// A message came and could not be decoded: where each one counts it goes once more, unless a newer one of a
     /// latched topic has gone. Says whether it does.
     pub(crate) fn again(&mut self, channel: u32, born: i64) -> bool {
-        let Some(again) = self.kept.damaged(channel, born) else {
+        let Some(again) = self.retransmit.damaged(channel, born) else {
             return false;
         };
         topic(&mut self.topics, channel).put_back(again);
@@ -376,9 +377,10 @@ impl Outgoing {
             }
         }
         for sending in std::mem::take(&mut self.sending) {
-            self.kept.add(sending.number, sending.again, sending.out);
+            self.retransmit
+                .add(sending.number, sending.again, sending.out);
         }
-        for (number, sent) in std::mem::take(&mut self.kept).into_records().rev() {
+        for (number, sent) in std::mem::take(&mut self.retransmit).into_records().rev() {
             if number <= received || ahead.contains(&number) {
                 continue;
             }

@@ -28,7 +28,7 @@ use crate::packing::Packing;
 use crate::record::{Data, Record};
 
 pub use opening::{receive_open, send_open};
-use throughput::{Throughput, Told};
+use throughput::{Counters, Throughput};
 
 /// No link is watched more closely.
 const SHORTEST: Duration = Duration::from_millis(50);
@@ -233,7 +233,7 @@ impl<O: Order> Session<O> {
     }
 
     /// Tells the peer something; it will come, in order, over however many connections.
-    pub fn tell(&self, order: &O) {
+    pub fn report(&self, order: &O) {
         self.control(order);
     }
 
@@ -347,13 +347,13 @@ impl<O: Order> Session<O> {
         let mut state = self.state.lock();
         state.out.acknowledge(received.number);
         state.let_go();
-        let told = Told {
+        let counters = Counters {
             at: Instant::now(),
             bytes: received.bytes,
             sent: state.out.sent,
             idle: state.out.is_idle(),
         };
-        if let Some(rate) = state.throughput.told(told) {
+        if let Some(rate) = state.throughput.report(counters) {
             state.out.set_throughput(rate);
             let pays = state.packing.pays(Some(rate));
             state.out.encoding.set_pays(pays);

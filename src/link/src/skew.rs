@@ -24,7 +24,7 @@ const SECOND: i64 = 1_000_000_000;
 
 /// The way of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Way {
+pub enum Direction {
     /// From the robot to the node.
     In,
     /// From the node to the robot.
@@ -75,7 +75,7 @@ impl Skew {
     }
 
     /// The message with its stamps in the other side's time. Stamps of zero stay zero, and so does what no clock shows.
-    pub fn apply(&self, way: Way, stamps: &Stamps, message: Bytes) -> Bytes {
+    pub fn apply(&self, direction: Direction, stamps: &Stamps, message: Bytes) -> Bytes {
         let difference = self.difference();
         if difference == 0 || stamps.is_empty() {
             return message;
@@ -90,9 +90,9 @@ impl Skew {
         });
         let mut known = self.known.lock();
         let Known { robots, ours } = &mut *known;
-        let (change, there, back) = match way {
-            Way::In => (-difference, ours, robots),
-            Way::Out => (difference, robots, ours),
+        let (change, there, back) = match direction {
+            Direction::In => (-difference, ours, robots),
+            Direction::Out => (difference, robots, ours),
         };
         for at in found {
             let Some(bytes) = message.get_mut(at..at + 8) else {

@@ -133,7 +133,7 @@ fn link(status: LinkStatus) -> Link {
         left_out: status.left_out,
         unfed: status.unfed,
         unserved: status.unserved,
-        twins: status.twins,
+        duplicates: status.duplicates,
         node: status.node,
     }
 }
@@ -273,12 +273,12 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
         );
     }
-    if !link.twins.is_empty() {
+    if !link.duplicates.is_empty() {
         say(
             Weight::Blocks,
             format!(
                 "another machine ({}) is connected as this robot, beside that of {node}",
-                link.twins.join(", ")
+                link.duplicates.join(", ")
             ),
             "give one of them another id: `robot` in stub.toml, or CLOUDROID_ROBOT".to_owned(),
         );
@@ -544,7 +544,7 @@ mod tests {
                 part("compute", vec![30.0; 3]).expect("times"),
                 part("total", vec![100.0; 3]).expect("times"),
             ],
-            twins: vec!["rover2".into()],
+            duplicates: vec!["rover2".into()],
             drops: vec!["on the robot 9 messages of /scan were dropped: why".into()],
             local: 7,
             satisfaction: Some(2.5),
@@ -646,7 +646,7 @@ mod tests {
             left_out: 1,
             unfed: vec![],
             unserved: vec![],
-            twins: vec![],
+            duplicates: vec![],
         });
         assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
         assert_eq!(seen.dropped, 32);
@@ -690,7 +690,7 @@ mod tests {
             left_out: 0,
             unfed: vec![],
             unserved: vec![],
-            twins: vec![],
+            duplicates: vec![],
         });
         assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
         let causes = texts(served(seen));

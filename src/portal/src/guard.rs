@@ -98,7 +98,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
         }
         Err(error) => {
             if let Error::Foreign { what, next } = &error {
-                tell(peer, what, next);
+                report(peer, what, next);
             }
             error.into_response()
         }
@@ -106,7 +106,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
 }
 
 /// Logs a refusal, so that the operator can allow it; at most once a minute, because pages repeat their requests.
-fn tell(peer: Peer, what: &str, next: &str) {
+fn report(peer: Peer, what: &str, next: &str) {
     static TOLD: Mutex<Vec<(Instant, String)>> = Mutex::new(Vec::new());
     let mut told = TOLD.lock();
     told.retain(|(at, _)| at.elapsed() < AGAIN);

@@ -88,9 +88,9 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
     gauge(
         out,
-        "cloudroid_spares",
+        "cloudroid_warm_pool",
         "Containers made ahead.",
-        [(String::new(), choreographer.spares() as f64)],
+        [(String::new(), choreographer.warm_pool() as f64)],
     );
     let mut connections: BTreeMap<String, usize> = BTreeMap::new();
     for handle in &handles {

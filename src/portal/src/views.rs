@@ -143,7 +143,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
         limits: app.choreographer.default_limits(),
         services: app.state.service_names()?.len(),
         servants: servants.len(),
-        spares: app.choreographer.spares(),
+        warm_pool: app.choreographer.warm_pool(),
         connections: servants.iter().map(|servant| servant.connections()).sum(),
         usage,
         warnings: app

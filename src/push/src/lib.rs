@@ -41,7 +41,7 @@ use tokio_util::task::TaskTracker;
 
 use bounds::Left;
 use places::Places;
-use request::Tell;
+use request::Reporter;
 use store::{Journal, NewEvent, Plan, RevisionRecord};
 
 pub use error::Error;
@@ -55,6 +55,22 @@ pub const EVENTS_AHEAD: usize = 256;
 const PUSHED: &str = "pushed";
 /// Where nodes run, and keep what they write: a tmpfs.
 const HOME_INSIDE: &str = "/root";
+
+/// What a push is done with.
+pub struct Parts {
+    /// Makes images.
+    pub builder: Builder,
+    /// Where they are published.
+    pub catalogue: Arc<Catalogue>,
+    /// Starts the container in which the interface is looked for.
+    pub engine: Arc<dyn Engine>,
+    /// Reaches its ROS.
+    pub opener: Arc<dyn Opener>,
+    /// Admits it, and ends the servants of what is removed.
+    pub choreographer: Choreographer,
+    /// Where the operator reads what came of it.
+    pub journal: Journal,
+}
 
 /// Publishes, rolls back and removes services.
 pub struct Pusher {
@@ -75,16 +91,15 @@ pub struct Pusher {
 
 impl Pusher {
     /// With half-made things below `home`, the state directory.
-    pub fn new(
-        options: Options,
-        home: PathBuf,
-        builder: Builder,
-        catalogue: Arc<Catalogue>,
-        engine: Arc<dyn Engine>,
-        opener: Arc<dyn Opener>,
-        choreographer: Choreographer,
-        journal: Journal,
-    ) -> Pusher {
+    pub fn new(options: Options, home: PathBuf, parts: Parts) -> Pusher {
+        let Parts {
+            builder,
+            catalogue,
+            engine,
+            opener,
+            choreographer,
+            journal,
+        } = parts;
         Pusher {
             places: Places::new(&options),
             options,
@@ -129,20 +144,20 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         archive: Archive,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<Published, Error> {
         let began = Instant::now();
         let known = options.name.as_deref().or(options.apt.as_deref());
-        let mut admitted = self.places.enter(known, tell).await?;
+        let mut admitted = self.places.enter(known, report).await?;
         let mut left = Left::new(&self.options, self.home.join("build").join(id));
-        let built = left.during(self.made(id, options, archive, tell)).await?;
+        let built = left.during(self.made(id, options, archive, report)).await?;
         let name = options
             .name
             .clone()
             .unwrap_or_else(|| built.package.clone());
         names::service(&name).map_err(catalogue::Error::from)?;
-        admitted.named(&name, tell).await?;
-        let shown = self.shown(id, options, built, name.clone(), tell);
+        admitted.named(&name, report).await?;
+        let shown = self.shown(id, options, built, name.clone(), report);
         Ok(Published {
             layers: left.during(shown).await?,
             service: name,
@@ -156,7 +171,7 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         archive: Archive,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<BuildOutcome, Error> {
         let source = match &options.apt {
             Some(package) => {
@@ -167,16 +182,16 @@ impl Pusher {
                 Source::Packaged(package.clone())
             }
             None => {
-                tell.step("receiving the package").await;
+                report.step("receiving the package").await;
                 let tree = self.home.join("build").join(id).join(PUSHED);
-                receive::unpack(archive, &tree, &self.options, tell).await?;
+                receive::unpack(archive, &tree, &self.options, report).await?;
                 if let Some(name) = &options.name {
                     self.check_owner(name, &receive::packages_of(&tree))?;
                 }
                 Source::Tree(tree)
             }
         };
-        self.build(id, options, source, tell).await
+        self.build(id, options, source, report).await
     }
 
     /// Finds the interface of an image, and publishes both; gives the image's layers.
@@ -186,17 +201,17 @@ impl Pusher {
         options: &PushOptions,
         built: BuildOutcome,
         name: String,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
-        tell.step("starting it once to find its interface").await;
+        report.step("starting it once to find its interface").await;
         let mut plan = plan_of(&built, options);
         for warning in self.choreographer.check_grants(&plan.grants)? {
-            tell.warning(warning).await;
+            report.warning(warning).await;
         }
-        let found = probe::interface(self, id, &built, &mut plan, options, tell).await?;
+        let found = probe::interface(self, id, &built, &mut plan, options, report).await?;
         for warning in found.warnings {
-            tell.warning(warning).await;
+            report.warning(warning).await;
         }
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
@@ -215,7 +230,7 @@ impl Pusher {
             plan,
             interface,
         };
-        tell.step("publishing").await;
+        report.step("publishing").await;
         let number = self.publish(record, built.inventory).await?;
         let about = NewEvent {
             service: Some(&name),
@@ -252,7 +267,7 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         source: Source,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<BuildOutcome, Error> {
         let request = PushRequest {
             id: id.to_owned(),
@@ -269,7 +284,7 @@ impl Pusher {
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {
             while let Some(event) = events.recv().await {
-                tell.event(push_event(event)).await;
+                report.event(push_event(event)).await;
             }
         };
         let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);

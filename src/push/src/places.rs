@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use parking_lot::Mutex;
 use tokio::sync::{OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
-use super::request::Tell;
+use super::request::Reporter;
 use crate::{Error, Options};
 
 /// Limits the number of pushes that are built at a time and that wait, and lets those of one service follow one
@@ -48,7 +48,7 @@ impl Places {
     pub(super) async fn enter(
         &self,
         service: Option<&str>,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<Admitted<'_>, Error> {
         let mut waiting = None;
         let turn = match service {
@@ -58,7 +58,7 @@ impl Places {
                     Ok(turn) => turn,
                     Err(_) => {
                         waiting = Some(self.wait()?);
-                        self.turn_told(name, tell).await
+                        self.report_turn(name, report).await
                     }
                 };
                 Some((name.to_owned(), turn))
@@ -71,7 +71,7 @@ impl Places {
                     Some(waiting) => waiting,
                     None => self.wait()?,
                 };
-                self.place_told(&waiting, tell).await?
+                self.report_place(&waiting, report).await?
             }
         };
         Ok(Admitted {
@@ -92,24 +92,26 @@ impl Places {
         Arc::clone(turns.entry(service.to_owned()).or_default())
     }
 
-    async fn turn_told(&self, service: &str, tell: &Tell) -> Turn {
-        tell.step(&format!(
-            "waiting: {service} is being pushed or changed already"
-        ))
-        .await;
+    async fn report_turn(&self, service: &str, report: &Reporter) -> Turn {
+        report
+            .step(&format!(
+                "waiting: {service} is being pushed or changed already"
+            ))
+            .await;
         self.turn(service).await
     }
 
-    async fn place_told(
+    async fn report_place(
         &self,
         waiting: &Waiting<'_>,
-        tell: &Tell,
+        report: &Reporter,
     ) -> Result<OwnedSemaphorePermit, Error> {
-        tell.step(&format!(
-            "waiting: {} pushes are being built, and {} wait before this one",
-            self.at_once, waiting.before
-        ))
-        .await;
+        report
+            .step(&format!(
+                "waiting: {} pushes are being built, and {} wait before this one",
+                self.at_once, waiting.before
+            ))
+            .await;
         let place = Arc::clone(&self.free).acquire_owned().await;
         place.map_err(|_| Error::Ending)
     }
@@ -137,7 +139,7 @@ impl Places {
 impl Admitted<'_> {
     /// Takes the turn of the service, which may be known only now: then the place is given back while another push of
     /// it is built, and taken again. That is never refused, since the work is done.
-    pub(super) async fn named(&mut self, service: &str, tell: &Tell) -> Result<(), Error> {
+    pub(super) async fn named(&mut self, service: &str, report: &Reporter) -> Result<(), Error> {
         if self.turn.as_ref().is_some_and(|(name, _)| name == service) {
             return Ok(());
         }
@@ -148,8 +150,8 @@ impl Admitted<'_> {
             Err(_) => {
                 let waiting = Waiting::among(&self.places.waiting);
                 self.place = None;
-                let turn = self.places.turn_told(service, tell).await;
-                self.place = Some(self.places.place_told(&waiting, tell).await?);
+                let turn = self.places.report_turn(service, report).await;
+                self.place = Some(self.places.report_place(&waiting, report).await?);
                 turn
             }
         };
@@ -195,15 +197,15 @@ mod tests {
     async fn pushes_take_turns_and_no_more_wait_than_may() {
         let places = Arc::new(Places::new(&options()));
         let (sender, mut told) = mpsc::channel(16);
-        let tell = Tell(sender);
-        let first = places.enter(None, &tell).await.expect("free");
-        let (again, tell_again) = (Arc::clone(&places), tell.clone());
-        let second = tokio::spawn(async move { again.enter(None, &tell_again).await.map(drop) });
+        let report = Reporter(sender);
+        let first = places.enter(None, &report).await.expect("free");
+        let (again, report_again) = (Arc::clone(&places), report.clone());
+        let second = tokio::spawn(async move { again.enter(None, &report_again).await.map(drop) });
         let Some(api::PushEvent::Step { title }) = told.recv().await else {
             panic!("nothing was told");
         };
         assert!(title.contains("1 pushes are being built"), "{title}");
-        let refused = places.enter(None, &tell).await.map(drop);
+        let refused = places.enter(None, &report).await.map(drop);
         let refused = refused.expect_err("the queue is full").words();
         assert!(
             refused.contains("1 wait already") && refused.contains("at_once"),
@@ -211,7 +213,7 @@ mod tests {
         );
         drop(first);
         second.await.expect("no panic").expect("its turn");
-        drop(places.enter(None, &tell).await.expect("free again"));
+        drop(places.enter(None, &report).await.expect("free again"));
     }
 
     #[tokio::test]
@@ -223,11 +225,11 @@ mod tests {
         };
         let places = Arc::new(Places::new(&options));
         let (sender, mut told) = mpsc::channel(16);
-        let tell = Tell(sender);
-        let first = places.enter(Some("a"), &tell).await.expect("free");
-        let (again, tell_again) = (Arc::clone(&places), tell.clone());
+        let report = Reporter(sender);
+        let first = places.enter(Some("a"), &report).await.expect("free");
+        let (again, report_again) = (Arc::clone(&places), report.clone());
         let named = tokio::spawn(async move {
-            let second = again.enter(Some("a"), &tell_again).await;
+            let second = again.enter(Some("a"), &report_again).await;
             second.map(drop)
         });
         let waits = |event| match event {
@@ -238,14 +240,14 @@ mod tests {
         };
         waits(told.recv().await);
         // One that is told its service when it is built.
-        let (again, tell_again) = (Arc::clone(&places), tell.clone());
+        let (again, report_again) = (Arc::clone(&places), report.clone());
         let unnamed = tokio::spawn(async move {
-            let mut second = again.enter(None, &tell_again).await?;
-            second.named("a", &tell_again).await
+            let mut second = again.enter(None, &report_again).await?;
+            second.named("a", &report_again).await
         });
         waits(told.recv().await);
         // Two wait, and there is a place for a third.
-        let other = places.enter(Some("b"), &tell).await.expect("a place");
+        let other = places.enter(Some("b"), &report).await.expect("a place");
         drop((first, other));
         for waiting in [named, unnamed] {
             waiting.await.expect("no panic").expect("its turn");

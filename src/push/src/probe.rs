@@ -14,7 +14,7 @@ use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::Spec;
 use tokio_util::task::TaskTracker;
 
-use super::request::Tell;
+use super::request::Reporter;
 use super::{Pusher, naming, supplement};
 use crate::Error;
 use choreographer::Permit;
@@ -32,9 +32,9 @@ pub(super) async fn interface(
     built: &BuildOutcome,
     plan: &mut Plan,
     options: &PushOptions,
-    tell: &Tell,
+    report: &Reporter,
 ) -> Result<Found, Error> {
-    let _room = room(pusher, options, tell).await?;
+    let _room = room(pusher, options, report).await?;
     naming::settle(pusher, id, built, plan, options).await?;
     let plan = &*plan;
     let spec = self::spec(pusher, id, built, plan, options);
@@ -72,7 +72,7 @@ pub(super) async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servan
 }
 
 /// Room for it, as for any servant of these limits: waited for where there is none.
-async fn room(pusher: &Pusher, options: &PushOptions, tell: &Tell) -> Result<Permit, Error> {
+async fn room(pusher: &Pusher, options: &PushOptions, report: &Reporter) -> Result<Permit, Error> {
     let (full, is_full) = tokio::sync::oneshot::channel();
     let patience = pusher.options.time;
     let admitted = pusher
@@ -82,7 +82,8 @@ async fn room(pusher: &Pusher, options: &PushOptions, tell: &Tell) -> Result<Per
         });
     let told = async {
         if is_full.await.is_ok() {
-            tell.step("waiting for room to start it: this machine is full")
+            report
+                .step("waiting for room to start it: this machine is full")
                 .await;
         }
         std::future::pending::<()>().await;

@@ -1,4 +1,4 @@
-//! Publishing, rolling back and removing services: the catalogue does it, servants and spares follow.
+//! Publishing, rolling back and removing services: the catalogue does it, servants and warm containers follow.
 
 use catalogue::RolledBack;
 use package::inventory::Inventory;
@@ -8,14 +8,14 @@ use super::Pusher;
 use crate::Error;
 
 impl Pusher {
-    /// Publishes the revision, and has a spare made of it.
+    /// Publishes the revision, and has a warm container made of it.
     pub(super) async fn publish(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
     ) -> Result<u64, Error> {
         let published = self.catalogue.publish(record, inventory).await;
-        self.choreographer.look_at_spares();
+        self.choreographer.refill_warm_pool();
         Ok(published?)
     }
 
@@ -23,7 +23,7 @@ impl Pusher {
     pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<u64, Error> {
         let _turn = self.places.turn(name).await;
         let RolledBack { from, to } = self.catalogue.rollback(name, wanted).await?;
-        self.choreographer.look_at_spares();
+        self.choreographer.refill_warm_pool();
         let about = NewEvent {
             service: Some(name),
             ..NewEvent::default()
@@ -41,7 +41,7 @@ impl Pusher {
             .choreographer
             .stop("its service was removed", |handle| handle.service() == name)
             .await;
-        self.choreographer.end_stale_spares().await?;
+        self.choreographer.end_stale_warm().await?;
         self.catalogue.untag(withdrawn).await?;
         self.collect_garbage().await;
         let about = NewEvent {

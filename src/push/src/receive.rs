@@ -16,7 +16,7 @@ use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
 use super::patience::{self, Patience, Stalled, TooSlow};
-use super::request::Tell;
+use super::request::Reporter;
 use crate::Error;
 use crate::Options;
 
@@ -37,7 +37,7 @@ pub(super) async fn unpack(
     archive: Archive,
     tree: &Path,
     limits: &Options,
-    tell: &Tell,
+    report: &Reporter,
 ) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
     // However this is left, the thread that reads the body hears of it.
@@ -85,12 +85,13 @@ pub(super) async fn unpack(
             ticks.tick().await;
             let done = received.load(Ordering::Relaxed);
             if done > 0 {
-                tell.event(PushEvent::Progress {
-                    unit: "bytes".to_owned(),
-                    done,
-                    total: None,
-                })
-                .await;
+                report
+                    .event(PushEvent::Progress {
+                        unit: "bytes".to_owned(),
+                        done,
+                        total: None,
+                    })
+                    .await;
             }
         }
     };
@@ -246,7 +247,7 @@ mod tests {
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
         let whole = futures_util::stream::iter([Ok(Bytes::from(bytes))]).boxed();
-        unpack(whole, &tree, limits, &Tell(sender)).await?;
+        unpack(whole, &tree, limits, &Reporter(sender)).await?;
         Ok(packages_of(&tree))
     }
 
@@ -292,7 +293,7 @@ mod tests {
             stall: Duration::from_millis(50),
             ..Options::wide()
         };
-        let refused = unpack(body, &tree, &limits, &Tell(sender))
+        let refused = unpack(body, &tree, &limits, &Reporter(sender))
             .await
             .expect_err("it never ends");
         assert!(
@@ -318,7 +319,7 @@ mod tests {
         });
         let push = tokio::spawn(async move {
             let body = never.boxed();
-            unpack(body, &tree, &Options::wide(), &Tell(sender)).await
+            unpack(body, &tree, &Options::wide(), &Reporter(sender)).await
         });
         waiting.await.expect("it reads");
         push.abort();

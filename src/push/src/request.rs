@@ -16,9 +16,9 @@ use super::{Archive, Error, Pusher, receive};
 
 /// Tells the client what is being done. It may have gone away: that cancels the push by itself.
 #[derive(Clone)]
-pub(super) struct Tell(pub(super) mpsc::Sender<PushEvent>);
+pub(super) struct Reporter(pub(super) mpsc::Sender<PushEvent>);
 
-impl Tell {
+impl Reporter {
     pub(super) async fn step(&self, title: &str) {
         self.event(PushEvent::Step {
             title: title.to_owned(),
@@ -63,7 +63,9 @@ impl Pusher {
         let guard = cancel.clone().drop_guard();
         let pusher = Arc::clone(self);
         self.tasks.spawn(async move {
-            let outcome = pusher.run(&options, archive, &Tell(events), cancel).await;
+            let outcome = pusher
+                .run(&options, archive, &Reporter(events), cancel)
+                .await;
             let failed = outcome.is_err();
             finished(outcome).await;
             if failed && !pusher.cancel.is_cancelled() {
@@ -100,12 +102,12 @@ impl Pusher {
         &self,
         options: &PushOptions,
         archive: Archive,
-        tell: &Tell,
+        report: &Reporter,
         cancel: CancellationToken,
     ) -> Result<Published, Error> {
         let id = format!("push-{}", names::random(8));
         let outcome = tokio::select! {
-            outcome = blocking::cancellable(self.push(&id, options, archive, tell)) => outcome,
+            outcome = blocking::cancellable(self.push(&id, options, archive, report)) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
         };
         // First what the builder has in there: it goes when its containers have ended.

@@ -223,7 +223,7 @@ impl<P: Clone> Governor<P> {
             let t = matches!(failure, Failure::Refused(_)).then(|| now - record.asked_at);
             self.judge(id, t);
             if t.is_some() {
-                self.tell(id);
+                self.announce(id);
             }
         }
         self.arbiter.failed(id, side, failure.text());

@@ -1,6 +1,6 @@
 //! Which hosts a servant may connect to, and at which of their addresses. A name's owner decides what it resolves to: this
 //! machine's loopback, another machine of the lab, or a cloud's metadata service. So each resolved address is checked before
-//! it is connected to ([`Way::permits`]). Public addresses are allowed; others need a line in the configuration
+//! it is connected to ([`Route::permits`]). Public addresses are allowed; others need a line in the configuration
 //! (docs/adr/032). What is allowed is passed on from inside by [`Relays`].
 
 use std::fmt;
@@ -55,7 +55,7 @@ pub enum Refused {
 
 /// One host and port that a servant may reach.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Way {
+pub struct Route {
     /// The host, as its push named it.
     pub host: String,
     /// The loopback address that the host's name has inside the servant.
@@ -213,13 +213,13 @@ pub fn check(allowed: &[String]) -> Result<(), Refused> {
 }
 
 /// Each host `asked` for, if it is `allowed`. One address inside for each host, so that several can be reached on the same port.
-pub fn ways_out(asked: &[String], allowed: &[String]) -> Result<Vec<Way>, Refused> {
+pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, Refused> {
     let rules: Vec<Rule> = allowed
         .iter()
         .map(|text| text.parse())
         .collect::<Result<_, _>>()?;
     let mut hosts: Vec<&str> = Vec::new();
-    let mut ways = Vec::new();
+    let mut routes = Vec::new();
     for name in asked {
         let malformed = || Refused::Malformed {
             name: name.clone(),
@@ -238,7 +238,7 @@ pub fn ways_out(asked: &[String], allowed: &[String]) -> Result<Vec<Way>, Refuse
             });
         // 127.0.1.1 and on: 127.0.0.1 is the servant's own.
         let number = u8::try_from(index + 1).map_err(|_| malformed())?;
-        ways.push(way(
+        routes.push(route(
             name,
             host,
             port,
@@ -246,26 +246,26 @@ pub fn ways_out(asked: &[String], allowed: &[String]) -> Result<Vec<Way>, Refuse
             &rules,
         )?);
     }
-    Ok(ways)
+    Ok(routes)
 }
 
 /// Names of the hosts `asked` for, if they are `allowed`, each with the address inside that stands for it.
 pub fn hosts(asked: &[String], allowed: &[String]) -> Result<Vec<(IpAddr, String)>, Refused> {
-    let ways = ways_out(asked, allowed)?.into_iter();
+    let routes = routes(asked, allowed)?.into_iter();
     // What is an address already has no name.
-    let named = ways.filter(|way| way.host.parse::<IpAddr>().is_err());
+    let named = routes.filter(|route| route.host.parse::<IpAddr>().is_err());
     Ok(named
-        .map(|way| (IpAddr::V4(way.inside), way.host))
+        .map(|route| (IpAddr::V4(route.inside), route.host))
         .collect())
 }
 
-fn way(
+fn route(
     name: &str,
     host: &str,
     port: u16,
     inside: Ipv4Addr,
     rules: &[Rule],
-) -> Result<Way, Refused> {
+) -> Result<Route, Refused> {
     let literal: Option<IpAddr> = host.parse().ok();
     let of_port = || rules.iter().filter(|rule| rule.port == port);
     let networks: Vec<Network> = of_port()
@@ -284,7 +284,7 @@ fn way(
             name: name.to_owned(),
         });
     }
-    let way = Way {
+    let route = Route {
         host: host.to_owned(),
         inside,
         port,
@@ -292,18 +292,18 @@ fn way(
         networks,
     };
     // What is an address already need not wait for its first connection.
-    match literal.map(|address| (address, way.permits(address))) {
+    match literal.map(|address| (address, route.permits(address))) {
         Some((address, Err(reach))) => Err(Refused::Inward {
             name: name.to_owned(),
             address,
             port,
             reach,
         }),
-        _ => Ok(way),
+        _ => Ok(route),
     }
 }
 
-impl Way {
+impl Route {
     /// Whether this address, to which the host was resolved, may be dialled; else what it leads to.
     pub fn permits(&self, address: IpAddr) -> Result<(), Destination> {
         if self
@@ -401,21 +401,21 @@ mod tests {
         written.iter().map(|text| (*text).to_owned()).collect()
     }
 
-    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Way>, Refused> {
-        ways_out(&list(asked), &list(allowed))
+    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Route>, Refused> {
+        routes(&list(asked), &list(allowed))
     }
 
     /// Whether a host that the rules allow may be dialled at an address.
     fn dials(allowed: &[&str], asked: &str, address: &str) -> bool {
-        let ways = out(allowed, &[asked]).expect("allowed");
-        ways[0]
+        let routes = out(allowed, &[asked]).expect("allowed");
+        routes[0]
             .permits(address.parse().expect("an address"))
             .is_ok()
     }
 
     #[test]
     fn each_host_has_an_address_inside() {
-        let ways = out(
+        let routes = out(
             &["models.example.org:443", "*:80"],
             &[
                 "models.example.org:443",
@@ -424,9 +424,9 @@ mod tests {
             ],
         )
         .expect("allowed");
-        let addresses: Vec<String> = ways
+        let addresses: Vec<String> = routes
             .iter()
-            .map(|way| format!("{}:{}", way.inside, way.port))
+            .map(|route| format!("{}:{}", route.inside, route.port))
             .collect();
         assert_eq!(addresses, ["127.0.1.1:443", "127.0.1.2:80", "127.0.1.1:80"]);
     }

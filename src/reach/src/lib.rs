@@ -86,7 +86,7 @@ pub trait Observer: Send + Sync + 'static {
     fn measured(&self, request: &Request);
 }
 
-/// Whom a servant serves: nobody while it is a spare.
+/// Whom a servant serves: nobody while it is a warm container.
 pub trait Tenant: Send + Sync + 'static {
     /// The robot's name.
     fn robot(&self) -> &str;

@@ -12,6 +12,7 @@
 //! link is the feeder; what nodes of one servant publish for each other stays inside.
 
 mod attempts;
+mod duplicates;
 mod given;
 mod held;
 mod inputs;
@@ -21,7 +22,6 @@ mod node_link;
 mod outputs;
 mod parameters;
 mod turns;
-mod twins;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -46,9 +46,9 @@ use link::skew::Skew;
 use link::{MAX_FRAME, MAX_RECORD};
 
 use attempts::Attempts;
+use duplicates::Machine;
 use node_link::NodeLink;
 use turns::Turns;
-use twins::Machine;
 
 /// For the robot's hello.
 const HELLO: Duration = Duration::from_secs(10);
@@ -132,7 +132,7 @@ pub struct Hub {
     skew: Skew,
     attempts: Attempts,
     /// Machines that were told of each other.
-    twins: Mutex<BTreeSet<(String, String)>>,
+    duplicates: Mutex<BTreeSet<(String, String)>>,
     closed: watch::Sender<Option<String>>,
 }
 
@@ -168,7 +168,7 @@ pub struct LinkStatus {
     /// Services that the node has looked for in vain, and that are not known to be there now.
     pub unserved: Vec<String>,
     /// Other machines that are connected as the same robot.
-    pub twins: Vec<String>,
+    pub duplicates: Vec<String>,
 }
 
 impl Hub {
@@ -193,7 +193,7 @@ impl Hub {
             lends: OnceCell::new(),
             skew: Skew::default(),
             attempts: Attempts::default(),
-            twins: Mutex::default(),
+            duplicates: Mutex::default(),
             closed: watch::Sender::new(None),
         })
     }
@@ -248,15 +248,15 @@ impl Hub {
                 };
             }
         };
-        // Whoever comes later than this one takes its place, while it waits for the seat, too.
+        // Whoever comes later than this one takes its place, while it waits for the lease, too.
         let mut kicked = link.kick.subscribe();
         let replaced = kicked.wait_for(|kicks| *kicks != turn);
         let _seat = tokio::select! {
             biased;
             _ = replaced => return replaced_by_another(),
-            seat = link.seat.lock() => seat,
+            lease = link.lease.lock() => lease,
         };
-        self.tell_twins(&link);
+        self.report_duplicates(&link);
         let (received, ahead, next) = link.session.position();
         let welcome = Welcome::Accepted {
             session: link.id.clone(),
@@ -338,7 +338,7 @@ impl Hub {
                 return Err(Refusal::final_(format!(
                     "another machine{} is connected as this robot and runs {node}; {}",
                     link.machine.named(),
-                    twins::NEXT
+                    duplicates::NEXT
                 )));
             }
             link.kick.send_modify(|kicks| *kicks += 1);
@@ -375,14 +375,14 @@ impl Hub {
         }
         let untold = self.parameters.untold();
         if !untold.is_empty() {
-            link.session.tell(&FromCloud::Parameters(untold));
+            link.session.report(&FromCloud::Parameters(untold));
         }
         // What the node has set before there was a link to tell.
         if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {
             let set = set
                 .into_iter()
                 .map(|(key, value)| (format!("{node}/{key}"), Some(value)));
-            link.session.tell(&FromCloud::Parameters(set.collect()));
+            link.session.report(&FromCloud::Parameters(set.collect()));
         }
         self.changed();
         let turn = *link.kick.borrow();

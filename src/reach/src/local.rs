@@ -45,8 +45,8 @@ impl LocalOpener {
 
     async fn relays(&self, servant: &LocalServant, egress: &[String]) -> Relays {
         // Not allowed any more: then the servant would not have been started either.
-        let ways_out = egress::ways_out(egress, &self.egress).unwrap_or_default();
-        Relays::open(servant.network(), &ways_out).await
+        let routes = egress::routes(egress, &self.egress).unwrap_or_default();
+        Relays::open(servant.network(), &routes).await
     }
 }
 
@@ -117,7 +117,7 @@ impl Opener for LocalOpener {
     }
 }
 
-/// ROS, sessions, links and ways out of one servant.
+/// ROS, sessions, links and routes out of one servant.
 struct LocalReach {
     servant: Arc<LocalServant>,
     bus: Arc<dyn Bus>,

@@ -204,7 +204,7 @@ impl Robot {
             md5: "abcd".to_owned(),
         });
         let service = "/map".to_owned();
-        self.session.tell(&FromRobot::Lent { service, of });
+        self.session.report(&FromRobot::Lent { service, of });
     }
 }
 

@@ -20,14 +20,14 @@ async fn main() -> std::io::Result<()> {
         uri,
         ..MasterOptions::default()
     });
-    tokio::spawn(tell(master.clone()));
+    tokio::spawn(report(master.clone()));
     tokio::spawn(obey(master.clone()));
     master.serve(listener, Arc::new(HostSockets)).await;
     Ok(())
 }
 
 /// Prints every change of topics, services and nodes.
-async fn tell(master: Master) {
+async fn report(master: Master) {
     let mut generation = master.generation();
     let mut before = Graph::default();
     while generation.changed().await.is_ok() {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use support::grants::{KIND, Specification, are_there_and_no_more, lay_out};
-use support::{Told, burglary};
+use support::{Verdict, burglary};
 
 use crate::machine::daemon;
 
@@ -18,19 +18,19 @@ pub fn allowed() -> String {
     format!("devices = [\"{KIND}=*\"]\nvolumes = [\"{MODELS}\"]\negress = [\"{OUT}\"]")
 }
 
-pub fn no_attempt_to_break_out_succeeds() -> Told {
+pub fn no_attempt_to_break_out_succeeds() -> Verdict {
     burglary::no_attempt_to_break_out_succeeds(&daemon()?)
 }
 
-pub fn nothing_of_the_host_is_reached() -> Told {
+pub fn nothing_of_the_host_is_reached() -> Verdict {
     burglary::nothing_of_the_host_is_reached(&daemon()?)
 }
 
-pub fn neighbours_are_not_reached() -> Told {
+pub fn neighbours_are_not_reached() -> Verdict {
     burglary::neighbours_are_not_reached(&daemon()?)
 }
 
-pub fn a_service_is_given_what_its_operator_allows() -> Told {
+pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     let _specification = Specification::write(KIND)?;
     lay_out(Path::new(MODELS))?;
     let listener = TcpListener::bind(OUT)?;

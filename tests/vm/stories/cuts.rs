@@ -8,12 +8,12 @@ use std::time::Instant;
 use anyhow::{Context, bail, ensure};
 use serde_json::json;
 use support::robot::PATIENCE;
-use support::{Told, binaries};
+use support::{Verdict, binaries};
 
 use crate::machine::{HOME, SERVANTS, daemon, types};
 
 /// Services work, and of earlier servants and builds there is nothing.
-fn all_is_well() -> Told {
+fn all_is_well() -> Verdict {
     let daemon = daemon()?;
     for part in ["servants", "build"] {
         let left: Vec<_> = std::fs::read_dir(Path::new(HOME).join(part))?
@@ -50,7 +50,7 @@ fn all_is_well() -> Told {
 }
 
 /// Every blob is whole, and what its name says.
-fn the_store_verifies() -> Told {
+fn the_store_verifies() -> Verdict {
     let blobs = Path::new(HOME).join("images/blobs/sha256");
     for blob in std::fs::read_dir(&blobs)?.flatten() {
         let name = blob.file_name().to_string_lossy().into_owned();
@@ -62,7 +62,7 @@ fn the_store_verifies() -> Told {
 }
 
 /// Waits for what is in the middle.
-fn once(what: &str, there: impl Fn() -> bool) -> Told {
+fn once(what: &str, there: impl Fn() -> bool) -> Verdict {
     let deadline = Instant::now() + PATIENCE;
     while !there() {
         if Instant::now() > deadline {
@@ -88,7 +88,7 @@ fn begins(program: &str, arguments: &[&str]) -> anyhow::Result<Child> {
 pub mod in_the_middle_of_a_start {
     use super::*;
 
-    pub fn before() -> Told {
+    pub fn before() -> Verdict {
         let daemon = daemon()?;
         let _ready = daemon
             .robot("greeter_cpp?robot=ready")?
@@ -106,7 +106,7 @@ pub mod in_the_middle_of_a_start {
         })
     }
 
-    pub fn after() -> Told {
+    pub fn after() -> Verdict {
         all_is_well()
     }
 }
@@ -115,7 +115,7 @@ pub mod in_the_middle_of_a_start {
 pub mod in_the_middle_of_a_push {
     use super::*;
 
-    pub fn before() -> Told {
+    pub fn before() -> Verdict {
         daemon()?;
         let _push = begins(
             "cloudroidctl",
@@ -134,7 +134,7 @@ pub mod in_the_middle_of_a_push {
         })
     }
 
-    pub fn after() -> Told {
+    pub fn after() -> Verdict {
         the_store_verifies()?;
         all_is_well()
     }
@@ -144,7 +144,7 @@ pub mod in_the_middle_of_a_push {
 pub mod in_the_middle_of_a_database_write {
     use super::*;
 
-    pub fn before() -> Told {
+    pub fn before() -> Verdict {
         let daemon = daemon()?;
         let mut robot = daemon.robot("greeter_cpp?robot=written")?;
         robot.calls("/greeter/count", json!({}))?;
@@ -159,7 +159,7 @@ pub mod in_the_middle_of_a_database_write {
         once("a write to the database", || size() != before)
     }
 
-    pub fn after() -> Told {
+    pub fn after() -> Verdict {
         all_is_well()
     }
 }

@@ -5,13 +5,13 @@ use std::path::Path;
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::robot::Robot;
-use support::{Told, leftovers, procfs};
+use support::{Verdict, leftovers, procfs};
 
 use crate::confinement;
 use crate::machine::{HOME, SERVANTS, daemon, main_pid, property, types};
 
 /// A clean machine, a package, a running service that has everything it needs.
-pub fn installs() -> Told {
+pub fn installs() -> Verdict {
     let package = std::fs::read_dir("/stage")?
         .flatten()
         .map(|entry| entry.path())
@@ -48,7 +48,7 @@ pub fn installs() -> Told {
 }
 
 /// Every servant is ended, and only the state is left.
-pub fn removes() -> Told {
+pub fn removes() -> Verdict {
     let daemon = daemon()?;
     let _robot = daemon
         .robot("greeter_cpp?robot=last")?
@@ -70,7 +70,7 @@ pub fn removes() -> Told {
 const BUILT: &str = "/var/built";
 
 /// What `make install` runs once it has built, and `make uninstall`.
-pub fn installs_and_removes_without_a_package() -> Told {
+pub fn installs_and_removes_without_a_package() -> Verdict {
     let script = |name: &str| format!("/stage/source/scripts/{name}");
     let said = types(&script("install"), &[BUILT, "", "/usr/local"])?;
     ensure!(said.contains("installed and running"), "{said}");
@@ -99,7 +99,7 @@ pub fn installs_and_removes_without_a_package() -> Told {
     nothing_but_the_state_is_left(&id).context(said)
 }
 
-fn nothing_but_the_state_is_left(id: &str) -> Told {
+fn nothing_but_the_state_is_left(id: &str) -> Verdict {
     ensure!(!Path::new(SERVANTS).exists(), "its cgroup is there");
     for pid in procfs::pids() {
         let command = procfs::command_line(pid).unwrap_or_default();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
-use support::Told;
+use support::Verdict;
 use support::burglar::tries;
 use support::daemon::Daemon;
 use support::robot::PATIENCE;
@@ -22,7 +22,7 @@ fn set(daemon: &Daemon, id: &str, flags: &[&str]) -> anyhow::Result<Value> {
     daemon.deployer().asks(&[&["set", id], flags].concat())
 }
 
-pub fn limits_are_in_the_kernels_own_files() -> Told {
+pub fn limits_are_in_the_kernels_own_files() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=limited")?;
     robot.calls("/rosapi/get_time", json!({}))?;
@@ -82,7 +82,7 @@ pub fn limits_are_in_the_kernels_own_files() -> Told {
     Ok(())
 }
 
-pub fn cores_are_shared_out_as_asked() -> Told {
+pub fn cores_are_shared_out_as_asked() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("burglar_cpp?robot=burner")?;
     tries(&mut robot, "burn", "2")?;
@@ -130,7 +130,7 @@ pub fn cores_are_shared_out_as_asked() -> Told {
     Ok(())
 }
 
-pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Told {
+pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     let daemon = daemon()?;
     let mut promised = daemon.robot("burglar_cpp?robot=burner")?;
     tries(&mut promised, "rest", "")?;
@@ -179,7 +179,7 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Told {
     Ok(())
 }
 
-pub fn who_takes_too_much_memory_is_told_so() -> Told {
+pub fn who_takes_too_much_memory_is_told_so() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=hungry")?;
     robot.says(json!({"op": "set_level", "level": "warning"}))?;
@@ -202,7 +202,7 @@ pub fn who_takes_too_much_memory_is_told_so() -> Told {
     Ok(())
 }
 
-pub fn a_fork_bomb_ends_when_its_servant_does() -> Told {
+pub fn a_fork_bomb_ends_when_its_servant_does() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=bomber")?;
     robot.calls("/rosapi/get_time", json!({}))?;

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::ensure;
 use serde_json::{Value, json};
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::{PATIENCE, Robot};
 
@@ -17,7 +17,7 @@ fn count(robot: &mut Robot) -> anyhow::Result<Option<u64>> {
 }
 
 /// Has a name greeted. This machine is slow: the node may be connected later than publications wait for it.
-fn greets(robot: &mut Robot) -> Told {
+fn greets(robot: &mut Robot) -> Verdict {
     let before = count(robot)?;
     robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
     let deadline = Instant::now() + PATIENCE;
@@ -29,7 +29,7 @@ fn greets(robot: &mut Robot) -> Told {
 }
 
 /// Greets before and after the daemon is ended by `end`, and finds the node that counted.
-fn counted_over(robot: &str, end: fn() -> Told) -> Told {
+fn counted_over(robot: &str, end: fn() -> Verdict) -> Verdict {
     let first = daemon()?;
     let path = format!("greeter_cpp?robot={robot}");
     let mut before = first.robot(&path)?;
@@ -58,7 +58,7 @@ fn counted_over(robot: &str, end: fn() -> Told) -> Told {
     Ok(())
 }
 
-pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Told {
+pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Verdict {
     counted_over("killed", || {
         types(
             "systemctl",
@@ -68,7 +68,7 @@ pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Told {
     })
 }
 
-pub fn a_restart_loses_nothing() -> Told {
+pub fn a_restart_loses_nothing() -> Verdict {
     counted_over("restarted", || {
         types("systemctl", &["restart", "cloudroid"]).map(|_| ())
     })

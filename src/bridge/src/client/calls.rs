@@ -141,7 +141,7 @@ impl Client {
             },
         );
         if let Ok(def) = &def {
-            self.tell_surplus(&call.reply(), "call_service", &def.request, call.args());
+            self.report_surplus(&call.reply(), "call_service", &def.request, call.args());
         }
         let request = match (&def, call.compression, call.args()) {
             (Ok(def), compression, args) => decode_args(&def.request, args, compression)?,
@@ -175,7 +175,12 @@ impl Client {
     /// Waits until what this client advertised before is known to ROS: its own operations are carried out in order, as it
     /// sees them. Not for long; what cannot be registered is told by a status.
     async fn is_registered(&self) {
-        let topics: Vec<String> = self.outlets.lock().topics().map(str::to_owned).collect();
+        let topics: Vec<String> = self
+            .topic_publishers
+            .lock()
+            .topics()
+            .map(str::to_owned)
+            .collect();
         let services: Vec<String> = self.services.lock().names().map(str::to_owned).collect();
         let mut graph = self.shared.bus.graph();
         let known = graph.wait_for(|graph| {

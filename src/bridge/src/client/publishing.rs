@@ -11,8 +11,8 @@ use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Una
 use super::{Client, Reply};
 use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
-use crate::outlet::Outlet;
 use crate::tf;
+use crate::topic_publisher::TopicPublisher;
 
 /// Messages on one topic that wait until its type is known.
 const MAX_UNTYPED: usize = 64;
@@ -34,7 +34,7 @@ pub(super) struct Outlets {
 
 /// A topic that is published on until it has been unadvertised as often as it was advertised.
 struct Advertised {
-    outlet: Arc<Outlet>,
+    topic_publisher: Arc<TopicPublisher>,
     /// Those of its advertisements; none where it was only published on.
     ids: HashSet<Option<Id<'static>>>,
 }
@@ -90,9 +90,9 @@ impl Client {
 
     pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &Reply) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
-        let mut outlets = self.outlets.lock();
-        outlets.told.remove(&*topic);
-        let known = outlets.open.get_mut(&*topic);
+        let mut topic_publishers = self.topic_publishers.lock();
+        topic_publishers.told.remove(&*topic);
+        let known = topic_publishers.open.get_mut(&*topic);
         // Without an id all of the client's advertisements are meant.
         let left = known.map(|known| match reply.id {
             None => Some(0),
@@ -101,11 +101,11 @@ impl Client {
         let (gone, warning) = match left {
             None => (None, Some("this client does not advertise")),
             Some(None) => (None, Some("no advertisement with this id is there of")),
-            Some(Some(0)) => (outlets.open.remove(&*topic), None),
+            Some(Some(0)) => (topic_publishers.open.remove(&*topic), None),
             Some(Some(_)) => (None, None),
         };
-        // The outlet goes outside of the lock.
-        drop(outlets);
+        // The topic_publisher goes outside of the lock.
+        drop(topic_publishers);
         match (&gone, warning) {
             (_, Some(warning)) => self.warn(reply, &format!("unadvertise: {warning} {topic}")),
             (Some(_), None) => self.info(
@@ -141,17 +141,17 @@ impl Client {
 
     /// The client is being told why nothing can be published on a topic. Gives whether it had been before.
     fn note_told(&self, topic: &str) -> bool {
-        let mut outlets = self.outlets.lock();
+        let mut topic_publishers = self.topic_publishers.lock();
         // Topics whose names never end must not fill the memory.
-        if outlets.told.len() >= self.shared.options.max_advertisements {
-            outlets.told.clear();
+        if topic_publishers.told.len() >= self.shared.options.max_advertisements {
+            topic_publishers.told.clear();
         }
-        !outlets.told.insert(topic.to_owned())
+        !topic_publishers.told.insert(topic.to_owned())
     }
 
     /// Gives the reason why a message cannot be published with the first such message of its topic: more of them may
     /// come by the hundred.
-    fn tell_once(&self, topic: &str, reason: String) -> Result<(), String> {
+    fn report_once(&self, topic: &str, reason: String) -> Result<(), String> {
         match self.note_told(topic) {
             false => Err(reason),
             true => Ok(()),
@@ -166,16 +166,16 @@ impl Client {
         queue_size: Option<u64>,
         reply: &Reply,
         advertised: bool,
-    ) -> Result<Arc<Outlet>, String> {
+    ) -> Result<Arc<TopicPublisher>, String> {
         let limit = self.shared.options.max_advertisements;
         let id = advertised.then(|| reply.id.clone());
-        let mut outlets = self.outlets.lock();
-        let count = outlets.count();
-        let known = outlets.open.get_mut(topic);
+        let mut topic_publishers = self.topic_publishers.lock();
+        let count = topic_publishers.count();
+        let known = topic_publishers.open.get_mut(topic);
         if let Some(known) = &known
-            && known.outlet.message_type.md5() != message_type.md5()
+            && known.topic_publisher.message_type.md5() != message_type.md5()
         {
-            let known = known.outlet.message_type.name();
+            let known = known.topic_publisher.message_type.name();
             return Err(format!(
                 "this client advertises {topic} as {known}; unadvertise it first"
             ));
@@ -190,14 +190,14 @@ impl Client {
         }
         let mut ids = HashSet::new();
         if let Some(known) = known {
-            if known.outlet.latch == latch || !advertised {
+            if known.topic_publisher.latch == latch || !advertised {
                 known.ids.extend(id);
-                return Ok(known.outlet.clone());
+                return Ok(known.topic_publisher.clone());
             }
             ids = std::mem::take(&mut known.ids);
         }
         ids.extend(id);
-        outlets.told.remove(topic);
+        topic_publishers.told.remove(topic);
         let queue = queue_size
             .filter(|size| *size > 0)
             .unwrap_or(DEFAULT_QUEUE)
@@ -205,22 +205,23 @@ impl Client {
         let (client, reply, name) = (Arc::downgrade(self), reply.clone(), topic.to_owned());
         let failed = move |reason: String| {
             if let Some(client) = client.upgrade() {
-                client.outlets.lock().open.remove(&name);
+                client.topic_publishers.lock().open.remove(&name);
                 client.error(&reply, &format!("advertise: topic {name}: {reason}"));
             }
         };
         if topic == tf::GOAL_TOPIC {
             self.shared.republisher.listen(&self.shared);
         }
-        let outlet = Outlet::open(&self.shared, topic, message_type, latch, queue, failed);
+        let topic_publisher =
+            TopicPublisher::open(&self.shared, topic, message_type, latch, queue, failed);
         let opened = Advertised {
-            outlet: outlet.clone(),
+            topic_publisher: topic_publisher.clone(),
             ids,
         };
-        let replaced = outlets.open.insert(topic.to_owned(), opened);
-        drop(outlets);
+        let replaced = topic_publishers.open.insert(topic.to_owned(), opened);
+        drop(topic_publishers);
         drop(replaced);
-        Ok(outlet)
+        Ok(topic_publisher)
     }
 
     pub(super) fn publish(
@@ -231,32 +232,37 @@ impl Client {
     ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
         let known = self
-            .outlets
+            .topic_publishers
             .lock()
             .open
             .get(&*topic)
-            .map(|known| known.outlet.clone());
-        let outlet = match known {
-            Some(outlet) => outlet,
+            .map(|known| known.topic_publisher.clone());
+        let topic_publisher = match known {
+            Some(topic_publisher) => topic_publisher,
             None => match self.type_to_publish(&topic, &op) {
                 Ok(Some(message_type)) => {
                     self.open_outlet(&topic, message_type, op.latch, None, reply, false)?
                 }
                 Ok(None) => return self.publish_later(&topic, &op, reply),
-                Err(reason) => return self.tell_once(&topic, reason),
+                Err(reason) => return self.report_once(&topic, reason),
             },
         };
-        let bytes = decode(&outlet.message_type, op.msg, op.compression, source)
-            .map_err(|reason| format!("topic {topic}: {reason}"))?;
-        outlet.publish(bytes);
+        let bytes = decode(
+            &topic_publisher.message_type,
+            op.msg,
+            op.compression,
+            source,
+        )
+        .map_err(|reason| format!("topic {topic}: {reason}"))?;
+        topic_publisher.publish(bytes);
         if op.compression != Compression::CborRaw && self.hears(Level::Warning) {
-            self.tell_defaults(&topic, &outlet.message_type, op.msg, reply);
+            self.report_defaults(&topic, &topic_publisher.message_type, op.msg, reply);
         }
         Ok(())
     }
 
     /// Names the message's own fields that were left out; not a header, which clients may leave to the server.
-    fn tell_defaults(
+    fn report_defaults(
         &self,
         topic: &str,
         message_type: &MessageType,
@@ -316,8 +322,8 @@ impl Client {
             compression: op.compression,
             reply: reply.clone(),
         };
-        let mut outlets = self.outlets.lock();
-        let waiting_bytes: usize = outlets
+        let mut topic_publishers = self.topic_publishers.lock();
+        let waiting_bytes: usize = topic_publishers
             .untyped
             .values()
             .flatten()
@@ -328,7 +334,7 @@ impl Client {
                 "topic {topic} has no known type yet, and {waiting_bytes} bytes wait for one already; advertise it first"
             ));
         }
-        if let Some(others) = outlets.untyped.get_mut(topic) {
+        if let Some(others) = topic_publishers.untyped.get_mut(topic) {
             if others.len() >= MAX_UNTYPED {
                 return Err(format!(
                     "topic {topic} has no known type yet; advertise it first"
@@ -337,8 +343,10 @@ impl Client {
             others.push(waiting);
             return Ok(());
         }
-        outlets.untyped.insert(topic.to_owned(), vec![waiting]);
-        drop(outlets);
+        topic_publishers
+            .untyped
+            .insert(topic.to_owned(), vec![waiting]);
+        drop(topic_publishers);
         let (client, topic) = (self.clone(), topic.to_owned());
         tokio::spawn(async move {
             let asked = tokio::select! {
@@ -346,7 +354,7 @@ impl Client {
                 asked = client.shared.bus.topic_type(&topic) => asked,
             };
             let waiting = client
-                .outlets
+                .topic_publishers
                 .lock()
                 .untyped
                 .remove(&topic)
@@ -355,7 +363,7 @@ impl Client {
             let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
             for message in waiting {
                 let done = found.clone().and_then(|message_type| {
-                    let outlet = client.open_outlet(
+                    let topic_publisher = client.open_outlet(
                         &topic,
                         message_type,
                         false,
@@ -367,8 +375,8 @@ impl Client {
                         format: message.format,
                         bytes: &message.payload,
                     };
-                    outlet.publish(decode(
-                        &outlet.message_type,
+                    topic_publisher.publish(decode(
+                        &topic_publisher.message_type,
                         payload,
                         message.compression,
                         None,

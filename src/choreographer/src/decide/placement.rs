@@ -1,6 +1,6 @@
 //! Which servant a robot is given: the one that it has, or a new one.
 
-use super::spares::Spare;
+use super::warm_pool::Warm;
 use super::{End, Servant};
 
 /// What a robot that asks for a service is given.
@@ -13,17 +13,17 @@ pub enum Placement<'a> {
         /// The one that it has is ended before.
         ends: Option<End<'a>>,
         /// The new one is made of the service's container in the warm pool, unless that is gone when it is needed.
-        spare: bool,
+        warm: bool,
     },
 }
 
-/// `has` is the servant that this robot is given for this service so far, `spare` the service's container in the warm pool.
+/// `has` is the servant that this robot is given for this service so far, `warm` the service's container in the warm pool.
 /// The revision that is published now has the number `current` and this `image`.
 ///
 /// A robot that is connected keeps the revision that it works with. A servant that is being ended is given to nobody.
 pub fn place<'a>(
     has: Option<&Servant<'a>>,
-    spare: Option<&Spare<'_>>,
+    warm: Option<&Warm<'_>>,
     current: u64,
     image: &str,
 ) -> Placement<'a> {
@@ -37,8 +37,8 @@ pub fn place<'a>(
             reason: "another revision takes its place",
         });
     }
-    let spare = spare.is_some_and(|spare| spare.runs && spare.is_of(current, image));
-    Placement::Start { ends, spare }
+    let warm = warm.is_some_and(|warm| warm.runs && warm.is_of(current, image));
+    Placement::Start { ends, warm }
 }
 
 #[cfg(test)]
@@ -51,7 +51,7 @@ mod tests {
             id: "one",
             reason: "another revision takes its place",
         };
-        let start = |ends| Placement::Start { ends, spare: false };
+        let start = |ends| Placement::Start { ends, warm: false };
         for (revision, connections, ending, expected) in [
             (2, 0, false, Placement::Keep("one")),
             (2, 1, false, Placement::Keep("one")),
@@ -82,19 +82,19 @@ mod tests {
             // Of a service that was removed and published anew.
             (2, "sha256:1", true, false),
         ] {
-            let spare = Spare {
+            let warm = Warm {
                 id: "two",
                 service: "detect",
                 revision,
                 image,
                 runs,
             };
-            let placement = place(None, Some(&spare), 2, "sha256:2");
+            let placement = place(None, Some(&warm), 2, "sha256:2");
             let expected = Placement::Start {
                 ends: None,
-                spare: used,
+                warm: used,
             };
-            assert_eq!(placement, expected, "{spare:?}");
+            assert_eq!(placement, expected, "{warm:?}");
         }
     }
 }

@@ -36,7 +36,7 @@ enum Step {
     /// The warm pool is looked after.
     Tidied,
     /// A container of the warm pool ends by itself.
-    SpareDies(usize),
+    WarmDies(usize),
     /// So many seconds pass.
     Passes(u64),
 }
@@ -55,7 +55,7 @@ fn step() -> impl Strategy<Value = Step> {
         1 => any.clone().prop_map(Step::Pushed),
         1 => (0..SERVICES.len()).prop_map(Step::Published),
         2 => Just(Step::Tidied),
-        1 => any.prop_map(Step::SpareDies),
+        1 => any.prop_map(Step::WarmDies),
         1 => (0u64..90).prop_map(Step::Passes),
     ]
 }

@@ -12,8 +12,8 @@ use tokio::time::Instant;
 
 use super::lifetime::{interface_there, unneeded};
 use super::nodes::Nodes;
-use super::spares::{self, Spare};
 use super::waiting::Permit;
+use super::warm_pool::{self, Warm};
 use super::{Inner, starting};
 use crate::decide::admission::Class;
 use crate::handle::{Failure, Handle};
@@ -25,7 +25,7 @@ const LOG_LINES: usize = 20;
 /// How a servant begins.
 pub(crate) enum Beginning {
     /// A robot asked for it; it may have been made but for its nodes.
-    Asked(Option<Spare>),
+    Asked(Option<Warm>),
     /// An earlier daemon started it.
     Adopted(Arc<dyn Servant>, Option<Permit>),
 }
@@ -40,7 +40,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
         Err(failure) => Err(with_log(failure, &handle).await),
     };
     handle.set_over(&outcome);
-    let farewell = tell_end(&inner, &handle, &outcome);
+    let farewell = report_end(&inner, &handle, &outcome);
     if let Some(reach) = handle.take_reach() {
         reach.close(&farewell);
     }
@@ -57,10 +57,10 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     inner.forget(&handle);
     // Whoever is first in the queue now may need more than that.
     inner.make_room();
-    if let Beginning::Asked(Some(spare)) = beginning {
-        spares::give_back(&inner, spare).await;
+    if let Beginning::Asked(Some(warm)) = beginning {
+        warm_pool::give_back(&inner, warm).await;
     }
-    inner.spares.look();
+    inner.warm_pool.look();
     handle.set_phase(if outcome.is_ok() {
         Phase::Stopped
     } else {
@@ -69,7 +69,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
 }
 
 /// Writes why the servant ended into the journal; gives the words for its robots.
-fn tell_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -> String {
+fn report_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -> String {
     let who = format!(
         "servant {} of {} for {}",
         handle.id,
@@ -110,7 +110,7 @@ async fn live(
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
     let (container, reach, fresh) = match beginning {
-        Beginning::Asked(spare) => {
+        Beginning::Asked(warm) => {
             let permit = tokio::select! {
                 permit = admit(inner, handle) => permit?,
                 reason = handle.end_asked() => return Ok(reason),
@@ -123,8 +123,8 @@ async fn live(
                 return Ok(reason);
             }
             starting::record(inner, handle)?;
-            match starting::use_spare(handle, spare.take()).await {
-                Some(spare) => (spare.container, Some(spare.reach), true),
+            match starting::use_warm(handle, warm.take()).await {
+                Some(warm) => (warm.container, Some(warm.reach), true),
                 None => (starting::start(inner, handle).await?, None, true),
             }
         }
@@ -138,7 +138,7 @@ async fn live(
     };
     handle.set_container(Arc::clone(&container));
     handle.set_phase(Phase::Created);
-    starting::tell_unmet(inner, handle, &container);
+    starting::report_unmet(inner, handle, &container);
     let mut nodes = Nodes::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, reach, &mut nodes, fresh));
     tokio::select! {
@@ -175,7 +175,7 @@ async fn run(
         failure = nodes.supervise() => return Err(failure),
     }
     handle.set_phase(Phase::Ready);
-    inner.spares.look();
+    inner.warm_pool.look();
     let took = store::now().saturating_sub(handle.created);
     let message = if fresh {
         format!(

@@ -25,7 +25,7 @@ pub(crate) async fn open(
         budget: memory.servant(container.id()),
         unfinished: memory.unfinished,
     };
-    let told = Told {
+    let reports = Reports {
         id: container.id().to_owned(),
         revision: Arc::clone(revision),
         catalogue: Arc::clone(&inner.catalogue),
@@ -35,7 +35,7 @@ pub(crate) async fn open(
     let recorded = Box::pin(recorded(inner, revision));
     let opener = &inner.opener;
     opener
-        .open(container, recorded, options, Arc::new(told))
+        .open(container, recorded, options, Arc::new(reports))
         .await
 }
 
@@ -67,7 +67,7 @@ async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
 }
 
 /// Who hears of what a servant and its robot tell.
-struct Told {
+struct Reports {
     id: String,
     revision: Arc<RevisionRecord>,
     catalogue: Arc<Catalogue>,
@@ -75,7 +75,7 @@ struct Told {
     request_times: Arc<RequestTimes>,
 }
 
-impl Observer for Told {
+impl Observer for Reports {
     fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
         self.catalogue.fits(&self.revision, made_of, image)
     }

@@ -10,7 +10,7 @@ use servant::spec::{NodeSpec, Spec};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::time::{Instant, timeout_at};
 
-use super::spares::Spare;
+use super::warm_pool::Warm;
 use super::{Inner, reaching};
 use crate::handle::{Failure, Handle};
 use crate::{Error, engine_limits};
@@ -49,18 +49,18 @@ fn planned(handle: &Handle) -> Vec<NodeSpec> {
 }
 
 /// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
-pub(super) async fn use_spare(handle: &Handle, spare: Option<Spare>) -> Option<Spare> {
-    let spare = spare?;
+pub(super) async fn use_warm(handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
+    let warm = warm?;
     // In their order and without waiting for one another. A program that cannot be executed is refused here, and
     // looked at where the ends of nodes are.
     let nodes = planned(handle).into_iter();
-    let started = join_all(nodes.map(|node| spare.container.start_node(node))).await;
+    let started = join_all(nodes.map(|node| warm.container.start_node(node))).await;
     let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
     if started.iter().any(lost) {
-        spare.end().await;
+        warm.end().await;
         return None;
     }
-    Some(spare)
+    Some(warm)
 }
 
 fn could_not_start(error: Error) -> Failure {
@@ -114,7 +114,7 @@ pub(super) fn spec(
 }
 
 /// Of limits that somebody asked for and that are not in force; that of the others the daemon has warned at its start.
-pub(super) fn tell_unmet(inner: &Inner, handle: &Handle, container: &Arc<dyn Servant>) {
+pub(super) fn report_unmet(inner: &Inner, handle: &Handle, container: &Arc<dyn Servant>) {
     let unmet = container.enforced().unmet(&engine_limits(&handle.asked()));
     if !unmet.is_empty() {
         let message = format!(

@@ -40,7 +40,7 @@ impl World {
         let options = Options {
             reserve_cpus: 1.0,
             reserve_memory: 0,
-            spares: 0,
+            warm_pool: 0,
             ..options()
         };
         Choreographer::new(

@@ -21,7 +21,7 @@ pub struct Group {
 }
 
 /// The parameters that may hold settings for a node, the nearest last: `/cloudroid`, `/front/cloudroid`,
-/// `/front/teller/cloudroid`.
+/// `/front/reporter/cloudroid`.
 pub fn groups(node: &str) -> Vec<String> {
     let ends = node.match_indices('/').map(|(at, _)| at).skip(1);
     let namespaces = std::iter::once("").chain(ends.map(|at| &node[..at]));
@@ -110,14 +110,14 @@ mod tests {
 
     #[test]
     fn a_node_is_in_its_namespaces() {
-        assert_eq!(groups("/teller"), ["/cloudroid", "/teller/cloudroid"]);
+        assert_eq!(groups("/reporter"), ["/cloudroid", "/reporter/cloudroid"]);
         assert_eq!(
-            groups("/a/b/teller"),
+            groups("/a/b/reporter"),
             [
                 "/cloudroid",
                 "/a/cloudroid",
                 "/a/b/cloudroid",
-                "/a/b/teller/cloudroid"
+                "/a/b/reporter/cloudroid"
             ]
         );
     }
@@ -134,7 +134,10 @@ mod tests {
                 "/front/cloudroid",
                 &[("max", ParamValue::Int(1)), ("local", text("warm"))],
             ),
-            group("/front/teller/cloudroid", &[("local", text("first-sign"))]),
+            group(
+                "/front/reporter/cloudroid",
+                &[("local", text("first-sign"))],
+            ),
         ])
         .unwrap();
         assert_eq!((config.desire, config.max), (Some(0.5), Some(1.0)));

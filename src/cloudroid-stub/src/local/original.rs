@@ -289,11 +289,11 @@ impl Runner {
         while let Some(order) = orders.recv().await {
             if matches!(order, Order::Start) {
                 let Some(program) = &self.setting.program else {
-                    self.tell(LocalState::Missing);
+                    self.report(LocalState::Missing);
                     continue;
                 };
                 self.live(program, &mut orders).await;
-                self.tell(LocalState::Stopped);
+                self.report(LocalState::Stopped);
             }
         }
     }
@@ -303,7 +303,7 @@ impl Runner {
         let mut pause = BACKOFF.0;
         loop {
             let born = Instant::now();
-            self.tell(LocalState::Starting);
+            self.report(LocalState::Starting);
             let reason = match self.spawn(program).await {
                 Ok(mut child) => tokio::select! {
                     reason = self.watch(&mut child) => reason,
@@ -338,7 +338,7 @@ impl Runner {
     async fn watch(&self, child: &mut Child) -> String {
         tokio::select! {
             status = child.wait() => return process::ended(status),
-            () = self.ready() => self.tell(LocalState::Ready),
+            () = self.ready() => self.report(LocalState::Ready),
         }
         process::ended(child.wait().await)
     }
@@ -373,7 +373,7 @@ impl Runner {
         }
     }
 
-    fn tell(&self, state: LocalState) {
+    fn report(&self, state: LocalState) {
         let _ = self.news.send(News::State(state));
     }
 }

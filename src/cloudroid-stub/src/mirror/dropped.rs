@@ -4,7 +4,7 @@ use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use link::control::FromRobot;
-use link::drops::{Drop, Teller};
+use link::drops::{Drop, Reporter};
 
 use super::Mirror;
 
@@ -26,8 +26,8 @@ impl Mirror {
 }
 
 /// Until the mirror is gone.
-pub async fn tell(mirror: Weak<Mirror>) {
-    let mut teller = Teller::default();
+pub async fn report(mirror: Weak<Mirror>) {
+    let mut reporter = Reporter::default();
     let mut told = (Weak::new(), Vec::new());
     loop {
         tokio::time::sleep(PERIOD).await;
@@ -35,7 +35,7 @@ pub async fn tell(mirror: Weak<Mirror>) {
             return;
         };
         let all = mirror.dropped();
-        for drop in teller.news(&all) {
+        for drop in reporter.news(&all) {
             if drop.cause.is_meant() {
                 tracing::info!("{drop}");
             } else {
@@ -46,7 +46,7 @@ pub async fn tell(mirror: Weak<Mirror>) {
         // Another session's cloud was told nothing yet.
         let other = !std::ptr::eq(Weak::as_ptr(&told.0), Arc::as_ptr(&session));
         if !all.is_empty() && (other || told.1 != all) {
-            session.tell(&FromRobot::Dropped(all.clone()));
+            session.report(&FromRobot::Dropped(all.clone()));
             told = (Arc::downgrade(&session), all);
         }
     }

@@ -255,7 +255,7 @@ impl Channels {
         let key = (publisher, message.wire_type.digest.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
-            mirror.session().tell(&FromRobot::Open(Input {
+            mirror.session().report(&FromRobot::Open(Input {
                 channel,
                 topic: topic.to_owned(),
                 type_name: message.wire_type.name.clone(),

@@ -49,11 +49,11 @@ impl Lent {
                     None
                 }
             };
-            mirror.lent.tell(&mirror, &session, service, provider);
+            mirror.lent.report(&mirror, &session, service, provider);
         });
     }
 
-    fn tell(
+    fn report(
         &self,
         mirror: &Mirror,
         session: &Arc<RobotSession>,
@@ -87,7 +87,7 @@ impl Lent {
         if of.is_none() {
             services.remove(&service);
         }
-        session.tell(&FromRobot::Lent { service, of });
+        session.report(&FromRobot::Lent { service, of });
     }
 
     /// Calls on behalf of the cloud; `id` and `arrived` are the call's.
@@ -130,7 +130,7 @@ impl Lent {
         services.retain(|name, service| {
             let gone = gone(service);
             if gone {
-                mirror.session().tell(&FromRobot::Lent {
+                mirror.session().report(&FromRobot::Lent {
                     service: name.clone(),
                     of: None,
                 });

@@ -306,7 +306,7 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
                     if channel != NOWHERE {
                         mirror
                             .session()
-                            .tell(&FromRobot::Listeners { channel, count });
+                            .report(&FromRobot::Listeners { channel, count });
                     }
                 }
                 keep_latched(&mirror, &topic).await;

@@ -48,7 +48,7 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                         && parameters::can_be_carried(key.trim_end_matches('/'), &mut value)
                     {
                         let changes = vec![(key, value)];
-                        mirror.session().tell(&FromRobot::Parameters(changes));
+                        mirror.session().report(&FromRobot::Parameters(changes));
                     }
                 }
             });

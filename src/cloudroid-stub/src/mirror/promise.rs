@@ -145,7 +145,7 @@ impl Mirror {
             Arc::downgrade(&keeper),
         ));
         tokio::spawn(follow(mirror.clone(), keeper));
-        tokio::spawn(reports::tell(mirror, diagnostics));
+        tokio::spawn(reports::report(mirror, diagnostics));
         Ok(())
     }
 

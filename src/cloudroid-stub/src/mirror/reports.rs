@@ -133,7 +133,7 @@ fn decision(event: &Event) -> Option<Decision> {
 }
 
 /// Reports until the node ends.
-pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
+pub async fn report(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
     let mut due = interval(PERIOD);
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
     // Of which session, and how many messages it had not sent.
@@ -150,7 +150,7 @@ pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
         if *session.up().borrow() {
             let requests = std::mem::take(&mut *promise.reports.waiting.lock());
             if !requests.is_empty() {
-                session.tell(&FromRobot::Requests(requests));
+                session.report(&FromRobot::Requests(requests));
             }
             let (of, dropped) = (Arc::downgrade(&session), session.dropped());
             if !Weak::ptr_eq(&told.0, &of) {
@@ -158,14 +158,14 @@ pub async fn tell(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             }
             if told.1 != dropped {
                 told.1 = dropped;
-                session.tell(&FromRobot::Unsent {
+                session.report(&FromRobot::Unsent {
                     replaced: dropped.replaced,
                     stale: dropped.stale,
                 });
             }
             let decisions = promise.reports.take_decisions();
             if !decisions.is_empty() {
-                session.tell(&FromRobot::Decided(decisions));
+                session.report(&FromRobot::Decided(decisions));
             }
         }
         diagnostics.publish(&promise.keeper().report());

@@ -25,7 +25,7 @@ impl Config {
             start: servant.start.0,
             grace: servant.grace.0,
             anonymous_grace: servant.anonymous_grace.0,
-            spares: servant.warm_pool,
+            warm_pool: servant.warm_pool,
             bridge: bridge_options(self),
             memory: MemoryOptions {
                 daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),

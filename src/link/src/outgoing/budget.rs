@@ -44,8 +44,8 @@ impl Outgoing {
         let (started, started_bytes) = sending.fold((0, 0), |(count, sum), one| {
             (count + 1, sum + one.out.held())
         });
-        let count = self.urgent.len() + self.kept.urgent + started;
-        let sum = self.urgent.bytes() + self.kept.bytes + started_bytes;
+        let count = self.urgent.len() + self.retransmit.urgent + started;
+        let sum = self.urgent.bytes() + self.retransmit.bytes + started_bytes;
         let too_much = count >= MAX_URGENT || (count > 0 && sum + bytes > MAX_URGENT_BYTES);
         self.full = match self.count_more(bytes) {
             _ if too_much => Some(format!(
@@ -83,7 +83,7 @@ impl Outgoing {
         let sending = self.sending.iter().map(|sending| &sending.out);
         let under_way = sending.chain(self.encoding.messages());
         let under_way: usize = under_way.map(Held::held).sum();
-        self.urgent.bytes() + topics + under_way + self.kept.bytes + self.kept.big
+        self.urgent.bytes() + topics + under_way + self.retransmit.bytes + self.retransmit.big
     }
 
     /// Counts `bytes` more. The sum is made only when enough has come together.

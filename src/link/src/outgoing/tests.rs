@@ -86,7 +86,7 @@ fn after_four_billion_records_every_one_still_comes_once() {
     }
     assert_eq!(incoming.received().number, first + 7);
     out.acknowledge(incoming.received().number);
-    assert!(out.kept.len() == 0, "the peer has them all");
+    assert!(out.retransmit.len() == 0, "the peer has them all");
     // The connection is lost while more is on its way: one came, one did not.
     for number in 8..10 {
         out.push(&control(number), Quality::Each);
@@ -194,11 +194,11 @@ fn what_the_peer_has_is_let_go() {
     out.push(&control(1), Quality::Each);
     out.push(&control(2), Quality::Each);
     while out.next(0).is_some() {}
-    assert_eq!(out.kept.len(), 2);
+    assert_eq!(out.retransmit.len(), 2);
     out.acknowledge(1);
-    assert_eq!(out.kept.len(), 1);
+    assert_eq!(out.retransmit.len(), 1);
     out.acknowledge(2);
-    assert_eq!((out.kept.len(), out.kept.bytes), (0, 0));
+    assert_eq!((out.retransmit.len(), out.retransmit.bytes), (0, 0));
 }
 
 proptest! {
@@ -307,7 +307,7 @@ fn a_message_that_came_damaged_goes_once_more_and_leaves_nothing() {
         .map(|frame| deliver(&mut incoming, frame));
     assert_eq!(came.find_map(born), Some(1));
     out.acknowledge(out.next_number() - 1);
-    let kept = &out.kept;
+    let kept = &out.retransmit;
     assert_eq!((kept.len(), kept.bytes, kept.big), (0, 0, 0));
 }
 
@@ -455,7 +455,9 @@ fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
     );
     out.acknowledge(incoming.state().0);
     assert_eq!(out.closed, [1]);
-    assert!(out.topics.is_empty() && out.encoding.channels().is_empty() && out.kept.len() == 0);
+    assert!(
+        out.topics.is_empty() && out.encoding.channels().is_empty() && out.retransmit.len() == 0
+    );
 }
 
 fn answer(size: usize) -> Record {
@@ -483,9 +485,9 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         let reason = out.is_full().unwrap().to_owned();
         assert!(reason.contains("not acknowledged"), "{reason}");
         // What comes then is not kept any more.
-        let held = out.kept.bytes;
+        let held = out.retransmit.bytes;
         out.push(&answer(size), Quality::Each);
-        assert!((out.next(0).is_none(), out.kept.bytes) == (true, held));
+        assert!((out.next(0).is_none(), out.retransmit.bytes) == (true, held));
     }
     // One that does may be sent as much as it likes, and one answer may be longer than all may be together.
     let mut out = Outgoing::new(None);
@@ -495,7 +497,7 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         out.acknowledge(out.next_number() - 1);
     }
     assert_eq!(
-        (out.is_full(), out.kept.urgent, out.kept.bytes),
+        (out.is_full(), out.retransmit.urgent, out.retransmit.bytes),
         (None, 0, 0)
     );
     out.push(&answer(MAX_URGENT_BYTES + 1), Quality::Each);

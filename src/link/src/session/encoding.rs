@@ -4,7 +4,7 @@ use codec::Answer;
 use tokio::task::JoinHandle;
 
 use super::{Session, State};
-use crate::control::{Between, Order, Told};
+use crate::control::{Between, Control, Order};
 use crate::frame::Frame;
 use crate::packing::Packed;
 use crate::record::Data;
@@ -83,9 +83,9 @@ impl<O: Order> Session<O> {
 
     /// What the peer orders, unless its session tells this one something.
     pub(super) fn understood(&self, json: &[u8]) -> Option<O::OfPeer> {
-        match Told::read(json) {
-            Ok(Told::Order(order)) => return Some(order),
-            Ok(Told::Between(Between::Keyframe { channel })) => {
+        match Control::read(json) {
+            Ok(Control::Order(order)) => return Some(order),
+            Ok(Control::Between(Between::Keyframe { channel })) => {
                 let packing = &mut self.state.lock().packing;
                 packing.answered(channel, Answer::Keyframe);
             }

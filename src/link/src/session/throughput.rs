@@ -12,12 +12,12 @@ const NEWEST: f64 = 0.25;
 pub(super) struct Throughput {
     known: Option<f64>,
     first: Vec<f64>,
-    before: Option<Told>,
+    before: Option<Counters>,
 }
 
 /// What the peer said of how much had come, and how things stood then.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Told {
+pub(super) struct Counters {
     pub(super) at: Instant,
     /// So much had come.
     pub(super) bytes: u64,
@@ -33,19 +33,19 @@ impl Throughput {
         self.known
     }
 
-    /// Another connection: what was told on the last one measures nothing.
+    /// Another connection: what was counters on the last one measures nothing.
     pub(super) fn reconnect(&mut self) {
         self.before = None;
     }
 
-    /// Takes in what was told; the new estimate, if it changes.
-    pub(super) fn told(&mut self, told: Told) -> Option<f64> {
-        let before = self.before.replace(told)?;
-        let seconds = told.at.duration_since(before.at).as_secs_f64();
-        let rate = told.bytes.saturating_sub(before.bytes) as f64 / seconds.max(1e-6);
+    /// Takes in what was counters; the new estimate, if it changes.
+    pub(super) fn report(&mut self, counters: Counters) -> Option<f64> {
+        let before = self.before.replace(counters)?;
+        let seconds = counters.at.duration_since(before.at).as_secs_f64();
+        let rate = counters.bytes.saturating_sub(before.bytes) as f64 / seconds.max(1e-6);
         // With nothing to send a link is not slow: all of it had been sent by then, or there was more all the time.
-        let busy = before.sent >= told.bytes || (!told.idle && !before.idle);
-        let counts = busy && seconds > 0.001 && told.bytes > before.bytes;
+        let busy = before.sent >= counters.bytes || (!counters.idle && !before.idle);
+        let counts = busy && seconds > 0.001 && counters.bytes > before.bytes;
         let quicker = self.known.is_some_and(|known| rate > known);
         (counts || quicker).then(|| self.measure(rate)).flatten()
     }
@@ -77,9 +77,9 @@ mod tests {
     fn a_link_is_as_fast_as_it_was_when_it_had_to_be() {
         let mut throughput = Throughput::default();
         let start = Instant::now();
-        let mut told = |seconds: u64, bytes: u64, sent: u64, idle: bool| {
+        let mut counters = |seconds: u64, bytes: u64, sent: u64, idle: bool| {
             let at = start + Duration::from_secs(seconds);
-            throughput.told(Told {
+            throughput.report(Counters {
                 at,
                 bytes,
                 sent,
@@ -87,23 +87,23 @@ mod tests {
             })
         };
         // There was always more: 100 bytes per second, disturbed once.
-        assert_eq!(told(0, 0, 1000, false), None);
-        assert_eq!(told(1, 100, 1000, false), None);
-        assert_eq!(told(2, 150, 1000, false), None);
-        assert_eq!(told(3, 250, 1000, false), Some(100.0));
+        assert_eq!(counters(0, 0, 1000, false), None);
+        assert_eq!(counters(1, 100, 1000, false), None);
+        assert_eq!(counters(2, 150, 1000, false), None);
+        assert_eq!(counters(3, 250, 1000, false), Some(100.0));
         // Little was to be sent: that tells nothing.
-        assert_eq!(told(9, 1000, 1000, true), Some(106.25));
-        assert_eq!(told(19, 1001, 1001, true), None);
+        assert_eq!(counters(9, 1000, 1000, true), Some(106.25));
+        assert_eq!(counters(19, 1001, 1001, true), None);
         // Another connection begins anew.
         throughput.reconnect();
         let at = start + Duration::from_secs(20);
-        let first = Told {
+        let first = Counters {
             at,
             bytes: 5000,
             sent: 5000,
             idle: false,
         };
-        assert_eq!(throughput.told(first), None);
+        assert_eq!(throughput.report(first), None);
         assert_eq!(throughput.known(), Some(106.25));
     }
 }

@@ -31,28 +31,28 @@ fn ahead() -> Skew {
 fn a_robot_s_stamps_become_ours_and_come_back() {
     let skew = ahead();
     let sent = stamped(1_700_000_120, 7);
-    let here = skew.apply(Way::In, &header(), sent.clone());
+    let here = skew.apply(Direction::In, &header(), sent.clone());
     assert_eq!(here, stamped(1_700_000_000, 0));
-    assert_eq!(skew.apply(Way::Out, &header(), here), sent);
+    assert_eq!(skew.apply(Direction::Out, &header(), here), sent);
     // And what the node made up itself.
     let made = stamped(1_700_000_500, 999_999_999);
-    let there = skew.apply(Way::Out, &header(), made.clone());
+    let there = skew.apply(Direction::Out, &header(), made.clone());
     assert_eq!(there, stamped(1_700_000_621, 6));
-    assert_eq!(skew.apply(Way::In, &header(), there), made);
+    assert_eq!(skew.apply(Direction::In, &header(), there), made);
 }
 
 #[test]
 fn a_stamp_comes_back_as_it_was_though_the_difference_was_measured_anew() {
     let skew = ahead();
     let sent = stamped(1_700_000_120, 7);
-    let here = skew.apply(Way::In, &header(), sent.clone());
+    let here = skew.apply(Direction::In, &header(), sent.clone());
     skew.measured(measured(AHEAD + 50_000_000, 100_000));
     assert_eq!(skew.difference(), AHEAD + 50_000_000);
-    assert_eq!(skew.apply(Way::Out, &header(), here), sent);
+    assert_eq!(skew.apply(Direction::Out, &header(), here), sent);
     let made = stamped(1_700_000_001, 0);
-    let there = skew.apply(Way::Out, &header(), made.clone());
+    let there = skew.apply(Direction::Out, &header(), made.clone());
     skew.measured(measured(AHEAD, 100_000));
-    assert_eq!(skew.apply(Way::In, &header(), there), made);
+    assert_eq!(skew.apply(Direction::In, &header(), there), made);
 }
 
 #[test]
@@ -74,16 +74,22 @@ fn what_no_clock_shows_stays() {
     let skew = ahead();
     for (seconds, nanoseconds) in [(0, 0), (5, 1_000_000_000), (60, 0), (0, 1)] {
         let message = stamped(seconds, nanoseconds);
-        assert_eq!(skew.apply(Way::In, &header(), message.clone()), message);
+        assert_eq!(
+            skew.apply(Direction::In, &header(), message.clone()),
+            message
+        );
     }
     let last = stamped(u32::MAX, 999_999_999);
-    assert_eq!(skew.apply(Way::Out, &header(), last.clone()), last);
+    assert_eq!(skew.apply(Direction::Out, &header(), last.clone()), last);
     // Too short to be one: as it is, for the node to refuse.
     let short = Bytes::from_static(&[0; 11]);
-    assert_eq!(skew.apply(Way::In, &header(), short.clone()), short);
+    assert_eq!(skew.apply(Direction::In, &header(), short.clone()), short);
     skew.leave(true);
     let message = stamped(1_700_000_120, 7);
-    assert_eq!(skew.apply(Way::In, &header(), message.clone()), message);
+    assert_eq!(
+        skew.apply(Direction::In, &header(), message.clone()),
+        message
+    );
 }
 
 #[test]
@@ -91,7 +97,7 @@ fn a_message_that_others_hold_is_not_changed_under_them() {
     let skew = ahead();
     let sent = stamped(1_700_000_120, 7);
     let held = sent.clone();
-    let here = skew.apply(Way::In, &header(), sent);
+    let here = skew.apply(Direction::In, &header(), sent);
     assert_ne!(here, held);
     assert_eq!(held, stamped(1_700_000_120, 7));
 }
@@ -101,7 +107,7 @@ fn memory_is_bounded() {
     let skew = ahead();
     for second in 0..3 * REMEMBERED {
         let message = stamped(1_700_000_000 + u32::try_from(second).unwrap(), 0);
-        skew.apply(Way::In, &header(), message);
+        skew.apply(Direction::In, &header(), message);
     }
     let known = skew.known.lock();
     assert_eq!(known.robots.found.len(), REMEMBERED);

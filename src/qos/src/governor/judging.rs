@@ -40,7 +40,7 @@ impl<P: Clone> Governor<P> {
         }
         let verdict = self.arbiter.answer_with(now, id, side, output);
         if answers && (side == Side::Cloud || verdict == Verdict::Deliver) {
-            self.tell(id);
+            self.announce(id);
         }
         self.arbiter.close_call(id);
         match (verdict, side) {
@@ -63,7 +63,7 @@ impl<P: Clone> Governor<P> {
             self.count(id, t);
         }
         if t.is_none() {
-            self.tell(id);
+            self.announce(id);
         }
     }
 
@@ -79,7 +79,7 @@ impl<P: Clone> Governor<P> {
     }
 
     /// Tells the outcome of a request that was judged.
-    pub(super) fn tell(&mut self, id: RequestId) {
+    pub(super) fn announce(&mut self, id: RequestId) {
         let Some(record) = self.arbiter.get(id).filter(|record| record.judged) else {
             return;
         };

@@ -14,12 +14,12 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use super::Way;
+use super::Route;
 
 /// Connections at a time through one way out. Each takes two descriptors of the daemon, and memory for what is passed on.
 const CONNECTIONS: usize = 128;
 
-/// The ways out of one servant; closed when dropped.
+/// The routes out of one servant; closed when dropped.
 #[derive(Debug, Default)]
 pub struct Relays {
     _listeners: JoinSet<()>,
@@ -27,15 +27,17 @@ pub struct Relays {
 
 impl Relays {
     /// Opens them. One that cannot be opened is told, and missing.
-    pub async fn open(network: &NetNs, ways_out: &[Way]) -> Relays {
+    pub async fn open(network: &NetNs, routes: &[Route]) -> Relays {
         let mut listeners = JoinSet::new();
-        for way in ways_out {
-            let inside = SocketAddr::from((way.inside, way.port));
+        for route in routes {
+            let inside = SocketAddr::from((route.inside, route.port));
             match network.listen(inside).await {
                 Ok(listener) => {
-                    listeners.spawn(pass_on(listener, way.clone()));
+                    listeners.spawn(pass_on(listener, route.clone()));
                 }
-                Err(error) => tracing::warn!("no way out to {}:{}: {error}", way.host, way.port),
+                Err(error) => {
+                    tracing::warn!("no route out to {}:{}: {error}", route.host, route.port)
+                }
             }
         }
         Relays {
@@ -44,9 +46,9 @@ impl Relays {
     }
 }
 
-async fn pass_on(listener: TcpListener, way: Way) {
+async fn pass_on(listener: TcpListener, route: Route) {
     let far = Arc::new(Far {
-        way,
+        route,
         told: Mutex::default(),
         told_full: AtomicBool::new(false),
     });
@@ -63,19 +65,19 @@ async fn pass_on(listener: TcpListener, way: Way) {
                 };
                 // A refusal is what a node understands; to wait would look like a host that is down.
                 let Ok(place) = Arc::clone(&room).try_acquire_owned() else {
-                    far.tell_full();
+                    far.report_full();
                     continue;
                 };
                 let far = Arc::clone(&far);
                 connections.spawn(async move {
                     let _place = place;
-                    let Far { way, .. } = &*far;
+                    let Far { route, .. } = &*far;
                     match far.dial().await {
                         Ok(mut stream) => {
                             let _ = tokio::io::copy_bidirectional(&mut near, &mut stream).await;
                         }
                         Err(error) => {
-                            tracing::debug!("{}:{} was not reached: {error}", way.host, way.port);
+                            tracing::debug!("{}:{} was not reached: {error}", route.host, route.port);
                         }
                     }
                 });
@@ -87,7 +89,7 @@ async fn pass_on(listener: TcpListener, way: Way) {
 
 /// The far end of a way out.
 struct Far {
-    way: Way,
+    route: Route,
     /// Addresses whose refusal was told.
     told: Mutex<BTreeSet<IpAddr>>,
     /// Whether it was told that there were too many connections.
@@ -96,9 +98,9 @@ struct Far {
 
 impl Far {
     /// Tells, once, that connections are refused.
-    fn tell_full(&self) {
+    fn report_full(&self) {
         if !self.told_full.swap(true, Ordering::Relaxed) {
-            let Way { host, port, .. } = &self.way;
+            let Route { host, port, .. } = &self.route;
             tracing::warn!(
                 "a servant has {CONNECTIONS} connections to {host}:{port}, as many as may be; further ones are closed until some end"
             );
@@ -108,16 +110,16 @@ impl Far {
     /// Resolves the host and connects to the first of its addresses that may be dialled and answers. What is dialled is
     /// the address that was looked at: the name is not resolved again.
     async fn dial(&self) -> io::Result<TcpStream> {
-        let Far { way, .. } = self;
+        let Far { route, .. } = self;
         let mut outcome = Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
-        for address in tokio::net::lookup_host((way.host.as_str(), way.port)).await? {
-            if let Err(reach) = way.permits(address.ip()) {
+        for address in tokio::net::lookup_host((route.host.as_str(), route.port)).await? {
+            if let Err(reach) = route.permits(address.ip()) {
                 if self.told.lock().insert(address.ip()) {
                     tracing::warn!(
-                        "a servant's way out to {}:{} leads to {} ({reach}) and is refused there; if that is meant, name \
+                        "a servant's route out to {}:{} leads to {} ({reach}) and is refused there; if that is meant, name \
                          the address in [allow] of the configuration: egress = [\"{address}\"]",
-                        way.host,
-                        way.port,
+                        route.host,
+                        route.port,
                         address.ip()
                     );
                 }
@@ -137,7 +139,7 @@ impl Far {
 mod tests {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
-    use super::super::ways_out;
+    use super::super::routes;
     use super::*;
 
     /// Asks `host` on the port of a listener of this machine's loopback, through a relay; what came back.
@@ -150,10 +152,10 @@ mod tests {
             }
         });
         let asked = [format!("{host}:{port}")];
-        let way = ways_out(&asked, &[rule(port)]).expect("allowed").remove(0);
+        let route = routes(&asked, &[rule(port)]).expect("allowed").remove(0);
         let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let near = relay.local_addr().expect("bound");
-        let relaying = tokio::spawn(pass_on(relay, way));
+        let relaying = tokio::spawn(pass_on(relay, route));
         let mut heard = String::new();
         let mut stream = TcpStream::connect(near).await.expect("relayed");
         let _ = stream.read_to_string(&mut heard).await;
@@ -183,10 +185,10 @@ mod tests {
             }
         });
         let egress = vec![format!("127.0.0.1:{port}")];
-        let way = ways_out(&egress, &egress).expect("allowed").remove(0);
+        let route = routes(&egress, &egress).expect("allowed").remove(0);
         let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let near = relay.local_addr().expect("bound");
-        let relaying = tokio::spawn(pass_on(relay, way));
+        let relaying = tokio::spawn(pass_on(relay, route));
         // What the first byte of a connection is, if it has one.
         let first = async || {
             let mut stream = TcpStream::connect(near).await.expect("accepted");

@@ -14,7 +14,7 @@ use link::clock::now;
 use link::control::Input;
 use link::drops::{Cause, Drops};
 use link::record::{Answered, Data};
-use link::skew::{Skew, Way};
+use link::skew::{Direction, Skew};
 use ros::codec::Stamps;
 
 /// Messages kept for a slow node.
@@ -76,7 +76,7 @@ impl Inputs {
         let message = data.message;
         // By the robot's stamp: outputs are looked at when theirs are the robot's again.
         let mark = mark(&message);
-        let message = skew.apply(Way::In, &channel.stamps, message);
+        let message = skew.apply(Direction::In, &channel.stamps, message);
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
             State::Waiting(waiting) => {

@@ -24,7 +24,7 @@ use tokio::time::{Instant as Moment, timeout_at};
 use super::Hub;
 use super::node_link::NodeLink;
 use link::control::{FromCloud, Served};
-use link::skew::Way;
+use link::skew::Direction;
 use ros::codec::Stamps;
 
 /// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
@@ -199,7 +199,7 @@ impl NodeLink {
             Some(State::There { there, asked }) => {
                 if asked.elapsed() > CONFIRM {
                     *asked = Instant::now();
-                    self.tell_lookup(service);
+                    self.report_lookup(service);
                 }
                 return Asked::Known(Some(Arc::clone(there)));
             }
@@ -217,13 +217,13 @@ impl NodeLink {
             }
         }
         names.insert(service.to_owned(), State::Asked { in_vain: false });
-        self.tell_lookup(service);
+        self.report_lookup(service);
         Asked::Wait
     }
 
-    fn tell_lookup(&self, service: &str) {
+    fn report_lookup(&self, service: &str) {
         let service = service.to_owned();
-        self.session.tell(&FromCloud::Lookup { service });
+        self.session.report(&FromCloud::Lookup { service });
     }
 
     /// Calls a service of the robot. Over a cut the call waits; it fails with the link.
@@ -265,7 +265,7 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     let known = hub.registry.service(&served.type_name).ok();
     let known = known.filter(|known| known.md5 == served.md5);
     if known.is_none() && hub.skew.difference() != 0 {
-        link.session.tell(&FromCloud::Notice {
+        link.session.report(&FromCloud::Notice {
             warning: true,
             text: format!(
                 "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with md5sum {}; push the package with the Debian package that holds it (--with DEB)",
@@ -349,8 +349,8 @@ impl ServiceHandler for Passing {
                 self.service, there.service_type.digest, self.digest
             ));
         }
-        let request = hub.skew.apply(Way::Out, &there.request, request);
+        let request = hub.skew.apply(Direction::Out, &there.request, request);
         let response = link.call_robot(there.channel, request).await?;
-        Ok(hub.skew.apply(Way::In, &there.response, response))
+        Ok(hub.skew.apply(Direction::In, &there.response, response))
     }
 }

@@ -12,7 +12,7 @@ use ros::codec::Stamps;
 
 /// What was told so far.
 #[derive(Default)]
-struct Told {
+struct Sent {
     types: BTreeSet<(String, Digest)>,
     channels: BTreeMap<String, u32>,
     services: BTreeMap<String, (u32, ServiceType)>,
@@ -24,11 +24,11 @@ struct Told {
 pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     let mut graphs = hub.bus.graph();
     let mut changes = hub.changes.subscribe();
-    let mut told = Told::default();
+    let mut sent = Sent::default();
     loop {
         graphs.borrow_and_update();
         changes.borrow_and_update();
-        told.tell(&link, &hub).await;
+        sent.report(&link, &hub).await;
         tokio::select! {
             changed = graphs.changed() => if changed.is_err() { return },
             changed = changes.changed() => if changed.is_err() { return },
@@ -36,8 +36,8 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     }
 }
 
-impl Told {
-    async fn tell(&mut self, link: &Arc<NodeLink>, hub: &Arc<Hub>) {
+impl Sent {
+    async fn report(&mut self, link: &Arc<NodeLink>, hub: &Arc<Hub>) {
         let seen = hub.bus.graph().borrow().clone();
         let listening: BTreeSet<String> = seen
             .topics
@@ -87,7 +87,7 @@ impl Told {
         }
         self.let_go(link, &graph);
         if self.graph.as_ref() != Some(&graph) {
-            link.session.tell(&FromCloud::Graph(graph.clone()));
+            link.session.report(&FromCloud::Graph(graph.clone()));
             self.graph = Some(graph);
         }
     }
@@ -107,7 +107,7 @@ impl Told {
         };
         let key = (wire_type.name.clone(), wire_type.digest.clone());
         if self.types.insert(key) {
-            link.session.tell(&FromCloud::Type {
+            link.session.report(&FromCloud::Type {
                 name: wire_type.name.clone(),
                 md5: wire_type.digest.to_string(),
                 definition: wire_type.definition.clone(),

@@ -9,19 +9,19 @@ use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 
+use super::duplicates::Machine;
 use super::held::{Held, Hold};
 use super::inputs::Inputs;
 use super::lent::Lent;
 use super::outputs::Outputs;
-use super::twins::Machine;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
 use link::clock::Sample;
 use link::control::{FromCloud, FromRobot, Hello, Request, Sla};
-use link::drops::{Drop, Drops, Teller};
+use link::drops::{Drop, Drops, Reporter};
 use link::record::Record;
 use link::session::{CloudSession, Handler, SessionOptions};
-use link::skew::Way;
+use link::skew::Direction;
 use ros::codec::Stamps;
 
 /// Requests remembered, for whoever explains.
@@ -38,7 +38,7 @@ pub(super) struct NodeLink {
     pub(super) id: String,
     pub(super) session: CloudSession,
     /// Held by the connection that carries the session.
-    pub(super) seat: tokio::sync::Mutex<()>,
+    pub(super) lease: tokio::sync::Mutex<()>,
     /// Grows when another connection, or nobody, is to carry it.
     pub(super) kick: watch::Sender<u64>,
     pub(super) hub: Weak<Hub>,
@@ -85,7 +85,7 @@ impl NodeLink {
             machine: Machine::of(hello),
             id,
             session: CloudSession::new(options).within(&hub.options.budget),
-            seat: tokio::sync::Mutex::default(),
+            lease: tokio::sync::Mutex::default(),
             kick: watch::Sender::new(0),
             hub: Arc::downgrade(hub),
             inputs: Inputs::default(),
@@ -112,7 +112,7 @@ impl NodeLink {
         tasks.push(
             tokio::spawn(async move {
                 let exit = nodes.ended(&watching.node).await;
-                watching.session.tell(&FromCloud::Exited(exit));
+                watching.session.report(&FromCloud::Exited(exit));
             })
             .abort_handle(),
         );
@@ -120,12 +120,12 @@ impl NodeLink {
         tasks.push(
             tokio::spawn(async move {
                 while let Some((error, text)) = lines.recv().await {
-                    printing.session.tell(&FromCloud::Line { error, text });
+                    printing.session.report(&FromCloud::Line { error, text });
                 }
             })
             .abort_handle(),
         );
-        tasks.push(tokio::spawn(tell_drops(Arc::clone(&link))).abort_handle());
+        tasks.push(tokio::spawn(report_drops(Arc::clone(&link))).abort_handle());
         link.tasks.lock().extend(tasks);
         link
     }
@@ -145,7 +145,7 @@ impl NodeLink {
     pub(super) fn is_connected(&self) -> bool {
         // One that is new has exchanged nothing yet.
         let fresh = self.session.clock().is_none();
-        self.seat.try_lock().is_err() && (fresh || *self.session.up().borrow())
+        self.lease.try_lock().is_err() && (fresh || *self.session.up().borrow())
     }
 
     pub(super) fn listens_to(&self, topic: &str) -> bool {
@@ -173,14 +173,16 @@ impl NodeLink {
             left_out,
             unfed: self.unfed(),
             unserved: self.unserved(),
-            twins: self.twins(),
+            duplicates: self.duplicates(),
         }
     }
 
-    fn twins(&self) -> Vec<String> {
+    fn duplicates(&self) -> Vec<String> {
         let hub = self.hub.upgrade();
-        let twins = hub.map(|hub| hub.twins_of(self)).unwrap_or_default();
-        let names = twins.iter().map(|twin| twin.machine.name().to_owned());
+        let duplicates = hub.map(|hub| hub.duplicates_of(self)).unwrap_or_default();
+        let names = duplicates
+            .iter()
+            .map(|duplicate| duplicate.machine.name().to_owned());
         let mut names: Vec<String> = names.collect();
         names.sort();
         names.dedup();
@@ -236,10 +238,10 @@ impl NodeLink {
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
         tokio::spawn(async move {
             let patience = hub.options.call_timeout;
-            let request = hub.skew.apply(Way::In, &service.request, request);
+            let request = hub.skew.apply(Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;
             let called =
-                called.map(|response| hub.skew.apply(Way::Out, &service.response, response));
+                called.map(|response| hub.skew.apply(Direction::Out, &service.response, response));
             link.session.answer(
                 id,
                 taken,
@@ -402,13 +404,13 @@ async fn deliver(link: Arc<NodeLink>, hub: Arc<Hub>, mut signals: mpsc::Unbounde
 }
 
 /// Tells of messages that were dropped here, in the daemon's log and in the robot's.
-async fn tell_drops(link: Arc<NodeLink>) {
-    let mut teller = Teller::default();
+async fn report_drops(link: Arc<NodeLink>) {
+    let mut reporter = Reporter::default();
     loop {
         tokio::time::sleep(DROPS).await;
-        for drop in teller.news(&link.drops_here()) {
+        for drop in reporter.news(&link.drops_here()) {
             tracing::info!(node = link.node, "{drop}");
-            link.session.tell(&FromCloud::Notice {
+            link.session.report(&FromCloud::Notice {
                 warning: !drop.cause.is_meant(),
                 text: format!("in the cloud {drop}"),
             });

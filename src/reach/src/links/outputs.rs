@@ -19,7 +19,7 @@ use link::Quality;
 use link::clock::now;
 use link::drops::Cause;
 use link::record::{Answered, Data};
-use link::skew::Way;
+use link::skew::Direction;
 use ros::codec::Stamps;
 
 /// Messages that the bus keeps for a busy link.
@@ -151,7 +151,7 @@ impl Outputs {
                     // Other nodes of the servant have links of their own.
                     if message.publisher.node() == reader.node {
                         let Some(hub) = hub.upgrade() else { break };
-                        let bytes = hub.skew.apply(Way::Out, &stamps, message.bytes);
+                        let bytes = hub.skew.apply(Direction::Out, &stamps, message.bytes);
                         reader.send(channel, bytes, message.latching);
                     }
                 }

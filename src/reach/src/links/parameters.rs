@@ -97,7 +97,7 @@ impl Known {
             let task = tokio::spawn(async move {
                 while let Some((key, value)) = changes.recv().await {
                     let Some(hub) = weak.upgrade() else { return };
-                    hub.parameters.tell(&hub, key, value);
+                    hub.parameters.report(&hub, key, value);
                 }
             });
             Ok::<_, ros::bus::BusError>(task.abort_handle())
@@ -108,7 +108,7 @@ impl Known {
     }
 
     /// Tells the link whose node the parameter belongs to, or any: they are on one robot.
-    fn tell(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+    fn report(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
         if key.starts_with(RUNS) || self.set.lock().get(&key) == value.as_ref() {
             return;
         }
@@ -118,7 +118,7 @@ impl Known {
         match owner.or_else(|| links.values().next()) {
             Some(link) => link
                 .session
-                .tell(&FromCloud::Parameters(vec![(key, value)])),
+                .report(&FromCloud::Parameters(vec![(key, value)])),
             None => drop(self.untold.lock().insert(key, value)),
         }
     }

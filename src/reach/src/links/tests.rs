@@ -170,7 +170,7 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
     let (_two, _) = says(&hub, &of("/two", "rover1", "a")).await;
     let (_arm, _) = says(&hub, &of("/arm", "computer in the arm", "a")).await;
     assert!(nodes.warnings.lock().is_empty(), "they are one robot");
-    assert!(hub.status().iter().all(|link| link.twins.is_empty()));
+    assert!(hub.status().iter().all(|link| link.duplicates.is_empty()));
     let (_copy, welcome) = says(&hub, &of("/other", "rover2", "b")).await;
     assert!(matches!(welcome, Welcome::Accepted { .. }));
     let warnings = nodes.warnings.lock().clone();
@@ -185,11 +185,11 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
         "{warnings:?}"
     );
     for link in hub.status() {
-        let twins = match link.node.as_str() {
+        let duplicates = match link.node.as_str() {
             "/other" => vec!["computer in the arm", "rover1"],
             _ => vec!["rover2"],
         };
-        assert_eq!(link.twins, twins, "{}", link.node);
+        assert_eq!(link.duplicates, duplicates, "{}", link.node);
     }
     // The same node is refused.
     let (_, refused) = says(&hub, &of("/one", "rover2", "b")).await;

@@ -85,13 +85,13 @@ pub(crate) struct TestNode {
     task: JoinHandle<()>,
 }
 
-struct Teller {
+struct Reporter {
     calls: mpsc::UnboundedSender<(String, Vec<Value>)>,
     answer: Value,
 }
 
 #[async_trait]
-impl Handler for Teller {
+impl Handler for Reporter {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         let _ = self.calls.send((method.to_owned(), params));
         Ok(Value::Array(vec![1.into(), "".into(), self.answer.clone()]))
@@ -109,11 +109,11 @@ impl TestNode {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let uri = format!("http://{}/", listener.local_addr().unwrap());
         let (sender, calls) = mpsc::unbounded_channel();
-        let teller = Arc::new(Teller {
+        let reporter = Arc::new(Reporter {
             calls: sender,
             answer,
         });
-        let task = tokio::spawn(serve(listener, teller, Limits::default()));
+        let task = tokio::spawn(serve(listener, reporter, Limits::default()));
         Self { uri, calls, task }
     }
 

@@ -74,7 +74,7 @@ impl Clients {
     }
 
     /// Tells everybody.
-    pub(super) fn tell(&self, message: &FromShim) {
+    pub(super) fn report(&self, message: &FromShim) {
         let line = protocol::line(message);
         for (queue, _) in self.connected.values() {
             let _ = queue.send(line.clone());

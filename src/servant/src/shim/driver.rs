@@ -202,7 +202,7 @@ impl Driver {
             Command::SetLimits(limits) => {
                 let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();
-                self.clients.tell(&FromShim::Enforced {
+                self.clients.report(&FromShim::Enforced {
                     enforced: enforced.clone(),
                 });
                 Some(match cgroup::unmet(&limits, &enforced).as_slice() {
@@ -226,7 +226,7 @@ impl Driver {
     fn set_state(&mut self, state: ContainerState) {
         self.state = state;
         let state = self.told();
-        self.clients.tell(&FromShim::State { state });
+        self.clients.report(&FromShim::State { state });
     }
 
     fn told(&self) -> State {
@@ -238,9 +238,9 @@ impl Driver {
         }
     }
 
-    fn tell_node(&self, event: NodeEvent) {
+    fn report_node(&self, event: NodeEvent) {
         let status = self.nodes.status(event.node());
-        self.clients.tell(&FromShim::Node { event, status });
+        self.clients.report(&FromShim::Node { event, status });
     }
 
     fn hello(&self) -> FromShim {

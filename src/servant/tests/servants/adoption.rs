@@ -15,7 +15,7 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let first = world.start(spec).await;
     let (uids, network) = (first.uid_range(), Arc::clone(first.network()));
     let enforced = first.enforced();
-    let of_first = processes(&*first, 2).await;
+    let of_first = processes(&first, 2).await;
     drop(first);
     let second = world.adopted(&world.restarted()).await;
     assert_eq!(second.id(), id);
@@ -23,8 +23,8 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     assert_eq!(second.nodes(), ["/goes", "/stays"]);
     assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
     assert_eq!(*second.network(), network);
-    assert_eq!(processes(&*second, 2).await, of_first, "the same");
-    assert!(hear(&*second, 11311).await.unwrap().starts_with("\"same\""));
+    assert_eq!(processes(&second, 2).await, of_first, "the same");
+    assert!(hear(&second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
     assert_eq!(
         within(second.wait_node("/goes")).await.unwrap().signal,
@@ -69,7 +69,7 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
     let spec = spec(vec![required]);
     let id = spec.id.clone();
     let servant = world.start(spec).await;
-    let pid = processes(&*servant, 1).await[0];
+    let pid = processes(&servant, 1).await[0];
     let runtime = world.runtime(&id);
     let shim = runtime.shim.open().unwrap().expect("it runs");
     drop(servant);
@@ -111,7 +111,7 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     let servant = world.start(spec).await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
-    let processes = processes(&*servant, 2).await;
+    let processes = processes(&servant, 2).await;
     let runtime = world.runtime(&id);
     let nodes: Vec<_> = processes
         .iter()

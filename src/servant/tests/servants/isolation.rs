@@ -36,7 +36,7 @@ async fn every_process_is_confined_as_seen_from_the_host() {
         .await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "family").await;
-    let processes = processes(&*servant, 3).await;
+    let processes = processes(&servant, 3).await;
     assert_eq!(processes.len(), 3, "two nodes and a child");
     let (first, count) = servant.uid_range();
     for pid in processes {
@@ -183,8 +183,8 @@ async fn two_servants_share_nothing_and_their_networks_are_apart() {
     let mut second = spec(vec![]);
     second.resident = serde_json::json!({ "name": "second" });
     let (first, second) = (world.start(first).await, world.start(second).await);
-    assert!(hear(&*first, 11311).await.unwrap().contains("first"));
-    assert!(hear(&*second, 11311).await.unwrap().contains("second"));
+    assert!(hear(&first, 11311).await.unwrap().contains("first"));
+    assert!(hear(&second, 11311).await.unwrap().contains("second"));
     assert_ne!(first.uid_range().0, second.uid_range().0);
     assert_ne!(first.network(), second.network());
     world.stop(first).await;

@@ -19,7 +19,7 @@ async fn stop_leaves_nothing_of_nodes_that_do_not_want_to_end() {
         .await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
-    assert_eq!(processes(&*servant, 3).await.len(), 3);
+    assert_eq!(processes(&servant, 3).await.len(), 3);
     let state = servant.state();
     world.stop(servant).await;
     assert_eq!(
@@ -212,7 +212,7 @@ async fn orphans_are_reaped_and_the_resident_is_told_of_every_end() {
     let servant = world.start(spec).await;
     within(servant.wait_node("/parent")).await.unwrap();
     within(async {
-        while hear(&*servant, 11311).await.unwrap() != "\"x\" 2" {
+        while hear(&servant, 11311).await.unwrap() != "\"x\" 2" {
             tokio::task::yield_now().await;
         }
     })

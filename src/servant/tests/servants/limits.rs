@@ -109,7 +109,7 @@ async fn limits_are_read_back_and_changed_while_it_runs() {
         }
     );
     assert_eq!(servant.enforced(), now);
-    processes(&*servant, 1).await;
+    processes(&servant, 1).await;
     let usage = servant.usage().await.unwrap();
     assert!(usage.memory > 0 && usage.pids >= 2, "{usage:?}");
     // Where a v2 hierarchy is mounted, alone or beside v1, and the kernel counts it.
@@ -163,7 +163,7 @@ async fn nodes_stay_on_the_cores_they_were_given() {
     spec.limits.cpuset = Some(cores);
     let servant = world.start(spec).await;
     assert_eq!(servant.enforced().limits.cpuset, Some(cores));
-    let pid = processes(&*servant, 1).await[0];
+    let pid = processes(&servant, 1).await[0];
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
     assert!(
         status.contains(&format!("Cpus_allowed_list:\t{core}\n")),
@@ -293,7 +293,7 @@ async fn a_shim_that_takes_too_much_ends_its_servant_and_says_why() {
     world.needs(&["memory"]);
     let servant = world.start(spec).await;
     // The resident takes memory as soon as somebody connects.
-    let _ = hear(&*servant, 11311).await;
+    let _ = hear(&servant, 11311).await;
     let ContainerState::Failed { reason } = ended(&*servant).await else {
         panic!("it did not fail")
     };
@@ -319,7 +319,7 @@ async fn what_protects_the_daemon_does_not_protect_nodes() {
     let shim = world.runtime(servant.id()).shim.pid;
     let expected = if protects { -500 } else { own };
     assert_eq!(score(shim), expected, "the shim is part of the daemon");
-    for pid in processes(&*servant, 1).await {
+    for pid in processes(&servant, 1).await {
         assert_eq!(score(pid), own.max(0), "a node");
     }
     let _ = std::fs::write("/proc/self/oom_score_adj", own.to_string());

@@ -82,7 +82,7 @@ impl Client {
     ) -> Result<Prepared, String> {
         let name = resolve(&op.action)?.into_owned();
         let def = self.action_def(&name, &op.action_type)?;
-        self.tell_surplus(reply, "send_action_goal", &def.goal, op.args);
+        self.report_surplus(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
         let action = self.action_client(&name, def)?;
         let goal_id = format!(

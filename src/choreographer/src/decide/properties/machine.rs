@@ -7,7 +7,7 @@ use super::{SERVICES, Step};
 use crate::decide::admission::{Admitted, Book, Class, Ticket, Verdict};
 use crate::decide::lifetime::{Need, Stage, Tenancy, needed};
 use crate::decide::placement::{Placement, place};
-use crate::decide::spares::{Spare, Wanted, deserving, stale};
+use crate::decide::warm_pool::{Wanted, Warm, deserving, stale};
 use crate::decide::{Amount, End, Servant, capacity};
 
 const GRACE: Duration = Duration::from_secs(60);
@@ -76,8 +76,8 @@ struct Pooled {
 }
 
 impl Pooled {
-    fn facts(&self) -> Spare<'_> {
-        Spare {
+    fn facts(&self) -> Warm<'_> {
+        Warm {
             id: &self.id,
             service: SERVICES[self.service].0,
             revision: self.revision,
@@ -199,7 +199,10 @@ impl Machine {
 
     /// How much more would have to be free for all robots that wait.
     fn lacked(&self) -> Amount {
-        let waiting = self.servants.iter().filter(|it| self.line.contains(&it.ticket));
+        let waiting = self
+            .servants
+            .iter()
+            .filter(|it| self.line.contains(&it.ticket));
         let wanted = waiting.fold(Amount::NONE, |sum, it| sum.plus(it.wants));
         wanted.minus(self.book.capacity().minus(self.book.promised()))
     }
@@ -216,12 +219,12 @@ impl Machine {
             found.expect("what is given lives")
         });
         let facts = has.map(|it| it.facts(began));
-        let spare = self.pool.iter().find(|it| it.service == service);
-        let spare = spare.map(Pooled::facts);
-        let decide = || place(facts.as_ref(), spare.as_ref(), current, "an image");
+        let warm = self.pool.iter().find(|it| it.service == service);
+        let warm = warm.map(Pooled::facts);
+        let decide = || place(facts.as_ref(), warm.as_ref(), current, "an image");
         let placement = decide();
         assert_eq!(placement, decide(), "the same facts, another decision");
-        let (ends, spare) = match placement {
+        let (ends, warm) = match placement {
             Placement::Keep(id) => {
                 let id = id.to_owned();
                 let servant = self.servant(&id);
@@ -230,22 +233,22 @@ impl Machine {
                 servant.idle_since = None;
                 return;
             }
-            Placement::Start { ends, spare } => (ends.map(|end| end.id.to_owned()), spare),
+            Placement::Start { ends, warm } => (ends.map(|end| end.id.to_owned()), warm),
         };
         if let Some(id) = ends {
             assert_eq!(self.servant(&id).connections, 0, "its robot uses it");
             self.end(&id);
         }
         let (ticket, fresh) = self.name();
-        let spare = spare.then(|| {
+        let warm = warm.then(|| {
             let index = self.pool.iter().position(|it| it.service == service);
-            let spare = self.pool.remove(index.expect("the pool has it"));
-            assert_eq!((spare.revision, spare.runs), (current, true));
+            let warm = self.pool.remove(index.expect("the pool has it"));
+            assert_eq!((warm.revision, warm.runs), (current, true));
             assert!(
-                self.used.insert(spare.id.clone()),
+                self.used.insert(warm.id.clone()),
                 "two robots have the same container"
             );
-            spare.id
+            warm.id
         });
         let wants = cores(SERVICES[service].1);
         let promised = match self.book.ask(ticket, wants, Class::Robot) {
@@ -256,7 +259,7 @@ impl Machine {
             Verdict::Waits => None,
             Verdict::Refused(_) => return,
         };
-        let id = spare.unwrap_or(fresh);
+        let id = warm.unwrap_or(fresh);
         self.given.insert(key, id.clone());
         self.servants.push(Lives {
             id,
@@ -368,7 +371,10 @@ impl Machine {
                         Err(_) => assert_eq!(self.book, before, "refused, and yet changed"),
                     }
                     let grew = !cores(size).fits(promised);
-                    assert!(!grew || self.lacked().fits(lacked), "a servant overtook who waits");
+                    assert!(
+                        !grew || self.lacked().fits(lacked),
+                        "a servant overtook who waits"
+                    );
                 }
             }
             Step::GivesUp(which) => {
@@ -400,9 +406,9 @@ impl Machine {
             }
             Step::Published(service) => self.revisions[service] += 1,
             Step::Tidied => self.tidy(),
-            Step::SpareDies(which) => {
-                if let Some(spare) = nth(self.pool.iter_mut(), which) {
-                    spare.runs = false;
+            Step::WarmDies(which) => {
+                if let Some(warm) = nth(self.pool.iter_mut(), which) {
+                    warm.runs = false;
                 }
             }
             Step::Passes(seconds) => self.now += Duration::from_secs(seconds),

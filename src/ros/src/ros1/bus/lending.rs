@@ -68,7 +68,7 @@ impl Lending for Ros1Bus {
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
         self.inner.check_open()?;
         self.inner.lending.begin(lender);
-        self.inner.tell_that_it_lends().await
+        self.inner.report_that_it_lends().await
     }
 
     async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
@@ -83,7 +83,7 @@ impl Lending for Ros1Bus {
 
 impl Inner {
     /// Tells the Master whom to ask, if anybody lends.
-    pub(super) async fn tell_that_it_lends(&self) -> Result<(), BusError> {
+    pub(super) async fn report_that_it_lends(&self) -> Result<(), BusError> {
         if self.lending.lender.lock().is_none() {
             return Ok(());
         }

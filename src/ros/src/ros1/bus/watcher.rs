@@ -123,7 +123,7 @@ impl Watcher {
         self.known = wire_generation(graph.generation);
         if first && self.waits {
             // It may be another Master than the one that was told.
-            let _ = self.bus.tell_that_it_lends().await;
+            let _ = self.bus.report_that_it_lends().await;
         }
         self.take(graph).await;
         Ok(())

@@ -160,7 +160,7 @@ impl Registry {
                     ends.push(node.to_owned());
                 }
                 if kind == Kind::Publisher {
-                    self.tell_subscribers(name, notices);
+                    self.report_subscribers(name, notices);
                 }
             }
             Kind::Service => {
@@ -258,7 +258,7 @@ impl Registry {
                 if let Some(topic) = self.topics.get_mut(name) {
                     topic.publishers.retain(|other| other != node);
                 }
-                self.tell_subscribers(name, notices);
+                self.report_subscribers(name, notices);
             }
             Kind::Subscriber => {
                 if let Some(topic) = self.topics.get_mut(name) {
@@ -274,7 +274,7 @@ impl Registry {
         }
     }
 
-    fn tell_subscribers(&self, name: &str, notices: &mut Vec<Notice>) {
+    fn report_subscribers(&self, name: &str, notices: &mut Vec<Notice>) {
         let publishers = self.publisher_apis(name);
         for api in self.subscriber_apis(name) {
             notices.push(Notice::publishers(&api, name, &publishers));

@@ -106,13 +106,13 @@ impl Driver {
                 exec_error: None,
             };
             if let Some((event, _)) = self.nodes.exited(pid, exit) {
-                self.tell_node(event);
+                self.report_node(event);
             }
         }
         for number in self.nodes.starting() {
             let reason = "its init ended before it was executed".to_owned();
             if let Some((event, _)) = self.nodes.failed(number, reason.clone()) {
-                self.tell_node(event);
+                self.report_node(event);
                 self.answer_start(number, Err(reason));
             }
         }

@@ -72,7 +72,7 @@ impl Driver {
                 // Gone already: then its number on the host is of no use to anybody.
                 let host = fd.as_ref().and_then(process::pid_of).unwrap_or(0);
                 if let Some(event) = self.nodes.started(id, pid, host) {
-                    self.tell_node(event.clone());
+                    self.report_node(event.clone());
                     self.answer_start(id, Ok(()));
                     self.deliver_early_signals(event.node()).await;
                 }
@@ -88,7 +88,7 @@ impl Driver {
                 self.resident.process_exited(pid);
                 let exit = nodes::exit_of(status, self.was_out_of_memory(status));
                 if let Some((event, consequence)) = self.nodes.exited(pid, exit.clone()) {
-                    self.tell_node(event.clone());
+                    self.report_node(event.clone());
                     self.follow_up(event.node(), consequence, &exit).await;
                 }
             }
@@ -129,7 +129,7 @@ impl Driver {
 
     pub(super) async fn start_failed(&mut self, number: u32, reason: String) {
         if let Some((event, consequence)) = self.nodes.failed(number, reason.clone()) {
-            self.tell_node(event.clone());
+            self.report_node(event.clone());
             self.answer_start(number, Err(reason.clone()));
             self.early_signals.retain(|(node, _)| node != event.node());
             let exit = NodeExit {
@@ -158,7 +158,7 @@ impl Driver {
         match consequence {
             Consequence::None => {}
             Consequence::Respawn(delay) => {
-                self.tell_node(NodeEvent::Respawning { node: node.into() });
+                self.report_node(NodeEvent::Respawning { node: node.into() });
                 let (inputs, name) = (self.inputs.clone(), node.to_owned());
                 tokio::task::spawn_local(async move {
                     tokio::time::sleep(Duration::from_secs_f64(delay)).await;

@@ -37,7 +37,7 @@ impl Api {
         let set = master.change(|state, notices| {
             let watchers = state.registry.parameter_watchers();
             if !watchers.is_empty() {
-                tell(params::updates(&watchers, &key, &value), notices);
+                report(params::updates(&watchers, &key, &value), notices);
             }
             let set = state.params.set(&key, value);
             match set {
@@ -60,7 +60,7 @@ impl Api {
             if deleted {
                 let nothing = Value::Struct(Default::default());
                 let watchers = state.registry.parameter_watchers();
-                tell(params::updates(&watchers, &key, &nothing), notices);
+                report(params::updates(&watchers, &key, &nothing), notices);
             }
             deleted
         });
@@ -149,7 +149,7 @@ impl Api {
     }
 }
 
-fn tell(updates: Vec<(String, String, Value)>, notices: &mut Vec<Notice>) {
+fn report(updates: Vec<(String, String, Value)>, notices: &mut Vec<Notice>) {
     notices.extend(
         updates
             .into_iter()

@@ -7,27 +7,30 @@ use anyhow::{Context, ensure};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
-use support::Told;
+use support::Verdict;
 use support::daemon::Daemon;
 use support::world::world;
 
-pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Told {
-    let daemon = world().own("spares").start()?;
+pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Verdict {
+    let daemon = world().own("warm-pool").start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
         .succeeded()?;
-    let first = spare(&daemon, &BTreeSet::new())?;
+    let first = warm(&daemon, &BTreeSet::new())?;
     ensure!(
         daemon.servants_of("adder_py")?.is_empty(),
-        "a spare is nobody's servant"
+        "a warm container is nobody's servant"
     );
     let mut one = daemon.robot("adder_py?robot=one")?;
     one.calls("/add_two", json!({"a": 1, "b": 1}))?;
-    ensure!(id_of(&daemon, "one")? == first, "the spare was used");
+    ensure!(
+        id_of(&daemon, "one")? == first,
+        "the warm container was used"
+    );
 
-    let second = spare(&daemon, &BTreeSet::from([first.clone()]))?;
-    // A spare that dies is no reason to keep a robot waiting for it.
+    let second = warm(&daemon, &BTreeSet::from([first.clone()]))?;
+    // A warm container that dies is no reason to keep a robot waiting for it.
     let runtime: Value = serde_json::from_slice(&fs::read(
         daemon
             .home
@@ -50,27 +53,27 @@ pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Told {
     Ok(())
 }
 
-pub fn a_killed_daemons_spares_end_without_a_word() -> Told {
-    let setup = world().own("spares-killed");
+pub fn a_killed_daemons_warm_pool_end_without_a_word() -> Verdict {
+    let setup = world().own("warm-pool-killed");
     let daemon = setup.start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
         .succeeded()?;
-    let old = spare(&daemon, &BTreeSet::new())?;
+    let old = warm(&daemon, &BTreeSet::new())?;
     daemon.is_killed()?;
     let daemon = setup.start()?;
-    let new = spare(&daemon, &BTreeSet::from([old.clone()]))?;
+    let new = warm(&daemon, &BTreeSet::from([old.clone()]))?;
     ensure!(directories(&daemon)? == BTreeSet::from([new]));
     let events = daemon.deployer().asks(&["events"])?.to_string();
     ensure!(!events.contains(&old), "{events}");
     Ok(())
 }
 
-/// Waits for a spare besides those known; its id.
-fn spare(daemon: &Daemon, known: &BTreeSet<String>) -> anyhow::Result<String> {
-    support::until("a spare", || {
-        let there = daemon.api("/api/v1/status")?["spares"] == 1;
+/// Waits for a warm container besides those known; its id.
+fn warm(daemon: &Daemon, known: &BTreeSet<String>) -> anyhow::Result<String> {
+    support::until("a warm container", || {
+        let there = daemon.api("/api/v1/status")?["warm_pool"] == 1;
         let new: Vec<String> = directories(daemon)?.difference(known).cloned().collect();
         Ok(match new.as_slice() {
             [only] if there => Ok(only.clone()),

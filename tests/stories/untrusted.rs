@@ -5,12 +5,12 @@ use std::net::TcpStream;
 
 use anyhow::{Context, ensure};
 use serde_json::json;
-use support::Told;
+use support::Verdict;
 use support::robot::{PATIENCE, Robot};
 use support::world::{ADDER, GREETER, world};
 use tokio_tungstenite::tungstenite::Message;
 
-pub fn who_dribbles_an_upgrade_is_let_go() -> Told {
+pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
     let daemon = world()
         .own("dribbled")
         .config("[portal]\nhandshake = \"1s\"\n")
@@ -58,7 +58,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Told {
     Ok(())
 }
 
-pub fn rubbish_instead_of_an_upgrade_is_refused() -> Told {
+pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
     let daemon = world().with(ADDER)?;
     let mut connection = TcpStream::connect(&daemon.address)?;
     connection.set_read_timeout(Some(PATIENCE))?;
@@ -86,7 +86,7 @@ pub fn rubbish_instead_of_an_upgrade_is_refused() -> Told {
     Ok(())
 }
 
-pub fn two_sockets_of_one_robot_share_its_servant() -> Told {
+pub fn two_sockets_of_one_robot_share_its_servant() -> Verdict {
     let daemon = world().with(GREETER)?;
     let mut stub = daemon.robot("greeter_cpp?robot=shared")?;
     let mut viewer = daemon.robot("greeter_cpp?robot=shared")?;
@@ -113,7 +113,7 @@ pub fn two_sockets_of_one_robot_share_its_servant() -> Told {
     Ok(())
 }
 
-pub fn nobody_takes_over_anothers_robot() -> Told {
+pub fn nobody_takes_over_anothers_robot() -> Verdict {
     let daemon = world()
         .own("owned")
         .config("tokens = [\"open sesame\", \"rosebuds\"]\n")
@@ -154,7 +154,7 @@ pub fn nobody_takes_over_anothers_robot() -> Told {
 }
 
 /// A client on a slow line has pictures waiting; what it asks is answered behind one of them, not behind all.
-pub fn an_answer_waits_for_one_big_message_at_most() -> Told {
+pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     const SIZE: usize = 900_000;
     let daemon = world().with(GREETER)?;
     let mut speaker = daemon.robot("greeter_cpp?robot=backlog")?;

@@ -25,7 +25,7 @@ pub(super) enum Sent {
 
 /// Records by number.
 #[derive(Debug, Default)]
-pub(super) struct Kept {
+pub(super) struct Retransmit {
     records: VecDeque<(u64, Sent)>,
     /// Bytes of those that are sent again, but for `big`.
     pub(super) bytes: usize,
@@ -35,7 +35,7 @@ pub(super) struct Kept {
     pub(super) big: usize,
 }
 
-impl Kept {
+impl Retransmit {
     pub(super) fn len(&self) -> usize {
         self.records.len()
     }

@@ -4,7 +4,7 @@ use super::End;
 
 /// A container of the warm pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Spare<'a> {
+pub struct Warm<'a> {
     /// Its id.
     pub id: &'a str,
     /// The service whose servant it can become.
@@ -17,7 +17,7 @@ pub struct Spare<'a> {
     pub runs: bool,
 }
 
-impl Spare<'_> {
+impl Warm<'_> {
     /// Whether it was made from this revision of its service.
     pub fn is_of(&self, revision: u64, image: &str) -> bool {
         self.revision == revision && self.image == image
@@ -49,20 +49,20 @@ pub fn deserving(published: &[String], asked_for: &[String], count: usize) -> Ve
 }
 
 /// Those of `pool` that are of none of the wanted revisions, or do not run.
-pub fn stale<'a>(pool: impl Iterator<Item = Spare<'a>>, wanted: &[Wanted<'_>]) -> Vec<End<'a>> {
-    let is_wanted = |spare: &Spare<'_>| {
+pub fn stale<'a>(pool: impl Iterator<Item = Warm<'a>>, wanted: &[Wanted<'_>]) -> Vec<End<'a>> {
+    let is_wanted = |warm: &Warm<'_>| {
         wanted.iter().any(|wanted| {
-            spare.service == wanted.service && spare.is_of(wanted.revision, wanted.image)
+            warm.service == wanted.service && warm.is_of(wanted.revision, wanted.image)
         })
     };
-    pool.filter_map(|spare| {
-        let reason = match (spare.runs, is_wanted(&spare)) {
+    pool.filter_map(|warm| {
+        let reason = match (warm.runs, is_wanted(&warm)) {
             (true, true) => return None,
             (true, false) => "its revision is not wanted",
             (false, _) => "it does not run",
         };
         Some(End {
-            id: spare.id,
+            id: warm.id,
             reason,
         })
     })
@@ -96,22 +96,22 @@ mod tests {
             revision: 2,
             image: "sha256:2",
         }];
-        let spare = |service, revision, image, runs| Spare {
+        let warm = |service, revision, image, runs| Warm {
             id: "it",
             service,
             revision,
             image,
             runs,
         };
-        for (spare, stays) in [
-            (spare("a", 2, "sha256:2", true), true),
-            (spare("a", 2, "sha256:2", false), false),
-            (spare("a", 1, "sha256:2", true), false),
-            (spare("a", 2, "sha256:1", true), false),
-            (spare("b", 2, "sha256:2", true), false),
+        for (warm, stays) in [
+            (warm("a", 2, "sha256:2", true), true),
+            (warm("a", 2, "sha256:2", false), false),
+            (warm("a", 1, "sha256:2", true), false),
+            (warm("a", 2, "sha256:1", true), false),
+            (warm("b", 2, "sha256:2", true), false),
         ] {
-            let ends = stale([spare].into_iter(), &wanted);
-            assert_eq!(ends.is_empty(), stays, "{spare:?}");
+            let ends = stale([warm].into_iter(), &wanted);
+            assert_eq!(ends.is_empty(), stays, "{warm:?}");
         }
     }
 }

@@ -20,9 +20,9 @@ async fn in_graph(bus: &dyn Bus, condition: impl Fn(&Graph) -> bool) {
     timeout(PATIENCE, seen).await.expect("in time").unwrap();
 }
 
-async fn is_live(outlet: &Outlet) {
+async fn is_live(topic_publisher: &TopicPublisher) {
     let live = async {
-        while !matches!(*outlet.state.lock(), State::Live { .. }) {
+        while !matches!(*topic_publisher.state.lock(), State::Live { .. }) {
             tokio::task::yield_now().await;
         }
     };
@@ -68,19 +68,24 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
     })
     .await;
     let failed = |reason| panic!("{reason}");
-    let outlet = Outlet::open(&shared, "/number", message_type.clone(), false, 10, failed);
-    is_live(&outlet).await;
+    let topic_publisher =
+        TopicPublisher::open(&shared, "/number", message_type.clone(), false, 10, failed);
+    is_live(&topic_publisher).await;
 
     // The graph changes, and what is published goes out at once all the same.
     for number in 0..3 {
         let name = format!("/other{number}");
         let _other = odd
-            .advertise(&name, (*outlet.wire_type).clone(), Qos::keep_last(1))
+            .advertise(
+                &name,
+                (*topic_publisher.wire_type).clone(),
+                Qos::keep_last(1),
+            )
             .await
             .unwrap();
         in_graph(&*bus, |graph| graph.topics.contains_key(&name)).await;
-        outlet.publish(vec![0; 4].into());
-        let live = matches!(*outlet.state.lock(), State::Live { .. });
+        topic_publisher.publish(vec![0; 4].into());
+        let live = matches!(*topic_publisher.state.lock(), State::Live { .. });
         assert!(live, "message {number} waits");
     }
 
@@ -90,7 +95,7 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
         graph.topics["/number"].subscribers.len() == 2
     })
     .await;
-    outlet.publish(vec![7; 4].into());
+    topic_publisher.publish(vec![7; 4].into());
     let first = timeout(PATIENCE, heard.messages.recv()).await;
     assert_eq!(&*first.expect("in time").unwrap().bytes, [7; 4]);
 }

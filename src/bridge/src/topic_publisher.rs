@@ -21,12 +21,12 @@ const WARM: Bounds = Bounds {
 };
 
 /// One client's advertisement of one topic.
-pub(crate) struct Outlet {
+pub(crate) struct TopicPublisher {
     pub(crate) topic: String,
     pub(crate) message_type: Arc<MessageType>,
     pub(crate) latch: bool,
     wire_type: Arc<WireType>,
-    /// Tells this outlet's latched message from others'.
+    /// Tells this topic_publisher's latched message from others'.
     pub(crate) id: PeerId,
     shared: Arc<Shared>,
     /// The last message, where it latches.
@@ -63,7 +63,7 @@ impl State {
     }
 }
 
-impl Outlet {
+impl TopicPublisher {
     /// Advertises in the background; `failed` is told if that does not succeed.
     pub(crate) fn open(
         shared: &Arc<Shared>,
@@ -72,9 +72,9 @@ impl Outlet {
         latch: bool,
         queue: usize,
         failed: impl FnOnce(String) + Send + 'static,
-    ) -> Arc<Outlet> {
+    ) -> Arc<TopicPublisher> {
         let wire_type = WireType::of(&message_type);
-        let outlet = Arc::new(Outlet {
+        let topic_publisher = Arc::new(TopicPublisher {
             topic: topic.to_owned(),
             message_type,
             latch,
@@ -85,11 +85,11 @@ impl Outlet {
             given_up: Mutex::default(),
             state: Mutex::new(State::warming(None)),
         });
-        shared.add_outlet(&outlet);
-        // Holds the outlet until what was published at once has been sent, even if the client is gone by then.
+        shared.add_outlet(&topic_publisher);
+        // Holds the topic_publisher until what was published at once has been sent, even if the client is gone by then.
         let qos = Qos::keep_last(queue).latching(latch);
-        tokio::spawn(warm_up(outlet.clone(), wire_type, qos, failed));
-        outlet
+        tokio::spawn(warm_up(topic_publisher.clone(), wire_type, qos, failed));
+        topic_publisher
     }
 
     pub(crate) fn publish(self: &Arc<Self>, bytes: Bytes) {
@@ -196,38 +196,47 @@ impl Outlet {
     }
 }
 
-impl Drop for Outlet {
+impl Drop for TopicPublisher {
     fn drop(&mut self) {
         self.shared.forget_outlet(self);
     }
 }
 
-async fn warm_up(outlet: Arc<Outlet>, of: WireType, qos: Qos, failed: impl FnOnce(String) + Send) {
-    let shared = outlet.shared.clone();
+async fn warm_up(
+    topic_publisher: Arc<TopicPublisher>,
+    of: WireType,
+    qos: Qos,
+    failed: impl FnOnce(String) + Send,
+) {
+    let shared = topic_publisher.shared.clone();
     let deadline = Instant::now() + shared.options.warm_up;
-    let publisher = match shared.bus.advertise(&outlet.topic, of, qos).await {
+    let publisher = match shared.bus.advertise(&topic_publisher.topic, of, qos).await {
         Ok(publisher) => publisher,
         Err(error) => {
-            *outlet.state.lock() = State::Failed;
+            *topic_publisher.state.lock() = State::Failed;
             return failed(error.to_string());
         }
     };
     let subscribers = publisher.matched();
     if let State::Warming {
         publisher: held, ..
-    } = &mut *outlet.state.lock()
+    } = &mut *topic_publisher.state.lock()
     {
         *held = Some(publisher);
     }
-    settle(outlet, subscribers, deadline).await;
+    settle(topic_publisher, subscribers, deadline).await;
 }
 
 /// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits.
-async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<Matched>, deadline: Instant) {
+async fn settle(
+    topic_publisher: Arc<TopicPublisher>,
+    mut subscribers: watch::Receiver<Matched>,
+    deadline: Instant,
+) {
     let connected = async {
         loop {
             let matched = subscribers.borrow_and_update().clone();
-            if outlet.is_complete(&matched) {
+            if topic_publisher.is_complete(&matched) {
                 return;
             }
             if subscribers.changed().await.is_err() {
@@ -237,11 +246,11 @@ async fn settle(outlet: Arc<Outlet>, mut subscribers: watch::Receiver<Matched>, 
     };
     if timeout_at(deadline.into(), connected).await.is_err() {
         // Not waited for again while they are what they are.
-        *outlet.given_up.lock() = outlet.missing(&subscribers.borrow());
+        *topic_publisher.given_up.lock() = topic_publisher.missing(&subscribers.borrow());
     }
-    outlet.go_live();
+    topic_publisher.go_live();
 }
 
 #[cfg(test)]
-#[path = "outlet_tests.rs"]
+#[path = "topic_publisher_tests.rs"]
 mod tests;

@@ -54,7 +54,7 @@ impl Machine {
 
 impl Hub {
     /// Other machines that are connected as the same robot, by a node of each.
-    pub(super) fn twins_of(&self, link: &NodeLink) -> Vec<Arc<NodeLink>> {
+    pub(super) fn duplicates_of(&self, link: &NodeLink) -> Vec<Arc<NodeLink>> {
         let links = self.links.lock();
         let others = links.values().filter(|other| {
             other.is_connected() && link.machine.is_of_another_robot(&other.machine)
@@ -63,12 +63,12 @@ impl Hub {
     }
 
     /// A link is connected: says on both sides, and here, that there are two robots, if there are.
-    pub(super) fn tell_twins(&self, link: &NodeLink) {
-        for other in self.twins_of(link) {
+    pub(super) fn report_duplicates(&self, link: &NodeLink) {
+        for other in self.duplicates_of(link) {
             let mut pair = [link.machine.id.clone(), other.machine.id.clone()];
             pair.sort();
             let [one, two] = pair;
-            if !self.twins.lock().insert((one, two)) {
+            if !self.duplicates.lock().insert((one, two)) {
                 continue;
             }
             let text = format!(
@@ -78,9 +78,9 @@ impl Hub {
                 link.machine.name(),
                 link.node
             );
-            self.nodes.warn("robot-twins", &text);
+            self.nodes.warn("duplicate-robot", &text);
             for side in [link, &other] {
-                side.session.tell(&FromCloud::Notice {
+                side.session.report(&FromCloud::Notice {
                     warning: true,
                     text: text.clone(),
                 });

@@ -1,9 +1,9 @@
 //! Containers made before anyone asks for them, so that a robot does not wait for their making.
 //!
-//! A spare is a whole servant but for its nodes: namespaces, limits, init, ROS Master and bridge are there. Nothing in it
+//! A warm container is a whole servant but for its nodes: namespaces, limits, init, ROS Master and bridge are there. Nothing in it
 //! belongs to a robot, and none of the service's code has run in it. The services used last have one each; a robot that
 //! takes it has only the nodes to wait for, and the next one is made when that robot's servant is ready, so that the two
-//! do not compete. A spare that is gone when it is needed costs nothing but time: the servant is made as if there were none.
+//! do not compete. A warm container that is gone when it is needed costs nothing but time: the servant is made as if there were none.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,12 +19,12 @@ use super::{Inner, reaching, starting};
 use crate::Error;
 use crate::decide;
 use crate::decide::placement::{Placement, place};
-use crate::decide::spares::{Spare as Facts, Wanted, deserving, stale};
+use crate::decide::warm_pool::{Wanted, Warm as Facts, deserving, stale};
 
 use store::RevisionRecord;
 
 /// A servant without nodes.
-pub(crate) struct Spare {
+pub(crate) struct Warm {
     /// Its container.
     pub(crate) container: Arc<dyn Servant>,
     /// Its ROS and its bridge.
@@ -34,23 +34,23 @@ pub(crate) struct Spare {
 
 /// All of them.
 #[derive(Default)]
-pub(crate) struct Spares {
+pub(crate) struct WarmPool {
     kept: Mutex<Kept>,
     /// Something may be missing or too many.
     look: Notify,
-    /// Held while spares are made or ended.
+    /// Held while warm containers are made or ended.
     turn: tokio::sync::Mutex<()>,
 }
 
 #[derive(Default)]
 struct Kept {
-    by_service: HashMap<String, Spare>,
+    by_service: HashMap<String, Warm>,
     /// Services in the order in which robots asked for them, the last one last.
     asked_for: Vec<String>,
     closed: bool,
 }
 
-impl Spare {
+impl Warm {
     fn runs(&self) -> bool {
         *self.container.state().borrow() == ContainerState::Running
     }
@@ -68,43 +68,42 @@ impl Spare {
 
     /// Ends it; nothing is left.
     pub(crate) async fn end(self) {
-        self.reach.close("the spare is not needed");
+        self.reach.close("the warm container is not needed");
         if let Err(error) = self.container.stop().await {
             let id = self.container.id();
-            tracing::warn!("spare {id} could not be cleaned up: {error}");
+            tracing::warn!("warm container {id} could not be cleaned up: {error}");
         }
     }
 }
 
-impl Spares {
+impl WarmPool {
     /// Decides which servant a robot is given that asks for this revision and `has` that servant so far. Where a new one is
-    /// to be made of a spare, gives that; and remembers that the service was asked for.
+    /// to be made of a warm container, gives that; and remembers that the service was asked for.
     pub(crate) fn place<'a>(
         &self,
         has: Option<&decide::Servant<'a>>,
         revision: &RevisionRecord,
-    ) -> (Placement<'a>, Option<Spare>) {
+    ) -> (Placement<'a>, Option<Warm>) {
         let mut kept = self.kept.lock();
         let service = &revision.service;
-        let spare = kept.by_service.get(service).map(Spare::facts);
-        let placement = place(has, spare.as_ref(), revision.number, &revision.image);
-        let Placement::Start { spare, .. } = placement else {
+        let warm = kept.by_service.get(service).map(Warm::facts);
+        let placement = place(has, warm.as_ref(), revision.number, &revision.image);
+        let Placement::Start { warm, .. } = placement else {
             return (placement, None);
         };
         kept.asked_for.retain(|asked| asked != service);
         kept.asked_for.push(service.clone());
-        let taken = spare.then(|| kept.by_service.remove(service));
+        let taken = warm.then(|| kept.by_service.remove(service));
         (placement, taken.flatten())
     }
 
     /// Takes one back that its robot had no use for; gives it if it is not wanted here either.
-    fn put_back(&self, spare: Spare) -> Option<Spare> {
+    fn put_back(&self, warm: Warm) -> Option<Warm> {
         let mut kept = self.kept.lock();
-        if kept.closed || kept.by_service.contains_key(&spare.revision.service) {
-            return Some(spare);
+        if kept.closed || kept.by_service.contains_key(&warm.revision.service) {
+            return Some(warm);
         }
-        kept.by_service
-            .insert(spare.revision.service.clone(), spare);
+        kept.by_service.insert(warm.revision.service.clone(), warm);
         None
     }
 
@@ -123,12 +122,12 @@ impl Spares {
         let kept = self.kept.lock();
         kept.by_service
             .values()
-            .map(|spare| spare.revision.image.clone())
+            .map(|warm| warm.revision.image.clone())
             .collect()
     }
 
     /// Removes those that are not of one of these revisions, or do not run.
-    fn remove_stale(&self, wanted: &[Arc<RevisionRecord>]) -> Vec<Spare> {
+    fn remove_stale(&self, wanted: &[Arc<RevisionRecord>]) -> Vec<Warm> {
         let wanted: Vec<Wanted<'_>> = wanted
             .iter()
             .map(|revision| Wanted {
@@ -138,11 +137,13 @@ impl Spares {
             })
             .collect();
         let kept = &mut *self.kept.lock();
-        let ends = stale(kept.by_service.values().map(Spare::facts), &wanted);
+        let ends = stale(kept.by_service.values().map(Warm::facts), &wanted);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
-        let ends = |_: &String, spare: &mut Spare| ends.iter().any(|id| id == spare.container.id());
-        let removed = kept.by_service.extract_if(ends);
-        removed.map(|(_, spare)| spare).collect()
+        let pool = std::mem::take(&mut kept.by_service).into_iter();
+        let (removed, stay): (HashMap<_, Warm>, _) =
+            pool.partition(|(_, warm)| ends.iter().any(|id| id == warm.container.id()));
+        kept.by_service = stay;
+        removed.into_values().collect()
     }
 
     fn has(&self, service: &str) -> bool {
@@ -150,46 +151,46 @@ impl Spares {
     }
 }
 
-/// Makes and ends spares as they are needed, for ever.
+/// Makes and ends warm containers as they are needed, for ever.
 pub(crate) async fn keep(inner: Arc<Inner>) {
     loop {
-        inner.spares.look.notified().await;
+        inner.warm_pool.look.notified().await;
         if let Err(error) = tidy(&inner, true).await {
-            tracing::warn!("no spare container could be made: {error}");
+            tracing::warn!("no warm container could be made: {error}");
         }
     }
 }
 
 /// Ends those that are not wanted any more and makes, if so told, those that are missing.
 pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), Error> {
-    let _turn = inner.spares.turn.lock().await;
+    let _turn = inner.warm_pool.turn.lock().await;
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
-    let asked_for = inner.spares.kept.lock().asked_for.clone();
-    for service in deserving(&published, &asked_for, inner.options.spares) {
+    let asked_for = inner.warm_pool.kept.lock().asked_for.clone();
+    for service in deserving(&published, &asked_for, inner.options.warm_pool) {
         wanted.extend(inner.state.current(&service)?);
     }
     join_all(
         inner
-            .spares
+            .warm_pool
             .remove_stale(&wanted)
             .into_iter()
-            .map(Spare::end),
+            .map(Warm::end),
     )
     .await;
     for revision in wanted.into_iter().filter(|_| make_missing) {
-        if inner.is_ending() || inner.spares.has(&revision.service) {
+        if inner.is_ending() || inner.warm_pool.has(&revision.service) {
             continue;
         }
-        let spare = make(inner, revision).await?;
-        if let Some(unwanted) = inner.spares.put_back(spare) {
+        let warm = make(inner, revision).await?;
+        if let Some(unwanted) = inner.warm_pool.put_back(warm) {
             unwanted.end().await;
         }
     }
     Ok(())
 }
 
-async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare, Error> {
+async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm, Error> {
     let id = names::servant_id(&revision.service);
     let limits = inner.asked(revision.plan.limits).limits();
     let spec = starting::spec(inner, &id, &revision, &limits, Vec::new())?;
@@ -197,22 +198,25 @@ async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Spare
     let limit = inner.options.start;
     let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
     match reached {
-        Ok(Ok(reach)) => Ok(Spare {
+        Ok(Ok(reach)) => Ok(Warm {
             container,
             reach,
             revision,
         }),
         failed => {
             container.stop().await?;
-            tracing::debug!("spare {id}: {:?}", failed.map(|reached| reached.err()));
-            Err(Error::Internal("reaching a spare container's ROS Master"))
+            tracing::debug!(
+                "warm container {id}: {:?}",
+                failed.map(|reached| reached.err())
+            );
+            Err(Error::Internal("reaching a warm container's ROS Master"))
         }
     }
 }
 
-/// Takes a spare back that its robot left unused, or ends it.
-pub(crate) async fn give_back(inner: &Inner, spare: Spare) {
-    if let Some(unwanted) = inner.spares.put_back(spare) {
+/// Takes a warm container back that its robot left unused, or ends it.
+pub(crate) async fn give_back(inner: &Inner, warm: Warm) {
+    if let Some(unwanted) = inner.warm_pool.put_back(warm) {
         unwanted.end().await;
     }
 }
@@ -220,11 +224,11 @@ pub(crate) async fn give_back(inner: &Inner, spare: Spare) {
 /// Ends all of them and makes no more.
 pub(crate) async fn end_all(inner: &Inner) {
     let all = {
-        let mut kept = inner.spares.kept.lock();
+        let mut kept = inner.warm_pool.kept.lock();
         kept.closed = true;
         std::mem::take(&mut kept.by_service)
     };
-    join_all(all.into_values().map(Spare::end)).await;
+    join_all(all.into_values().map(Warm::end)).await;
     // One that is being made just now is ended by whoever makes it.
-    let _turn = inner.spares.turn.lock().await;
+    let _turn = inner.warm_pool.turn.lock().await;
 }

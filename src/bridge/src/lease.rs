@@ -8,7 +8,7 @@ use crate::shared::Shared;
 
 /// A connection's place: counted and seen by others until it is given up, by [`leave`](Self::leave) or by dropping the
 /// future that serves it.
-pub(crate) struct Seat {
+pub(crate) struct Lease {
     shared: Arc<Shared>,
     client: Arc<Client>,
     token: Option<String>,
@@ -19,13 +19,13 @@ pub(crate) struct Seat {
     over: bool,
 }
 
-impl Seat {
+impl Lease {
     pub(crate) fn take(shared: Arc<Shared>, client: Arc<Client>, token: Option<String>) -> Self {
         shared.metrics.sessions.add(1);
         shared.sessions.send_modify(|count| count.connected += 1);
         let present = shared.next_number();
         shared.presence.enter(present, &client.name);
-        shared.tell_presence();
+        shared.report_presence();
         let socket = client.outbox.attach();
         Self {
             shared,
@@ -42,12 +42,12 @@ impl Seat {
     }
 }
 
-impl Drop for Seat {
+impl Drop for Lease {
     fn drop(&mut self) {
         let shared = &self.shared;
         shared.sessions.send_modify(|count| count.connected -= 1);
         shared.presence.leave(self.present);
-        shared.tell_presence();
+        shared.report_presence();
         let Some(token) = self.token.take() else {
             return self.client.end();
         };
