@@ -45,7 +45,7 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
             (labels(&[("result", "failed")]), failed as f64),
         ],
     );
-    room(&mut out, &app.choreographer);
+    capacity(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
     gauge(
         &mut out,
@@ -145,16 +145,16 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     }
 }
 
-fn room(out: &mut String, choreographer: &Choreographer) {
+fn capacity(out: &mut String, choreographer: &Choreographer) {
     let (capacity, taken, waiting) = choreographer.admission().look();
     let rows = [
         (
-            "cloudroid_room_cpus",
+            "cloudroid_capacity_cpus",
             "Cores that may be promised.",
             capacity.cpus(),
         ),
         (
-            "cloudroid_room_memory_bytes",
+            "cloudroid_capacity_memory_bytes",
             "Memory that may be promised.",
             capacity.memory as f64,
         ),
@@ -166,7 +166,7 @@ fn room(out: &mut String, choreographer: &Choreographer) {
         ),
         (
             "cloudroid_waiting",
-            "Robots that wait for room.",
+            "Robots that wait for capacity.",
             waiting as f64,
         ),
     ];
