@@ -5,6 +5,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use budget::Budget;
+use parking_lot::Mutex;
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::time::{Instant, timeout_at};
 
 use crate::bus::BusError;
 use crate::net::Sockets;
@@ -13,12 +16,23 @@ use crate::ros1::xmlrpc::{self, Client, Value};
 
 /// For the Master to answer anything but a long poll.
 const ANSWER: Duration = Duration::from_secs(10);
+/// Calls at a time, but for long polls. Each takes a connection of the Master, which has a limit; more would only wait
+/// there, and their time would run.
+pub(super) const AT_A_TIME: usize = 32;
 
 /// The Master, as this node calls it.
 pub(super) struct MasterClient {
     client: Client,
     uri: String,
     node: String,
+    turns: Turns,
+}
+
+/// Whose turn it is to call: somebody who registers a thousand topics at once waits here.
+pub(super) struct Turns {
+    free: Semaphore,
+    /// When the Master last answered a call.
+    answered: Mutex<Instant>,
 }
 
 impl MasterClient {
@@ -36,6 +50,7 @@ impl MasterClient {
             client,
             uri,
             node: node.to_owned(),
+            turns: Turns::new(),
         })
     }
 
@@ -69,8 +84,15 @@ impl MasterClient {
         method: &str,
         args: Vec<Value>,
     ) -> Result<Result<Value, String>, BusError> {
+        let Some(_turn) = self.turns.next().await else {
+            return Err(BusError::Timeout {
+                what: format!("{method} of {}", self.uri),
+                after: ANSWER,
+            });
+        };
         let answer = self.raw(caller, method, args, ANSWER).await;
         let reply = answer.map_err(to_bus_error)?;
+        self.turns.was_answered();
         Ok(if reply.code == 1 {
             Ok(reply.value)
         } else {
@@ -92,6 +114,34 @@ impl MasterClient {
             peer: "the ROS Master".to_owned(),
             reason: format!("its answer to {method} is not [code, message, value]"),
         })
+    }
+}
+
+impl Turns {
+    pub(super) fn new() -> Self {
+        Self {
+            free: Semaphore::new(AT_A_TIME),
+            answered: Mutex::new(Instant::now()),
+        }
+    }
+
+    pub(super) fn was_answered(&self) {
+        *self.answered.lock() = Instant::now();
+    }
+
+    /// Waits for the caller's turn, as long as others are answered; `None` when nobody was for [`ANSWER`].
+    pub(super) async fn next(&self) -> Option<SemaphorePermit<'_>> {
+        let mut since = Instant::now();
+        loop {
+            if let Ok(turn) = timeout_at(since + ANSWER, self.free.acquire()).await {
+                return turn.ok();
+            }
+            let answered = *self.answered.lock();
+            if answered <= since {
+                return None;
+            }
+            since = answered;
+        }
     }
 }
 

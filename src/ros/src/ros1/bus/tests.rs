@@ -2,6 +2,7 @@
 
 mod hostile;
 mod lending;
+mod master_client;
 mod services;
 mod topics;
 
