@@ -3,7 +3,7 @@
 use bridge::{BridgeOptions, SessionOptions};
 use serde_json::{Value, json};
 
-use super::support::{Client, World};
+use super::support::{Client, World, patient};
 
 const COUNT: &str = "x_msgs/Count";
 
@@ -156,7 +156,7 @@ async fn a_goal_goes_with_feedback_to_its_result() {
 async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
     let options = BridgeOptions {
         action_timeout: std::time::Duration::from_millis(50),
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     let mut user = world.client().await;

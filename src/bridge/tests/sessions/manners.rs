@@ -6,7 +6,7 @@ use bridge::{BridgeOptions, SessionEnd, refuse};
 use serde_json::json;
 use tokio_tungstenite::tungstenite::protocol::Message;
 
-use super::support::{World, connected, patiently};
+use super::support::{World, connected, patient, patiently};
 
 #[tokio::test]
 async fn rubbish_is_answered_and_the_connection_lives() {
@@ -111,7 +111,7 @@ async fn the_client_hears_what_it_asked_to_hear() {
 async fn a_frame_over_the_limit_closes_with_the_reason() {
     let world = World::with(BridgeOptions {
         max_frame: 1000,
-        ..BridgeOptions::default()
+        ..patient()
     })
     .await;
     let mut client = world.client().await;
@@ -153,7 +153,7 @@ async fn a_silent_client_is_pinged_and_then_left() {
         ping_interval: Duration::from_millis(20),
         idle_timeout: Duration::from_millis(200),
         close_timeout: Duration::from_millis(50),
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     // Never polled, so it answers no ping.
@@ -246,7 +246,7 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
     let options = BridgeOptions {
         budget: budget.clone(),
         max_encoded: 3 << 20,
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     let publisher = world
@@ -328,7 +328,7 @@ async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
     let options = BridgeOptions {
         topic_bytes: 1 << 20,
         session_bytes: 2 << 20,
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     let publisher = world
@@ -424,7 +424,7 @@ async fn answers_in_fragments_wait_in_the_queue_that_is_bounded() {
     let options = BridgeOptions {
         control_messages: 100,
         close_timeout: Duration::from_secs(60),
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     let mut client = world.client().await;

@@ -10,7 +10,7 @@ use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::Notify;
 
-use super::support::{World, connected, patiently};
+use super::support::{World, connected, patient, patiently};
 
 fn with_token(token: &str) -> SessionOptions {
     SessionOptions {
@@ -125,7 +125,7 @@ async fn the_newer_connection_takes_over() {
 async fn who_does_not_come_back_in_time_has_lost_everything() {
     let options = BridgeOptions {
         resume_grace: Duration::from_millis(50),
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(options).await;
     let publisher = world

@@ -1,7 +1,6 @@
 //! Services both ways.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use async_trait::async_trait;
 use bridge::BridgeOptions;
@@ -11,7 +10,7 @@ use rosbridge::{CallService, Compression, Format, Frame, Op, Payload};
 use serde_json::json;
 use tokio::sync::Notify;
 
-use super::support::{World, patiently};
+use super::support::{PATIENCE, World, patient, patiently};
 
 /// Adds; waits first where told to.
 struct Add {
@@ -147,7 +146,7 @@ async fn a_slow_call_holds_up_no_other_and_ends_by_its_timeout() {
 async fn too_many_calls_at_once_are_refused() {
     let world = World::with(BridgeOptions {
         max_calls: 2,
-        ..BridgeOptions::default()
+        ..patient()
     })
     .await;
     let gate = Arc::new(Notify::new());
@@ -177,7 +176,7 @@ async fn too_many_calls_at_once_are_refused() {
 async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
     let world = World::with(BridgeOptions {
         max_call_bytes: 10_000,
-        ..BridgeOptions::default()
+        ..patient()
     })
     .await;
     let gate = Arc::new(Notify::new());
@@ -346,12 +345,8 @@ async fn a_client_serves_and_each_call_is_answered_once() {
     let call = |request: &'static [u8]| {
         let node = world.node.clone();
         tokio::spawn(async move {
-            node.call(
-                "/twice",
-                Bytes::from_static(request),
-                Duration::from_secs(20),
-            )
-            .await
+            node.call("/twice", Bytes::from_static(request), PATIENCE)
+                .await
         })
     };
     let first = call(&[1; 16]);

@@ -7,7 +7,7 @@ use ros::codec::{self, FillOptions};
 use rosbridge::{Frame, Op};
 use serde_json::json;
 
-use super::support::{World, connected};
+use super::support::{World, connected, patient};
 
 #[tokio::test]
 async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
@@ -408,7 +408,7 @@ async fn the_end_of_a_burst_comes_by_itself() {
     let quiet = BridgeOptions {
         ping_interval: Duration::ZERO,
         idle_timeout: Duration::ZERO,
-        ..BridgeOptions::default()
+        ..patient()
     };
     let world = World::with(quiet).await;
     let publisher = world
