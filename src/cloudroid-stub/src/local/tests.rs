@@ -21,7 +21,7 @@ use super::process::Program;
 use super::{Application, Cloud, Interface, Keeper, Original, Setting};
 
 /// Generous: it only bounds how long a failing test takes.
-pub const SOON: Duration = Duration::from_secs(20);
+pub const SOON: Duration = Duration::from_secs(120);
 
 /// A robot: a Master with a parameter, and a node on it.
 async fn robot() -> Arc<Ros1Bus> {

@@ -203,7 +203,7 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
 }
 
 /// Not a measure of anything: a test that hangs shall say so.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 #[tokio::test]
 async fn a_link_is_taken_up_while_other_nodes_start_and_end() {

@@ -14,7 +14,7 @@ use crate::ros1::master::{Master, MasterOptions};
 use crate::ros1::xmlrpc::{Client, Fault, Handler, Limits, Value, serve};
 
 /// Longer than anything here takes.
-pub(crate) const LONG: Duration = Duration::from_secs(20);
+pub(crate) const LONG: Duration = Duration::from_secs(120);
 
 /// A Master that serves until dropped.
 pub(crate) struct TestMaster {

@@ -6,7 +6,7 @@ use super::*;
 use crate::net::HostSockets;
 use crate::ros1::xmlrpc::{Client, Error, print_call};
 
-const LONG: Duration = Duration::from_secs(20);
+const LONG: Duration = Duration::from_secs(120);
 
 /// Answers `echo` with its arguments, `wait` never, anything else with a fault.
 struct Echo;
@@ -40,10 +40,10 @@ async fn start(limits: Limits) -> Running {
     Running { address, task }
 }
 
-fn short() -> Limits {
+fn small() -> Limits {
     Limits {
         body: 10_000,
-        transfer: Duration::from_millis(200),
+        transfer: LONG,
         ..Limits::default()
     }
 }
@@ -131,7 +131,12 @@ async fn clients_of_all_kinds_are_served() {
 
 #[tokio::test]
 async fn bad_requests_are_refused_with_a_reason() {
-    let server = start(short()).await;
+    let server = start(small()).await;
+    let hasty = start(Limits {
+        transfer: Duration::from_millis(50),
+        ..small()
+    })
+    .await;
     let many = "a: b\r\n".repeat(200);
     let post = "POST / HTTP/1.1\r\n";
     for (request, wanted) in [
@@ -155,7 +160,8 @@ async fn bad_requests_are_refused_with_a_reason() {
         ("POST / HT".to_owned(), "408"),
         (format!("{post}Content-Length: 100\r\n\r\n<"), "408"),
     ] {
-        let answer = raw(&server, request.as_bytes()).await;
+        let server = if wanted == "408" { &hasty } else { &server };
+        let answer = raw(server, request.as_bytes()).await;
         let status = answer.split_whitespace().nth(1).unwrap_or_default();
         let shown: String = request.chars().take(60).collect();
         assert_eq!(status, wanted, "{shown}: {answer}");
@@ -167,7 +173,7 @@ async fn bad_requests_are_refused_with_a_reason() {
 
 #[tokio::test]
 async fn what_is_no_xml_rpc_is_answered_with_a_fault() {
-    let server = start(short()).await;
+    let server = start(small()).await;
     let answer = raw(&server, request("Connection: close\r\n", "{}").as_bytes()).await;
     assert!(
         answer.contains("<fault>") && answer.contains("malformed"),
@@ -179,7 +185,7 @@ async fn what_is_no_xml_rpc_is_answered_with_a_fault() {
 async fn an_idle_connection_is_closed_in_the_end() {
     let limits = Limits {
         idle: Duration::from_millis(50),
-        ..short()
+        ..small()
     };
     let server = start(limits).await;
     assert_eq!(raw(&server, b"").await, "");
@@ -287,11 +293,15 @@ async fn who_waits_for_memory_in_vain_is_told_so() {
     let limits = Limits {
         body: 1 << 20,
         budget: Budget::new("XML-RPC", 1 << 20),
-        ..short()
+        ..small()
     };
     let held = limits.budget.take(1 << 20).unwrap();
-    let server = start(limits).await;
-    let answer = raw(&server, request("", &"x".repeat(200_000)).as_bytes()).await;
+    let hasty = Limits {
+        transfer: Duration::from_millis(200),
+        ..limits.clone()
+    };
+    let (server, hasty) = (start(limits).await, start(hasty).await);
+    let answer = raw(&hasty, request("", &"x".repeat(200_000)).as_bytes()).await;
     let status = answer.split_whitespace().nth(1);
     assert_eq!(status, Some("503"), "{answer}");
     assert!(answer.contains("the memory for XML-RPC"), "{answer}");
