@@ -239,7 +239,7 @@ fn main() -> ExitCode {
             a_node_that_leaves_at_once,
             archives_that_reach_out_of_their_tree,
             reserved_and_taken_names,
-            a_disk_with_no_room,
+            a_full_disk_ends_a_push_and_nothing_else,
         ],
         stories![warm_pool:
             a_robot_takes_the_container_made_ahead_and_another_is_made,

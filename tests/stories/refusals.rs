@@ -155,7 +155,7 @@ pub fn reserved_and_taken_names() -> Verdict {
     Ok(())
 }
 
-pub fn a_disk_with_no_room() -> Verdict {
+pub fn a_full_disk_ends_a_push_and_nothing_else() -> Verdict {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-stories-small-")
         .tempdir()?;
@@ -171,7 +171,7 @@ pub fn a_disk_with_no_room() -> Verdict {
         daemon
             .deployer()
             .pushes("adder_py", &["--node", "adder.py"])?
-            .failed_saying(&["room"])?;
+            .failed_saying(&["no space"])?;
         nothing_half_made(&daemon, "adder_py")?;
         ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
         Ok(())
