@@ -309,6 +309,35 @@ impl Choreographer {
         Ok(self.inner.admission.check(self.inner.promised(limits))?)
     }
 
+    /// A servant as the API shows it.
+    pub async fn describe(&self, handle: &Handle) -> api::Servant {
+        let life = handle.life();
+        let reach = handle.reach();
+        let running = runs(life.phase);
+        let container = handle.container().filter(|_| running);
+        let enforced = container.as_ref().map(|container| container.enforced());
+        let pids = container.as_ref().map(|container| self.inner.opener.processes(container.id()));
+        api::Servant {
+            id: handle.id.clone(),
+            service: handle.service().to_owned(),
+            revision: handle.revision.number,
+            robot: handle.robot.clone(),
+            phase: life.phase,
+            reason: life.reason(),
+            created: handle.created,
+            connections: handle.connections(),
+            idle_until: handle.idle_until(),
+            limits: handle.limits(),
+            cgroup_version: enforced
+                .as_ref()
+                .map_or(0, |enforced| enforced.cgroup_version),
+            enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
+            usage: usage(handle).await,
+            pids: pids.unwrap_or_default(),
+            dropped: reach.map_or(0, |reach| reach.dropped()),
+        }
+    }
+
     /// Images that live servants and warm containers were started from; they must stay.
     pub fn images_in_use(&self) -> Vec<String> {
         let mut images = self.inner.warm_pool.images();
@@ -320,35 +349,6 @@ impl Choreographer {
                 .map(|handle| handle.revision.image.clone()),
         );
         images
-    }
-}
-
-/// A servant as the API shows it.
-pub async fn describe(handle: &Handle) -> api::Servant {
-    let life = handle.life();
-    let reach = handle.reach();
-    let running = runs(life.phase);
-    let container = handle.container().filter(|_| running);
-    let enforced = container.map(|container| container.enforced());
-    let pids = reach.as_ref().filter(|_| running);
-    api::Servant {
-        id: handle.id.clone(),
-        service: handle.service().to_owned(),
-        revision: handle.revision.number,
-        robot: handle.robot.clone(),
-        phase: life.phase,
-        reason: life.reason(),
-        created: handle.created,
-        connections: handle.connections(),
-        idle_until: handle.idle_until(),
-        limits: handle.limits(),
-        cgroup_version: enforced
-            .as_ref()
-            .map_or(0, |enforced| enforced.cgroup_version),
-        enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
-        usage: usage(handle).await,
-        pids: pids.map_or_else(Vec::new, |reach| reach.processes()),
-        dropped: reach.map_or(0, |reach| reach.dropped()),
     }
 }
 

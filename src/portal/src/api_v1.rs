@@ -19,7 +19,6 @@ use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
 use crate::views;
-use choreographer::describe;
 
 type Answer<T> = Result<Json<T>, Error>;
 
@@ -189,12 +188,16 @@ pub async fn trial(
 /// All servants.
 pub async fn servants(State(app): State<Arc<App>>) -> Json<Vec<api::Servant>> {
     let handles = app.choreographer.servants();
-    Json(futures_util::future::join_all(handles.iter().map(|handle| describe(handle))).await)
+    let described = handles
+        .iter()
+        .map(|handle| app.choreographer.describe(handle));
+    Json(futures_util::future::join_all(described).await)
 }
 
 /// One servant.
 pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<api::Servant> {
-    Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
+    let handle = app.choreographer.servant(&id)?;
+    Ok(Json(app.choreographer.describe(&handle).await))
 }
 
 /// Changes limits of one servant while it runs.
@@ -209,7 +212,8 @@ pub async fn set_limits(
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
     choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
     app.choreographer.set_limits(&id, change).await?;
-    Ok(Json(describe(&*app.choreographer.servant(&id)?).await))
+    let handle = app.choreographer.servant(&id)?;
+    Ok(Json(app.choreographer.describe(&handle).await))
 }
 
 /// Why a robot is slow, or on its local original.

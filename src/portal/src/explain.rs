@@ -9,7 +9,7 @@ use link::control::Request;
 use reach::links::LinkStatus;
 
 use crate::errors::Error;
-use choreographer::{Choreographer, Handle, describe};
+use choreographer::{Choreographer, Handle};
 use store::State;
 
 /// Between two looks at what a servant uses.
@@ -46,7 +46,9 @@ pub async fn robot(
             exists,
         });
     }
-    let servants = futures_util::future::join_all(mine.iter().map(|handle| served(handle))).await;
+    let servants =
+        futures_util::future::join_all(mine.iter().map(|handle| served(choreographer, handle)))
+            .await;
     Ok(Explanation {
         robot: name.to_owned(),
         causes: causes(&servants, &events),
@@ -62,10 +64,10 @@ fn events(state: &State, robot: &str) -> Result<Vec<Event>, Error> {
     Ok(events.split_off(skipped))
 }
 
-async fn served(handle: &Handle) -> Served {
-    let before = describe(handle).await;
+async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {
+    let before = choreographer.describe(handle).await;
     tokio::time::sleep(MOMENT).await;
-    let servant = describe(handle).await;
+    let servant = choreographer.describe(handle).await;
     let spent = |of: fn(&api::Usage) -> u64| {
         let (Some(before), Some(after)) = (&before.usage, &servant.usage) else {
             return 0.0;

@@ -139,8 +139,6 @@ pub trait Reach: Send + Sync + 'static {
         let metrics = self.metrics();
         metrics.dropped.get() + metrics.bus_dropped.get()
     }
-    /// Pids of its processes, as whoever looks at the machine sees them.
-    fn processes(&self) -> Vec<i32>;
     /// Gives it material, and tells what it answers and when.
     async fn trial(
         &self,
@@ -175,6 +173,8 @@ pub trait Opener: Send + Sync + 'static {
         name: &str,
         egress: &[String],
     ) -> Result<Look, Error>;
+    /// Pids of a servant's processes as whoever looks at this machine sees them; none of one that runs elsewhere.
+    fn processes(&self, servant: &str) -> Vec<i32>;
 }
 
 /// A bus of a servant that is looked at; hosts that its nodes connect to are reached for as long as this lives.

@@ -90,7 +90,6 @@ impl Opener for LocalOpener {
         };
         let bridge = Bridge::new(Arc::clone(&bus), registry, options);
         Ok(Arc::new(LocalReach {
-            servant: local,
             bus,
             bridge,
             hub,
@@ -115,11 +114,17 @@ impl Opener for LocalOpener {
             _relays: relays,
         })
     }
+
+    fn processes(&self, servant: &str) -> Vec<i32> {
+        let servant = self.engine.servant(servant);
+        servant
+            .and_then(|servant| servant.processes().ok())
+            .unwrap_or_default()
+    }
 }
 
 /// ROS, sessions, links and routes out of one servant.
 struct LocalReach {
-    servant: Arc<LocalServant>,
     bus: Arc<dyn Bus>,
     bridge: Arc<Bridge>,
     hub: Arc<Hub>,
@@ -152,10 +157,6 @@ impl Reach for LocalReach {
 
     fn metrics(&self) -> &Metrics {
         self.bridge.metrics()
-    }
-
-    fn processes(&self) -> Vec<i32> {
-        self.servant.processes().unwrap_or_default()
     }
 
     async fn trial(

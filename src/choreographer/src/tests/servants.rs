@@ -103,7 +103,7 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     let reach = lease.ready().await.expect("ready");
     assert!(reach.graph().borrow().nodes.contains_key("/greeter"));
     let handle = Arc::clone(lease.handle());
-    let shown = describe(&handle).await;
+    let shown = daemon.describe(&handle).await;
     assert_eq!((shown.phase, shown.connections), (Phase::Ready, 1));
     assert_eq!(shown.usage.expect("it runs").pids, 1);
     assert_eq!(world.engine.started()[0].image, "sha256:greet");
@@ -251,7 +251,7 @@ async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it()
     lease.ready().await.expect("ready");
     let id = lease.handle().id.clone();
     let enforced = async || {
-        let shown = describe(lease.handle()).await;
+        let shown = daemon.describe(lease.handle()).await;
         shown.enforced.expect("it runs").memory
     };
     assert_eq!(enforced().await, Some(api::Size(150 << 20)));

@@ -56,6 +56,10 @@ impl Opener for MemoryEngine {
     ) -> Result<Look, Error> {
         Err(Error::Elsewhere(servant.id().to_owned()))
     }
+
+    fn processes(&self, _servant: &str) -> Vec<i32> {
+        Vec::new()
+    }
 }
 
 impl MemoryReach {
@@ -96,10 +100,6 @@ impl Reach for MemoryReach {
 
     fn metrics(&self) -> &Metrics {
         &self.metrics
-    }
-
-    fn processes(&self) -> Vec<i32> {
-        Vec::new()
     }
 
     async fn trial(
