@@ -8,9 +8,13 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 /// How many cores can be told apart.
 const CORES: usize = 256;
 
-/// Some cores: bit n of word n / 64 is core n.
+/// Some cores, written such as `0-3,6`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct CpuSet(pub [u64; CORES / 64]);
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema), schema(value_type = String))]
+pub struct CpuSet(
+    /// Bit n of word n / 64 is core n.
+    pub [u64; CORES / 64],
+);
 
 impl CpuSet {
     fn has(&self, core: usize) -> bool {

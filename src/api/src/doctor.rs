@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// The result of all checks.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Doctor {
     /// Every check, in the order in which a person would fix them.
     pub checks: Vec<Check>,
@@ -20,6 +21,7 @@ impl Doctor {
 
 /// One need.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Check {
     /// What is needed.
     pub name: String,
@@ -34,6 +36,7 @@ pub struct Check {
 
 /// Whether a need is met.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum CheckStatus {
     /// It is there.

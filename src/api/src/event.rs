@@ -6,6 +6,7 @@ use crate::Millis;
 
 /// How much it matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
     /// As it should be.
@@ -18,10 +19,12 @@ pub enum Level {
 
 /// One line of the daemon's journal.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Event {
     /// Grows with every event.
     pub id: i64,
     /// When it happened.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
     /// How much it matters.
     pub level: Level,

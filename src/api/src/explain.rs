@@ -7,6 +7,7 @@ use crate::servant::Servant;
 
 /// All that is known of one robot, and what follows from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Explanation {
     /// The robot.
     pub robot: String,
@@ -20,6 +21,7 @@ pub struct Explanation {
 
 /// One reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Cause {
     /// How much it matters.
     pub weight: Weight,
@@ -31,6 +33,7 @@ pub struct Cause {
 
 /// How much a cause matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Weight {
     /// Nothing works with it.
@@ -43,6 +46,7 @@ pub enum Weight {
 
 /// A servant of the robot, and the links to it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Served {
     /// As in a list.
     pub servant: Servant,
@@ -56,6 +60,7 @@ pub struct Served {
 
 /// A node's link and its last requests. Times are in milliseconds.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Link {
     /// The node.
     pub node: String,
@@ -123,6 +128,7 @@ pub struct Link {
 
 /// A part of the response time, over the last requests.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Part {
     /// `serialise`, `up`, `queue`, `compute`, `down` or `total`.
     pub name: String,

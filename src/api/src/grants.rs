@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 /// Devices, volumes and ways out.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Grants {
     /// Devices by their names in CDI specifications, such as `nvidia.com/gpu=0`.
@@ -27,6 +28,7 @@ impl Grants {
 
 /// A directory or file of the machine, as nodes see it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Volume {
     /// On the machine; absolute.

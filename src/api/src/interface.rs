@@ -5,23 +5,30 @@ use serde::{Deserialize, Serialize};
 
 /// Topics, services, actions and parameters.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Interface {
     /// Topics, by name.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub topics: Vec<Topic>,
     /// ROS services, by name.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub services: Vec<Service>,
     /// Actions, by name.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub actions: Vec<Action>,
     /// Parameters, by name.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub parameters: Vec<Parameter>,
     /// ROS services that the package calls and does not serve, by name.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub needs: Vec<Need>,
 }
 
 /// A ROS service that a robot should serve.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Need {
     /// Absolute name.
     pub name: String,
@@ -31,6 +38,7 @@ pub struct Need {
 
 /// From the package's point of view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Direction {
     /// The package subscribes: a robot publishes.
@@ -41,6 +49,7 @@ pub enum Direction {
 
 /// One end of a topic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Topic {
     /// Absolute name, such as `/image`.
     pub name: String,
@@ -59,6 +68,7 @@ pub struct Topic {
 
 /// A ROS service.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema), schema(as = RosService))]
 pub struct Service {
     /// Absolute name.
     pub name: String,
@@ -71,6 +81,7 @@ pub struct Service {
 
 /// An action.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Action {
     /// Absolute name.
     pub name: String,
@@ -83,6 +94,7 @@ pub struct Action {
 
 /// A parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Parameter {
     /// Absolute name.
     pub name: String,

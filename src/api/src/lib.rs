@@ -28,7 +28,7 @@ pub use interface::Interface;
 pub use limits::{Limits, Pressure, Usage};
 pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
-pub use servant::{LogLine, Phase, Servant, Stopped};
+pub use servant::{LogLine, Phase, Servant, Stopped, Stream};
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use size::Size;
 pub use status::{Capacity, Clock, Isolation, Status};
@@ -39,3 +39,11 @@ pub const NDJSON: &str = "application/x-ndjson";
 
 /// Milliseconds since 1970-01-01 UTC.
 pub type Millis = u64;
+
+/// Schemas of types that bear no name of their own.
+#[cfg(feature = "schema")]
+pub mod schema {
+    /// Milliseconds since 1970-01-01 UTC.
+    #[derive(utoipa::ToSchema)]
+    pub struct Millis(pub u64);
+}

@@ -7,6 +7,7 @@ use crate::size::Size;
 
 /// Hard limits of one servant; none: the daemon's default, or not limited (in `enforced`).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
     /// Cores, such as 1.5.
@@ -53,6 +54,7 @@ impl Limits {
 
 /// What a servant has used, as the kernel counts it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Usage {
     /// Microseconds of processor time so far.
     pub cpu_usec: u64,
@@ -72,6 +74,7 @@ pub struct Usage {
 
 /// Percent of the last ten seconds in which some thread waited (`some avg10` of pressure stall information).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Pressure {
     /// For a core.
     pub cpu: f64,

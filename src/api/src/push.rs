@@ -12,6 +12,7 @@ use crate::service::ServiceDetail;
 /// What to make of the archive (`POST /api/v1/push?options=JSON`; the body is a tar, gzipped or not, and empty
 /// with `apt`).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PushOptions {
     /// The service's name; the package's by default.
@@ -63,6 +64,7 @@ pub struct PushOptions {
 
 /// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum PushEvent {
     /// A new step begins.
@@ -108,6 +110,7 @@ pub enum PushEvent {
 
 /// A layer of the pushed image.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Layer {
     /// `base`, `dependencies` or `package`.
     pub name: String,

@@ -9,6 +9,7 @@ use crate::limits::{Limits, Usage};
 
 /// Where a servant is in its life; the choreographer draws the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
     /// A robot asked for it.
@@ -46,6 +47,7 @@ impl fmt::Display for Phase {
 
 /// A servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Servant {
     /// Its id, also its container's and its cgroup's name.
     pub id: String,
@@ -61,11 +63,13 @@ pub struct Servant {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
     /// When it was asked for.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
     /// Connections that use it now.
     pub connections: usize,
     /// When it is ended if nobody connects before.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub idle_until: Option<Millis>,
     /// Limits asked for.
     pub limits: Limits,
@@ -74,34 +78,51 @@ pub struct Servant {
     pub enforced: Option<Limits>,
     /// Version of the cgroup controllers that enforce them; 0: none could be used.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true, maximum = 2))]
     pub cgroup_version: u8,
     /// Usage now; none while it is not running.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Usage>,
     /// Host process ids of its nodes and their children.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub pids: Vec<i32>,
     /// Messages dropped because its clients or nodes were slow.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub dropped: u64,
 }
 
 /// Which servants were ended.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Stopped {
     /// Their ids.
     pub stopped: Vec<String>,
 }
 
+/// What a program prints to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum Stream {
+    /// Standard output.
+    Stdout,
+    /// Standard error.
+    Stderr,
+}
+
 /// One line that a node printed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct LogLine {
     /// When the line was printed.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
     /// Which node.
     pub node: String,
-    /// `stdout` or `stderr`.
-    pub stream: String,
+    /// How it was printed.
+    pub stream: Stream,
     /// Without the line end.
     pub line: String,
 }

@@ -8,6 +8,7 @@ use crate::limits::Limits;
 
 /// A service in a list.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServiceSummary {
     /// Its name: the path under which robots reach it.
     pub name: String,
@@ -20,6 +21,7 @@ pub struct ServiceSummary {
     /// Digest of that revision's image manifest.
     pub image: String,
     /// When that revision was published.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub published: Millis,
     /// How many topics, ROS services, actions and parameters its interface has.
     pub topics: usize,
@@ -37,6 +39,7 @@ pub struct ServiceSummary {
 
 /// A service with everything known of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServiceDetail {
     /// As in a list.
     #[serde(flatten)]
@@ -51,12 +54,14 @@ pub struct ServiceDetail {
 
 /// One push that succeeded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Revision {
     /// From 1.
     pub number: u64,
     /// Digest of the image manifest.
     pub image: String,
     /// When it was published.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub published: Millis,
     /// What was pushed, in words, such as `--apt opencv_apps`.
     pub source: String,
@@ -66,6 +71,7 @@ pub struct Revision {
 
 /// A process of a servant.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Node {
     /// Its ROS name.
     pub name: String,
@@ -75,6 +81,7 @@ pub struct Node {
 
 /// Asks for an earlier revision.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Rollback {
     /// Which; none: the one before the current.

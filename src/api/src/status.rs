@@ -7,6 +7,7 @@ use crate::limits::{Limits, Usage};
 
 /// What `GET /api/v1/status` answers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Status {
     /// The daemon's version.
     pub version: String,
@@ -20,6 +21,7 @@ pub struct Status {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_service: Option<String>,
     /// When it started.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub started: Millis,
     /// What holds the servants apart.
     pub isolation: Isolation,
@@ -46,6 +48,7 @@ pub struct Status {
 
 /// What holds the servants apart.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Isolation {
     /// `require` or `best-effort`.
     pub mode: String,
@@ -57,6 +60,7 @@ pub struct Isolation {
 
 /// Room for servants.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Capacity {
     /// Cores that servants may be promised.
     pub cpus: f64,
@@ -72,6 +76,7 @@ pub struct Capacity {
 
 /// The daemon's clock, for comparing another with it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Clock {
     /// Milliseconds since 1970 with their fraction.
     pub now: f64,

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// What a service made of recorded inputs. Times are in milliseconds, on this machine, without any network.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Trial {
     /// The service.
     pub service: String,
@@ -23,6 +24,7 @@ pub struct Trial {
 
 /// An input.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Fed {
     /// The service's topic.
     pub topic: String,
@@ -35,6 +37,7 @@ pub struct Fed {
 
 /// An output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Heard {
     /// Topic on which the answer came.
     pub topic: String,
@@ -52,6 +55,7 @@ pub struct Heard {
 
 /// Response times and what follows from them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Times {
     /// Median.
     pub p50: f64,

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
-use axum::extract::{OriginalUri, Path, Query, State};
+use axum::extract::{Path, Query, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -13,6 +13,7 @@ use reach::{Material, Picture};
 use serde::Deserialize;
 use servant::engine::LogStart;
 use tokio_stream::wrappers::ReceiverStream;
+use utoipa::{IntoParams, ToSchema};
 
 use super::body::{self, Held};
 use super::guard::Caller;
@@ -54,10 +55,12 @@ pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
 }
 
 /// Which events.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 pub struct Which {
+    /// Only events with a greater number.
     #[serde(default)]
     since: i64,
+    /// So many of the newest; 100 by default.
     limit: Option<u32>,
 }
 
@@ -141,15 +144,19 @@ async fn held(app: &App, caller: &Caller, body: Body, max: usize) -> Result<Held
 }
 
 /// With what a service is tried.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 pub struct With {
+    /// What the body is.
+    #[param(inline)]
     kind: Kind,
 }
 
-#[derive(Debug, Clone, Copy, Deserialize)]
+#[derive(Debug, Clone, Copy, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 enum Kind {
+    /// A recording (rosbag 2.0).
     Bag,
+    /// A picture (PNG).
     Image,
 }
 
@@ -238,8 +245,9 @@ pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -
 }
 
 /// Whose servants.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 pub struct OfService {
+    /// Only those of this service.
     service: Option<String>,
 }
 
@@ -262,10 +270,12 @@ pub async fn stop_servants(
 }
 
 /// Which part of a log.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 pub struct Part {
+    /// Go on as lines come.
     #[serde(default)]
     follow: bool,
+    /// So many of the last lines; 10000 by default.
     tail: Option<usize>,
 }
 
@@ -300,69 +310,4 @@ pub fn lines<T: serde::Serialize + Send + 'static>(
         Ok::<_, serde_json::Error>(line)
     });
     ([(header::CONTENT_TYPE, NDJSON)], Body::from_stream(encoded)).into_response()
-}
-
-/// The OpenAPI description of all this.
-pub async fn openapi(OriginalUri(_): OriginalUri) -> Response {
-    (
-        [(header::CONTENT_TYPE, "application/json")],
-        include_str!("openapi.json"),
-    )
-        .into_response()
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::Value;
-
-    use super::super::routes::{ROUTES, Route};
-
-    /// Every `$ref` in the document.
-    fn references(value: &Value, found: &mut Vec<String>) {
-        match value {
-            Value::Object(members) => {
-                for (name, member) in members {
-                    match member.as_str() {
-                        Some(target) if name == "$ref" => found.push(target.to_owned()),
-                        _ => references(member, found),
-                    }
-                }
-            }
-            Value::Array(elements) => elements
-                .iter()
-                .for_each(|element| references(element, found)),
-            _ => {}
-        }
-    }
-
-    #[test]
-    fn the_description_is_whole() {
-        let document: Value = serde_json::from_str(include_str!("openapi.json")).expect("JSON");
-        let mut found = Vec::new();
-        references(&document, &mut found);
-        assert!(!found.is_empty());
-        for target in found {
-            let pointer = target.strip_prefix('#').expect("within the document");
-            assert!(
-                document.pointer(pointer).is_some(),
-                "{target} leads nowhere"
-            );
-        }
-    }
-
-    #[test]
-    fn every_route_is_described() {
-        let document: Value = serde_json::from_str(include_str!("openapi.json")).expect("JSON");
-        let described = |route: &&Route| {
-            let path = route.path.strip_prefix("/api/v1").expect("of this version");
-            let operation = &document["paths"][path][route.method.to_ascii_lowercase()];
-            operation.is_object() || path == "/openapi.json"
-        };
-        let mut v1 = ROUTES
-            .iter()
-            .filter(|route| route.path.starts_with("/api/v1/"));
-        if let Some(unknown) = v1.find(|route| !described(route)) {
-            panic!("{} {} is not described", unknown.method, unknown.path);
-        }
-    }
 }

@@ -1,5 +1,5 @@
-//! Access control: decides for each request, before its handler, whether the caller may make it. An address that is not
-//! opened here by name is refused.
+//! Access control: decides for each request, before its handler, whether the caller may make it. An address that the table
+//! of routes does not open is refused.
 //!
 //! Where tokens are configured, each TCP request needs one, also from this machine, because requests of a web server in front
 //! of the portal come from this machine, too. Without a token only the page (which asks for one), its assets, `/healthz`
@@ -23,6 +23,7 @@ use parking_lot::Mutex;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::routes::{self, Access};
 use crate::tokens::{self, TokenHash, Tokens};
 
 /// Shortest time between two log lines about the same refusal.
@@ -233,20 +234,18 @@ fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     }
 }
 
-/// Whether a request is answered without a token: the page (which asks for one), its assets, `/healthz`, and a robot's
-/// handshake (which must send `auth` as its first message).
+/// Whether a request is answered without a token, as the table of routes says.
 fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
-    if is_upgrade(headers) {
-        return *method == Method::GET && (path == "/" || is_service(path));
+    match (routes::access(path), is_upgrade(headers)) {
+        (Access::Connect | Access::ReadOrConnect, true) => {
+            *method == Method::GET && (path == "/" || is_service(path))
+        }
+        (Access::Read | Access::ReadOrConnect, false) => {
+            matches!(*method, Method::GET | Method::HEAD)
+        }
+        _ => false,
     }
-    let reads = matches!(*method, Method::GET | Method::HEAD);
-    reads && (path == "/" || path == "/healthz" || is_asset(path))
-}
-
-fn is_asset(path: &str) -> bool {
-    path.strip_prefix("/assets/")
-        .is_some_and(|name| !name.is_empty() && !name.contains('/'))
 }
 
 /// Whether a path can be that of a service: `/NAME`, or `/NAME/`.

@@ -21,6 +21,7 @@ mod guard;
 mod handshake;
 mod metrics;
 mod oci;
+mod openapi;
 mod page;
 mod push;
 mod robots;

@@ -1,5 +1,5 @@
-//! Every address that the portal answers, in one table. The router is made of it, and a test checks for each row that it is
-//! not answered without a token where tokens are configured.
+//! Every address that the portal answers, in one table: its method, who is answered there, its handler, and what the
+//! OpenAPI document says of it. Router, guard and document are made of it.
 
 use axum::extract::{DefaultBodyLimit, OriginalUri};
 use axum::response::{IntoResponse, Response};
@@ -7,89 +7,239 @@ use axum::routing::{MethodRouter, any, delete, get, patch, post};
 
 use std::sync::Arc;
 
-use super::{App, api_v1, metrics, oci, page, push, robots, stubs};
+use utoipa::openapi::Required;
+
+use super::{App, api_v1, metrics, oci, openapi, page, push, robots, stubs};
 use crate::errors::Error;
+use crate::openapi::{Operation, operation};
+
+/// Who is answered where tokens are configured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Who has a token.
+    Token,
+    /// Anyone who reads.
+    Read,
+    /// Any robot that connects: its first message must be rosbridge's `auth`.
+    Connect,
+    /// Anyone who reads, and any robot that connects.
+    ReadOrConnect,
+}
+
+use Access::{Connect, Read, ReadOrConnect, Token};
 
 /// One method at one address.
 pub struct Route {
     /// `GET`, …, or `ANY` where the handler tells methods apart. `GET` answers `HEAD`, too.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for those who read the table"))]
     pub method: &'static str,
     /// Its address as axum writes it; `{…}` is one segment.
     pub path: &'static str,
+    /// Whom it answers.
+    pub access: Access,
     /// Makes its handler.
     pub handler: fn() -> MethodRouter<Arc<App>>,
+    /// What the OpenAPI document says of it.
+    pub operation: Option<fn() -> Operation>,
 }
 
 const fn at(
     method: &'static str,
     path: &'static str,
+    access: Access,
     handler: fn() -> MethodRouter<Arc<App>>,
 ) -> Route {
     Route {
         method,
         path,
+        access,
         handler,
+        operation: None,
     }
 }
 
-/// All routes. Access is not decided here: [`super::guard`] refuses each address that it does not open by name.
+impl Route {
+    const fn described(self, operation: fn() -> Operation) -> Self {
+        Route {
+            operation: Some(operation),
+            ..self
+        }
+    }
+
+    /// Whether a path is one of its address, as it stands in the request.
+    fn leads(&self, path: &str) -> bool {
+        let mut segments = path.split('/');
+        self.path.split('/').all(|expected| {
+            segments.next().is_some_and(|segment| {
+                segment == expected || (expected.starts_with('{') && !segment.is_empty())
+            })
+        }) && segments.next().is_none()
+    }
+}
+
+/// Who is answered at a path: whom the first row says that leads there.
+pub fn access(path: &str) -> Access {
+    let row = ROUTES.iter().find(|route| route.leads(path));
+    row.map_or(Token, |route| route.access)
+}
+
+/// All routes: a fixed address before those with a name in its place.
 pub const ROUTES: &[Route] = &[
-    at("ANY", "/", || any(robots::root)),
-    at("GET", "/healthz", || get(api_v1::health)),
-    at("GET", "/metrics", || get(metrics::metrics)),
-    at("ANY", "/assets", || any(nothing)),
-    at("GET", "/assets/{name}", || get(page::asset)),
-    at("ANY", "/api", || any(nothing)),
-    at("GET", "/api/v1/status", || get(api_v1::status)),
-    at("GET", "/api/v1/doctor", || get(api_v1::doctor)),
-    at("GET", "/api/v1/clock", || get(api_v1::clock)),
-    at("GET", "/api/v1/events", || get(api_v1::events)),
-    at("GET", "/api/v1/services", || get(api_v1::services)),
-    at("GET", "/api/v1/services/{name}", || get(api_v1::service)),
-    at("DELETE", "/api/v1/services/{name}", || {
+    at("ANY", "/", ReadOrConnect, || any(robots::root)),
+    at("GET", "/healthz", Read, || get(api_v1::health)),
+    at("GET", "/metrics", Token, || get(metrics::metrics)),
+    at("ANY", "/assets", Token, || any(nothing)),
+    at("GET", "/assets/{name}", Read, || get(page::asset)),
+    at("ANY", "/api", Token, || any(nothing)),
+    at("GET", "/api/v1/status", Token, || get(api_v1::status))
+        .described(|| operation("status", "The daemon at a glance.").answers::<api::Status>()),
+    at("GET", "/api/v1/doctor", Token, || get(api_v1::doctor)).described(|| {
+        operation(
+            "doctor",
+            "What this machine needs, and whether it is there.",
+        )
+        .answers::<api::Doctor>()
+    }),
+    at("GET", "/api/v1/clock", Token, || get(api_v1::clock)).described(|| {
+        operation(
+            "clock",
+            "The daemon's clock, for comparing another with it.",
+        )
+        .answers::<api::Clock>()
+    }),
+    at("GET", "/api/v1/events", Token, || get(api_v1::events)).described(|| {
+        operation("events", "The journal, oldest first.")
+            .asks::<api_v1::Which>()
+            .lists::<api::Event>()
+    }),
+    at("GET", "/api/v1/services", Token, || get(api_v1::services))
+        .described(|| operation("services", "All services.").lists::<api::ServiceSummary>()),
+    at("GET", "/api/v1/services/{name}", Token, || {
+        get(api_v1::service)
+    })
+    .described(|| {
+        operation("service", "One service with its interface and revisions.")
+            .answers::<api::ServiceDetail>()
+    }),
+    at("DELETE", "/api/v1/services/{name}", Token, || {
         delete(api_v1::remove_service)
+    })
+    .described(|| {
+        operation(
+            "removeService",
+            "Removes the service, its servants and its images.",
+        )
+        .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/services/{name}/interface", || {
+    at("GET", "/api/v1/services/{name}/interface", Token, || {
         get(api_v1::interface)
-    }),
-    at("POST", "/api/v1/services/{name}/rollback", || {
+    })
+    .described(|| operation("interface", "The interface with all definitions.").answers_object()),
+    at("POST", "/api/v1/services/{name}/rollback", Token, || {
         post(api_v1::rollback)
+    })
+    .described(|| {
+        operation("rollback", "Makes an earlier revision the current one.")
+            .takes::<api::Rollback>(Required::False)
+            .answers::<api::ServiceDetail>()
     }),
-    at("POST", "/api/v1/services/{name}/trial", || {
+    at("POST", "/api/v1/services/{name}/trial", Token, || {
         post(api_v1::trial)
+    })
+    .described(|| {
+        operation(
+            "trial",
+            "What a service makes of a recording (rosbag 2.0) or a picture (PNG), and how fast.",
+        )
+        .asks::<api_v1::With>()
+        .takes_file(
+            "application/octet-stream",
+            "The recording or the picture.",
+            Required::True,
+        )
+        .answers::<api::trial::Trial>()
     }),
-    at("GET", "/api/v1/servants", || get(api_v1::servants)),
-    at("DELETE", "/api/v1/servants", || {
+    at("GET", "/api/v1/servants", Token, || get(api_v1::servants))
+        .described(|| operation("servants", "All servants.").lists::<api::Servant>()),
+    at("DELETE", "/api/v1/servants", Token, || {
         delete(api_v1::stop_servants)
+    })
+    .described(|| {
+        operation(
+            "stopServants",
+            "Ends all servants, or those of one service.",
+        )
+        .asks::<api_v1::OfService>()
+        .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/servants/{id}", || get(api_v1::servant)),
-    at("PATCH", "/api/v1/servants/{id}", || {
+    at("GET", "/api/v1/servants/{id}", Token, || {
+        get(api_v1::servant)
+    })
+    .described(|| operation("servant", "One servant.").answers::<api::Servant>()),
+    at("PATCH", "/api/v1/servants/{id}", Token, || {
         patch(api_v1::set_limits)
+    })
+    .described(|| {
+        operation(
+            "setLimits",
+            "Changes the limits that are given, while the servant runs.",
+        )
+        .takes::<api::Limits>(Required::True)
+        .answers::<api::Servant>()
     }),
-    at("DELETE", "/api/v1/servants/{id}", || {
+    at("DELETE", "/api/v1/servants/{id}", Token, || {
         delete(api_v1::stop_servant)
+    })
+    .described(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
+    at("GET", "/api/v1/servants/{id}/logs", Token, || {
+        get(api_v1::logs)
+    })
+    .described(|| {
+        operation("logs", "What its nodes printed.")
+            .asks::<api_v1::Part>()
+            .streams::<api::LogLine>()
     }),
-    at("GET", "/api/v1/servants/{id}/logs", || get(api_v1::logs)),
-    at("GET", "/api/v1/robots/{name}/explain", || {
+    at("GET", "/api/v1/robots/{name}/explain", Token, || {
         get(api_v1::explain)
+    })
+    .described(|| {
+        operation(
+            "explain",
+            "Why a robot is slow, or on its local original, now.",
+        )
+        .answers::<api::explain::Explanation>()
     }),
-    at("POST", "/api/v1/push", || {
+    at("POST", "/api/v1/push", Token, || {
         post(push::push).layer(DefaultBodyLimit::disable())
+    })
+    .described(|| {
+        operation(
+            "push",
+            "Builds an image of a package and publishes it. The last line is done or error.",
+        )
+        .asks_json::<api::PushOptions>("options", "What to make of the archive.")
+        .takes_file(
+            "application/x-tar",
+            "A tar archive, gzipped or not; empty with apt.",
+            Required::False,
+        )
+        .streams::<api::PushEvent>()
     }),
-    at("GET", "/api/v1/openapi.json", || get(api_v1::openapi)),
-    at("GET", "/v2", || get(oci::version)),
-    at("GET", "/v2/", || get(oci::version)),
-    at("GET", "/v2/_catalog", || get(oci::catalog)),
-    at("GET", "/v2/{name}/tags/list", || get(oci::tags)),
-    at("GET", "/v2/{name}/manifests/{reference}", || {
+    at("GET", "/api/v1/openapi.json", Token, || get(openapi::serve))
+        .described(|| operation("openapi", "This document.").answers_object()),
+    at("GET", "/v2", Token, || get(oci::version)),
+    at("GET", "/v2/", Token, || get(oci::version)),
+    at("GET", "/v2/_catalog", Token, || get(oci::catalog)),
+    at("GET", "/v2/{name}/tags/list", Token, || get(oci::tags)),
+    at("GET", "/v2/{name}/manifests/{reference}", Token, || {
         get(oci::manifest)
     }),
-    at("GET", "/v2/{name}/blobs/{digest}", || get(oci::blob)),
-    at("GET", "/stubs", || get(stubs::list)),
-    at("GET", "/stubs/{file}", || get(stubs::archive)),
-    at("ANY", "/{service}", || any(robots::service)),
-    at("ANY", "/{service}/", || any(robots::service_with_slash)),
+    at("GET", "/v2/{name}/blobs/{digest}", Token, || get(oci::blob)),
+    at("GET", "/stubs", Token, || get(stubs::list)),
+    at("GET", "/stubs/{file}", Token, || get(stubs::archive)),
+    at("ANY", "/{service}", Connect, || any(robots::service)),
+    at("ANY", "/{service}/", Connect, || {
+        any(robots::service_with_slash)
+    }),
 ];
 
 /// Answers paths that are in no row: 404.

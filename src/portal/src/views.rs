@@ -179,7 +179,10 @@ pub fn log_line(line: servant::engine::LogLine) -> api::LogLine {
     api::LogLine {
         time: store::millis(line.time),
         node: line.node,
-        stream: line.stream,
+        stream: match &*line.stream {
+            "stderr" => api::Stream::Stderr,
+            _ => api::Stream::Stdout,
+        },
         line: line.line,
     }
 }

@@ -1,0 +1,218 @@
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
+use super::{BASE, document};
+use crate::routes::{Access, ROUTES};
+
+mod samples;
+
+fn written() -> Value {
+    serde_json::to_value(document(ROUTES)).expect("plain data")
+}
+
+/// Every `$ref` in the document.
+fn references(value: &Value, found: &mut Vec<String>) {
+    match value {
+        Value::Object(members) => {
+            for (name, member) in members {
+                match member.as_str() {
+                    Some(target) if name == "$ref" => found.push(target.to_owned()),
+                    _ => references(member, found),
+                }
+            }
+        }
+        Value::Array(elements) => elements
+            .iter()
+            .for_each(|element| references(element, found)),
+        _ => {}
+    }
+}
+
+#[test]
+fn every_reference_leads_to_a_schema() {
+    let document = written();
+    let mut found = Vec::new();
+    references(&document, &mut found);
+    assert!(!found.is_empty());
+    for target in found {
+        let pointer = target.strip_prefix('#').expect("within the document");
+        assert!(
+            document.pointer(pointer).is_some(),
+            "{target} leads nowhere"
+        );
+    }
+}
+
+#[test]
+fn the_document_lists_exactly_the_routes_of_the_table() {
+    let document = written();
+    let mut listed = BTreeSet::new();
+    let mut ids = BTreeSet::new();
+    for (path, item) in document["paths"].as_object().expect("paths") {
+        for (method, operation) in item.as_object().expect("operations") {
+            listed.insert(format!("{} {BASE}{path}", method.to_ascii_uppercase()));
+            let id = operation["operationId"].as_str().expect("an id");
+            assert!(ids.insert(id.to_owned()), "{id} is the id of two");
+        }
+    }
+    let v1 = ROUTES.iter().filter(|row| row.path.starts_with("/api/v1/"));
+    let table: BTreeSet<String> = v1
+        .map(|row| format!("{} {}", row.method, row.path))
+        .collect();
+    assert_eq!(listed, table);
+}
+
+#[test]
+fn what_the_document_describes_needs_a_token() {
+    for row in ROUTES.iter().filter(|row| row.operation.is_some()) {
+        assert_eq!(row.access, Access::Token, "{} {}", row.method, row.path);
+    }
+}
+
+/// Whether a value is as a schema says; which properties were met on the way, as `SCHEMA.PROPERTY`.
+struct Judge<'a> {
+    document: &'a Value,
+    met: BTreeSet<String>,
+}
+
+impl<'a> Judge<'a> {
+    /// Follows a reference; its name is that of what is judged from there on.
+    fn resolve(&self, name: &'a str, schema: &'a Value) -> (&'a str, &'a Value) {
+        match schema["$ref"].as_str() {
+            None => (name, schema),
+            Some(target) => (
+                target.rsplit('/').next().unwrap_or(target),
+                self.document.pointer(&target[1..]).expect("a schema"),
+            ),
+        }
+    }
+
+    /// A schema's parts, each with its name: itself, or what all of it consists of.
+    fn parts(&self, name: &'a str, schema: &'a Value) -> Vec<(&'a str, &'a Value)> {
+        let (name, schema) = self.resolve(name, schema);
+        match schema["allOf"].as_array() {
+            None => vec![(name, schema)],
+            Some(all) => all.iter().flat_map(|part| self.parts(name, part)).collect(),
+        }
+    }
+
+    fn judge(&mut self, name: &'a str, schema: &'a Value, value: &Value) -> Result<(), String> {
+        let (name, schema) = self.resolve(name, schema);
+        if let Some(choices) = schema["oneOf"].as_array() {
+            let met = self.met.clone();
+            for choice in choices {
+                if self.judge(name, choice, value).is_ok() {
+                    return Ok(());
+                }
+                self.met.clone_from(&met);
+            }
+            return Err(format!("{name}: {value} is none of the choices"));
+        }
+        let kinds: &[&str] = match value {
+            Value::Null => &["null"],
+            Value::Bool(_) => &["boolean"],
+            Value::Number(number) if number.is_f64() => &["number"],
+            Value::Number(_) => &["integer", "number"],
+            Value::String(_) => &["string"],
+            Value::Array(_) => &["array"],
+            Value::Object(_) => &["object"],
+        };
+        let allowed = |kind: &&str| match &schema["type"] {
+            Value::String(one) => one == kind,
+            Value::Array(several) => several.iter().any(|one| one == kind),
+            _ => true,
+        };
+        if !kinds.iter().any(allowed) {
+            return Err(format!("{name}: {value} is no {}", schema["type"]));
+        }
+        if schema["enum"]
+            .as_array()
+            .is_some_and(|values| !values.contains(value))
+        {
+            return Err(format!("{name}: {value} is not in {}", schema["enum"]));
+        }
+        match value {
+            Value::Array(elements) => elements
+                .iter()
+                .try_for_each(|element| self.judge(name, &schema["items"], element)),
+            Value::Object(_) => self.judge_members(name, schema, value),
+            _ => Ok(()),
+        }
+    }
+
+    fn judge_members(
+        &mut self,
+        name: &'a str,
+        schema: &'a Value,
+        value: &Value,
+    ) -> Result<(), String> {
+        let parts = self.parts(name, schema);
+        for (part, schema) in &parts {
+            for required in schema["required"].as_array().into_iter().flatten() {
+                let required = required.as_str().unwrap_or_default();
+                if value.get(required).is_none() {
+                    return Err(format!("{part}: {required} is required, not in {value}"));
+                }
+            }
+        }
+        // Any object at all.
+        if parts
+            .iter()
+            .all(|(_, schema)| schema["properties"].is_null())
+            && schema["additionalProperties"].is_null()
+        {
+            return Ok(());
+        }
+        for (key, member) in value.as_object().into_iter().flatten() {
+            let described = parts
+                .iter()
+                .find_map(|(part, schema)| Some((*part, schema["properties"].get(key)?)));
+            match described {
+                Some((part, property)) => {
+                    self.met.insert(format!("{part}.{key}"));
+                    self.judge(part, property, member)?;
+                }
+                None if !schema["additionalProperties"].is_null() => {
+                    self.judge(name, &schema["additionalProperties"], member)?;
+                }
+                None => return Err(format!("{name}: {key} is not described")),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Properties of a schema that it does not take from another.
+fn own(name: &str, schema: &Value, found: &mut BTreeSet<String>) {
+    for property in schema["properties"].as_object().into_iter().flatten() {
+        found.insert(format!("{name}.{}", property.0));
+    }
+    for several in ["allOf", "oneOf"] {
+        for part in schema[several].as_array().into_iter().flatten() {
+            own(name, part, found);
+        }
+    }
+}
+
+#[test]
+fn schemas_are_as_serde_writes() {
+    let document = written();
+    let schemas = &document["components"]["schemas"];
+    let mut judge = Judge {
+        document: &document,
+        met: BTreeSet::new(),
+    };
+    for (name, value) in samples::samples() {
+        assert!(schemas[name].is_object(), "{name} is not described");
+        judge
+            .judge(name, &schemas[name], &value)
+            .expect("as the schema says");
+    }
+    let mut described = BTreeSet::new();
+    for (name, schema) in schemas.as_object().expect("schemas") {
+        own(name, schema, &mut described);
+    }
+    let never: Vec<&String> = described.difference(&judge.met).collect();
+    assert!(never.is_empty(), "serde never writes {never:?}");
+}

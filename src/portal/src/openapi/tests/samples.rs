@@ -1,0 +1,324 @@
+//! One value or more of every type that the document describes.
+
+use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
+use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
+use api::push::Layer;
+use api::trial::{Fed, Heard, Times, Trial};
+use api::{
+    Capacity, Check, CheckStatus, Clock, Doctor, Event, Grants, Isolation, Level, Limits, LogLine,
+    Node, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant,
+    ServiceDetail, ServiceSummary, Size, Status, Stopped, Stream, Usage, Volume,
+};
+use serde_json::Value;
+
+fn some(text: &str) -> Option<String> {
+    Some(text.to_owned())
+}
+
+fn all(text: &str) -> Vec<String> {
+    vec![text.to_owned()]
+}
+
+fn limits() -> Limits {
+    Limits {
+        cpus: Some(1.5),
+        cpu_weight: Some(100),
+        memory: Some(Size(512 << 20)),
+        memory_high: Some(Size(256 << 20)),
+        pids: Some(64),
+        io_read: Some(Size(1 << 20)),
+        io_write: Some(Size(1 << 20)),
+        cpuset: Some("0-3,6".parse().expect("a set")),
+    }
+}
+
+fn usage() -> Usage {
+    Usage {
+        pressure: Some(Pressure::default()),
+        ..Usage::default()
+    }
+}
+
+fn event() -> Event {
+    Event {
+        id: 7,
+        time: 1,
+        level: Level::Warning,
+        kind: "servant-ready".into(),
+        service: some("opencv_apps"),
+        servant: some("opencv_apps-1"),
+        robot: some("r1"),
+        message: "it is ready".into(),
+    }
+}
+
+fn servant() -> Servant {
+    Servant {
+        id: "opencv_apps-1".into(),
+        service: "opencv_apps".into(),
+        revision: 1,
+        robot: "r1".into(),
+        phase: Phase::Ready,
+        reason: some("it was stopped"),
+        created: 1,
+        connections: 1,
+        idle_until: Some(2),
+        limits: limits(),
+        enforced: Some(limits()),
+        cgroup_version: 2,
+        usage: Some(usage()),
+        pids: vec![1],
+        dropped: 0,
+    }
+}
+
+fn detail() -> ServiceDetail {
+    let (name, type_name, node) = ("/x".to_owned(), "p/T".to_owned(), "/n".to_owned());
+    ServiceDetail {
+        summary: ServiceSummary {
+            name: name.clone(),
+            address: "ws://127.0.0.1:9090/x".into(),
+            package: "x".into(),
+            revision: 1,
+            image: "sha256:0".into(),
+            published: 1,
+            topics: 1,
+            services: 1,
+            actions: 1,
+            parameters: 1,
+            servants: 0,
+            limits: Limits::default(),
+        },
+        revisions: vec![Revision {
+            number: 1,
+            image: "sha256:0".into(),
+            published: 1,
+            source: "--apt x".into(),
+            current: true,
+        }],
+        nodes: vec![Node {
+            name: node.clone(),
+            argv: all("x"),
+        }],
+        interface: Interface {
+            topics: vec![Topic {
+                name: name.clone(),
+                type_name: type_name.clone(),
+                md5: String::new(),
+                direction: Direction::Input,
+                latched: false,
+                lazy: true,
+            }],
+            services: vec![Service {
+                name: name.clone(),
+                type_name: type_name.clone(),
+                node: node.clone(),
+            }],
+            actions: vec![Action {
+                name: name.clone(),
+                type_name,
+                node,
+            }],
+            parameters: vec![Parameter {
+                name: name.clone(),
+                value: Some(Value::from(1)),
+            }],
+            needs: vec![Need {
+                name,
+                nodes: all("/n"),
+            }],
+        },
+    }
+}
+
+fn options() -> PushOptions {
+    let names = || [("a".to_owned(), "b".to_owned())].into();
+    PushOptions {
+        name: some("x"),
+        apt: some("x"),
+        base: some("noetic"),
+        launch: some("x.launch"),
+        nodes: all("x"),
+        params: [("k".to_owned(), Value::from(1))].into(),
+        args: names(),
+        remaps: names(),
+        interface: some(""),
+        map: names(),
+        with: all("x"),
+        limits: limits(),
+        grants: Grants {
+            devices: all("nvidia.com/gpu=0"),
+            volumes: vec![Volume {
+                source: "/a".into(),
+                target: "/b".into(),
+            }],
+            egress: all("example.org:80"),
+        },
+        stateful: true,
+        source: "--apt x".into(),
+    }
+}
+
+fn problem() -> Problem {
+    Problem {
+        kind: "urn:cloudroid:unknown-service".into(),
+        title: "unknown service".into(),
+        status: 404,
+        detail: "there is none".into(),
+        next: some("push it"),
+        exists: all("x"),
+        retry_after: Some(1),
+        log: all("x"),
+    }
+}
+
+fn explanation() -> Explanation {
+    let link = Link {
+        round_trip: Some(1.5),
+        clock: Some(0.5),
+        throughput: Some(1e6),
+        drops: all("x"),
+        desire: Some(1.5),
+        max: Some(1.5),
+        threshold: Some(0.5),
+        frames_per_second: Some(1.5),
+        age: Some(1.5),
+        fallback_after: Some(1.5),
+        satisfaction: Some(0.5),
+        phases: vec![Part::default()],
+        late_in: Some(Part::default()),
+        ..Link::default()
+    };
+    Explanation {
+        robot: "r1".into(),
+        causes: vec![Cause {
+            weight: Weight::Slows,
+            what: "it is slow".into(),
+            next: "wait".into(),
+        }],
+        servants: vec![Served {
+            servant: servant(),
+            throttled: 0.5,
+            cores: 1.5,
+            links: vec![link, Link::default()],
+        }],
+        events: vec![event()],
+    }
+}
+
+fn status() -> Status {
+    Status {
+        version: "0.1.0".into(),
+        pid: 1,
+        home: "/h".into(),
+        listen: "127.0.0.1:9090".into(),
+        default_service: some("x"),
+        started: 1,
+        isolation: Isolation::default(),
+        capacity: Capacity::default(),
+        limits: limits(),
+        services: 1,
+        servants: 1,
+        warm_pool: 1,
+        connections: 1,
+        usage: usage(),
+        warnings: all("x"),
+    }
+}
+
+fn tried() -> Trial {
+    Trial {
+        service: "x".into(),
+        inputs: vec![Fed {
+            topic: "/x".into(),
+            type_name: "p/T".into(),
+            sent: 1,
+        }],
+        outputs: vec![Heard {
+            topic: "/x".into(),
+            type_name: "p/T".into(),
+            received: 1,
+            bytes: 1,
+            last: Some(Value::from(1)),
+        }],
+        rrt: Some(Times {
+            p50: 1.5,
+            p90: 1.5,
+            max: 1.5,
+            desire: 1.5,
+            acceptable: 1.5,
+        }),
+        ..Trial::default()
+    }
+}
+
+/// Values of every type of the document, as serde writes them, with all that is optional and without.
+pub fn samples() -> Vec<(&'static str, Value)> {
+    fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
+        (name, serde_json::to_value(value).expect("plain data"))
+    }
+    let mut samples = vec![
+        sample("Clock", Clock { now: 1.5 }),
+        sample("Event", event()),
+        sample("Explanation", explanation()),
+        sample("Limits", Limits::default()),
+        sample("Problem", problem()),
+        sample("Problem", Problem::default()),
+        sample("PushOptions", options()),
+        sample("PushOptions", PushOptions::default()),
+        sample("Rollback", Rollback { revision: Some(1) }),
+        sample("Rollback", Rollback::default()),
+        sample("Servant", servant()),
+        sample("ServiceDetail", detail()),
+        sample("Status", status()),
+        sample("Stopped", Stopped { stopped: all("x") }),
+        sample("Trial", tried()),
+        sample("Trial", Trial::default()),
+    ];
+    let check = |status, fix| Check {
+        name: "cgroups".into(),
+        status,
+        found: "none".into(),
+        fix,
+    };
+    let checks = vec![
+        check(CheckStatus::Missing, some("mount them")),
+        check(CheckStatus::Ok, None),
+    ];
+    samples.push(sample("Doctor", Doctor { checks }));
+    for stream in [Stream::Stdout, Stream::Stderr] {
+        let line = LogLine {
+            time: 1,
+            node: "/n".into(),
+            stream,
+            line: "x".into(),
+        };
+        samples.push(sample("LogLine", line));
+    }
+    for event in [
+        PushEvent::Step { title: "x".into() },
+        PushEvent::Log { line: "x".into() },
+        PushEvent::Progress {
+            unit: "bytes".into(),
+            done: 1,
+            total: Some(2),
+        },
+        PushEvent::Warning {
+            message: "x".into(),
+        },
+        PushEvent::Done {
+            service: Box::new(detail()),
+            layers: vec![Layer {
+                name: "base".into(),
+                digest: "sha256:0".into(),
+                size: 1,
+                cached: true,
+            }],
+            took: 1,
+        },
+        PushEvent::Error { problem: problem() },
+    ] {
+        samples.push(sample("PushEvent", event));
+    }
+    samples
+}
