@@ -316,7 +316,9 @@ impl Choreographer {
         let running = runs(life.phase);
         let container = handle.container().filter(|_| running);
         let enforced = container.as_ref().map(|container| container.enforced());
-        let pids = container.as_ref().map(|container| self.inner.opener.processes(container.id()));
+        let pids = container
+            .as_ref()
+            .map(|container| self.inner.opener.processes(container.id()));
         api::Servant {
             id: handle.id.clone(),
             service: handle.service().to_owned(),
