@@ -220,6 +220,8 @@ impl<'a> Feed<'a> {
                 return false;
             }
         };
+        // How long that takes on a busy machine tells how long the nodes will take.
+        let _ = timeout(ANSWER, reaches(publisher.matched(), 1)).await;
         let frames = self.frames.clone();
         let beating = tokio::spawn(async move {
             let mut beats = tokio::time::interval(BEAT);
