@@ -11,7 +11,7 @@ use crate::error::{Error, Unresolved};
 
 /// Who asks for what.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Asked {
+pub(crate) struct Needed {
     /// Key → packages that ask for it while compiling.
     pub(crate) build: BTreeMap<String, BTreeSet<String>>,
     /// Key → packages that ask for it at run time.
@@ -41,7 +41,7 @@ pub(crate) fn resolve(
     base: &Base,
     map: &BTreeMap<String, String>,
     own: &BTreeSet<String>,
-    asked: &Asked,
+    asked: &Needed,
 ) -> Result<Resolved, Error> {
     let find = |key: &str| -> Found {
         if let Some(deb) = map.get(key) {
@@ -167,13 +167,13 @@ mod tests {
         keys.iter().map(|&key| key.to_owned()).collect()
     }
 
-    fn asked(build: &[&str], run: &[&str]) -> Asked {
+    fn asked(build: &[&str], run: &[&str]) -> Needed {
         let by = |keys: &[&str]| {
             keys.iter()
                 .map(|&key| (key.to_owned(), set(&["app"])))
                 .collect()
         };
-        Asked {
+        Needed {
             build: by(build),
             run: by(run),
         }

@@ -11,7 +11,7 @@ use crate::compile;
 use crate::error::{Error, IoAt};
 use crate::install::{Made, set_mode};
 use crate::key::{self, Key};
-use crate::keys::{self, Asked};
+use crate::keys::{self, Needed};
 use crate::workshop::Packing;
 use crate::{pushed, source};
 
@@ -38,7 +38,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
         pushed::asked(&space.packages),
     );
     // Compiled already: what it was compiled with is of no interest.
-    let asked = Asked {
+    let asked = Needed {
         build: BTreeMap::new(),
         ..asked
     };

@@ -12,7 +12,7 @@ use rustix::fs::FileType;
 
 use crate::base::Base;
 use crate::error::Error;
-use crate::keys::Asked;
+use crate::keys::Needed;
 
 /// Looks at a pushed tree.
 pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
@@ -35,8 +35,8 @@ pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
 }
 
 /// What its packages need from elsewhere.
-pub(crate) fn asked(packages: &[Package]) -> Asked {
-    let mut asked = Asked::default();
+pub(crate) fn asked(packages: &[Package]) -> Needed {
+    let mut asked = Needed::default();
     for external in workspace::external(packages) {
         let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
         if needs(&[

@@ -7,7 +7,7 @@ use ros::bus::ParamValue;
 use ros::codec::{Stamps, Time};
 use tokio::sync::mpsc;
 
-use crate::hub::Listener;
+use crate::fanout::Listener;
 use crate::sample::Sample;
 use crate::shared::Shared;
 
@@ -32,7 +32,7 @@ impl Listener for Ticks {
 pub(crate) async fn now(shared: &Arc<Shared>) -> Time {
     if let Ok(ParamValue::Bool(true)) = shared.bus.parameter("/use_sim_time").await {
         let (ticks, mut heard) = mpsc::unbounded_channel();
-        let listening = shared.hub("/clock", None).listen(Arc::new(Ticks(ticks)));
+        let listening = shared.fanout("/clock", None).listen(Arc::new(Ticks(ticks)));
         let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;
         drop(listening);
         if let Ok(Some(time)) = tick {

@@ -5,7 +5,7 @@
 //! [`Metrics`].
 //!
 //! ```text
-//!               ┌ Hub per topic: one subscription, one encoding per format ┐      ┌ topic queues ┐
+//!               ┌ Fanout per topic: one subscription, encoded per format   ┐      ┌ topic queues ┐
 //!  Bus ─────────┤                                                          ├──▶ ──┤              ├── Session ── socket
 //!   ▲  ▲        └ services, actions, rosapi: answers ──────────────────────┘      └ control queue┘       │
 //!   │  └───────── calls, goals ◀──────────────────────────────── Client ◀──── ops ◀──────────────────────┤
@@ -32,7 +32,7 @@ mod bridge;
 mod client;
 mod clock;
 mod cut;
-mod hub;
+mod fanout;
 mod kept;
 mod lacking;
 mod lease;

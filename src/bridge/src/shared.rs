@@ -11,7 +11,7 @@ use tokio::sync::watch;
 
 use crate::bridge::SessionCount;
 use crate::client::Client;
-use crate::hub::Hub;
+use crate::fanout::Fanout;
 use crate::presence::{self, Presence};
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
@@ -29,7 +29,7 @@ pub(crate) struct Shared {
     pub(crate) registrations: Registrations,
     pub(crate) presence: Presence,
     pub(crate) republisher: Republisher,
-    hubs: Mutex<HashMap<String, Weak<Hub>>>,
+    fanouts: Mutex<HashMap<String, Weak<Fanout>>>,
     /// What clients publish on, by topic.
     topic_publishers: Mutex<HashMap<String, Vec<Weak<TopicPublisher>>>>,
     clients: Mutex<Clients>,
@@ -62,7 +62,7 @@ impl Shared {
             registrations: Registrations::default(),
             presence: Presence::default(),
             republisher: Republisher::default(),
-            hubs: Mutex::default(),
+            fanouts: Mutex::default(),
             topic_publishers: Mutex::default(),
             clients: Mutex::default(),
             sessions: watch::Sender::default(),
@@ -119,37 +119,37 @@ impl Shared {
         client.end();
     }
 
-    /// The topic's hub; begun if it is not there.
-    pub(crate) fn hub(
+    /// The topic's fanout; begun if it is not there.
+    pub(crate) fn fanout(
         self: &Arc<Self>,
         topic: &str,
         message_type: Option<&MessageType>,
-    ) -> Arc<Hub> {
-        let mut hubs = self.hubs.lock();
-        if let Some(hub) = hubs.get(topic).and_then(Weak::upgrade) {
-            return hub;
+    ) -> Arc<Fanout> {
+        let mut fanouts = self.fanouts.lock();
+        if let Some(fanout) = fanouts.get(topic).and_then(Weak::upgrade) {
+            return fanout;
         }
-        let hub = match self.own_topic(topic) {
+        let fanout = match self.own_topic(topic) {
             Some(own) => {
-                let hub = Hub::internal(self, topic);
+                let fanout = Fanout::internal(self, topic);
                 if presence::type_name(topic).is_some() {
-                    self.report_presence_to(&hub, &own);
+                    self.report_presence_to(&fanout, &own);
                 }
-                hub
+                fanout
             }
-            None => Hub::start(self, topic, message_type),
+            None => Fanout::start(self, topic, message_type),
         };
         let topic_publishers = self.outlets_of(topic);
         for message in topic_publishers
             .iter()
             .filter_map(|topic_publisher| topic_publisher.latched())
         {
-            hub.deliver(message, true);
+            fanout.deliver(message, true);
         }
-        hubs.insert(topic.to_owned(), Arc::downgrade(&hub));
+        fanouts.insert(topic.to_owned(), Arc::downgrade(&fanout));
         // The last owner of an topic_publisher must not drop it under the lock.
-        drop(hubs);
-        hub
+        drop(fanouts);
+        fanout
     }
 
     /// The type of a topic that the bridge itself publishes, unless a node of the servant has one of this name.
@@ -162,17 +162,19 @@ impl Shared {
     /// Tells who listens that somebody has come or gone.
     pub(crate) fn report_presence(&self) {
         for topic in presence::TOPICS {
-            let hub = self.live_hub(topic).filter(|hub| hub.is_internal());
+            let fanout = self
+                .live_fanout(topic)
+                .filter(|fanout| fanout.is_internal());
             let own = presence::type_name(topic).and_then(|name| self.registry.message(name).ok());
-            if let (Some(hub), Some(own)) = (hub, own) {
-                self.report_presence_to(&hub, &own);
+            if let (Some(fanout), Some(own)) = (fanout, own) {
+                self.report_presence_to(&fanout, &own);
             }
         }
     }
 
-    fn report_presence_to(&self, hub: &Hub, of: &MessageType) {
-        if let Some(message) = self.presence.message(&hub.topic, of) {
-            hub.deliver(message, true);
+    fn report_presence_to(&self, fanout: &Fanout, of: &MessageType) {
+        if let Some(message) = self.presence.message(&fanout.topic, of) {
+            fanout.deliver(message, true);
         }
     }
 
@@ -212,9 +214,9 @@ impl Shared {
         }
         drop(topic_publishers);
         if topic_publisher.latch
-            && let Some(hub) = self.live_hub(&topic_publisher.topic)
+            && let Some(fanout) = self.live_fanout(&topic_publisher.topic)
         {
-            hub.forget(&topic_publisher.id);
+            fanout.forget(&topic_publisher.id);
         }
     }
 
@@ -230,19 +232,19 @@ impl Shared {
             .map(str::to_owned)
     }
 
-    /// The topic's hub, if anybody listens.
-    pub(crate) fn live_hub(&self, topic: &str) -> Option<Arc<Hub>> {
-        self.hubs.lock().get(topic).and_then(Weak::upgrade)
+    /// The topic's fanout, if anybody listens.
+    pub(crate) fn live_fanout(&self, topic: &str) -> Option<Arc<Fanout>> {
+        self.fanouts.lock().get(topic).and_then(Weak::upgrade)
     }
 
-    /// Forgets a hub that is gone, or that will never carry anything.
-    pub(crate) fn forget_hub(&self, hub: &Hub) {
-        let mut hubs = self.hubs.lock();
-        if hubs
-            .get(&hub.topic)
-            .is_some_and(|known| std::ptr::eq(known.as_ptr(), hub))
+    /// Forgets a fanout that is gone, or that will never carry anything.
+    pub(crate) fn forget_fanout(&self, fanout: &Fanout) {
+        let mut fanouts = self.fanouts.lock();
+        if fanouts
+            .get(&fanout.topic)
+            .is_some_and(|known| std::ptr::eq(known.as_ptr(), fanout))
         {
-            hubs.remove(&hub.topic);
+            fanouts.remove(&fanout.topic);
         }
     }
 

@@ -97,8 +97,8 @@ impl TopicPublisher {
         if self.latch {
             *self.last.lock() = Some(bytes.clone());
         }
-        if let Some(hub) = self.shared.live_hub(&self.topic) {
-            hub.deliver(self.message(bytes.clone()), true);
+        if let Some(fanout) = self.shared.live_fanout(&self.topic) {
+            fanout.deliver(self.message(bytes.clone()), true);
         }
         let mut state = self.state.lock();
         if let State::Live { publisher, settled } = &mut *state

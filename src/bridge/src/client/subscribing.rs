@@ -7,7 +7,7 @@ use std::time::Instant;
 use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 
 use super::{Client, Reply};
-use crate::hub::{Listener, Listening};
+use crate::fanout::{Listener, Listening};
 use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::outbox::{Outbox, TopicKey};
@@ -115,7 +115,7 @@ impl Client {
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
             self.apply_wishes(known);
-            known.listening.hub().replay(known.listener.as_ref());
+            known.listening.fanout().replay(known.listener.as_ref());
         } else {
             let topic: Arc<str> = op.topic.as_ref().into();
             let key = self.outbox.add_topic(topic.clone(), wishes);
@@ -129,8 +129,8 @@ impl Client {
                 id: reply.id.clone(),
                 format: reply.format,
             });
-            let hub = self.shared.hub(&name, expected.as_deref());
-            let listening = hub.listen(listener.clone());
+            let fanout = self.shared.fanout(&name, expected.as_deref());
+            let listening = fanout.listen(listener.clone());
             let subscriptions = Subscriptions::from([(reply.id.clone(), wishes)]);
             subscribed.insert(
                 topic,

@@ -8,7 +8,7 @@ use ros::codec::{Time, Value};
 use ros::schema::MessageType;
 
 use super::transform::Transform;
-use crate::hub::{Listener, Listening};
+use crate::fanout::{Listener, Listening};
 use crate::sample::Sample;
 use crate::shared::Shared;
 
@@ -70,7 +70,7 @@ impl Buffer {
         let listening = [("/tf", false), ("/tf_static", true)].map(|(topic, fixed)| {
             let frames = frames.clone();
             let ear = Arc::new(Ear { frames, fixed });
-            shared.hub(topic, None).listen(ear)
+            shared.fanout(topic, None).listen(ear)
         });
         Self {
             frames,

@@ -18,7 +18,7 @@ use super::buffer::Found;
 use super::transform::Transform;
 use super::{Buffer, SharedBuffer, buffer, write_transforms};
 use crate::clock;
-use crate::hub::{Listener, Listening};
+use crate::fanout::{Listener, Listening};
 use crate::sample::Sample;
 use crate::shared::Shared;
 
@@ -139,10 +139,10 @@ impl Republisher {
         let mut heard = Instant::now();
         let of = message_type.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
-            if let Some(hub) = shared.live_hub(&name) {
+            if let Some(fanout) = shared.live_fanout(&name) {
                 heard = Instant::now();
                 if let Some(transforms) = transforms {
-                    hub.deliver(message(&message_type, transforms.into()), true);
+                    fanout.deliver(message(&message_type, transforms.into()), true);
                 }
             }
             // Nobody has listened for as long as the caller said: it is gone.
@@ -189,10 +189,10 @@ impl Republisher {
             })
         };
         let goals = shared
-            .hub(GOAL_TOPIC, Some(&action.action_goal))
+            .fanout(GOAL_TOPIC, Some(&action.action_goal))
             .listen(listener(false));
         let cancels = shared
-            .hub(CANCEL_TOPIC, Some(&cancel))
+            .fanout(CANCEL_TOPIC, Some(&cancel))
             .listen(listener(true));
         // Whoever comes second has listened in vain, and stops.
         let _ = self.listening.set([goals, cancels]);
@@ -224,10 +224,12 @@ impl Republisher {
             .insert(goal.id.clone(), stop.clone().drop_guard());
         let of = action.feedback.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
-            if let (Some(hub), Some(transforms)) = (shared.live_hub(FEEDBACK_TOPIC), transforms) {
+            if let (Some(fanout), Some(transforms)) =
+                (shared.live_fanout(FEEDBACK_TOPIC), transforms)
+            {
                 let bytes =
                     messages::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
-                hub.deliver(message(&action.action_feedback, bytes), true);
+                fanout.deliver(message(&action.action_feedback, bytes), true);
             }
             // The goal of a client that is gone is given up.
             let alive = shared.has_outlet(GOAL_TOPIC, &publisher);
@@ -260,7 +262,7 @@ impl Republisher {
         };
         drop(goals);
         let action = shared.registry.action("tf2_web_republisher/TFSubscription");
-        let (Some(hub), Ok(action)) = (shared.live_hub(RESULT_TOPIC), action) else {
+        let (Some(fanout), Ok(action)) = (shared.live_fanout(RESULT_TOPIC), action) else {
             return;
         };
         for id in ended {
@@ -269,7 +271,7 @@ impl Republisher {
                 ..GoalId::default()
             };
             let bytes = messages::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
-            hub.deliver(message(&action.action_result, bytes), true);
+            fanout.deliver(message(&action.action_result, bytes), true);
         }
     }
 }
@@ -367,8 +369,8 @@ async fn send(
         };
         // Callers learn the topic's name from the answer and listen only then; whoever comes late wants to hear all.
         let newest = shared
-            .live_hub(&topic)
-            .and_then(|hub| hub.newest_listener());
+            .live_fanout(&topic)
+            .and_then(|fanout| fanout.newest_listener());
         if newest != heard_by {
             heard_by = newest;
             sent.clear();

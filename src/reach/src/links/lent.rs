@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Lender, Lent as LentService, ServiceHandler, ServiceType};
+use ros::bus::{Digest, Lender, Lent, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
@@ -37,7 +37,7 @@ const CONFIRM: Duration = Duration::from_secs(1);
 const NAMES: usize = 1000;
 
 /// What one link knows of the robot's services.
-pub(super) struct Lent {
+pub(super) struct RobotServices {
     /// The robot's end answers lookups.
     answers: bool,
     names: Mutex<HashMap<String, State>>,
@@ -87,7 +87,7 @@ struct Calls {
     over: bool,
 }
 
-impl Lent {
+impl RobotServices {
     pub(super) fn new(answers: bool) -> Self {
         Self {
             answers,
@@ -176,8 +176,8 @@ impl NodeLink {
         loop {
             told.borrow_and_update();
             match self.ask(service) {
-                Asked::Known(there) => return there,
-                Asked::Wait => {}
+                Lookup::Known(there) => return there,
+                Lookup::Wait => {}
             }
             match timeout_at(deadline, told.changed()).await {
                 Ok(Ok(())) => {}
@@ -193,7 +193,7 @@ impl NodeLink {
         }
     }
 
-    fn ask(&self, service: &str) -> Asked {
+    fn ask(&self, service: &str) -> Lookup {
         let mut names = self.lent.names.lock();
         match names.get_mut(service) {
             Some(State::There { there, asked }) => {
@@ -201,24 +201,24 @@ impl NodeLink {
                     *asked = Instant::now();
                     self.report_lookup(service);
                 }
-                return Asked::Known(Some(Arc::clone(there)));
+                return Lookup::Known(Some(Arc::clone(there)));
             }
             Some(State::NotThere { since }) if since.elapsed() < NOT_THERE => {
-                return Asked::Known(None);
+                return Lookup::Known(None);
             }
-            Some(State::Asked { in_vain: true }) => return Asked::Known(None),
-            Some(State::Asked { in_vain: false }) => return Asked::Wait,
+            Some(State::Asked { in_vain: true }) => return Lookup::Known(None),
+            Some(State::Asked { in_vain: false }) => return Lookup::Wait,
             Some(State::NotThere { .. }) | None => {}
         }
         if names.len() >= NAMES && !names.contains_key(service) {
             names.retain(|_, state| !matches!(state, State::NotThere { .. }));
             if names.len() >= NAMES {
-                return Asked::Known(None);
+                return Lookup::Known(None);
             }
         }
         names.insert(service.to_owned(), State::Asked { in_vain: false });
         self.report_lookup(service);
-        Asked::Wait
+        Lookup::Wait
     }
 
     fn report_lookup(&self, service: &str) {
@@ -244,7 +244,7 @@ impl NodeLink {
     }
 }
 
-enum Asked {
+enum Lookup {
     Known(Option<Arc<There>>),
     Wait,
 }
@@ -311,11 +311,11 @@ struct Robot(Weak<Hub>);
 
 #[async_trait]
 impl Lender for Robot {
-    async fn find(&self, service: &str, node: &str) -> Option<LentService> {
+    async fn find(&self, service: &str, node: &str) -> Option<Lent> {
         let hub = self.0.upgrade()?;
         let link = hub.way(node, |link| link.lent.answers)?;
         let there = link.look_up(service).await?;
-        Some(LentService {
+        Some(Lent {
             service_type: there.service_type.clone(),
             gone: there.gone.subscribe(),
             handler: Arc::new(Passing {

@@ -12,7 +12,7 @@ use tokio::task::AbortHandle;
 use super::duplicates::Machine;
 use super::held::{Held, Hold};
 use super::inputs::Inputs;
-use super::lent::Lent;
+use super::lent::RobotServices;
 use super::outputs::Outputs;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
@@ -44,7 +44,7 @@ pub(super) struct NodeLink {
     pub(super) hub: Weak<Hub>,
     pub(super) inputs: Inputs,
     pub(super) outputs: Outputs,
-    pub(super) lent: Lent,
+    pub(super) lent: RobotServices,
     pub(super) services: Mutex<HashMap<u32, Arc<Service>>>,
     pub(super) listening: Mutex<BTreeSet<String>>,
     sla: Sla,
@@ -90,7 +90,7 @@ impl NodeLink {
             hub: Arc::downgrade(hub),
             inputs: Inputs::default(),
             outputs: Outputs::default(),
-            lent: Lent::new(hello.lends),
+            lent: RobotServices::new(hello.lends),
             services: Mutex::default(),
             listening: Mutex::default(),
             sla: hello.sla.clone(),

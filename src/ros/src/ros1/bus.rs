@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   subscribe ─▶ registrar ─▶ Master ─▶ publisherUpdate, graph ─▶ one link per publisher ─▶ all local queues
-//!   advertise ─▶ registrar ─▶ Master;  subscribers connect ─▶ one outbox each ◀─ publish
+//!   advertise ─▶ registrar ─▶ Master;  subscribers connect ─▶ one send_queue each ◀─ publish
 //!   call ─▶ lookupService ─▶ pooled persistent connections
 //!   serve ─▶ registrar ─▶ Master;  callers connect ─▶ handler
 //! ```

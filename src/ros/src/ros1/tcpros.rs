@@ -2,7 +2,7 @@
 
 mod frames;
 mod header;
-mod outbox;
+mod send_queue;
 mod service;
 
 use std::io;
@@ -11,7 +11,7 @@ use std::time::Duration;
 pub(crate) use frames::BIG;
 pub use frames::{FrameBounds, FrameReader};
 pub use header::{Header, MAX_HEADER};
-pub use outbox::{Outbox, write_messages};
+pub use send_queue::{SendQueue, write_messages};
 pub use service::{CallError, ServiceConnection, serve_calls};
 
 /// A message longer than this ends its connection, unless set otherwise.

@@ -12,7 +12,7 @@ use super::registrar::Kind;
 use super::{End, Inner, subscriptions};
 use crate::bus::{BusError, Matched, Message, Peer, PeerId, Publisher, Qos, WireType};
 use crate::ring::{DropCount, Lost};
-use crate::ros1::tcpros::Outbox;
+use crate::ros1::tcpros::SendQueue;
 
 /// One topic with everyone here who publishes it, and every subscriber.
 #[derive(Default)]
@@ -43,7 +43,7 @@ struct LocalPublisher {
 pub(super) struct Subscriber {
     pub(super) id: i32,
     pub(super) peer: PeerId,
-    pub(super) outbox: Outbox,
+    pub(super) send_queue: SendQueue,
     pub(super) messages: AtomicU64,
     pub(super) bytes: AtomicU64,
     pub(super) closing: watch::Sender<bool>,
@@ -174,7 +174,7 @@ impl TopicOut {
         let subscriber = Arc::new(Subscriber {
             id,
             peer: PeerId::new(name, id.unsigned_abs().into()),
-            outbox: Outbox::new(queue.unwrap_or(1), latched),
+            send_queue: SendQueue::new(queue.unwrap_or(1), latched),
             messages: AtomicU64::new(0),
             bytes: AtomicU64::new(0),
             closing: watch::Sender::new(false),
@@ -233,7 +233,7 @@ impl TopicOut {
         for subscriber in &state.subscribers {
             subscriber.messages.fetch_add(1, Ordering::Relaxed);
             subscriber.bytes.fetch_add(size, Ordering::Relaxed);
-            lost += subscriber.outbox.push(message.clone());
+            lost += subscriber.send_queue.push(message.clone());
         }
         self.dropped.add(lost);
         !state.actions.is_empty()
@@ -274,7 +274,7 @@ fn retire(state: &mut State) {
     state.locals.clear();
     state.actions.clear();
     for subscriber in &state.subscribers {
-        subscriber.outbox.close();
+        subscriber.send_queue.close();
         subscriber.closing.send_replace(true);
     }
 }

@@ -138,7 +138,7 @@ impl Attached<'_> {
             tokio::time::sleep(FAREWELL).await;
         };
         tokio::select! {
-            result = self.subscriber.outbox.drain(&mut writing) => result?,
+            result = self.subscriber.send_queue.drain(&mut writing) => result?,
             () = hung_up => return Ok(()),
             () = too_slow => return Ok(()),
         }

@@ -14,14 +14,14 @@ use crate::shared::Shared;
 
 /// Who listens to a topic: a client's queue, a goal waiting for its result.
 pub(crate) trait Listener: Send + Sync {
-    /// A message; `replay` where it is an old one from a latching publisher. Must not block or call the hub.
+    /// A message; `replay` where it is an old one from a latching publisher. Must not block or call the fanout.
     fn sample(&self, sample: &Arc<Sample>, replay: bool);
     /// The topic cannot be subscribed to.
     fn failed(&self, reason: &str);
 }
 
 /// The one subscription.
-pub(crate) struct Hub {
+pub(crate) struct Fanout {
     pub(crate) topic: String,
     shared: Weak<Shared>,
     types: Arc<TopicTypes>,
@@ -40,21 +40,21 @@ struct State {
 
 type Listeners = Vec<(u64, Arc<dyn Listener>)>;
 
-/// Keeps a listener on a hub.
+/// Keeps a listener on a fanout.
 pub(crate) struct Listening {
-    hub: Arc<Hub>,
+    fanout: Arc<Fanout>,
     number: u64,
 }
 
 impl Listening {
-    pub(crate) fn hub(&self) -> &Arc<Hub> {
-        &self.hub
+    pub(crate) fn fanout(&self) -> &Arc<Fanout> {
+        &self.fanout
     }
 }
 
 impl Drop for Listening {
     fn drop(&mut self) {
-        let mut state = self.hub.state.lock();
+        let mut state = self.fanout.state.lock();
         let earlier = state.listeners.clone();
         let kept = earlier
             .iter()
@@ -67,14 +67,14 @@ impl Drop for Listening {
     }
 }
 
-impl Hub {
+impl Fanout {
     /// Subscribes in the background. `message_type` is what the first listener expects, where it knows.
     pub(crate) fn start(
         shared: &Arc<Shared>,
         topic: &str,
         message_type: Option<&MessageType>,
-    ) -> Arc<Hub> {
-        let hub = Arc::new(Hub {
+    ) -> Arc<Fanout> {
+        let fanout = Arc::new(Fanout {
             topic: topic.to_owned(),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
@@ -86,20 +86,20 @@ impl Hub {
         let of = message_type.map_or_else(WireType::any, |found| WireType::named(found.name()));
         let qos = Qos::keep_last(shared.options.bus_queue).latching(true);
         let pump = tokio::spawn(pump(
-            Arc::downgrade(&hub),
+            Arc::downgrade(&fanout),
             shared.bus.clone(),
             shared.metrics.clone(),
             topic.to_owned(),
             (of, qos),
         ));
         // Set once, here.
-        let _ = hub.pump.set(pump.abort_handle());
-        hub
+        let _ = fanout.pump.set(pump.abort_handle());
+        fanout
     }
 
-    /// A hub for a topic of the bridge itself, which no node publishes.
-    pub(crate) fn internal(shared: &Arc<Shared>, topic: &str) -> Arc<Hub> {
-        Arc::new(Hub {
+    /// A fanout for a topic of the bridge itself, which no node publishes.
+    pub(crate) fn internal(shared: &Arc<Shared>, topic: &str) -> Arc<Fanout> {
+        Arc::new(Fanout {
             topic: topic.to_owned(),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
@@ -108,7 +108,7 @@ impl Hub {
         })
     }
 
-    /// Who came last of those who listen now; no two listeners of any hub have the same number.
+    /// Who came last of those who listen now; no two listeners of any fanout have the same number.
     pub(crate) fn newest_listener(&self) -> Option<u64> {
         let state = self.state.lock();
         state.listeners.last().map(|(number, _)| *number)
@@ -131,7 +131,7 @@ impl Hub {
         listeners.push((number, listener));
         state.listeners = Arc::new(listeners);
         Listening {
-            hub: self.clone(),
+            fanout: self.clone(),
             number,
         }
     }
@@ -211,25 +211,25 @@ impl Hub {
         }
         // The next to subscribe tries anew.
         if let Some(shared) = self.shared.upgrade() {
-            shared.forget_hub(self);
+            shared.forget_fanout(self);
         }
     }
 }
 
-impl Drop for Hub {
+impl Drop for Fanout {
     fn drop(&mut self) {
         if let Some(pump) = self.pump.get() {
             pump.abort();
         }
         if let Some(shared) = self.shared.upgrade() {
-            shared.forget_hub(self);
+            shared.forget_fanout(self);
         }
     }
 }
 
-/// Moves messages from the bus to the hub until either is gone. Owns nothing of the bridge, which may end meanwhile.
+/// Moves messages from the bus to the fanout until either is gone. Owns nothing of the bridge, which may end meanwhile.
 async fn pump(
-    hub: Weak<Hub>,
+    fanout: Weak<Fanout>,
     bus: Arc<dyn Bus>,
     metrics: Arc<Metrics>,
     topic: String,
@@ -238,8 +238,8 @@ async fn pump(
     let mut subscription: Subscription = match bus.subscribe(&topic, of, qos).await {
         Ok(subscription) => subscription,
         Err(error) => {
-            if let Some(hub) = hub.upgrade() {
-                hub.fail(error.to_string());
+            if let Some(fanout) = fanout.upgrade() {
+                fanout.fail(error.to_string());
             }
             return;
         }
@@ -248,11 +248,13 @@ async fn pump(
     drop(bus);
     let mut dropped = 0;
     while let Some(message) = subscription.messages.recv().await {
-        let Some(hub) = hub.upgrade() else { return };
+        let Some(fanout) = fanout.upgrade() else {
+            return;
+        };
         metrics.received.add(1);
         // From an action of another client.
         let local = message.publisher.node() == own;
-        hub.deliver(message, local);
+        fanout.deliver(message, local);
         let now_dropped = subscription.dropped.get();
         if now_dropped > dropped {
             metrics.bus_dropped.add(now_dropped - dropped);

@@ -15,7 +15,7 @@ const BATCH_BYTES: usize = 1 << 20;
 
 /// The queue of one connection.
 #[derive(Debug)]
-pub struct Outbox {
+pub struct SendQueue {
     state: Mutex<State>,
     ready: Notify,
 }
@@ -28,7 +28,7 @@ struct State {
     closed: bool,
 }
 
-impl Outbox {
+impl SendQueue {
     /// A queue for at most `capacity` messages (0 counts as 1) and 64 MiB, after `first`, however many those are.
     pub fn new(capacity: usize, first: impl IntoIterator<Item = Bytes>) -> Self {
         Self {
@@ -54,7 +54,7 @@ impl Outbox {
         lost
     }
 
-    /// Takes no more messages; [`Outbox::drain`] ends when what is queued was sent.
+    /// Takes no more messages; [`SendQueue::drain`] ends when what is queued was sent.
     pub fn close(&self) {
         self.state.lock().closed = true;
         self.ready.notify_one();
@@ -130,9 +130,9 @@ mod tests {
         Bytes::from(vec![byte; size])
     }
 
-    async fn sent(outbox: &Outbox) -> Vec<Bytes> {
+    async fn sent(send_queue: &SendQueue) -> Vec<Bytes> {
         let (mut ours, mut theirs) = tokio::io::duplex(1000);
-        outbox.close();
+        send_queue.close();
         let reading = tokio::spawn(async move {
             let mut frames = FrameReader::new(BytesMut::new(), 1 << 20);
             let mut messages = Vec::new();
@@ -141,35 +141,35 @@ mod tests {
             }
             messages
         });
-        outbox.drain(&mut ours).await.unwrap();
+        send_queue.drain(&mut ours).await.unwrap();
         drop(ours);
         reading.await.unwrap()
     }
 
     #[tokio::test]
     async fn newest_win() {
-        let outbox = Outbox::new(2, []);
+        let send_queue = SendQueue::new(2, []);
         let mut lost = Lost::default();
         for n in 0..5 {
-            lost += outbox.push(message(n, 10));
+            lost += send_queue.push(message(n, 10));
         }
         assert_eq!(lost.messages, 3);
-        assert_eq!(sent(&outbox).await, [message(3, 10), message(4, 10)]);
+        assert_eq!(sent(&send_queue).await, [message(3, 10), message(4, 10)]);
     }
 
     #[tokio::test]
     async fn all_sizes_arrive_in_order() {
         let all: Vec<Bytes> = (0..=255).map(|n| message(n, usize::from(n) * 50)).collect();
-        let outbox = Outbox::new(1000, []);
+        let send_queue = SendQueue::new(1000, []);
         for one in all.iter().chain(&all) {
-            assert_eq!(outbox.push(one.clone()).messages, 0);
+            assert_eq!(send_queue.push(one.clone()).messages, 0);
         }
-        assert_eq!(sent(&outbox).await, [all.clone(), all].concat());
+        assert_eq!(sent(&send_queue).await, [all.clone(), all].concat());
     }
 
     #[tokio::test]
     async fn what_newcomers_are_given_is_not_dropped() {
-        let outbox = Outbox::new(1, [message(1, 1), message(2, 1), message(3, 1)]);
-        assert_eq!(sent(&outbox).await.len(), 3);
+        let send_queue = SendQueue::new(1, [message(1, 1), message(2, 1), message(3, 1)]);
+        assert_eq!(sent(&send_queue).await.len(), 3);
     }
 }
