@@ -5,6 +5,7 @@
 //! a [`problem::Problem`] with the HTTP status that it names.
 
 pub mod cpuset;
+pub mod dictionary;
 pub mod doctor;
 pub mod event;
 pub mod explain;
@@ -16,6 +17,7 @@ pub mod push;
 pub mod servant;
 pub mod service;
 pub mod size;
+pub mod sla;
 pub mod status;
 pub mod stub;
 pub mod trial;
@@ -25,12 +27,13 @@ pub use doctor::{Check, CheckStatus, Doctor};
 pub use event::{Event, Level};
 pub use grants::{Grants, Volume};
 pub use interface::Interface;
-pub use limits::{Limits, Pressure, Usage};
+pub use limits::{Caps, Limits, Pressure, Usage};
 pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
-pub use servant::{LogLine, Phase, Servant, Stopped, Stream};
+pub use servant::{LogLine, Phase, Servant, Stopped, Stream, Terms};
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use size::Size;
+pub use sla::{Measure, Sla, Span, Stated};
 pub use status::{Capacity, Clock, Isolation, Status};
 pub use stub::Stubs;
 

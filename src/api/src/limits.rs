@@ -52,6 +52,26 @@ impl Limits {
     }
 }
 
+/// The most that a robot may ask for.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(default, deny_unknown_fields)]
+pub struct Caps {
+    /// Cores.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cpus: Option<f64>,
+    /// Memory.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory: Option<Size>,
+}
+
+impl Caps {
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        *self == Caps::default()
+    }
+}
+
 /// What a servant has used, as the kernel counts it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]

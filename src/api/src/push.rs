@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::grants::Grants;
-use crate::limits::Limits;
+use crate::limits::{Caps, Limits};
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
 
@@ -51,6 +51,9 @@ pub struct PushOptions {
     pub with: Vec<String>,
     /// Limits of a servant; those given are also reserved for it.
     pub limits: Limits,
+    /// The most that robots may ask for.
+    #[serde(skip_serializing_if = "Caps::is_empty")]
+    pub caps: Caps,
     /// What a servant is given beyond its container.
     #[serde(skip_serializing_if = "Grants::is_empty")]
     pub grants: Grants,

@@ -1,11 +1,14 @@
 //! Servants: containers at work for one robot.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
+use crate::dictionary::Row;
 use crate::limits::{Limits, Usage};
+use crate::sla::Stated;
 
 /// Where a servant is in its life; the choreographer draws the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -71,6 +74,9 @@ pub struct Servant {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub idle_until: Option<Millis>,
+    /// What its robot stated, and what follows from it; none where nothing was stated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub terms: Option<Terms>,
     /// Limits asked for.
     pub limits: Limits,
     /// Limits in force, read back from the kernel; none while it is not running.
@@ -91,6 +97,41 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub dropped: u64,
+}
+
+/// What a robot stated, and what its servant is promised for it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Terms {
+    /// What was stated: by the node that a stub stands for, or by `` (nothing), a rosbridge client.
+    pub stated: BTreeMap<String, Stated>,
+    /// The class of the configuration that it is in.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub class: Option<String>,
+    /// The class's priority: who has the greater one is served first.
+    pub priority: i32,
+    /// Rows of the dictionary that were taken.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub rows: Vec<Row>,
+    /// The limits that follow, those of the push included. They are promised.
+    pub limits: Limits,
+    /// How they follow, a sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub why: Vec<String>,
+}
+
+impl Terms {
+    /// What all of its robot's clients stated, in a line.
+    pub fn stated_in_words(&self) -> String {
+        let stated = self.stated.iter().map(|(node, stated)| match &**node {
+            "" => stated.to_string(),
+            node => format!("{node}: {stated}"),
+        });
+        stated.collect::<Vec<_>>().join("; ")
+    }
 }
 
 /// Which servants were ended.

@@ -5,6 +5,7 @@
 //! | file | decides | from |
 //! |---|---|---|
 //! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
+//! | [`terms`] | which limits a robot's servant is promised | what the robot states, classes, the service, caps |
 //! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
 //! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue |
 //! | [`capacity`] | which idle servants end for those who wait | what they lack, all servants |
@@ -23,6 +24,7 @@ pub(crate) mod demand;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;
 pub(crate) mod placement;
+pub(crate) mod terms;
 pub(crate) mod warm_pool;
 
 #[cfg(test)]

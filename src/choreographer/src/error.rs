@@ -1,4 +1,6 @@
 use crate::decide::admission::Refused;
+use crate::decide::terms::Untenable;
+use crate::lives::limits::Unchanged;
 
 /// Why a servant cannot be had, used or changed.
 #[derive(Debug, thiserror::Error)]
@@ -14,6 +16,21 @@ pub enum Error {
     /// There is no room.
     #[error(transparent)]
     Full(#[from] Refused),
+    /// What the robot states cannot be had.
+    #[error(transparent)]
+    Terms(#[from] Untenable),
+    /// What the robot states anew cannot be had by the servant that it has, which stays as it is.
+    #[error("servant {servant} of {service} cannot be resized for {stated}: {reason}")]
+    NotResized {
+        /// Its id.
+        servant: String,
+        /// Its service.
+        service: String,
+        /// What was stated.
+        stated: String,
+        /// Why not.
+        reason: Unchanged,
+    },
     /// The servant could not be started, or ended.
     #[error("the servant of {service} for robot {robot} {reason}")]
     Servant {

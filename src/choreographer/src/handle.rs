@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use api::{Limits, Millis, Phase};
+use api::{Limits, Millis, Phase, Stated, Terms};
 use parking_lot::Mutex;
 use reach::{Reach, Tenant};
 use tokio::sync::watch;
@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 use crate::Error;
 use crate::decide::admission::Refused;
 use crate::decide::demand::Asked;
+use crate::lives::Inner;
 use crate::lives::waiting::Promise;
 use store::{NewEvent, RevisionRecord};
 
@@ -138,11 +139,26 @@ impl Handle {
 
     /// Those of them that somebody asked for, which are promised to it.
     pub fn asked(&self) -> Limits {
-        self.asked.lock().promised
+        self.asked.lock().promised()
     }
 
-    pub(crate) fn set_asked(&self, limits: Limits) {
-        self.asked.lock().promised = limits;
+    /// What its robot stated, and what follows.
+    pub fn terms(&self) -> Terms {
+        self.asked.lock().terms.clone()
+    }
+
+    /// Who has the greater one is served first.
+    pub fn priority(&self) -> i32 {
+        self.asked.lock().terms.priority
+    }
+
+    /// All limits that somebody asked for, by who did.
+    pub(crate) fn all_asked(&self) -> Asked {
+        self.asked.lock().clone()
+    }
+
+    pub(crate) fn set_asked(&self, asked: Asked) {
+        *self.asked.lock() = asked;
     }
 
     /// Whoever changes its limits holds this.
@@ -308,13 +324,28 @@ impl Tenant for Handle {
 /// The right to use a servant; while one lives the servant is not idle.
 pub struct Lease {
     handle: Arc<Handle>,
+    /// Terms that are to be agreed upon before it is used: those of a servant that was there.
+    anew: Option<Anew>,
+}
+
+/// What a client states to a servant that was there.
+pub(crate) struct Anew {
+    pub(crate) inner: Arc<Inner>,
+    pub(crate) who: String,
+    pub(crate) stated: Stated,
 }
 
 impl Lease {
     /// Counts one more connection in. Only under the choreographer's lock.
     pub(crate) fn new(handle: Arc<Handle>) -> Lease {
         handle.connections.send_modify(|count| *count += 1);
-        Lease { handle }
+        Lease { handle, anew: None }
+    }
+
+    /// With what its client states to a servant that was there.
+    pub(crate) fn stating(mut self, anew: Anew) -> Lease {
+        self.anew = (!anew.stated.is_empty()).then_some(anew);
+        self
     }
 
     /// The servant.
@@ -322,13 +353,24 @@ impl Lease {
         &self.handle
     }
 
-    /// Waits until there is room for the servant.
+    /// Waits until there is room for the servant. Where one was there and the client states something else than before,
+    /// it is resized in place; an error says what would fit, and the servant keeps what it had.
     pub async fn admitted(&self) -> Result<(), Error> {
-        self.reached(Phase::Admitted).await
+        self.reached(Phase::Admitted).await?;
+        let Some(Anew { inner, who, stated }) = &self.anew else {
+            return Ok(());
+        };
+        if self.handle.terms().stated.get(who) == Some(stated) {
+            return Ok(());
+        }
+        // Until then its limits are those that it begins with.
+        self.reached(Phase::Created).await?;
+        inner.agree(&self.handle, who, stated).await
     }
 
     /// Waits until the servant's interface is there.
     pub async fn ready(&self) -> Result<Arc<dyn Reach>, Error> {
+        self.admitted().await?;
         self.reached(Phase::Ready).await?;
         self.handle
             .reach()

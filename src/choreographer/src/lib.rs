@@ -41,6 +41,7 @@ pub mod limits;
 mod lives;
 mod memory;
 mod options;
+mod request;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -56,15 +57,19 @@ use store::{Journal, State};
 
 pub use decide::Amount;
 pub use decide::admission::Refused;
+pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
 pub use handle::{Handle, Lease};
 pub use limits::engine_limits;
+pub use lives::limits::Unchanged;
 pub use lives::waiting::{Admission, Permit};
 pub use memory::{Memory, MemoryOptions};
-pub use options::Options;
+pub use options::{Class, DEFAULT_CLASS, Options};
+pub use request::ServantRequest;
 
-use decide::admission::Class;
+use decide::admission;
 use decide::placement::Placement;
+use handle::Anew;
 use lives::Inner;
 use lives::driver::{self, Beginning};
 use lives::warm_pool::{self, WarmPool};
@@ -107,50 +112,55 @@ impl Choreographer {
         }
     }
 
-    /// The servant of `robot` for `service`: the one that is there, or a new one. Comes back at once; the lease
-    /// tells when the servant can be used, and keeps it for as long as it lives.
-    pub fn ensure(&self, service: &str, robot: &str, anonymous: bool) -> Result<Lease, Error> {
-        self.ensure_with(service, robot, anonymous, false)
-    }
-
-    /// The same for a robot's stub: a new servant begins without nodes, since stubs start them one by one.
-    pub fn ensure_linked(&self, service: &str, robot: &str) -> Result<Lease, Error> {
-        self.ensure_with(service, robot, false, true)
-    }
-
-    fn ensure_with(
-        &self,
-        service: &str,
-        robot: &str,
-        anonymous: bool,
-        linked: bool,
-    ) -> Result<Lease, Error> {
+    /// The servant that is asked for: the one that is there, or a new one. Comes back at once; the lease tells when the
+    /// servant can be used, and keeps it for as long as it lives.
+    ///
+    /// # Errors
+    /// Terms that cannot be had ([`Error::Terms`]) where a new one is needed. Those of a servant that is there are looked at by
+    /// [`Lease::admitted`].
+    pub fn ensure(&self, request: ServantRequest) -> Result<Lease, Error> {
         let inner = &self.inner;
-        let key = (service.to_owned(), robot.to_owned());
+        let key = (request.service.clone(), request.robot.clone());
         let (handle, lease, warm) = {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
             // followed by one of the revision before.
-            let revision = inner.catalogue.current(service)?;
+            let revision = inner.catalogue.current(&request.service)?;
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
+            let terms = inner.terms(&request.statement(), &revision);
             let has = servants.given.get(&key).map(|handle| inner.facts(handle));
             let (placement, warm) = inner.warm_pool.place(has.as_ref(), &revision);
-            match placement {
-                Placement::Keep(id) => return Ok(Lease::new(Arc::clone(&servants.all[id]))),
-                Placement::Start { ends, .. } => servants.end(ends),
-            }
+            let ends = match placement {
+                Placement::Keep(id) => {
+                    let lease = Lease::new(Arc::clone(&servants.all[id]));
+                    return Ok(lease.stating(Anew {
+                        inner: Arc::clone(inner),
+                        who: request.who().to_owned(),
+                        stated: request.stated,
+                    }));
+                }
+                Placement::Start { ends, .. } => ends,
+            };
+            let terms = match terms {
+                Ok(terms) => terms,
+                Err(error) => {
+                    inner.give_back(warm);
+                    return Err(error);
+                }
+            };
+            servants.end(ends);
             let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
             let handle = Arc::new(Handle::new(
-                id.unwrap_or_else(|| names::servant_id(service)),
-                robot.to_owned(),
-                anonymous,
-                inner.asked(revision.plan.limits),
+                id.unwrap_or_else(|| names::servant_id(&request.service)),
+                request.robot,
+                request.anonymous,
+                inner.asked(terms),
                 revision,
                 store::now(),
             ));
-            if linked {
+            if request.stub.is_some() {
                 handle.set_linked();
             }
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
@@ -268,7 +278,7 @@ impl Choreographer {
         };
         let admission = &self.inner.admission;
         Ok(admission
-            .admit(wanted, Class::Push, deadline, make_room)
+            .admit(wanted, admission::Class::Push, deadline, make_room)
             .await?)
     }
 
@@ -295,7 +305,7 @@ impl Choreographer {
         material: Material,
     ) -> Result<api::trial::Trial, Error> {
         let robot = format!("~try-{}", names::random(6));
-        let lease = self.ensure(service, &robot, true)?;
+        let lease = self.ensure(ServantRequest::new(service, &robot).anonymous())?;
         lease.admitted().await?;
         let (reach, handle) = (lease.ready().await?, lease.handle());
         let interface = &handle.revision.interface;
@@ -329,6 +339,8 @@ impl Choreographer {
             created: handle.created,
             connections: handle.connections(),
             idle_until: handle.idle_until(),
+            terms: Some(handle.terms())
+                .filter(|terms| !terms.stated.is_empty() || terms.class.is_some()),
             limits: handle.limits(),
             cgroup_version: enforced
                 .as_ref()

@@ -4,14 +4,14 @@
 mod adoption;
 pub(crate) mod driver;
 mod lifetime;
-mod limits;
+pub(crate) mod limits;
 mod nodes;
 mod reaching;
 mod starting;
 pub(crate) mod waiting;
 pub(crate) mod warm_pool;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -19,9 +19,11 @@ use catalogue::Catalogue;
 use parking_lot::Mutex;
 use reach::{Opener, RequestTimes};
 use servant::engine::Engine;
-use store::{Journal, State};
+use store::{Journal, RevisionRecord, State};
 
+use crate::Error;
 use crate::decide::demand::{self, Asked};
+use crate::decide::terms::{Offer, terms};
 use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
@@ -60,10 +62,36 @@ impl Inner {
         self.ending.load(Ordering::SeqCst)
     }
 
-    /// The limits of a servant for which `promised` was asked.
-    pub(crate) fn asked(&self, promised: api::Limits) -> Asked {
-        let default = self.options.limits;
-        Asked { promised, default }
+    /// The limits of a servant of this revision where no robot stated anything.
+    pub(crate) fn of_push(&self, revision: &RevisionRecord) -> Asked {
+        self.asked(api::Terms {
+            limits: revision.plan.limits,
+            ..api::Terms::default()
+        })
+    }
+
+    /// The limits of a servant that its robot has on these terms.
+    pub(crate) fn asked(&self, terms: api::Terms) -> Asked {
+        Asked {
+            set: api::Limits::default(),
+            terms,
+            default: self.options.limits,
+        }
+    }
+
+    /// The terms for what the clients of one robot state to a servant of this revision.
+    pub(crate) fn terms(
+        &self,
+        stated: &BTreeMap<String, api::Stated>,
+        revision: &RevisionRecord,
+    ) -> Result<api::Terms, Error> {
+        let offer = Offer {
+            service: &revision.service,
+            limits: revision.plan.limits,
+            caps: revision.plan.caps,
+            classes: &self.options.classes,
+        };
+        Ok(terms(stated, &offer)?)
     }
 
     /// What is promised to a servant of these limits.

@@ -1,6 +1,7 @@
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use api::Limits;
+use api::{Caps, Limits, Sla};
 use bridge::BridgeOptions;
 
 use crate::memory::MemoryOptions;
@@ -10,6 +11,8 @@ use crate::memory::MemoryOptions;
 pub struct Options {
     /// Limits of a servant where its push says nothing.
     pub limits: Limits,
+    /// Classes that robots may name, by name. [`DEFAULT_CLASS`] is that of robots that name none.
+    pub classes: BTreeMap<String, Class>,
     /// Cores promised to a servant whose push asked for none.
     pub reserve_cpus: f64,
     /// Bytes of memory promised to a servant whose push asked for none.
@@ -28,4 +31,20 @@ pub struct Options {
     pub bridge: BridgeOptions,
     /// Memory held for clients and servants.
     pub memory: MemoryOptions,
+}
+
+/// The class of robots that name none, where it is configured.
+pub const DEFAULT_CLASS: &str = "default";
+
+/// A class of robots.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Class {
+    /// Who has the greater one is served first; 0 without a class.
+    pub priority: i32,
+    /// What its robots may ask for.
+    pub caps: Caps,
+    /// The SLA of robots that state neither one nor resources.
+    pub sla: Sla,
+    /// Limits where neither the robot nor the push says anything.
+    pub limits: Limits,
 }

@@ -6,6 +6,7 @@ use super::*;
 use store::{Plan, RevisionRecord, State};
 
 mod servants;
+mod terms;
 
 fn revision(image: &str, cpus: f64) -> RevisionRecord {
     RevisionRecord {
@@ -32,6 +33,7 @@ fn options() -> Options {
     let memory = 64 << 20;
     Options {
         limits: api::Limits::default(),
+        classes: Default::default(),
         reserve_cpus: 0.01,
         reserve_memory: memory,
         deadline: Duration::from_secs(10),
@@ -77,7 +79,7 @@ async fn runs(
 ) -> Arc<Handle> {
     let inner = &choreographer.inner;
     let revision = Arc::new(revision("sha256:1", cpus));
-    let asked = inner.asked(revision.plan.limits);
+    let asked = inner.of_push(&revision);
     let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
     let permit = inner.admission.adopt(inner.promised(&handle.asked()));
     handle.set_promise(permit.promise());
@@ -104,7 +106,9 @@ async fn as_many_idle_servants_end_as_it_takes() {
     let deadline = Duration::from_secs(1);
     let waiting = inner
         .admission
-        .admit(wanted, Class::Robot, deadline, || inner.make_room());
+        .admit(wanted, admission::Class::Robot, deadline, || {
+            inner.make_room()
+        });
     let refused = waiting.await;
     assert!(refused.is_err(), "none of them ends in this test");
     assert!(
@@ -116,7 +120,9 @@ async fn as_many_idle_servants_end_as_it_takes() {
     let wanted = Amount::new(2.0, 0);
     let waiting = inner
         .admission
-        .admit(wanted, Class::Robot, deadline, || inner.make_room());
+        .admit(wanted, admission::Class::Robot, deadline, || {
+            inner.make_room()
+        });
     let left = async {
         tokio::time::sleep(deadline / 2).await;
         assert!(ending(&newest) && !ending(&busy));
@@ -143,7 +149,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
         std::thread::spawn(move || {
             let _entered = runtime.enter();
             sender.send(nix::unistd::gettid()).expect("it is awaited");
-            let lease = choreographer.ensure("detect", "r", false);
+            let lease = choreographer.ensure(ServantRequest::new("detect", "r"));
             lease.expect("a lease").handle().revision.number
         })
     };

@@ -1,6 +1,6 @@
-//! Limits as flags, of `push` and `set`.
+//! Limits as flags, of `push` and `set`, and caps.
 
-use api::{CpuSet, Limits, Size};
+use api::{Caps, CpuSet, Limits, Size};
 
 /// What a servant may use.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
@@ -29,6 +29,26 @@ pub struct LimitFlags {
     /// Bytes a second that it may write to disk.
     #[arg(long, value_name = "SIZE")]
     io_write: Option<Size>,
+}
+
+/// The most that robots may ask for.
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
+pub struct CapFlags {
+    /// Cores that a robot may ask for at most.
+    #[arg(long, value_name = "N", value_parser = cores)]
+    max_cpus: Option<f64>,
+    /// Memory that a robot may ask for at most, such as 2G.
+    #[arg(long, value_name = "SIZE")]
+    max_memory: Option<Size>,
+}
+
+impl From<CapFlags> for Caps {
+    fn from(flags: CapFlags) -> Caps {
+        Caps {
+            cpus: flags.max_cpus,
+            memory: flags.max_memory,
+        }
+    }
 }
 
 impl From<LimitFlags> for Limits {

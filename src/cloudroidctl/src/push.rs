@@ -11,7 +11,7 @@ use futures_util::StreamExt;
 use hyper::Method;
 
 use crate::client::{self, Client, escaped};
-use crate::limits::LimitFlags;
+use crate::limits::{CapFlags, LimitFlags};
 use crate::output::Format;
 use crate::services;
 use progress::Progress;
@@ -69,6 +69,8 @@ pub struct Push {
     stateful: bool,
     #[command(flatten)]
     limits: LimitFlags,
+    #[command(flatten)]
+    caps: CapFlags,
     /// Device by its name in the machine's CDI specifications, such as nvidia.com/gpu=0; may be given several times.
     #[arg(long = "device", value_name = "VENDOR/CLASS=NAME")]
     devices: Vec<String>,
@@ -181,6 +183,7 @@ impl Push {
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
             limits: self.limits.into(),
+            caps: self.caps.into(),
             grants: Grants {
                 devices: self.devices.clone(),
                 volumes: self.volumes.clone(),
@@ -254,7 +257,7 @@ mod tests {
         let push = parse(
             "--apt opencv_apps --name people --base b --node people_detect --node other/node --param debug_view=false \
              --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map eigen=libeigen3-dev \
-             --with opencv-data --cpus 1.5 --memory 512M",
+             --with opencv-data --cpus 1.5 --memory 512M --max-cpus 2 --max-memory 1G",
         )
         .expect("valid");
         let options = push.options().expect("no file is read");
@@ -262,7 +265,8 @@ mod tests {
             "apt": "opencv_apps", "name": "people", "base": "b", "nodes": ["people_detect", "other/node"],
             "params": {"debug_view": false, "/rate": 1.5, "word": "hi", "list": [1, 2]},
             "remaps": {"image": "/camera/image"}, "map": {"eigen": "libeigen3-dev"}, "with": ["opencv-data"],
-            "limits": {"cpus": 1.5, "memory": 536_870_912}, "source": "--apt opencv_apps"
+            "limits": {"cpus": 1.5, "memory": 536_870_912},
+            "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "source": "--apt opencv_apps"
         });
         assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
     }
@@ -304,6 +308,8 @@ mod tests {
             "./pkg --map key=",
             "./pkg --cpus none",
             "./pkg --cpus 0",
+            "./pkg --max-cpus 0",
+            "./pkg --max-memory lots",
             "./pkg --memory lots",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), 2, "{line}");

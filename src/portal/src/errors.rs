@@ -5,7 +5,7 @@ use api::problem::PROBLEM_JSON;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
-use choreographer::{Refused, with_last_words};
+use choreographer::{Refused, Unchanged, Untenable, with_last_words};
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
@@ -27,6 +27,9 @@ pub enum Error {
     /// Something in the request is not what it should be.
     #[error("{0}")]
     BadRequest(String),
+    /// What a robot states cannot be.
+    #[error("{0}")]
+    Unstatable(api::sla::Unstatable),
     /// A WebSocket handshake of another version than 13.
     #[error("this is no WebSocket handshake: Sec-WebSocket-Version is not 13")]
     WebSocketVersion,
@@ -124,7 +127,11 @@ impl Error {
         if let Error::UnknownRobot { exists, .. } = self {
             problem.exists = exists.clone();
         }
-        if let Some(choreographer::Error::UnknownServant { exists, .. }) = self.of_choreographer() {
+        if let Some(
+            choreographer::Error::UnknownServant { exists, .. }
+            | choreographer::Error::Terms(Untenable::UnknownClass { exists, .. }),
+        ) = self.of_choreographer()
+        {
             problem.exists = exists.clone();
         }
         if let Some(
@@ -186,6 +193,7 @@ impl Error {
             Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
             Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body not complete"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
+            Error::Unstatable(_) => (S::BAD_REQUEST, "unstatable", "cannot be stated"),
             Error::WebSocketVersion => (
                 S::UPGRADE_REQUIRED,
                 "websocket-version",
@@ -206,6 +214,7 @@ impl Error {
             Error::UnknownRobot { .. } => {
                 "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
             }
+            Error::Unstatable(_) => "see what can be stated in docs/robots.md".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unauthorised(_) => {
                 "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
@@ -272,6 +281,12 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
         C::Full(Refused::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
         C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
+        C::Terms(untenable) => kind_of_terms(untenable),
+        C::NotResized { reason, .. } => match reason {
+            Unchanged::Untenable(untenable) => kind_of_terms(untenable),
+            Unchanged::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
+            Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
+        },
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
@@ -287,6 +302,19 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
     let text = match error {
         C::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
         C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
+        C::Terms(untenable) => next_of_terms(untenable),
+        C::NotResized { reason, .. } => match reason {
+            Unchanged::Untenable(untenable) => next_of_terms(untenable),
+            Unchanged::Full(Refused::NoMore { free, .. }) => format!(
+                "state what fits: cpus={} memory={}; it keeps what it has until then",
+                free.cpus(),
+                api::Size(free.memory)
+            ),
+            Unchanged::Full(_) => "try again later; it keeps what it has until then".into(),
+            Unchanged::Used { used, .. } => {
+                format!("state memory={used} or more, or end it with: cloudroidctl stop")
+            }
+        },
         C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
@@ -296,6 +324,29 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
         _ => return None,
     };
     Some(text)
+}
+
+fn kind_of_terms(untenable: &Untenable) -> Kind {
+    use StatusCode as S;
+    match untenable {
+        Untenable::UnknownClass { .. } => (S::BAD_REQUEST, "unknown-class", "unknown class"),
+        Untenable::Capped { .. } => (S::FORBIDDEN, "capped", "more than is allowed"),
+    }
+}
+
+fn next_of_terms(untenable: &Untenable) -> String {
+    match untenable {
+        Untenable::UnknownClass { exists, .. } if exists.is_empty() => {
+            "state none, or have the operator add it: [class.NAME] of the configuration".into()
+        }
+        Untenable::UnknownClass { .. } => {
+            "state one that exists, or have the operator add it: [class.NAME] of the configuration"
+                .into()
+        }
+        Untenable::Capped { cap, .. } => {
+            format!("state {}={} or less", cap.resource, cap.most)
+        }
+    }
 }
 
 fn kind_of_engine(error: &servant::Error) -> Kind {

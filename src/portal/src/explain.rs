@@ -456,6 +456,7 @@ mod tests {
                 created: 0,
                 connections: 1,
                 idle_until: None,
+                terms: None,
                 limits: api::Limits {
                     cpus: Some(0.5),
                     ..api::Limits::default()

@@ -9,6 +9,7 @@
 //! not use the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS
 //! rebinding), with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -272,9 +273,13 @@ fn token_in(uri: &Uri, headers: &HeaderMap) -> Option<String> {
 
 /// One value of the query, decoded.
 pub fn query(query: Option<&str>, name: &str) -> Option<String> {
-    let mut pairs = form_urlencoded::parse(query?.as_bytes());
-    let (_, value) = pairs.find(|(key, _)| key == name)?;
+    let (_, value) = pairs(query).find(|(key, _)| key == name)?;
     Some(value.into_owned())
+}
+
+/// All parameters of a query, in their order.
+pub fn pairs(query: Option<&str>) -> impl Iterator<Item = (Cow<'_, str>, Cow<'_, str>)> {
+    form_urlencoded::parse(query.unwrap_or_default().as_bytes())
 }
 
 fn header_text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {

@@ -1,9 +1,10 @@
-//! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`.
+//! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`, and on which terms ([`api::sla`]): `&rrt=100ms&max_rrt=300ms`.
 //!
 //! Where tokens are configured, a client without one can only send `auth`: it gets no servant and no information before.
 
 use std::sync::Arc;
 
+use api::Stated;
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
@@ -22,7 +23,7 @@ use super::guard::{self, Caller, Peer};
 use super::{App, auth, handshake, page};
 use crate::errors::Error;
 use crate::tokens;
-use choreographer::Lease;
+use choreographer::{Lease, ServantRequest};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
@@ -115,6 +116,10 @@ struct Asked {
     resume: Option<String>,
     /// A robot's stub asks, in the link's protocol.
     link: bool,
+    /// The node that the stub stands for; stubs of earlier versions do not say it here.
+    node: String,
+    /// On which terms.
+    stated: Stated,
 }
 
 impl Asked {
@@ -134,7 +139,10 @@ impl Asked {
                 "a link needs the robot's id: ?robot=ID".to_owned(),
             ));
         }
+        let stated = Stated::read(guard::pairs(uri.query()));
         Ok(Asked {
+            node: guard::query(uri.query(), "node").unwrap_or_default(),
+            stated: stated.map_err(Error::Unstatable)?,
             link,
             service,
             robot,
@@ -226,20 +234,27 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
 
 /// The right to the servant that is asked for, if the robot's name is the caller's.
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
-    let Some(robot) = &asked.robot else {
-        let (robot, anonymous) = nameless(asked.bound_resume(caller).as_deref());
-        let lease = app
-            .choreographer
-            .ensure(&asked.service, &robot, anonymous)?;
-        return Ok(lease);
+    let (service, stated) = (&asked.service, asked.stated.clone());
+    let request = match &asked.robot {
+        None => {
+            let (robot, anonymous) = nameless(asked.bound_resume(caller).as_deref());
+            ServantRequest {
+                anonymous,
+                ..ServantRequest::new(service, &robot)
+            }
+        }
+        Some(robot) => {
+            if !asked.shared {
+                check_owner(app, robot, caller)?;
+            }
+            let request = ServantRequest::new(service, robot);
+            match asked.link {
+                true => request.by_stub(&asked.node),
+                false => request,
+            }
+        }
     };
-    if !asked.shared {
-        check_owner(app, robot, caller)?;
-    }
-    if asked.link {
-        return Ok(app.choreographer.ensure_linked(&asked.service, robot)?);
-    }
-    Ok(app.choreographer.ensure(&asked.service, robot, false)?)
+    Ok(app.choreographer.ensure(request.stating(stated))?)
 }
 
 /// Nobody takes over another's robot.

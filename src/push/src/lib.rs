@@ -305,6 +305,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
             .collect(),
         parameters: built.plan.parameters.clone(),
         limits: options.limits,
+        caps: options.caps,
         grants: options.grants.clone(),
         // A launch file says itself which nodes come again.
         restart: options.launch.is_none(),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use api::{PushEvent, PushOptions};
+use api::{Limits, PushEvent, PushOptions};
 use catalogue::names;
 use rootfs_builder::blocking;
 use store::NewEvent;
@@ -93,6 +93,7 @@ impl Pusher {
         }
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
+        check_caps(options).map_err(Error::Options)?;
         self.choreographer.check_grants(&options.grants)?;
         Ok(self.choreographer.check_limits(&options.limits)?)
     }
@@ -138,6 +139,76 @@ impl Pusher {
                 self.journal.warning("push-failed", &message, &about);
                 Err(error)
             }
+        }
+    }
+}
+
+/// Refuses caps that no limits keep.
+fn check_caps(options: &PushOptions) -> Result<(), String> {
+    let PushOptions { caps, limits, .. } = options;
+    let most = Limits {
+        cpus: caps.cpus,
+        memory: caps.memory,
+        ..Limits::default()
+    };
+    choreographer::limits::check(&most).map_err(|error| format!("max_{error}"))?;
+    if let (Some(cpus), Some(most)) = (limits.cpus, caps.cpus)
+        && cpus > most
+    {
+        return Err(format!(
+            "--cpus {cpus} is more than --max-cpus {most}; lower it, or raise --max-cpus"
+        ));
+    }
+    if let (Some(memory), Some(most)) = (limits.memory, caps.memory)
+        && memory > most
+    {
+        return Err(format!(
+            "--memory {memory} is more than --max-memory {most}; lower it, or raise --max-memory"
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use api::{Caps, Size};
+
+    use super::*;
+
+    #[test]
+    fn caps_below_the_pushs_own_limits_are_refused() {
+        let check = |cpus, max_cpus, memory: Option<u64>, max_memory: Option<u64>| {
+            let mib = |mib: u64| Size(mib << 20);
+            check_caps(&PushOptions {
+                limits: Limits {
+                    cpus,
+                    memory: memory.map(mib),
+                    ..Limits::default()
+                },
+                caps: Caps {
+                    cpus: max_cpus,
+                    memory: max_memory.map(mib),
+                },
+                ..PushOptions::default()
+            })
+        };
+        assert_eq!(check(None, None, None, None), Ok(()));
+        assert_eq!(check(Some(1.0), Some(1.0), Some(64), Some(64)), Ok(()));
+        assert_eq!(check(Some(9.0), None, None, Some(64)), Ok(()));
+        for (refused, words) in [
+            (
+                check(Some(2.0), Some(1.5), None, None),
+                "--cpus 2 is more than --max-cpus 1.5; lower it",
+            ),
+            (
+                check(None, None, Some(65), Some(64)),
+                "--memory 65M is more than --max-memory 64M; lower it",
+            ),
+            (check(None, Some(0.0), None, None), "max_cpus = 0 is not"),
+            (check(None, None, None, Some(1)), "max_memory = 1M is too"),
+        ] {
+            let refused = refused.expect_err(words);
+            assert!(refused.starts_with(words), "{refused}");
         }
     }
 }

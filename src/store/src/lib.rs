@@ -33,10 +33,11 @@ pub use servants::ServantRecord;
 pub use services::{Plan, RevisionLine, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 3] = [
+const MIGRATIONS: [&str; 4] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
+    include_str!("004-terms.sql"),
 ];
 
 /// What can go wrong.

@@ -63,6 +63,9 @@ pub struct Plan {
     /// Limits that the push asked for.
     #[serde(default)]
     pub limits: api::Limits,
+    /// The most that robots may ask for.
+    #[serde(default, skip_serializing_if = "api::Caps::is_empty")]
+    pub caps: api::Caps,
     /// What the push asked for beyond a container; whether it is allowed is looked at anew at each start.
     #[serde(default)]
     pub grants: api::Grants,

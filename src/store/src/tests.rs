@@ -158,9 +158,40 @@ fn servants_are_remembered_until_they_end() {
         anonymous: false,
         created: 5,
         limits: api::Limits::default(),
+        terms: None,
     };
     state.add_servant(&record).expect("written");
-    assert_eq!(state.servants().expect("readable"), [record]);
+    assert_eq!(
+        state.servants().expect("readable"),
+        std::slice::from_ref(&record)
+    );
+    let terms = api::Terms {
+        stated: [(
+            String::new(),
+            api::Stated::read([("rrt", "100ms"), ("class", "urgent")]).expect("valid"),
+        )]
+        .into(),
+        class: Some("urgent".into()),
+        priority: 3,
+        ..api::Terms::default()
+    };
+    state.set_servant_terms("a-1", &terms).expect("written");
+    let record = ServantRecord {
+        terms: Some(terms),
+        ..record
+    };
+    assert_eq!(
+        state.servants().expect("readable"),
+        std::slice::from_ref(&record)
+    );
+    let other = ServantRecord {
+        id: "a-2".into(),
+        created: 6,
+        ..record.clone()
+    };
+    state.add_servant(&other).expect("written");
+    assert_eq!(state.servants().expect("readable"), [record, other]);
+    state.remove_servant("a-2");
     state.remove_servant("a-1");
     assert!(state.servants().expect("readable").is_empty());
 }

@@ -1,22 +1,29 @@
 //! What a servant needs: from the limits that somebody asked for to the limits that it gets and to what is promised to it.
 
-use api::Limits;
+use api::{Limits, Terms};
 
 use super::Amount;
 
 /// Limits of a servant, and where they come from.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Asked {
-    /// By whoever pushed the package, or changed the servant: a promise.
-    pub promised: Limits,
+    /// By the operator, of the servant at work: a promise.
+    pub set: Limits,
+    /// By its robot and by whoever pushed the package: a promise.
+    pub terms: Terms,
     /// Where they said nothing.
     pub default: Limits,
 }
 
 impl Asked {
+    /// Those that are promised to it.
+    pub fn promised(&self) -> Limits {
+        self.set.or(self.terms.limits)
+    }
+
     /// The limits that it is to have.
     pub fn limits(&self) -> Limits {
-        with_weight(self.promised).or(self.default)
+        with_weight(self.promised()).or(self.default)
     }
 }
 

@@ -8,6 +8,7 @@ use servant::engine::ContainerState;
 
 use crate::Error;
 use crate::decide::adoption::{Fate, Found, fate};
+use crate::decide::demand::Asked;
 use crate::{Choreographer, Handle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
@@ -111,7 +112,13 @@ impl Choreographer {
         servant: Arc<dyn servant::engine::Servant>,
     ) {
         let inner = &self.inner;
-        let asked = inner.asked(record.limits.or(revision.plan.limits));
+        let of_push = || inner.of_push(&revision);
+        let asked = Asked {
+            set: record.limits,
+            ..record
+                .terms
+                .map_or_else(of_push, |terms| inner.asked(terms))
+        };
         let key = (record.service, record.robot.clone());
         let handle = Arc::new(Handle::new(
             record.id.clone(),

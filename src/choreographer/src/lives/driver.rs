@@ -123,7 +123,8 @@ async fn live(
                 return Ok(reason);
             }
             starting::record(inner, handle)?;
-            match starting::use_warm(handle, warm.take()).await {
+            starting::report_terms(inner, handle);
+            match starting::use_warm(inner, handle, warm.take()).await {
                 Some(warm) => (warm.container, Some(warm.reach), true),
                 None => (starting::start(inner, handle).await?, None, true),
             }

@@ -1,13 +1,128 @@
-//! Changes the limits of a servant while it works.
+//! Changes the limits of a servant while it works: because the operator says so, or because its robot states something else
+//! than before.
 
-use crate::decide::demand::with_weight;
+use api::{Limits, Size, Stated};
+use servant::engine::Servant;
+
+use super::Inner;
+use crate::decide::admission::Refused;
+use crate::decide::demand::{Asked, with_weight};
+use crate::decide::terms::{Untenable, in_words};
+use crate::handle::Handle;
 use crate::limits::limits_of;
 use crate::{Choreographer, Error, engine_limits};
 
+/// Why a servant is not resized.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Unchanged {
+    /// On no terms.
+    #[error(transparent)]
+    Untenable(Untenable),
+    /// There is no room for more.
+    #[error(transparent)]
+    Full(Refused),
+    /// It would be killed for want of memory.
+    #[error("it uses {used} of memory, which is more than the {wanted} that it would have")]
+    Used {
+        /// What it uses.
+        used: Size,
+        /// What it would have.
+        wanted: Size,
+    },
+}
+
 impl Choreographer {
     /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.
-    pub async fn set_limits(&self, id: &str, change: api::Limits) -> Result<(), Error> {
+    pub async fn set_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
         let handle = self.servant(id)?;
+        // One change after the other: what is promised, in force and remembered must be of the same.
+        let _turn = handle.limits_turn().await;
+        let before = handle.all_asked();
+        let after = Asked {
+            set: change.or(before.set),
+            ..before
+        };
+        let inner = &self.inner;
+        let set = after.set;
+        let in_force = inner.resize(&handle, with_weight(change), after).await?;
+        inner.state.set_servant_limits(id, &set)?;
+        let message = format!("servant {id}: limits changed to {in_force}");
+        inner
+            .journal
+            .info("limits-changed", &message, &handle.about());
+        Ok(())
+    }
+}
+
+impl Inner {
+    /// Gives a servant that runs what its robot states now, by one of its clients. Where that cannot be, it keeps what it
+    /// has.
+    pub(crate) async fn agree(
+        &self,
+        handle: &Handle,
+        who: &str,
+        stated: &Stated,
+    ) -> Result<(), Error> {
+        let _turn = handle.limits_turn().await;
+        let before = handle.all_asked();
+        let mut all = before.terms.stated.clone();
+        if all.insert(who.to_owned(), stated.clone()).as_ref() == Some(stated) {
+            // Another connection of the same client was faster.
+            return Ok(());
+        }
+        let refused = |reason| Error::NotResized {
+            servant: handle.id.clone(),
+            service: handle.service().to_owned(),
+            stated: stated.to_string(),
+            reason,
+        };
+        let terms = match self.terms(&all, &handle.revision) {
+            Err(Error::Terms(untenable)) => return Err(refused(Unchanged::Untenable(untenable))),
+            terms => terms?,
+        };
+        let after = Asked {
+            terms,
+            ..before.clone()
+        };
+        let (earlier, told) = (before.limits(), after.terms.clone());
+        let change = changed(&earlier, &after.limits());
+        if let (Some(wanted), Some(container)) = (change.memory, handle.container())
+            && earlier.memory.is_none_or(|earlier| wanted < earlier)
+            && let Ok(usage) = container.usage().await
+            && wanted.0 < usage.memory
+        {
+            let used = Size(usage.memory);
+            return Err(refused(Unchanged::Used { used, wanted }));
+        }
+        let resized = change != Limits::default();
+        if resized {
+            self.resize(handle, change, after)
+                .await
+                .map_err(|error| match error {
+                    Error::Full(full) => refused(Unchanged::Full(full)),
+                    error => error,
+                })?;
+        } else {
+            handle.set_asked(after);
+        }
+        self.state.set_servant_terms(&handle.id, &told)?;
+        let (stated, id) = (told.stated_in_words(), &handle.id);
+        let message = match resized {
+            true => format!(
+                "servant {id}: its robot states {stated}; limits changed from {} to {}",
+                in_words(&earlier),
+                in_words(&handle.limits()),
+            ),
+            false => format!("servant {id}: its robot states {stated}; its limits stay"),
+        };
+        self.journal
+            .info("terms-changed", &message, &handle.about());
+        Ok(())
+    }
+
+    /// Gives a servant the limits of `change`, and promises `after` to it; all or nothing. Only in its
+    /// [`Handle::limits_turn`]. Gives what is in force then.
+    async fn resize(&self, handle: &Handle, change: Limits, after: Asked) -> Result<String, Error> {
         let unreached = || Error::Servant {
             service: handle.service().to_owned(),
             robot: handle.robot.clone(),
@@ -15,48 +130,46 @@ impl Choreographer {
             log: Vec::new(),
         };
         let container = handle.container().ok_or_else(unreached)?;
-        // One change after the other: what is promised, in force and remembered must be of the same.
-        let _turn = handle.limits_turn().await;
-        let (before, wanted) = (handle.asked(), change.or(handle.asked()));
         let promise = handle.promise().ok_or_else(unreached)?;
-        promise.change(self.inner.promised(&wanted))?;
-        if let Err(error) = container
-            .set_limits(engine_limits(&with_weight(change)))
-            .await
-        {
+        let before = handle.all_asked();
+        promise.change(self.promised(&after.promised()))?;
+        if let Err(error) = container.set_limits(engine_limits(&change)).await {
             // What the kernel took of it before it refused the rest is taken back.
-            let earlier = engine_limits(&before.or(handle.limits()));
-            let _ = container.set_limits(earlier).await;
-            let _ = promise.change(self.inner.promised(&before));
+            let _ = container.set_limits(engine_limits(&before.limits())).await;
+            let _ = promise.change(self.promised(&before.promised()));
             return Err(error.into());
         }
-        handle.set_asked(wanted);
-        self.inner.state.set_servant_limits(id, &wanted)?;
-        let message = format!(
-            "servant {id}: limits changed to {}",
-            in_words(&limits_of(&container.enforced().limits))
-        );
-        self.inner
-            .journal
-            .info("limits-changed", &message, &handle.about());
-        Ok(())
+        handle.set_asked(after);
+        Ok(in_words(&limits_of(&container.enforced().limits)))
     }
 }
 
-/// Limits for people, by the names of the flags that set them.
-fn in_words(limits: &api::Limits) -> String {
-    let named = [
-        ("cpus", limits.cpus.map(|cpus| cpus.to_string())),
-        ("cpu-weight", limits.cpu_weight.map(|n| n.to_string())),
-        ("cpuset", limits.cpuset.map(|cores| cores.to_string())),
-        ("memory", limits.memory.map(|bytes| bytes.to_string())),
-        ("memory-high", limits.memory_high.map(|n| n.to_string())),
-        ("pids", limits.pids.map(|pids| pids.to_string())),
-        ("io-read", limits.io_read.map(|bytes| bytes.to_string())),
-        ("io-write", limits.io_write.map(|bytes| bytes.to_string())),
-    ];
-    let set = named
-        .into_iter()
-        .filter_map(|(name, value)| Some(format!("{name} {}", value?)));
-    set.collect::<Vec<_>>().join(", ")
+/// Gives a container that was made with the limits `made` those of the servant that it becomes.
+pub(super) async fn fit(
+    container: &dyn Servant,
+    made: &Limits,
+    limits: &Limits,
+) -> Result<(), servant::Error> {
+    let change = changed(made, limits);
+    if change != Limits::default() {
+        container.set_limits(engine_limits(&change)).await?;
+    }
+    Ok(())
+}
+
+/// Those of `after` that are not so before: some, such as a cpuset on cgroup v1, cannot be set again.
+fn changed(before: &Limits, after: &Limits) -> Limits {
+    fn new<T: PartialEq>(before: Option<T>, after: Option<T>) -> Option<T> {
+        after.filter(|after| before.as_ref() != Some(after))
+    }
+    Limits {
+        cpus: new(before.cpus, after.cpus),
+        cpu_weight: new(before.cpu_weight, after.cpu_weight),
+        memory: new(before.memory, after.memory),
+        memory_high: new(before.memory_high, after.memory_high),
+        pids: new(before.pids, after.pids),
+        io_read: new(before.io_read, after.io_read),
+        io_write: new(before.io_write, after.io_write),
+        cpuset: new(before.cpuset, after.cpuset),
+    }
 }

@@ -11,7 +11,8 @@ use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::time::{Instant, timeout_at};
 
 use super::warm_pool::Warm;
-use super::{Inner, reaching};
+use super::{Inner, limits, reaching};
+use crate::decide::terms::in_words;
 use crate::handle::{Failure, Handle};
 use crate::{Error, engine_limits};
 
@@ -25,6 +26,7 @@ pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
         anonymous: handle.anonymous,
         created: handle.created,
         limits: api::Limits::default(),
+        terms: Some(handle.terms()),
     };
     let added = inner.state.add_servant(&record);
     added.map_err(|error| could_not_start(error.into()))
@@ -49,8 +51,15 @@ fn planned(handle: &Handle) -> Vec<NodeSpec> {
 }
 
 /// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
-pub(super) async fn use_warm(handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
+pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
     let warm = warm?;
+    let made = inner.of_push(&handle.revision).limits();
+    let limits = handle.limits();
+    if let Err(error) = limits::fit(&*warm.container, &made, &limits).await {
+        tracing::debug!("a warm container cannot be given {limits:?}: {error}");
+        warm.end().await;
+        return None;
+    }
     // In their order and without waiting for one another. A program that cannot be executed is refused here, and
     // looked at where the ends of nodes are.
     let nodes = planned(handle).into_iter();
@@ -111,6 +120,23 @@ pub(super) fn spec(
         grants: plan.grants.clone(),
         resident: resident_config(&revision.flavour, &plan.parameters),
     })
+}
+
+/// What its robot stated, if anything, and what follows.
+pub(super) fn report_terms(inner: &Inner, handle: &Handle) {
+    let terms = handle.terms();
+    if terms.stated.is_empty() {
+        return;
+    }
+    let message = format!(
+        "servant {} of {}: its robot states {}; it is promised {} ({})",
+        handle.id,
+        handle.service(),
+        terms.stated_in_words(),
+        in_words(&handle.asked()),
+        terms.why.join("; "),
+    );
+    inner.journal.info("terms", &message, &handle.about());
 }
 
 /// Of limits that somebody asked for and that are not in force; that of the others the daemon has warned at its start.

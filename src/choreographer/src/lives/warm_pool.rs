@@ -192,7 +192,7 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm, Error> {
     let id = names::servant_id(&revision.service);
-    let limits = inner.asked(revision.plan.limits).limits();
+    let limits = inner.of_push(&revision).limits();
     let spec = starting::spec(inner, &id, &revision, &limits, Vec::new())?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.options.start;
@@ -210,6 +210,15 @@ async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm,
                 failed.map(|reached| reached.err())
             );
             Err(Error::Internal("reaching a warm container's ROS Master"))
+        }
+    }
+}
+
+impl Inner {
+    /// Takes a warm container back, if there is one, that its robot cannot have; comes back at once.
+    pub(crate) fn give_back(self: &Arc<Self>, warm: Option<Warm>) {
+        if let Some(unwanted) = warm.and_then(|warm| self.warm_pool.put_back(warm)) {
+            tokio::spawn(unwanted.end());
         }
     }
 }

@@ -8,15 +8,15 @@ use servant::spec::NodeSpec;
 use super::*;
 
 /// A machine, and what outlives a daemon on it.
-struct World {
+pub(super) struct World {
     _home: tempfile::TempDir,
     state: Arc<State>,
     catalogue: Arc<Catalogue>,
-    engine: MemoryEngine,
+    pub(super) engine: MemoryEngine,
 }
 
 impl World {
-    fn new() -> World {
+    pub(super) fn new() -> World {
         let home = tempfile::tempdir().expect("a directory");
         let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
         let state = Arc::new(state);
@@ -36,13 +36,19 @@ impl World {
     }
 
     /// A daemon on it, which promises a core to each servant and has two.
-    fn daemon(&self) -> Choreographer {
-        let options = Options {
+    pub(super) fn daemon(&self) -> Choreographer {
+        self.daemon_with(|_| {})
+    }
+
+    /// The same with other options.
+    pub(super) fn daemon_with(&self, change: impl FnOnce(&mut Options)) -> Choreographer {
+        let mut options = Options {
             reserve_cpus: 1.0,
             reserve_memory: 0,
             warm_pool: 0,
             ..options()
         };
+        change(&mut options);
         Choreographer::new(
             options,
             Arc::clone(&self.state),
@@ -54,7 +60,12 @@ impl World {
     }
 
     /// Publishes a service of one node, `/greeter`, that runs `program` and publishes a topic.
-    fn publish(&self, service: &str, program: &str, change: impl FnOnce(&mut RevisionRecord)) {
+    pub(super) fn publish(
+        &self,
+        service: &str,
+        program: &str,
+        change: impl FnOnce(&mut RevisionRecord),
+    ) {
         let mut record = revision(&format!("sha256:{service}"), 1.0);
         record.service = service.to_owned();
         record.plan.limits = api::Limits::default();
@@ -69,7 +80,7 @@ impl World {
     }
 
     /// Messages of events of a kind.
-    fn told(&self, kind: &str) -> Vec<String> {
+    pub(super) fn told(&self, kind: &str) -> Vec<String> {
         let mut events = self.state.events(0, 1000).expect("events");
         events.retain(|event| event.kind == kind);
         events.into_iter().map(|event| event.message).collect()
@@ -99,7 +110,9 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     let reach = lease.ready().await.expect("ready");
     assert!(reach.graph().borrow().nodes.contains_key("/greeter"));
     let handle = Arc::clone(lease.handle());
@@ -109,7 +122,9 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     assert_eq!(world.engine.started()[0].image, "sha256:greet");
     // Back within the grace time, and then not.
     drop(lease);
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     assert!(Arc::ptr_eq(lease.handle(), &handle), "the same servant");
     drop(lease);
     handle.ended().await;
@@ -128,11 +143,15 @@ async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
     world.publish("greet", "/broken", |_| {});
     world.publish("other", "/missing", |_| {});
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     let (reason, log) = broken(lease.ready().await.err().expect("it failed"));
     assert!(reason.contains("/greeter exited with status 3"), "{reason}");
     assert_eq!(log, ["no model in /models"]);
-    let lease = daemon.ensure("other", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("other", "r1"))
+        .expect("a lease");
     let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
     assert!(reason.contains("there is no program /missing"), "{reason}");
 }
@@ -143,7 +162,9 @@ async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
     world.publish("greet", "/greet", |_| {});
     world.engine.breaks("sha256:greet", "the registry is away");
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
     assert!(reason.ends_with("the registry is away"), "{reason}");
     let camera = api::Grants {
@@ -155,11 +176,15 @@ async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
     world.publish("see", "/greet", |record| {
         record.plan.grants = camera.clone()
     });
-    let lease = daemon.ensure("see", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("see", "r1"))
+        .expect("a lease");
     let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
     assert!(reason.contains("lab.org/camera=0"), "{reason}");
     world.engine.allow(camera.clone());
-    let lease = daemon.ensure("see", "r2", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("see", "r2"))
+        .expect("a lease");
     lease.ready().await.expect("ready");
     let started = world.engine.started();
     assert_eq!(started.last().expect("it was started").grants, camera);
@@ -179,7 +204,9 @@ async fn a_failing_node_is_started_again_after_pauses_and_then_given_up() {
     world.engine.program("/fails", program);
     world.publish("greet", "/fails", |record| record.plan.restart = true);
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     lease.ready().await.expect("ready");
     let reason = failure(&lease).await;
     assert!(reason.contains("gave /greeter up"), "{reason}");
@@ -209,7 +236,9 @@ async fn a_respawning_node_is_the_engines_and_its_servant_lives_on() {
         record.plan.nodes[0].respawn_delay = 2.0;
     });
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     let reach = lease.ready().await.expect("ready");
     let mut graph = reach.graph();
     let there = |graph: &Arc<ros::bus::Graph>| graph.nodes.contains_key("/greeter");
@@ -247,7 +276,9 @@ async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it()
     };
     world.publish("greet", "/eats", |record| record.plan.limits = memory(150));
     let daemon = world.daemon();
-    let lease = daemon.ensure("greet", "r1", false).expect("a lease");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     lease.ready().await.expect("ready");
     let id = lease.handle().id.clone();
     let enforced = async || {
@@ -275,12 +306,16 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
     world.publish("greet", "/greet", |_| {});
     let daemon = world.daemon();
     let ready = async |robot: &str| {
-        let lease = daemon.ensure("greet", robot, false).expect("a lease");
+        let lease = daemon
+            .ensure(ServantRequest::new("greet", robot))
+            .expect("a lease");
         lease.ready().await.expect("ready");
         lease
     };
     let (first, _second) = (ready("r1").await, ready("r2").await);
-    let third = daemon.ensure("greet", "r3", false).expect("a lease");
+    let third = daemon
+        .ensure(ServantRequest::new("greet", "r3"))
+        .expect("a lease");
     let waiting = tokio::time::timeout(Duration::from_secs(1), third.admitted());
     waiting.await.expect_err("there are two cores");
     let ended = Arc::clone(first.handle());
@@ -288,7 +323,9 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
     third.ready().await.expect("ready");
     assert_eq!(ended.life().phase, Phase::Stopped);
     // Nobody leaves this time.
-    let fourth = daemon.ensure("greet", "r4", false).expect("a lease");
+    let fourth = daemon
+        .ensure(ServantRequest::new("greet", "r4"))
+        .expect("a lease");
     let refused = fourth.ready().await.err().expect("no room");
     assert!(matches!(refused, Error::Full(_)), "{refused}");
 }
@@ -304,7 +341,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
         let ids = runtime.block_on(async {
             let mut ids = Vec::new();
             for robot in ["r1", "r2"] {
-                let lease = daemon.ensure("greet", robot, false).expect("a lease");
+                let lease = daemon
+                    .ensure(ServantRequest::new("greet", robot))
+                    .expect("a lease");
                 lease.ready().await.expect("ready");
                 ids.push(lease.handle().id.clone());
                 // It dies before its robots leave.
@@ -329,7 +368,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
         "{lost:?}"
     );
     // The robot finds its servant, and nothing was started for that.
-    let lease = next.ensure("greet", "r1", false).expect("a lease");
+    let lease = next
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
     lease.ready().await.expect("ready");
     assert_eq!(lease.handle().id, ids[0]);
     assert_eq!(world.engine.started().len(), 2);

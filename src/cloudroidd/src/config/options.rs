@@ -1,10 +1,10 @@
 //! What of the file is whose: the options of each crate.
 
-use api::Size;
+use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{Config, NonFinite, Push};
+use super::{Class, Config, NonFinite, Push};
 use crate::supervision::machine_memory;
 
 /// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
@@ -19,6 +19,11 @@ impl Config {
         let daemon = memory.daemon.map(|size| size.0);
         choreographer::Options {
             limits: self.limits,
+            classes: self
+                .class
+                .iter()
+                .map(|(name, class)| (name.clone(), of(class)))
+                .collect(),
             reserve_cpus: servant.reserve_cpus,
             reserve_memory: servant.reserve_memory.0,
             deadline: self.capacity.deadline.0,
@@ -75,6 +80,18 @@ impl Push {
             pids: Some(self.pids),
             ..servant::spec::Limits::default()
         }
+    }
+}
+
+fn of(class: &Class) -> choreographer::Class {
+    choreographer::Class {
+        priority: class.priority,
+        caps: Caps {
+            cpus: class.max_cpus,
+            memory: class.max_memory,
+        },
+        sla: class.sla,
+        limits: class.limits,
     }
 }
 

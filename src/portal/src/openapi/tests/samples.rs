@@ -1,13 +1,15 @@
 //! One value or more of every type that the document describes.
 
+use api::dictionary::{Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use api::push::Layer;
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
-    Capacity, Check, CheckStatus, Clock, Doctor, Event, Grants, Isolation, Level, Limits, LogLine,
-    Node, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant,
-    ServiceDetail, ServiceSummary, Size, Status, Stopped, Stream, Usage, Volume,
+    Capacity, Caps, Check, CheckStatus, Clock, Doctor, Event, Grants, Isolation, Level, Limits,
+    LogLine, Measure, Node, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback,
+    Servant, ServiceDetail, ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream,
+    Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -63,12 +65,55 @@ fn servant() -> Servant {
         created: 1,
         connections: 1,
         idle_until: Some(2),
+        terms: Some(terms()),
         limits: limits(),
         enforced: Some(limits()),
         cgroup_version: 2,
         usage: Some(usage()),
         pids: vec![1],
         dropped: 0,
+    }
+}
+
+fn terms() -> Terms {
+    let stated = Stated {
+        sla: Sla {
+            rrt: Span::millis(100),
+            max_rrt: Span::millis(300),
+            fps: Some(5.0),
+            min_fps: Some(2.0),
+            age: Span::millis(100),
+            max_age: Span::millis(300),
+        },
+        class: some("default"),
+        cpus: Some(1.0),
+        memory: Some(Size(1 << 30)),
+        aux: [("width".to_owned(), "640".to_owned())].into(),
+    };
+    Terms {
+        stated: [("/n".to_owned(), stated)].into(),
+        class: some("default"),
+        priority: 1,
+        rows: vec![row()],
+        limits: limits(),
+        why: all("cpus 1 as stated"),
+    }
+}
+
+fn row() -> Row {
+    Row {
+        id: 1,
+        measure: Measure::Rrt,
+        value: 0.1,
+        aux: [("width".to_owned(), "640".to_owned())].into(),
+        limits: limits(),
+        spread: Some(Spread {
+            p50: 0.05,
+            p95: 0.1,
+            requests: 100,
+        }),
+        revision: Some(1),
+        written: 1,
     }
 }
 
@@ -146,6 +191,10 @@ fn options() -> PushOptions {
         map: names(),
         with: all("x"),
         limits: limits(),
+        caps: Caps {
+            cpus: Some(2.0),
+            memory: Some(Size(1 << 30)),
+        },
         grants: Grants {
             devices: all("nvidia.com/gpu=0"),
             volumes: vec![Volume {

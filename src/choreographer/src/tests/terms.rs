@@ -1,0 +1,232 @@
+//! What robots state, and what their servants get for it, told with the engine in memory.
+
+use super::servants::World;
+use super::*;
+
+fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
+    let stated = api::Stated::read(query.iter().copied()).expect("valid");
+    ServantRequest::new("greet", robot).stating(stated)
+}
+
+async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
+    let lease = daemon.ensure(request).expect("a lease");
+    lease.ready().await.expect("ready");
+    lease
+}
+
+/// Cores and memory that are in force.
+async fn enforced(daemon: &Choreographer, lease: &Lease) -> (Option<f64>, Option<api::Size>) {
+    let shown = daemon.describe(lease.handle()).await;
+    let limits = shown.enforced.expect("it runs");
+    (limits.cpus, limits.memory)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_gets_and_is_promised_what_it_states() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| {
+        record.plan.limits.cpus = Some(0.25);
+    });
+    let daemon = world.daemon();
+    let plain = ready(&daemon, ServantRequest::new("greet", "r0")).await;
+    assert_eq!(enforced(&daemon, &plain).await.0, Some(0.25));
+    assert_eq!(daemon.describe(plain.handle()).await.terms, None);
+    let lease = ready(
+        &daemon,
+        stating("r1", &[("cpus", "1.5"), ("memory", "512M")]),
+    )
+    .await;
+    let memory = api::Size(512 << 20);
+    assert_eq!(enforced(&daemon, &lease).await, (Some(1.5), Some(memory)));
+    let promised = Amount::new(1.75, memory.0);
+    assert_eq!(daemon.admission().look().1, promised);
+    let terms = daemon.describe(lease.handle()).await.terms;
+    let terms = terms.expect("it stated something");
+    assert_eq!(terms.stated_in_words(), "cpus=1.5 memory=512M");
+    let told = world.told("terms");
+    assert!(told[0].contains("states cpus=1.5 memory=512M"), "{told:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_states_something_else_is_resized_in_place_or_told_what_would_fit() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let lease = ready(&daemon, stating("r1", &[("cpus", "0.5")])).await;
+    let id = lease.handle().id.clone();
+    let again = ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;
+    assert_eq!(again.handle().id, id, "the same servant");
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
+    assert_eq!(daemon.admission().look().1, Amount::new(1.5, 0));
+    let told = world.told("terms-changed");
+    assert!(
+        told[0].contains("cpus=1.5") && told[0].contains("from cpus 0.5"),
+        "{told:?}"
+    );
+    // Nothing stated, or the same: nothing changes.
+    ready(&daemon, ServantRequest::new("greet", "r1")).await;
+    ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;
+    assert_eq!(world.told("terms-changed").len(), 1);
+    // There are two cores.
+    let more = daemon
+        .ensure(stating("r1", &[("cpus", "2.5")]))
+        .expect("a lease");
+    let refused = more.ready().await.err().expect("there is no room");
+    let Error::NotResized { reason, .. } = &refused else {
+        panic!("{refused}");
+    };
+    let free = Amount::new(2.0, 1 << 30);
+    assert!(
+        matches!(reason, Unchanged::Full(Refused::NoMore { free: left, .. }) if *left == free),
+        "{refused}"
+    );
+    assert!(refused.to_string().contains("cpus=2.5"), "{refused}");
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5), "as it was");
+    let stated = lease.handle().terms().stated_in_words();
+    assert_eq!(stated, "cpus=1.5");
+}
+
+#[tokio::test(start_paused = true)]
+async fn stubs_of_one_robot_state_each_for_itself() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let by = |node: &str, cpus| stating("r1", &[("cpus", cpus)]).by_stub(node);
+    let one = ready(&daemon, by("/one", "1")).await;
+    ready(&daemon, by("/two", "0.5")).await;
+    assert_eq!(enforced(&daemon, &one).await.0, Some(1.0), "the more");
+    ready(&daemon, by("/two", "1.5")).await;
+    assert_eq!(enforced(&daemon, &one).await.0, Some(1.5));
+    ready(&daemon, by("/two", "0.25")).await;
+    assert_eq!(enforced(&daemon, &one).await.0, Some(1.0));
+    assert_eq!(
+        one.handle().terms().stated_in_words(),
+        "/one: cpus=1; /two: cpus=0.25"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_the_operator_sets_stays_whatever_the_robot_states() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let lease = ready(&daemon, stating("r1", &[("cpus", "0.5")])).await;
+    let set = api::Limits {
+        cpus: Some(0.75),
+        ..api::Limits::default()
+    };
+    let id = lease.handle().id.clone();
+    daemon.set_limits(&id, set).await.expect("changed");
+    let again = ready(
+        &daemon,
+        stating("r1", &[("cpus", "1.5"), ("memory", "64M")]),
+    )
+    .await;
+    let memory = api::Size(64 << 20);
+    assert_eq!(enforced(&daemon, &again).await, (Some(0.75), Some(memory)));
+    assert_eq!(daemon.admission().look().1, Amount::new(0.75, memory.0));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_servant_is_not_made_smaller_than_what_it_uses() {
+    let world = World::new();
+    world.engine.program("/eats", |process| async move {
+        process.allocate(100 << 20).await;
+        process.advertise("/greeting", "std_msgs/String");
+        std::future::pending().await
+    });
+    world.publish("greet", "/eats", |_| {});
+    let daemon = world.daemon();
+    let lease = ready(&daemon, stating("r1", &[("memory", "200M")])).await;
+    let less = daemon
+        .ensure(stating("r1", &[("memory", "50M")]))
+        .expect("a lease");
+    let refused = less.ready().await.err().expect("it would be killed");
+    assert!(
+        refused.to_string().contains("it uses 100M of memory"),
+        "{refused}"
+    );
+    assert_eq!(
+        enforced(&daemon, &lease).await.1,
+        Some(api::Size(200 << 20))
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_class_bounds_what_its_robots_state_and_ranks_them() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon_with(|options| {
+        let caps = api::Caps {
+            cpus: Some(1.0),
+            memory: None,
+        };
+        let class = Class {
+            caps,
+            ..Class::default()
+        };
+        let urgent = Class {
+            priority: 7,
+            ..Class::default()
+        };
+        options.classes = [("default".to_owned(), class), ("urgent".to_owned(), urgent)].into();
+    });
+    let refused = daemon.ensure(stating("r1", &[("cpus", "1.5")])).err();
+    let refused = refused.expect("more than its class may have").to_string();
+    assert!(refused.contains("max_cpus of class default"), "{refused}");
+    let lease = ready(
+        &daemon,
+        stating("r1", &[("cpus", "1.5"), ("class", "urgent")]),
+    )
+    .await;
+    assert_eq!(lease.handle().priority(), 7);
+    let shown = daemon.describe(lease.handle()).await.terms.expect("terms");
+    assert_eq!(
+        (shown.class.as_deref(), shown.priority),
+        (Some("urgent"), 7)
+    );
+    assert!(
+        daemon.servants().len() == 1,
+        "the one that was refused left nothing"
+    );
+}
+
+#[tokio::test]
+async fn the_terms_of_a_servant_outlive_the_daemon() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let died = tokio::task::spawn_blocking(move || {
+        let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+        runtime.block_on(async {
+            let one = ready(&daemon, stating("r1", &[("cpus", "0.5")])).await;
+            let two = ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;
+            // It dies before its robot leaves.
+            std::mem::forget((one, two));
+        });
+        runtime.shutdown_background();
+    });
+    died.await.expect("no panic");
+    let next = world.daemon();
+    assert_eq!(next.adopt().await.expect("adopted"), 1);
+    assert_eq!(next.admission().look().1, Amount::new(1.5, 0));
+    let lease = ready(&next, stating("r1", &[("cpus", "1.5")])).await;
+    assert_eq!(lease.handle().terms().stated_in_words(), "cpus=1.5");
+    assert_eq!(enforced(&next, &lease).await.0, Some(1.5));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_warm_container_gets_what_its_robot_states() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| {
+        record.plan.limits.cpus = Some(0.5);
+    });
+    let daemon = world.daemon_with(|options| options.warm_pool = 1);
+    daemon.keep_warm_pool();
+    while daemon.warm_pool() == 0 {
+        tokio::task::yield_now().await;
+    }
+    let lease = ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
+    assert_eq!(world.engine.started().len(), 1, "the warm one was used");
+}

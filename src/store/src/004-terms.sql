@@ -1,0 +1,1 @@
+ALTER TABLE servants ADD COLUMN terms TEXT;
