@@ -111,6 +111,9 @@ pub struct Usage {
     pub cpu_usec: u64,
     /// Bytes of memory now.
     pub memory: u64,
+    /// Of them those of files that were not used lately, which the kernel drops where memory is short.
+    #[serde(default)]
+    pub reclaimable: u64,
     /// Processes and threads now.
     pub pids: u64,
     /// Processes killed for want of memory so far.

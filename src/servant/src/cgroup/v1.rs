@@ -121,6 +121,10 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         cpu_usec: cpu.or_else(beside).unwrap_or(0),
         throttled_usec: throttled.unwrap_or(0) / 1000,
         memory: memory.unwrap_or(0),
+        reclaimable: cgroup
+            .file("memory", "memory.stat")
+            .and_then(|file| read_field(&file, "total_inactive_file"))
+            .unwrap_or(0),
         pressure: unified.and_then(|leaf| pressure_of_cgroup(&leaf.directory)),
         ..Usage::default()
     }

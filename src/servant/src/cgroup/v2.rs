@@ -90,6 +90,10 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
         cpu_usec: stat("usage_usec").unwrap_or(0),
         throttled_usec: stat("throttled_usec").unwrap_or(0),
         memory: memory.unwrap_or(0),
+        reclaimable: cgroup
+            .file("memory", "memory.stat")
+            .and_then(|file| read_field(&file, "inactive_file"))
+            .unwrap_or(0),
         pressure: cgroup
             .leaves
             .first()
