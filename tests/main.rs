@@ -12,6 +12,8 @@ mod answer;
 mod bounds;
 #[path = "stories/burglary.rs"]
 mod burglary;
+#[path = "stories/calibration.rs"]
+mod calibration;
 #[path = "stories/calls.rs"]
 mod calls;
 #[path = "stories/clients.rs"]
@@ -97,6 +99,12 @@ fn main() -> ExitCode {
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
             neighbours_are_not_reached,
+        ],
+        stories![calibration:
+            fewer_cores_take_longer_and_rows_say_how_long,
+            what_cannot_be_calibrated_is_said,
+            a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers,
+            a_calibration_that_nobody_waits_for_leaves_nothing,
         ],
         stories![calls:
             a_python_node_calls_the_robot,

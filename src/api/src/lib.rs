@@ -4,6 +4,7 @@
 //! A request is answered by one of these types as JSON, by a stream of them as JSON lines ([`NDJSON`]), or by
 //! a [`problem::Problem`] with the HTTP status that it names.
 
+pub mod calibration;
 pub mod cpuset;
 pub mod dictionary;
 pub mod doctor;
@@ -22,6 +23,7 @@ pub mod status;
 pub mod stub;
 pub mod trial;
 
+pub use calibration::{Calibration, CalibrationEvent, CalibrationOptions};
 pub use cpuset::CpuSet;
 pub use doctor::{Check, CheckStatus, Doctor};
 pub use event::{Event, Level};

@@ -11,6 +11,7 @@
 //! | [`capacity`] | which idle servants end for those who wait | what they lack, all servants |
 //! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
 //! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
+//! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
 //! | [`warm_pool`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
 //! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
 //!
@@ -19,6 +20,7 @@
 pub(crate) mod admission;
 pub(crate) mod adoption;
 mod amount;
+pub(crate) mod calibration;
 pub(crate) mod capacity;
 pub(crate) mod demand;
 pub(crate) mod lifetime;

@@ -46,6 +46,9 @@ pub enum Error {
     /// The daemon is ending.
     #[error("the daemon is ending")]
     Ending,
+    /// A service cannot be calibrated so.
+    #[error("{0}")]
+    Calibration(String),
     /// What is published.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),

@@ -377,6 +377,15 @@ impl Lease {
             .ok_or(Error::Internal("reaching a ready servant"))
     }
 
+    /// Comes back when the servant has failed or is ended, with the reason.
+    pub(crate) async fn over(&self) -> Error {
+        let mut life = self.handle.watch();
+        match life.wait_for(Life::is_over).await {
+            Ok(life) => self.handle.error(&life),
+            Err(_) => Error::Internal("waiting for a servant's end"),
+        }
+    }
+
     async fn reached(&self, phase: Phase) -> Result<(), Error> {
         let mut life = self.handle.watch();
         let Ok(life) = life

@@ -51,7 +51,7 @@ use api::Phase;
 use bridge::BridgeOptions;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
-use reach::{Material, Opener, RequestTimes};
+use reach::{Material, Opener, Pace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 
@@ -61,6 +61,8 @@ pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
 pub use handle::{Handle, Lease};
 pub use limits::engine_limits;
+pub use lives::calibration::Requests;
+pub use lives::capture::Bounds;
 pub use lives::limits::Unchanged;
 pub use lives::waiting::{Admission, Permit};
 pub use memory::{Memory, MemoryOptions};
@@ -73,6 +75,11 @@ use handle::Anew;
 use lives::Inner;
 use lives::driver::{self, Beginning};
 use lives::warm_pool::{self, WarmPool};
+
+/// In a trial, for one answer: a message of a recording that is answered by nothing must not hold up the rest.
+const TRIED: Duration = Duration::from_secs(2);
+/// A picture is tried with so many requests.
+const SHOWN: usize = 20;
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]
@@ -304,14 +311,24 @@ impl Choreographer {
         service: &str,
         material: Material,
     ) -> Result<api::trial::Trial, Error> {
-        let robot = format!("~try-{}", names::random(6));
+        let measured = self.measured(service, "try")?;
+        measured.lease.admitted().await?;
+        let reach = measured.lease.ready().await?;
+        let interface = &measured.lease.handle().revision.interface;
+        let mut pace = Pace::once(TRIED);
+        if let Material::Pictures(_) = material {
+            pace.again = true;
+            pace.requests = SHOWN;
+        }
+        let replay = reach.replay(service, interface, &material, &pace).await?;
+        Ok(replay.into_trial(service))
+    }
+
+    /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name.
+    fn measured(&self, service: &str, why: &str) -> Result<Measured, Error> {
+        let robot = format!("~{why}-{}", names::random(6));
         let lease = self.ensure(ServantRequest::new(service, &robot).anonymous())?;
-        lease.admitted().await?;
-        let (reach, handle) = (lease.ready().await?, lease.handle());
-        let interface = &handle.revision.interface;
-        let trial = reach.trial(service, interface, material).await;
-        handle.end("its trial is over");
-        Ok(trial?)
+        Ok(Measured { lease })
     }
 
     /// Refuses limits that would never be admitted.
@@ -363,6 +380,17 @@ impl Choreographer {
                 .map(|handle| handle.revision.image.clone()),
         );
         images
+    }
+}
+
+/// A servant that serves no robot; it is ended with this value, also where what measures it is given up halfway.
+pub(crate) struct Measured {
+    pub(crate) lease: Lease,
+}
+
+impl Drop for Measured {
+    fn drop(&mut self) {
+        self.lease.handle().end("it has been measured");
     }
 }
 

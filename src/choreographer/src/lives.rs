@@ -2,6 +2,8 @@
 //! keeps the warm pool ([`warm_pool`]). Servants of an earlier daemon are taken over here ([`adoption`]).
 
 mod adoption;
+pub(crate) mod calibration;
+pub(crate) mod capture;
 pub(crate) mod driver;
 mod lifetime;
 pub(crate) mod limits;

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+mod calibrate;
 mod client;
 mod doctor;
 mod events;
@@ -72,6 +73,7 @@ enum Verb {
     Rollback(rollback::Rollback),
     Stub(stub::Stub),
     Try(Box<trial::Try>),
+    Calibrate(Box<calibrate::Calibrate>),
     Explain(explain::Explain),
     Status(status::Status),
     Doctor(doctor::Doctor),
@@ -117,6 +119,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Rollback(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,
+        Verb::Calibrate(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,

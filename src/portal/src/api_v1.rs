@@ -131,7 +131,7 @@ pub async fn rollback(
     Ok(Json(views::service(&app, &name)?))
 }
 
-/// The largest recording for a trial, where its sender may have so much: it is held in memory.
+/// The largest recording for a trial or a calibration, where its sender may have so much: it is held in memory.
 const LARGEST_TRIAL: usize = 512 << 20;
 /// The longest of other bodies.
 const LARGEST_WORDS: usize = 64 << 10;
@@ -141,6 +141,17 @@ async fn held(app: &App, caller: &Caller, body: Body, max: usize) -> Result<Held
     let memory = app.choreographer.memory();
     let budget = memory.client(&caller.peer.client(None));
     body::read(body, max, &budget, memory.unfinished).await
+}
+
+/// A recording or pictures.
+pub(super) async fn recording(app: &App, caller: &Caller, body: Body) -> Result<Held, Error> {
+    let memory = app.choreographer.memory();
+    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.client(None)).most());
+    let read = held(app, caller, body, max).await;
+    read.map_err(|error| match error {
+        Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
+        error => error,
+    })
 }
 
 /// With what a service is tried.
@@ -168,16 +179,10 @@ pub async fn trial(
     Extension(caller): Extension<Caller>,
     body: Body,
 ) -> Answer<api::trial::Trial> {
-    let memory = app.choreographer.memory();
-    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.client(None)).most());
-    let read = held(&app, &caller, body, max).await;
-    let Held { bytes, permit } = read.map_err(|error| match error {
-        Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
-        error => error,
-    })?;
+    let Held { bytes, permit } = recording(&app, &caller, body).await?;
     let material = tokio::task::spawn_blocking(move || match with.kind {
         Kind::Image => Picture::read(&bytes)
-            .map(Material::Picture)
+            .map(|picture| Material::Pictures(vec![picture]))
             .map_err(|error| Error::BadRequest(error.to_string())),
         Kind::Bag => ros::bag::read(&bytes, reach::RECORDED)
             .map(Material::Bag)

@@ -15,6 +15,7 @@ mod api_v1;
 mod app;
 mod auth;
 mod body;
+mod calibration;
 mod errors;
 mod explain;
 mod guard;

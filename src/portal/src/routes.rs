@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use utoipa::openapi::Required;
 
-use super::{App, api_v1, metrics, oci, openapi, page, push, robots, stubs};
+use super::{App, api_v1, calibration, metrics, oci, openapi, page, push, robots, stubs};
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
 
@@ -157,6 +157,23 @@ pub const ROUTES: &[Route] = &[
             Required::True,
         )
         .answers::<api::trial::Trial>()
+    }),
+    at("POST", "/api/v1/services/{name}/calibration", Token, || {
+        post(calibration::calibration).layer(DefaultBodyLimit::disable())
+    })
+    .described(|| {
+        operation(
+            "calibrate",
+            "Replays recorded requests at several limits and proposes rows of the dictionary; writes none. The last line is \
+             done or error.",
+        )
+        .asks_json::<api::CalibrationOptions>("options", "What to measure, and with what.")
+        .takes_file(
+            "application/octet-stream",
+            "A recording (rosbag 2.0), or pictures (PNG files, one behind the other); empty with live.",
+            Required::False,
+        )
+        .streams::<api::CalibrationEvent>()
     }),
     at("GET", "/api/v1/servants", Token, || get(api_v1::servants))
         .described(|| operation("servants", "All servants.").lists::<api::Servant>()),

@@ -27,7 +27,6 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use api::trial::Trial;
 use async_trait::async_trait;
 use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use budget::Budget;
@@ -51,7 +50,7 @@ pub use ends::how_it_ended;
 pub use local::LocalOpener;
 pub use nodes::LinkedNodes;
 pub use request_times::RequestTimes;
-pub use trial::{Material, Picture, RECORDED};
+pub use trial::{Gap, Material, Pace, Picture, RECORDED, Replay, fits};
 
 /// What is recorded of the revision that a servant was started from.
 #[derive(Debug, Clone)]
@@ -140,12 +139,13 @@ pub trait Reach: Send + Sync + 'static {
         metrics.dropped.get() + metrics.bus_dropped.get()
     }
     /// Gives it material, and tells what it answers and when.
-    async fn trial(
+    async fn replay(
         &self,
         service: &str,
         interface: &Interface,
-        material: Material,
-    ) -> Result<Trial, Error>;
+        material: &Material,
+        pace: &Pace,
+    ) -> Result<Replay, Error>;
     /// From now on it serves this one.
     fn bind(&self, tenant: Weak<dyn Tenant>);
     /// Ends every rosbridge session, and refuses new ones, with these words.

@@ -2,7 +2,6 @@
 
 use std::sync::{Arc, Weak};
 
-use api::trial::Trial;
 use async_trait::async_trait;
 use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use futures_util::future::BoxFuture;
@@ -18,7 +17,7 @@ use crate::egress::{self, Relays};
 use crate::links::{self, Hub, HubOptions, LinkStatus};
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
-use crate::trial::{self, Material};
+use crate::trial::{self, Material, Pace, Replay};
 use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, Stream, Tenant, master};
 
 /// The name of our node in every servant's graph.
@@ -159,13 +158,14 @@ impl Reach for LocalReach {
         self.bridge.metrics()
     }
 
-    async fn trial(
+    async fn replay(
         &self,
         service: &str,
         interface: &Interface,
-        material: Material,
-    ) -> Result<Trial, Error> {
-        trial::attempt(&self.bus, service, interface, material).await
+        material: &Material,
+        pace: &Pace,
+    ) -> Result<Replay, Error> {
+        trial::replay(&self.bus, service, interface, material, pace).await
     }
 
     fn bind(&self, tenant: Weak<dyn Tenant>) {

@@ -1,5 +1,6 @@
-//! A picture as a camera would publish it: `sensor_msgs/Image`, `rgb8`.
+//! Pictures as a camera would publish them: `sensor_msgs/Image`, `rgb8`.
 
+use std::fmt;
 use std::io::Cursor;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -10,17 +11,47 @@ use crate::Error;
 
 /// What becomes of it.
 pub const TYPE: &str = "sensor_msgs/Image";
-/// The largest picture, decoded.
+const SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
+/// The largest picture, decoded; and as much as several may have together.
 const MAX_BYTES: usize = 128 << 20;
 
 /// Rows of red, green, blue.
+#[derive(Clone)]
 pub struct Picture {
     width: u32,
     height: u32,
-    rgb: Vec<u8>,
+    rgb: Bytes,
+}
+
+impl fmt::Debug for Picture {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "Picture({}x{})", self.width, self.height)
+    }
 }
 
 impl Picture {
+    /// Decodes PNG files, one behind the other: as many of them as have 128 MiB when decoded. Also how many there are.
+    pub fn read_all(mut files: &[u8]) -> Result<(Vec<Picture>, usize), Error> {
+        let (mut pictures, mut bytes, mut count) = (Vec::new(), 0, 0);
+        while !files.is_empty() {
+            count += 1;
+            let (file, rest) = files.split_at(length(files).unwrap_or(files.len()));
+            files = rest;
+            if bytes >= MAX_BYTES {
+                continue;
+            }
+            let picture = Picture::read(file)?;
+            bytes += picture.rgb.len();
+            if bytes <= MAX_BYTES {
+                pictures.push(picture);
+            }
+        }
+        if pictures.is_empty() {
+            return Err(Error::Trial("there is no picture; give PNG files".into()));
+        }
+        Ok((pictures, count))
+    }
+
     /// Decodes a PNG file.
     pub fn read(file: &[u8]) -> Result<Picture, Error> {
         let bad = |error: png::DecodingError| {
@@ -86,20 +117,57 @@ impl Picture {
     }
 }
 
+/// Length of the PNG file that `files` begin with: its signature and its chunks, each with its length before and a checksum
+/// behind, up to `IEND` (PNG specification, section 5); none where it is cut off or another file.
+fn length(files: &[u8]) -> Option<usize> {
+    let mut at = SIGNATURE.len();
+    if !files.starts_with(SIGNATURE) {
+        return None;
+    }
+    loop {
+        let head: [u8; 4] = files.get(at..at + 4)?.try_into().ok()?;
+        let kind = files.get(at + 4..at + 8)?;
+        at = at.checked_add(u32::from_be_bytes(head) as usize + 12)?;
+        if kind == b"IEND" {
+            return (at <= files.len()).then_some(at);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_picture_becomes_a_message_of_its_size() {
+    fn png(pixels: &[u8]) -> Vec<u8> {
         let mut file = Vec::new();
-        let mut encoder = png::Encoder::new(&mut file, 2, 1);
+        let mut encoder = png::Encoder::new(&mut file, pixels.len() as u32, 1);
         encoder.set_color(ColorType::Grayscale);
         let mut writer = encoder.write_header().expect("a header");
-        writer.write_image_data(&[7, 9]).expect("pixels");
+        writer.write_image_data(pixels).expect("pixels");
         writer.finish().expect("an end");
+        file
+    }
+
+    #[test]
+    fn several_pictures_come_one_behind_the_other() {
+        let files = [png(&[1]), png(&[2, 3]), png(&[4])].concat();
+        let (pictures, count) = Picture::read_all(&files).expect("pictures");
+        let widths: Vec<u32> = pictures.iter().map(|picture| picture.width).collect();
+        assert_eq!((widths, count), (vec![1, 2, 1], 3));
+        for bad in [&files[..files.len() - 1], &files[1..], &[]] {
+            let error = Picture::read_all(bad).err().map(|error| error.to_string());
+            assert!(error.is_some_and(|text| text.contains("PNG")));
+        }
+        // A chunk that is longer than any file.
+        let endless = [SIGNATURE, &[255; 8]].concat();
+        assert_eq!(length(&endless), None);
+    }
+
+    #[test]
+    fn a_picture_becomes_a_message_of_its_size() {
+        let file = png(&[7, 9]);
         let picture = Picture::read(&file).expect("a picture");
-        assert_eq!(picture.rgb, [7, 7, 7, 9, 9, 9]);
+        assert_eq!(picture.rgb[..], [7, 7, 7, 9, 9, 9]);
         let message = picture.message(3);
         assert!(message.ends_with(&[6, 0, 0, 0, 6, 0, 0, 0, 7, 7, 7, 9, 9, 9]));
     }

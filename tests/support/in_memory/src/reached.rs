@@ -2,7 +2,6 @@
 
 use std::sync::{Arc, Weak};
 
-use api::trial::Trial;
 use async_trait::async_trait;
 use bridge::{Metrics, SessionEnd, SessionOptions, Waiting};
 use futures_util::future::BoxFuture;
@@ -11,7 +10,8 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
 use reach::{
-    Error, Look, Material, Observer, Opener, Reach, ReachOptions, Recorded, Stream, Tenant,
+    Error, Look, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded, Replay, Stream,
+    Tenant,
 };
 use ros::bus::{Graph, RosVersion};
 use servant::engine::Servant;
@@ -102,12 +102,13 @@ impl Reach for MemoryReach {
         &self.metrics
     }
 
-    async fn trial(
+    async fn replay(
         &self,
         service: &str,
         _interface: &Interface,
-        _material: Material,
-    ) -> Result<Trial, Error> {
+        _material: &Material,
+        _pace: &Pace,
+    ) -> Result<Replay, Error> {
         Err(Error::Trial(format!("{service} answers nothing")))
     }
 

@@ -1,15 +1,16 @@
 //! One value or more of every type that the document describes.
 
+use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use api::push::Layer;
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
-    Capacity, Caps, Check, CheckStatus, Clock, Doctor, Event, Grants, Isolation, Level, Limits,
-    LogLine, Measure, Node, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback,
-    Servant, ServiceDetail, ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream,
-    Terms, Usage, Volume,
+    CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Doctor, Event,
+    Grants, Isolation, Level, Limits, LogLine, Measure, Node, Phase, Pressure, Problem, PushEvent,
+    PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Size, Sla, Span,
+    Stated, Status, Stopped, Stream, Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -301,12 +302,45 @@ fn tried() -> Trial {
     }
 }
 
+fn calibration() -> Calibration {
+    Calibration {
+        service: "x".into(),
+        inputs: tried().inputs,
+        pace: Some(1.5),
+        network: Some(TimeSpread::default()),
+        points: vec![Point {
+            compute: Some(TimeSpread::default()),
+            ..Point::default()
+        }],
+        rows: vec![row()],
+        ..Calibration::default()
+    }
+}
+
+fn calibration_options() -> CalibrationOptions {
+    CalibrationOptions {
+        source: Source::Live,
+        robot: some("r1"),
+        seconds: Some(1.5),
+        bytes: Some(Size(1 << 20)),
+        cpus: vec![0.5],
+        requests: Some(40),
+        rate: Some(1.5),
+        fast: true,
+        input: some("/x"),
+        network: Some(1.5),
+        aux: [("image".to_owned(), "640x480".to_owned())].into(),
+    }
+}
+
 /// Values of every type of the document, as serde writes them, with all that is optional and without.
 pub fn samples() -> Vec<(&'static str, Value)> {
     fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
         (name, serde_json::to_value(value).expect("plain data"))
     }
     let mut samples = vec![
+        sample("CalibrationOptions", calibration_options()),
+        sample("CalibrationOptions", CalibrationOptions::default()),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
         sample("Explanation", explanation()),
@@ -343,6 +377,21 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             line: "x".into(),
         };
         samples.push(sample("LogLine", line));
+    }
+    for event in [
+        CalibrationEvent::Step { title: "x".into() },
+        CalibrationEvent::Measured {
+            point: Point::default(),
+        },
+        CalibrationEvent::Done {
+            calibration: Box::new(calibration()),
+        },
+        CalibrationEvent::Done {
+            calibration: Box::default(),
+        },
+        CalibrationEvent::Error { problem: problem() },
+    ] {
+        samples.push(sample("CalibrationEvent", event));
     }
     for event in [
         PushEvent::Step { title: "x".into() },

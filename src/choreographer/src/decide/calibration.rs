@@ -1,0 +1,340 @@
+//! At which limits a service is measured, when that is enough, and which rows of the dictionary follow from it.
+
+use std::collections::BTreeMap;
+
+use api::calibration::{Point, TimeSpread};
+use api::dictionary::{Row, Spread};
+use api::{Limits, Measure, Size};
+
+/// The smallest limit of a ladder, in thousandths of a core.
+const SMALLEST: u64 = 100;
+/// Each limit of a ladder is so many times the one before.
+const STEP: f64 = 1.5;
+/// Times that are less than this share of the best so far are better; anything above may be chance.
+const BETTER: f64 = 0.9;
+/// The ladder ends when so many limits, one after the other, made nothing better.
+const PATIENCE: usize = 2;
+/// Fewer answers say nothing of a 95th percentile.
+pub(crate) const FEWEST: usize = 10;
+/// At least such a share of the requests must be answered, and such a share of the recording's pace be kept.
+const ENOUGH: f64 = 0.95;
+/// Percent that proposed memory lies above the peak, which is looked for only now and then.
+pub(crate) const MARGIN: u64 = 25;
+/// The least that it lies above.
+const LEAST_MARGIN: u64 = 16 << 20;
+
+/// Limits to measure at, in cores, fewest first: a geometric ladder that ends with `most`, which are thousandths of a core.
+pub(crate) fn ladder(most: u64) -> Vec<f64> {
+    let mut rungs = Vec::new();
+    let mut rung = SMALLEST as f64;
+    // Another rung just below the last would tell nothing.
+    while rung * (1.0 + STEP) / 2.0 < most as f64 {
+        rungs.push((rung / 10.0).round() / 100.0);
+        rung *= STEP;
+    }
+    rungs.push(most as f64 / 1000.0);
+    rungs
+}
+
+/// What is measured next.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Next {
+    /// At this limit, in cores.
+    Measure(f64),
+    /// Nothing, and why.
+    Enough(String),
+}
+
+/// What comes after what was `measured`, in the ladder's order. Limits that somebody `named` are all measured.
+pub(crate) fn next(ladder: &[f64], named: bool, measured: &[Point]) -> Next {
+    let Some(limit) = ladder.get(measured.len()) else {
+        let last = ladder.last().copied().unwrap_or_default();
+        return Next::Enough(if named {
+            "all limits that were named are measured".to_owned()
+        } else {
+            format!("{last} cores are all that this machine can promise now")
+        });
+    };
+    match elbow(measured) {
+        Some(elbow) if !named => Next::Enough(format!("more than {elbow} cores make it no faster")),
+        _ => Next::Measure(*limit),
+    }
+}
+
+/// The limit behind which [`PATIENCE`] others made nothing better.
+fn elbow(measured: &[Point]) -> Option<f64> {
+    let mut best: Option<(f64, TimeSpread)> = None;
+    let mut idle = 0;
+    for point in measured {
+        let Some(spread) = point.compute.filter(|_| answers(point)) else {
+            continue;
+        };
+        match &mut best {
+            Some((_, best)) if !is_better(&spread, best) => idle += 1,
+            _ => {
+                best = Some((point.cpus, spread));
+                idle = 0;
+            }
+        }
+    }
+    best.filter(|_| idle >= PATIENCE).map(|(cpus, _)| cpus)
+}
+
+fn is_better(new: &TimeSpread, best: &TimeSpread) -> bool {
+    new.p50 < best.p50 * BETTER || new.p95 < best.p95 * BETTER
+}
+
+/// Enough of its requests were answered.
+fn answers(point: &Point) -> bool {
+    point.answered >= FEWEST && point.answered as f64 >= point.requests as f64 * ENOUGH
+}
+
+/// Rows that follow from what was measured, fewest cores first. Each is faster than all that are cheaper. None is of a limit
+/// at which requests were left unanswered or the recording's `pace` (requests a second) was not kept: there they would queue
+/// without end.
+pub(crate) fn propose(
+    points: &[Point],
+    pace: Option<f64>,
+    network: TimeSpread,
+    memory: Size,
+    aux: &BTreeMap<String, String>,
+) -> Vec<Row> {
+    let mut usable: Vec<(&Point, TimeSpread)> = points
+        .iter()
+        .filter(|point| answers(point) && keeps(point, pace))
+        .filter_map(|point| Some((point, point.compute?)))
+        .collect();
+    usable.sort_by(|(one, _), (other, _)| one.cpus.total_cmp(&other.cpus));
+    let mut best = f64::INFINITY;
+    let mut rows = Vec::new();
+    for (point, compute) in usable {
+        let p95 = compute.p95 + network.p95;
+        if p95 >= best * BETTER {
+            continue;
+        }
+        best = p95;
+        rows.push(Row {
+            id: 0,
+            measure: Measure::Rrt,
+            value: rounded_up(p95) / 1000.0,
+            aux: aux.clone(),
+            limits: Limits {
+                cpus: Some(point.cpus),
+                memory: Some(memory),
+                ..Limits::default()
+            },
+            spread: Some(Spread {
+                p50: (compute.p50 + network.p50) / 1000.0,
+                p95: p95 / 1000.0,
+                requests: point.answered as u64,
+            }),
+            revision: None,
+            written: 0,
+        });
+    }
+    rows
+}
+
+fn keeps(point: &Point, pace: Option<f64>) -> bool {
+    pace.is_none_or(|pace| point.rate >= pace * ENOUGH)
+}
+
+/// Memory for a servant whose peak was `peak`: [`MARGIN`] more, in whole MiB.
+pub(crate) fn with_margin(peak: Size) -> Size {
+    let margin = (peak.0 / 100 * MARGIN).max(LEAST_MARGIN);
+    Size((peak.0 + margin).next_multiple_of(1 << 20))
+}
+
+/// To two digits, never down.
+fn rounded_up(milliseconds: f64) -> f64 {
+    let digit = 10f64.powf(milliseconds.max(1e-3).log10().floor() - 1.0);
+    let up = (milliseconds / digit).ceil() * digit;
+    // What powers of ten left behind the digits.
+    (up * 1e6).round() / 1e6
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn point(cpus: f64, p50: f64, p95: f64) -> Point {
+        Point {
+            cpus,
+            requests: 40,
+            answered: 40,
+            compute: Some(TimeSpread {
+                p50,
+                p95,
+                max: p95 * 2.0,
+            }),
+            rate: 10.0,
+            ..Point::default()
+        }
+    }
+
+    #[test]
+    fn ladders_grow_by_half_and_end_with_all_that_can_be_promised() {
+        for (most, rungs) in [
+            (2000, &[0.1, 0.15, 0.23, 0.34, 0.51, 0.76, 1.14, 2.0][..]),
+            (800, &[0.1, 0.15, 0.23, 0.34, 0.51, 0.8]),
+            (120, &[0.12]),
+            (130, &[0.1, 0.13]),
+            (50, &[0.05]),
+        ] {
+            assert_eq!(ladder(most), rungs, "{most}");
+        }
+    }
+
+    #[test]
+    fn a_ladder_ends_behind_its_elbow() {
+        let rungs = ladder(4000);
+        let mut measured = Vec::new();
+        // A program of one thread that needs 100 ms: no faster than a core.
+        let ended = loop {
+            match next(&rungs, false, &measured) {
+                Next::Measure(cpus) => {
+                    let time = 100.0 / f64::min(cpus, 1.0);
+                    measured.push(point(cpus, time, time * 1.1));
+                }
+                Next::Enough(why) => break why,
+            }
+        };
+        assert_eq!(ended, "more than 1.14 cores make it no faster");
+        assert_eq!(measured.last().map(|point| point.cpus), Some(2.56));
+        // Who names limits is given all of them.
+        assert_eq!(next(&rungs, true, &measured), Next::Measure(4.0));
+        assert_eq!(
+            next(&[1.0], false, &[point(1.0, 5.0, 6.0)]),
+            Next::Enough("1 cores are all that this machine can promise now".into())
+        );
+    }
+
+    #[test]
+    fn limits_at_which_nothing_is_answered_are_no_elbow() {
+        let rungs = ladder(4000);
+        let dead = Point {
+            requests: 3,
+            ..Point::default()
+        };
+        let measured = [dead, dead, dead, dead];
+        assert_eq!(next(&rungs, false, &measured), Next::Measure(rungs[4]));
+    }
+
+    #[test]
+    fn rows_are_proposed_where_more_is_faster_and_nothing_queues() {
+        let slow = Point {
+            rate: 5.0,
+            ..point(0.1, 190.0, 200.0)
+        };
+        let silent = Point {
+            answered: 30,
+            ..point(0.2, 90.0, 100.0)
+        };
+        let points = [
+            slow,
+            silent,
+            point(0.4, 70.0, 80.0),
+            // By chance.
+            point(0.6, 69.0, 79.0),
+            point(0.8, 40.0, 41.2),
+            point(1.2, 40.0, 60.0),
+        ];
+        let network = TimeSpread {
+            p50: 5.0,
+            p95: 20.0,
+            max: 90.0,
+        };
+        let aux = BTreeMap::from([("width".to_owned(), "640".to_owned())]);
+        let rows = propose(&points, Some(10.0), network, Size(7), &aux);
+        let told: Vec<_> = rows
+            .iter()
+            .map(|row| {
+                let spread = row.spread.expect("measured");
+                (row.limits.cpus, row.value, spread.p50, spread.p95)
+            })
+            .collect();
+        let expected = [
+            (Some(0.4), 0.1, 0.075, 0.1),
+            (Some(0.8), 0.062, 0.045, 0.0612),
+        ];
+        assert_eq!(told, expected);
+        let row = &rows[0];
+        assert_eq!((row.measure, &row.aux), (Measure::Rrt, &aux));
+        assert_eq!(row.limits.memory, Some(Size(7)));
+        assert_eq!(row.spread.map(|spread| spread.requests), Some(40));
+        // Where requests follow answers, nothing queues.
+        let rows = propose(&points, None, TimeSpread::default(), Size(7), &aux);
+        assert_eq!(rows.len(), 3);
+    }
+
+    #[test]
+    fn memory_has_a_margin() {
+        const MIB: u64 = 1 << 20;
+        assert_eq!(with_margin(Size(100 * MIB)), Size(125 * MIB));
+        assert_eq!(with_margin(Size(10 * MIB + 1)), Size(27 * MIB));
+    }
+
+    #[test]
+    fn times_are_rounded_up_to_two_digits() {
+        for (time, rounded) in [
+            (424.3, 430.0),
+            (8.21, 8.3),
+            (8.2, 8.2),
+            (100.0, 100.0),
+            (99.1, 100.0),
+            (0.0, 0.001),
+        ] {
+            assert_eq!(rounded_up(time), rounded, "{time}");
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn ladders_rise_to_the_most_and_never_above(most in 1u64..200_000) {
+            let rungs = ladder(most);
+            prop_assert!(rungs.windows(2).all(|pair| pair[0] < pair[1]), "{rungs:?}");
+            prop_assert_eq!(rungs.last().copied(), Some(most as f64 / 1000.0));
+        }
+
+        #[test]
+        fn dearer_rows_are_faster_and_every_row_was_measured(
+            measured in prop::collection::vec((1u64..8000, 1f64..1000.0, 1f64..3.0, 0usize..50, 1f64..20.0), 0..20),
+            pace in prop::option::of(1f64..20.0),
+        ) {
+            let points: Vec<Point> = measured
+                .into_iter()
+                .map(|(millicpus, p50, factor, answered, rate)| Point {
+                    answered,
+                    requests: answered.max(40),
+                    rate,
+                    ..point(millicpus as f64 / 1000.0, p50, p50 * factor)
+                })
+                .collect();
+            let rows = propose(&points, pace, TimeSpread::default(), Size(1), &BTreeMap::new());
+            let told: Vec<(f64, f64, Spread)> = rows
+                .iter()
+                .map(|row| (row.limits.cpus.unwrap_or(0.0), row.value, row.spread.expect("measured")))
+                .collect();
+            for pair in told.windows(2) {
+                prop_assert!(pair[0].0 < pair[1].0, "{told:?}");
+                prop_assert!(pair[0].2.p95 > pair[1].2.p95, "{told:?}");
+                prop_assert!(pair[0].1 >= pair[1].1, "{told:?}");
+            }
+            let usable: Vec<&Point> = points.iter().filter(|point| answers(point) && keeps(point, pace)).collect();
+            let p95 = |point: &Point| point.compute.map_or(f64::INFINITY, |compute| compute.p95) / 1000.0;
+            for (cpus, value, spread) in &told {
+                prop_assert!(*value >= spread.p95 - 1e-9 && *value <= spread.p95 * 1.1 + 1e-9, "{told:?}");
+                prop_assert!(spread.requests >= FEWEST as u64);
+                prop_assert!(usable.iter().any(|point| point.cpus == *cpus && p95(point) == spread.p95), "{told:?}");
+            }
+            // The fastest of all is among them, or one so near that it may be chance.
+            let best = usable.iter().map(|point| p95(point)).fold(f64::INFINITY, f64::min);
+            let proposed = told.last().map_or(f64::INFINITY, |(_, _, spread)| spread.p95);
+            prop_assert!(best.is_infinite() || proposed * BETTER <= best + 1e-9, "{best} {told:?}");
+        }
+    }
+}

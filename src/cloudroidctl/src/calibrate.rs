@@ -1,0 +1,292 @@
+//! `calibrate`: what response times cost, measured, as rows of the dictionary.
+
+mod curve;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use api::calibration::{Point, Source};
+use api::dictionary::Row;
+use api::{Calibration, CalibrationEvent, CalibrationOptions, Size};
+use futures_util::StreamExt;
+use http_body_util::{BodyExt, Full};
+use hyper::Method;
+
+use crate::client::{self, Client, escaped};
+use crate::output::{self, Format, Table};
+
+/// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
+///
+/// A servant of its own is started, asks for room as any other, and is ended afterwards.
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "frames", "live"])))]
+pub struct Calibrate {
+    /// The service.
+    service: String,
+    /// A recording of its inputs: a rosbag file, not compressed. It is replayed at its own pace.
+    #[arg(long, value_name = "FILE")]
+    bag: Option<PathBuf>,
+    /// A directory of pictures for its camera inputs: PNG files, in the order of their names.
+    #[arg(long, value_name = "DIR")]
+    frames: Option<PathBuf>,
+    /// Take what this connected robot sends now; it is answered as before, and hears nothing of this.
+    #[arg(long, value_name = "ROBOT")]
+    live: Option<String>,
+    /// Seconds for which a robot's requests are taken, at most; 20 by default.
+    #[arg(long, value_name = "N", requires = "live")]
+    seconds: Option<f64>,
+    /// Bytes of a robot's requests, at most; 256M by default.
+    #[arg(long, value_name = "BYTES", requires = "live")]
+    bytes: Option<Size>,
+    /// Limits to measure at, in cores, separated by commas; by default ever larger ones, until more makes nothing faster.
+    #[arg(long, value_name = "N,…", value_delimiter = ',')]
+    cpus: Vec<f64>,
+    /// Requests at each limit, at most; 40 by default.
+    #[arg(long, value_name = "N")]
+    requests: Option<usize>,
+    /// Requests a second, instead of the recording's own pace.
+    #[arg(long, value_name = "HZ", conflicts_with = "fast")]
+    rate: Option<f64>,
+    /// Each request follows the last answer at once, as pictures do without --rate.
+    #[arg(long)]
+    fast: bool,
+    /// The input whose messages are the requests; by default the recording's first topic that is an input.
+    #[arg(long, value_name = "TOPIC")]
+    input: Option<String>,
+    /// Milliseconds that robots' networks add to each request; with --live it is measured.
+    #[arg(long, value_name = "MS")]
+    network: Option<f64>,
+    /// Auxiliary parameter of the rows, such as width=640; may be given several times.
+    #[arg(long, value_name = "K=V", value_parser = auxiliary)]
+    aux: Vec<(String, String)>,
+    /// Where to draw the curve; SERVICE-calibration.svg by default.
+    #[arg(long, value_name = "FILE")]
+    curve: Option<PathBuf>,
+}
+
+fn auxiliary(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() && !value.is_empty() => {
+            Ok((key.to_owned(), value.to_owned()))
+        }
+        _ => Err("write K=V".to_owned()),
+    }
+}
+
+impl Calibrate {
+    /// Measures and shows.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let body = self.body()?;
+        let curve = self
+            .curve
+            .clone()
+            .unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
+        let calibration = tokio::select! {
+            measured = self.measure(client, format, body) => measured?,
+            _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
+        };
+        fs::write(&curve, curve::draw(&calibration))
+            .with_context(|| format!("cannot write the curve {}", curve.display()))?;
+        match format {
+            Format::Json => output::json_line(&calibration),
+            Format::Table => print(&calibration, &curve),
+        }
+    }
+
+    /// What is sent: a recording, or pictures one behind the other.
+    fn body(&self) -> anyhow::Result<Vec<u8>> {
+        let read =
+            |path: &Path| fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+        match (&self.bag, &self.frames) {
+            (Some(path), _) => read(path),
+            (None, Some(directory)) => {
+                let mut body = Vec::new();
+                for path in pictures(directory)? {
+                    body.extend(read(&path)?);
+                }
+                Ok(body)
+            }
+            (None, None) => Ok(Vec::new()),
+        }
+    }
+
+    fn options(&self) -> CalibrationOptions {
+        CalibrationOptions {
+            source: match (&self.bag, &self.frames) {
+                (Some(_), _) => Source::Bag,
+                (None, Some(_)) => Source::Frames,
+                (None, None) => Source::Live,
+            },
+            robot: self.live.clone(),
+            seconds: self.seconds,
+            bytes: self.bytes,
+            cpus: self.cpus.clone(),
+            requests: self.requests,
+            rate: self.rate,
+            fast: self.fast,
+            input: self.input.clone(),
+            network: self.network,
+            aux: self.aux.iter().cloned().collect(),
+        }
+    }
+
+    async fn measure(
+        &self,
+        client: &Client,
+        format: Format,
+        body: Vec<u8>,
+    ) -> anyhow::Result<Calibration> {
+        let path = format!(
+            "/api/v1/services/{}/calibration?options={}",
+            escaped(&self.service),
+            escaped(&serde_json::to_string(&self.options())?)
+        );
+        let body = Full::new(body.into())
+            .map_err(|never| match never {})
+            .boxed_unsync();
+        let answer = client.send(Method::POST, &path, body).await?;
+        let mut events = client::lines(answer);
+        while let Some(event) = events.next().await {
+            match event? {
+                CalibrationEvent::Done { calibration } => return Ok(*calibration),
+                CalibrationEvent::Error { problem } => return Err(problem.into()),
+                event if format == Format::Json => output::json_line(&event)?,
+                CalibrationEvent::Step { title } => output::line(&format!("== {title}"))?,
+                CalibrationEvent::Measured { point } => {
+                    output::line(&format!("   {}", in_a_line(&point)))?;
+                }
+            }
+        }
+        bail!("the daemon broke off the calibration; nothing was written")
+    }
+}
+
+/// PNG files of a directory, in the order of their names.
+fn pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let reading = || format!("cannot read {}", directory.display());
+    let mut found = Vec::new();
+    for entry in fs::read_dir(directory).with_context(reading)? {
+        let path = entry.with_context(reading)?.path();
+        let is_png = path
+            .extension()
+            .is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
+        if is_png {
+            found.push(path);
+        }
+    }
+    if found.is_empty() {
+        bail!(
+            "{} holds no .png file; convert pictures to PNG, or give a recording with --bag",
+            directory.display()
+        );
+    }
+    found.sort();
+    Ok(found)
+}
+
+fn in_a_line(point: &Point) -> String {
+    match point.compute {
+        Some(compute) => format!(
+            "{} of {} answered: {:.1} ms (median), {:.1} ms (95 %)",
+            point.answered, point.requests, compute.p50, compute.p95
+        ),
+        None => format!("none of {} answered", point.requests),
+    }
+}
+
+fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
+    let mut table = Table::new(&[
+        "CPUS", "ANSWERED", "P50 MS", "P95 MS", "MAX MS", "RUNNING", "HELD UP", "PER S", "MEMORY",
+    ]);
+    for point in &calibration.points {
+        let time = |of: fn(&api::calibration::TimeSpread) -> f64| {
+            point
+                .compute
+                .as_ref()
+                .map_or("-".to_owned(), |compute| format!("{:.1}", of(compute)))
+        };
+        table.row([
+            point.cpus.to_string(),
+            format!("{} of {}", point.answered, point.requests),
+            time(|compute| compute.p50),
+            time(|compute| compute.p95),
+            time(|compute| compute.max),
+            format!("{:.1}", point.running),
+            format!("{:.1}", point.throttled),
+            format!("{:.1}", point.rate),
+            point.memory.to_string(),
+        ]);
+    }
+    output::line("")?;
+    table.print()?;
+    output::line(&format!("ended: {}", calibration.ended))?;
+    if !calibration.unused.is_empty() {
+        output::line(&format!("not used: {}", calibration.unused.join(", ")))?;
+    }
+    if let Some(pace) = calibration.pace {
+        output::line(&format!(
+            "asked for {pace:.1} requests a second; limits that do not keep it are not proposed"
+        ))?;
+    }
+    if let Some(network) = calibration.network {
+        output::line(&format!(
+            "added for the network: {:.1} ms (median), {:.1} ms (95 %)",
+            network.p50, network.p95
+        ))?;
+    }
+    output::line(&format!(
+        "largest request {}; memory at most {}, proposed with {} % more",
+        calibration.largest, calibration.memory_peak, calibration.memory_margin
+    ))?;
+    output::line(&format!("curve: {}", curve.display()))?;
+    if calibration.rows.is_empty() {
+        return output::line(
+            "no row is proposed: at no limit were enough requests answered at the asked pace",
+        );
+    }
+    output::line("")?;
+    rows(&calibration.rows)
+}
+
+/// Proposed rows.
+fn rows(rows: &[Row]) -> anyhow::Result<()> {
+    let mut table = Table::new(&["ROW", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
+    for row in rows {
+        let shown = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
+        let time = |time: f64| format!("{:.1}", time * 1000.0);
+        table.row([
+            row.to_string(),
+            shown(row.limits.cpus.map(|cpus| cpus.to_string())),
+            shown(row.limits.memory.map(|memory| memory.to_string())),
+            shown(row.spread.map(|spread| time(spread.p50))),
+            shown(row.spread.map(|spread| time(spread.p95))),
+            shown(row.spread.map(|spread| spread.requests.to_string())),
+        ]);
+    }
+    table.print()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_come_in_the_order_of_their_names() {
+        let directory = std::env::temp_dir().join(format!("calibrate-{}", std::process::id()));
+        fs::create_dir_all(&directory).expect("a directory");
+        let none = pictures(&directory).expect_err("none").to_string();
+        assert!(none.contains("holds no .png file"), "{none}");
+        for name in ["b.png", "a.PNG", "c.jpg"] {
+            fs::write(directory.join(name), name).expect("a file");
+        }
+        let found = pictures(&directory);
+        fs::remove_dir_all(&directory).expect("removed");
+        let names: Vec<_> = found
+            .expect("pictures")
+            .iter()
+            .filter_map(|path| path.file_name()?.to_str().map(str::to_owned))
+            .collect();
+        assert_eq!(names, ["a.PNG", "b.png"]);
+    }
+}

@@ -1,0 +1,236 @@
+//! `POST /api/v1/services/NAME/calibration`: options in the query, a recording or pictures in the body, events as JSON lines
+//! in the answer.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::calibration::Source;
+use api::{CalibrationEvent, CalibrationOptions, Size};
+use axum::Extension;
+use axum::body::Body;
+use axum::extract::{OriginalUri, Path, State};
+use axum::response::Response;
+use budget::Permit;
+use choreographer::{Bounds, Requests};
+use futures_util::StreamExt;
+use reach::{Material, Picture, RECORDED};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::api_v1::{lines, recording};
+use super::guard::{Caller, query};
+use crate::app::App;
+use crate::errors::Error;
+
+/// Events that a client has not read.
+const EVENTS_AHEAD: usize = 64;
+/// For how long a robot's requests are taken where nobody says it, and the longest.
+const SECONDS: f64 = 20.0;
+const LONGEST: f64 = 600.0;
+/// Bytes of them, where nobody says it.
+const BYTES: Size = Size(256 << 20);
+/// Limits that are measured in one calibration, and requests at each.
+const MOST_LIMITS: usize = 32;
+const MOST_REQUESTS: usize = 10_000;
+
+/// Answers a calibration.
+pub async fn calibration(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
+    OriginalUri(uri): OriginalUri,
+    body: Body,
+) -> Result<Response, Error> {
+    let options = read_options(uri.query())?;
+    app.catalogue.current(&name)?;
+    let given = match options.source {
+        Source::Live => None,
+        Source::Bag | Source::Frames => Some(recording(&app, &caller, body).await?),
+    };
+    let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
+    let ending = app.ending.clone().cancelled_owned();
+    let work = async move {
+        let outcome = async {
+            let (requests, permit) = match given {
+                Some(held) => (
+                    material(options.source, held.bytes, &events).await?,
+                    held.permit,
+                ),
+                None => live(&app, &caller, &name, &options, &events).await?,
+            };
+            let choreographer = &app.choreographer;
+            let calibration = choreographer.calibrate(&name, &requests, &options, &events);
+            let calibration = calibration.await?;
+            // Messages were cut from the body, or recorded.
+            drop(permit);
+            Ok::<_, Error>(calibration)
+        };
+        let event = match outcome.await {
+            Ok(calibration) => CalibrationEvent::Done {
+                calibration: Box::new(calibration),
+            },
+            Err(error) => CalibrationEvent::Error {
+                problem: error.problem(),
+            },
+        };
+        let _ = events.send(event).await;
+    };
+    // Lives in the answer: when the client goes away the answer is dropped, and the calibration with it.
+    let work = AbortOnDropHandle::new(tokio::spawn(work));
+    let events = ReceiverStream::new(receiver).take_until(ending);
+    Ok(lines(events.map(move |event| {
+        let _ = &work;
+        event
+    })))
+}
+
+async fn step(events: &mpsc::Sender<CalibrationEvent>, title: String) {
+    let _ = events.send(CalibrationEvent::Step { title }).await;
+}
+
+/// What was sent, as messages.
+async fn material(
+    source: Source,
+    bytes: bytes::Bytes,
+    events: &mpsc::Sender<CalibrationEvent>,
+) -> Result<Requests, Error> {
+    let reading = tokio::task::spawn_blocking(move || match source {
+        Source::Frames => Picture::read_all(&bytes)
+            .map(|(pictures, count)| (Some((pictures.len(), count)), Material::Pictures(pictures)))
+            .map_err(|error| Error::BadRequest(error.to_string())),
+        Source::Bag | Source::Live => ros::bag::read(&bytes, RECORDED)
+            .map(|recorded| (None, Material::Bag(recorded)))
+            .map_err(|error| Error::BadRequest(error.to_string())),
+    });
+    let (pictures, material) = reading
+        .await
+        .map_err(|_| Error::Internal("reading what a service is calibrated with"))??;
+    if let Some((used, count)) = pictures.filter(|(used, count)| used < count) {
+        step(
+            events,
+            format!("using the first {used} of {count} pictures: more do not fit into memory"),
+        )
+        .await;
+    }
+    Ok(Requests {
+        material,
+        network: None,
+    })
+}
+
+/// What a robot sends.
+async fn live(
+    app: &App,
+    caller: &Caller,
+    service: &str,
+    options: &CalibrationOptions,
+    events: &mpsc::Sender<CalibrationEvent>,
+) -> Result<(Requests, Permit), Error> {
+    let robot = options.robot.as_deref().unwrap_or_default();
+    let bounds = Bounds {
+        time: Duration::from_secs_f64(options.seconds.unwrap_or(SECONDS)),
+        bytes: options.bytes.unwrap_or(BYTES).0 as usize,
+        messages: RECORDED,
+    };
+    step(
+        events,
+        format!(
+            "taking what robot {robot} sends to {service}, for {} s at most",
+            bounds.time.as_secs_f64()
+        ),
+    )
+    .await;
+    let budget = app.choreographer.memory().client(&caller.peer.client(None));
+    let captured = app.choreographer.capture(service, robot, bounds, &budget);
+    Ok(captured.await?)
+}
+
+fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
+    let options = match query(query_of, "options") {
+        Some(text) => serde_json::from_str(&text).map_err(|error| {
+            Error::BadRequest(format!("the calibration's options cannot be read: {error}"))
+        })?,
+        None => CalibrationOptions::default(),
+    };
+    check(&options).map_err(Error::BadRequest)?;
+    Ok(options)
+}
+
+/// Refuses what cannot be measured.
+fn check(options: &CalibrationOptions) -> Result<(), String> {
+    let positive = |name: &str, value: Option<f64>, least: f64, most: f64| match value {
+        Some(value) if !(least..=most).contains(&value) => Err(format!(
+            "{name} = {value} is not between {least} and {most}"
+        )),
+        _ => Ok(()),
+    };
+    for cpus in &options.cpus {
+        positive("cpus", Some(*cpus), 0.01, 4096.0)?;
+    }
+    if options.cpus.len() > MOST_LIMITS {
+        return Err(format!("at most {MOST_LIMITS} limits are measured at once"));
+    }
+    positive("rate", options.rate, 0.01, 10_000.0)?;
+    positive("seconds", options.seconds, 0.1, LONGEST)?;
+    positive("network", options.network, 0.0, 3_600_000.0)?;
+    let requests = options.requests.map(|requests| requests as f64);
+    positive("requests", requests, 10.0, MOST_REQUESTS as f64)?;
+    if options.rate.is_some() && options.fast {
+        return Err("rate and fast exclude each other".to_owned());
+    }
+    match (options.source, &options.robot) {
+        (Source::Live, None) => Err("live needs the robot whose requests are taken".to_owned()),
+        (Source::Bag | Source::Frames, Some(_)) => {
+            Err("a robot's requests are taken with live alone".to_owned())
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_that_cannot_be_measured_are_refused() {
+        let read = |options: &str| {
+            let query = form_urlencoded::Serializer::new(String::new())
+                .append_pair("options", options)
+                .finish();
+            read_options(Some(&query)).map_err(|error| error.problem().detail)
+        };
+        assert_eq!(
+            read_options(None).expect("none"),
+            CalibrationOptions::default()
+        );
+        let live = read(r#"{"source":"live","robot":"r1","seconds":5}"#).expect("valid");
+        assert_eq!((live.source, live.seconds), (Source::Live, Some(5.0)));
+        for (options, words) in [
+            (
+                r#"{"cpus":[0.5,0]}"#,
+                "cpus = 0 is not between 0.01 and 4096",
+            ),
+            (r#"{"rate":-1}"#, "rate = -1"),
+            (
+                r#"{"seconds":1e9}"#,
+                "seconds = 1000000000 is not between 0.1 and 600",
+            ),
+            (r#"{"network":-3}"#, "network = -3"),
+            (
+                r#"{"requests":3}"#,
+                "requests = 3 is not between 10 and 10000",
+            ),
+            (r#"{"rate":5,"fast":true}"#, "exclude each other"),
+            (r#"{"source":"live"}"#, "needs the robot"),
+            (r#"{"robot":"r1"}"#, "with live alone"),
+            (r#"{"limits":[1]}"#, "`limits`"),
+            (r#"{"source":"video"}"#, "`video`"),
+        ] {
+            let refused = read(options).expect_err(options);
+            assert!(refused.contains(words), "{options}: {refused}");
+        }
+        let many = format!(r#"{{"cpus":[{}]}}"#, vec!["1"; 33].join(","));
+        assert!(read(&many).expect_err("many").contains("32 limits"));
+    }
+}

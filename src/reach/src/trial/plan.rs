@@ -1,0 +1,338 @@
+//! What is published where: the messages of a recording, or pictures, and the inputs that they go to.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use package::interface::{Direction, Interface, Topic};
+use ros::bag::Recorded;
+use ros::bus::WireType;
+use ros::codec::{Time, header_stamp};
+use ros::schema::Registry;
+
+use super::{Material, Picture, picture};
+use crate::Error;
+
+/// Longer pauses of a recording are cut to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+
+/// The inputs, and the messages in their order.
+pub(super) struct Plan<'a> {
+    pub(super) inputs: Vec<(String, WireType)>,
+    /// The input whose messages are requests.
+    pub(super) request: usize,
+    pub(super) items: Vec<Item<'a>>,
+    /// From the first message to the first of the next round, at the recording's own pace; pictures come once a second.
+    pub(super) length: Duration,
+    pub(super) unused: Vec<String>,
+}
+
+/// One message.
+pub(super) struct Item<'a> {
+    /// Number of its input.
+    pub(super) input: usize,
+    pub(super) content: Content<'a>,
+    /// Since the first message.
+    pub(super) at: Duration,
+}
+
+pub(super) enum Content<'a> {
+    Recorded(Bytes),
+    Picture(&'a Picture),
+}
+
+impl Content<'_> {
+    /// The message; a picture is taken now.
+    pub(super) fn message(&self, sequence: usize) -> Bytes {
+        match self {
+            Content::Recorded(bytes) => bytes.clone(),
+            Content::Picture(picture) => picture.message(sequence),
+        }
+    }
+}
+
+impl<'a> Plan<'a> {
+    /// What becomes of `material`; the messages of the topic `request` are the requests, else those of the first topic that
+    /// the service has an input for.
+    pub(super) fn new(
+        interface: &Interface,
+        registry: &Registry,
+        material: &'a Material,
+        request: Option<&str>,
+    ) -> Result<Plan<'a>, Error> {
+        let inputs: Vec<&Topic> = interface
+            .topics
+            .iter()
+            .filter(|topic| topic.direction == Direction::Input)
+            .collect();
+        let nothing = |what: &str| {
+            let known: Vec<String> = inputs
+                .iter()
+                .map(|topic| format!("{} ({})", topic.name, topic.type_name))
+                .collect();
+            Error::Trial(format!(
+                "{what}; its inputs are: {}",
+                if known.is_empty() {
+                    "none".to_owned()
+                } else {
+                    known.join(", ")
+                }
+            ))
+        };
+        let mut plan = Plan {
+            inputs: Vec::new(),
+            request: 0,
+            items: Vec::new(),
+            length: Duration::ZERO,
+            unused: Vec::new(),
+        };
+        match material {
+            Material::Pictures(pictures) => {
+                let eyes = inputs
+                    .iter()
+                    .filter(|topic| topic.type_name == picture::TYPE);
+                for topic in eyes {
+                    plan.inputs
+                        .push((topic.name.clone(), wire_type(registry, topic)?));
+                }
+                if plan.inputs.is_empty() {
+                    return Err(nothing("the service takes no sensor_msgs/Image"));
+                }
+                plan.choose(request)
+                    .ok_or_else(|| unfed(request, &nothing))?;
+                let eyes = plan.inputs.len();
+                for (number, picture) in pictures.iter().enumerate() {
+                    // Of several that of the requests comes last: its answer is what is waited for.
+                    let others = (0..eyes).filter(|eye| *eye != plan.request);
+                    plan.items
+                        .extend(others.chain([plan.request]).map(|input| Item {
+                            input,
+                            content: Content::Picture(picture),
+                            at: Duration::from_secs(number as u64),
+                        }));
+                }
+                plan.length = Duration::from_secs(pictures.len() as u64);
+            }
+            Material::Bag(recorded) => {
+                let mut before = None;
+                for message in recorded {
+                    match plan.place(&inputs, registry, message)? {
+                        Some(input) => {
+                            let pause = message.time.saturating_sub(before.unwrap_or(message.time));
+                            plan.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
+                            before = Some(message.time.max(before.unwrap_or(0)));
+                            plan.items.push(Item {
+                                input,
+                                content: Content::Recorded(message.bytes.clone()),
+                                at: plan.length,
+                            });
+                        }
+                        None if plan.unused.iter().all(|topic| **topic != *message.topic) => {
+                            plan.unused.push(message.topic.to_string());
+                        }
+                        None => {}
+                    }
+                }
+                if plan.items.is_empty() {
+                    return Err(nothing(
+                        "no topic of the recording is an input of the service",
+                    ));
+                }
+                plan.choose(request)
+                    .ok_or_else(|| unfed(request, &nothing))?;
+                // The next round begins as if one more pause of average length were between.
+                if let Some(pauses) = u32::try_from(plan.items.len() - 1).ok().filter(|n| *n > 0) {
+                    plan.length += plan.length / pauses;
+                }
+            }
+        }
+        Ok(plan)
+    }
+
+    /// The messages in their order; round after round where they are to come `again`.
+    pub(super) fn items(&self, again: bool) -> impl Iterator<Item = &Item<'a>> {
+        let rounds = if again { usize::MAX } else { 1 };
+        let length = self.items.len();
+        (0..rounds.saturating_mul(length)).map(move |turn| &self.items[turn % length])
+    }
+
+    /// How many of a round's messages are requests.
+    pub(super) fn requests(&self) -> usize {
+        let requests = self.items.iter().filter(|item| item.input == self.request);
+        requests.count()
+    }
+
+    /// The stamp of a message of an input.
+    pub(super) fn stamp(&self, input: usize, bytes: &[u8], registry: &Registry) -> Option<Time> {
+        stamp(&self.inputs[input].1.name, bytes, registry)
+    }
+
+    fn choose(&mut self, request: Option<&str>) -> Option<()> {
+        if let Some(named) = request {
+            let mut inputs = self.inputs.iter();
+            self.request = inputs.position(|(topic, _)| topic == named)?;
+        }
+        Some(())
+    }
+
+    /// The input that a recorded topic goes to: of the same name, else the only one of its type.
+    fn place(
+        &mut self,
+        inputs: &[&Topic],
+        registry: &Registry,
+        message: &Recorded,
+    ) -> Result<Option<usize>, Error> {
+        let of_type = || {
+            inputs
+                .iter()
+                .filter(|topic| topic.type_name == message.wire_type.name)
+        };
+        let named = of_type().find(|topic| *topic.name == *message.topic);
+        let alone = || of_type().next().filter(|_| of_type().count() == 1);
+        let Some(input) = named.or_else(alone) else {
+            return Ok(None);
+        };
+        if let Some(known) = self
+            .inputs
+            .iter()
+            .position(|(topic, _)| *topic == input.name)
+        {
+            return Ok(Some(known));
+        }
+        let wire_type = wire_type(registry, input)?;
+        if wire_type.digest != message.wire_type.digest {
+            return Err(Error::Trial(format!(
+                "{} was recorded with another definition of {} ({}) than the service has ({})",
+                message.topic, wire_type.name, message.wire_type.digest, wire_type.digest
+            )));
+        }
+        self.inputs.push((input.name.clone(), wire_type));
+        Ok(Some(self.inputs.len() - 1))
+    }
+}
+
+fn unfed(request: Option<&str>, nothing: &dyn Fn(&str) -> Error) -> Error {
+    let request = request.unwrap_or_default();
+    nothing(&format!(
+        "nothing that was given goes to an input {request}"
+    ))
+}
+
+/// The stamp of a message whose type begins with a header.
+pub(super) fn stamp(type_name: &str, bytes: &[u8], registry: &Registry) -> Option<Time> {
+    header_stamp(&*registry.message(type_name).ok()?, bytes)
+}
+
+fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
+    let known = registry.message(&topic.type_name).map_err(|error| {
+        Error::Trial(format!("the type of {} is not known: {error}", topic.name))
+    })?;
+    Ok(WireType::of(&known))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    fn interface() -> Interface {
+        let topic = |name: &str, of_type: &str, direction| Topic {
+            name: name.into(),
+            type_name: of_type.into(),
+            md5: String::new(),
+            direction,
+            nodes: vec![],
+            latched: false,
+            lazy: false,
+        };
+        Interface {
+            topics: vec![
+                topic("/name", "std_msgs/String", Direction::Input),
+                topic("/count", "std_msgs/Int32", Direction::Input),
+                topic("/greeting", "std_msgs/String", Direction::Output),
+            ],
+            definitions: [
+                ("std_msgs/msg/String".to_owned(), "string data\n".to_owned()),
+                ("std_msgs/msg/Int32".to_owned(), "int32 data\n".to_owned()),
+            ]
+            .into(),
+            ..Interface::default()
+        }
+    }
+
+    fn recorded(topic: &str, of_type: &str, md5: &str) -> Recorded {
+        Recorded {
+            topic: topic.into(),
+            wire_type: Arc::new(WireType::new(of_type, md5, "")),
+            time: 0,
+            bytes: Bytes::from_static(b"\0\0\0\0"),
+        }
+    }
+
+    const STRING: &str = "992ce8a1687cec8c8bd883ec73ca41d1";
+
+    fn plan<'a>(material: &'a Material, request: Option<&str>) -> Result<Plan<'a>, Error> {
+        let interface = interface();
+        let registry = Registry::from_definitions(&interface.definitions).expect("valid");
+        Plan::new(&interface, &registry, material, request)
+    }
+
+    #[test]
+    fn recorded_topics_go_to_inputs_of_their_name_or_type() {
+        let material = Material::Bag(vec![
+            recorded("/chatter", "std_msgs/String", STRING),
+            recorded("/tf", "tf2_msgs/TFMessage", "x"),
+            recorded("/tf", "tf2_msgs/TFMessage", "x"),
+            recorded("/name", "std_msgs/String", STRING),
+        ]);
+        let plan = plan(&material, None).expect("a plan");
+        assert_eq!(plan.inputs.len(), 1);
+        assert_eq!((plan.inputs[0].0.as_str(), plan.items.len()), ("/name", 2));
+        assert_eq!(plan.unused, ["/tf"]);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_told_with_what_does() {
+        let refused = |recorded, request| {
+            let material = Material::Bag(vec![recorded]);
+            let error = plan(&material, request).err();
+            error.map(|error| error.to_string()).unwrap_or_default()
+        };
+        let text = refused(recorded("/tf", "tf2_msgs/TFMessage", "x"), None);
+        assert!(text.contains("/name (std_msgs/String)"), "{text}");
+        let text = refused(recorded("/name", "std_msgs/String", "other"), None);
+        assert!(text.contains("recorded with another definition"), "{text}");
+        let text = refused(recorded("/name", "std_msgs/String", STRING), Some("/count"));
+        assert!(text.contains("goes to an input /count"), "{text}");
+    }
+
+    #[test]
+    fn a_recordings_pace_is_kept_but_for_long_pauses() {
+        let at = |millis: u64, topic: &str, of_type: &str, md5: &str| Recorded {
+            time: millis * 1_000_000,
+            ..recorded(topic, of_type, md5)
+        };
+        const INT: &str = "da5909fbe378aeaf85e547e830cc1bb7";
+        let material = Material::Bag(vec![
+            at(5000, "/name", "std_msgs/String", STRING),
+            at(5100, "/count", "std_msgs/Int32", INT),
+            // Out of order, and after a minute of nothing.
+            at(5050, "/name", "std_msgs/String", STRING),
+            at(65_100, "/count", "std_msgs/Int32", INT),
+        ]);
+        let plan = plan(&material, Some("/count")).expect("a plan");
+        let millis = |time: Duration| time.as_millis();
+        let times: Vec<u128> = plan.items.iter().map(|item| millis(item.at)).collect();
+        assert_eq!(times, [0, 100, 100, 1100]);
+        assert_eq!(millis(plan.length), 1100 + 1100 / 3);
+        assert_eq!((plan.request, plan.requests()), (1, 2));
+        assert_eq!(plan.items(false).count(), 4);
+        let inputs: Vec<usize> = plan
+            .items(true)
+            .skip(3)
+            .take(3)
+            .map(|item| item.input)
+            .collect();
+        assert_eq!(inputs, [1, 0, 1]);
+    }
+}

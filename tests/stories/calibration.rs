@@ -1,0 +1,273 @@
+//! What response times cost is measured, and a robot whose requests are taken for it notices nothing.
+
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::daemon::Daemon;
+use support::deployer::{path_str, run};
+use support::robot::Robot;
+use support::world::{PEOPLE, TELLER, world};
+
+/// Of Debian's opencv-doc.
+const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
+
+/// Five pictures.
+fn frames(directory: &Path) -> Verdict {
+    run(Command::new("ffmpeg")
+        .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", "5"])
+        .args(["-s", "640x480"])
+        .arg(directory.join("frame%02d.png")))?
+    .succeeded()?;
+    Ok(())
+}
+
+/// Servants that are measured, of a service.
+fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
+    let servants = daemon.servants_of(service)?.into_iter();
+    let measured = servants.filter(|servant| {
+        let robot = servant["robot"].as_str().unwrap_or_default();
+        robot.starts_with("~calibrate-")
+    });
+    Ok(measured.collect())
+}
+
+/// None is left, once those that end have ended.
+fn none_is_left(daemon: &Daemon, service: &str) -> Verdict {
+    support::until("the measured servant's end", || {
+        let left = measured(daemon, service)?;
+        Ok(if left.is_empty() {
+            Ok(())
+        } else {
+            Err(format!("{left:#?}"))
+        })
+    })
+}
+
+/// The last line of what is printed for programs.
+fn calibration(printed: &str) -> anyhow::Result<Value> {
+    let last = printed.lines().last().context("nothing was printed")?;
+    serde_json::from_str(last).with_context(|| last.to_owned())
+}
+
+fn time(point: &Value, name: &str) -> anyhow::Result<f64> {
+    point[name]
+        .as_f64()
+        .with_context(|| format!("{name} of {point}"))
+}
+
+pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
+    let daemon = world().with(PEOPLE)?;
+    let place = world().directory("frames")?;
+    frames(place.path())?;
+    let curve = place.path().join("curve.svg");
+    let printed = daemon
+        .deployer()
+        .types(&[
+            "--format",
+            "json",
+            "calibrate",
+            "opencv_apps",
+            "--frames",
+            path_str(place.path()),
+            "--cpus",
+            "0.2,1",
+            "--requests",
+            "12",
+            "--network",
+            "10",
+            "--curve",
+            path_str(&curve),
+        ])?
+        .succeeded()?;
+    none_is_left(&daemon, "opencv_apps")?;
+    let calibration = calibration(&printed.stdout)?;
+    let points = calibration["points"].as_array().context("points")?;
+    ensure!(points.len() == 2, "{calibration:#}");
+    let (tight, wide) = (&points[0], &points[1]);
+    ensure!(
+        tight["answered"] == 12 && tight["requests"] == 12,
+        "{tight:#}"
+    );
+    // A fifth of a core needs five times as long as the work; half of that stands even where a first tenth of a second is free.
+    let (running, took) = (time(tight, "running")?, time(&tight["compute"], "p50")?);
+    ensure!(took > running * 2.5, "no limit was in force: {tight:#}");
+    ensure!(time(tight, "throttled")? > running, "{tight:#}");
+    ensure!(
+        time(wide, "throttled")? < time(tight, "throttled")?,
+        "{calibration:#}"
+    );
+    let peak = calibration["memory_peak"].as_u64().context("a peak")?;
+    let rows = calibration["rows"].as_array().context("rows")?;
+    let cheapest = rows.first().with_context(|| format!("{calibration:#}"))?;
+    ensure!(
+        cheapest["limits"]["memory"].as_u64() >= Some(peak / 100 * 125),
+        "{calibration:#}"
+    );
+    ensure!(
+        peak > 20 << 20,
+        "people_detect has more than that: {calibration:#}"
+    );
+    // The network's share is in the row.
+    let slowest = time(&tight["compute"], "p95")? + 10.0;
+    ensure!(
+        (time(&cheapest["spread"], "p95")? * 1000.0 - slowest).abs() < 1e-6,
+        "{calibration:#}"
+    );
+    let drawn = std::fs::read_to_string(&curve)?;
+    ensure!(
+        drawn.contains("opencv_apps, revision") && drawn.contains("class=\"row\""),
+        "{drawn}"
+    );
+    Ok(())
+}
+
+pub fn what_cannot_be_calibrated_is_said() -> Verdict {
+    let daemon = world().with(PEOPLE)?;
+    let place = world().directory("no-frames")?;
+    let refused = |words: &[&str], saying: &[&str]| {
+        let outcome = daemon
+            .deployer()
+            .types(&[&["calibrate", "opencv_apps"], words].concat())?;
+        outcome.failed_saying(saying)
+    };
+    refused(
+        &["--frames", path_str(place.path())],
+        &["holds no .png file"],
+    )?;
+    let bad = place.path().join("bad.png");
+    std::fs::write(&bad, "no picture")?;
+    refused(
+        &["--frames", path_str(place.path())],
+        &["cannot be read", "PNG"],
+    )?;
+    refused(&["--bag", path_str(&bad)], &["no rosbag file"])?;
+    refused(
+        &["--live", "nobody"],
+        &[
+            "robot nobody does not use opencv_apps now",
+            "cloudroidctl servants",
+        ],
+    )?;
+    refused(
+        &["--live", "nobody", "--cpus", "0"],
+        &["cpus = 0 is not between"],
+    )?;
+    let robot = daemon.robot("opencv_apps?robot=silent")?;
+    daemon.awaits_event("a ready servant", |event| {
+        event["kind"] == "servant-ready" && event["robot"] == "silent"
+    })?;
+    refused(
+        &["--live", "silent", "--seconds", "0.2"],
+        &["robot silent sent nothing to opencv_apps within 0.2 s"],
+    )?;
+    drop(robot);
+    none_is_left(&daemon, "opencv_apps")
+}
+
+/// Says so many words one after the other, each once the one before is answered.
+fn talks(robot: &mut Robot, told: &AtomicBool) -> anyhow::Result<(Vec<String>, Vec<String>)> {
+    let (mut said, mut heard) = (Vec::new(), Vec::new());
+    while !told.load(Ordering::SeqCst) {
+        let word = format!("word {}", said.len());
+        robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))?;
+        said.push(word);
+        let answer = robot.hears_on("/teller/said")?;
+        heard.push(answer["data"].as_str().unwrap_or_default().to_owned());
+    }
+    // Whatever else is on its way arrives before this is answered.
+    let more = !robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
+    ensure!(!more, "something was answered twice");
+    Ok((said, heard))
+}
+
+pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> Verdict {
+    let daemon = world().with(TELLER)?;
+    let mut robot = daemon.robot("teller_py?robot=talker")?;
+    robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
+    robot.subscribes("/teller/said")?;
+    robot.awaits_subscriber("/teller/say")?;
+    let over = AtomicBool::new(false);
+    let place = world().directory("live")?;
+    let curve = place.path().join("curve.svg");
+    let (calibrated, talked) = std::thread::scope(|scope| {
+        let talking = scope.spawn(|| talks(&mut robot, &over));
+        let words = [
+            "--format",
+            "json",
+            "calibrate",
+            "teller_py",
+            "--live",
+            "talker",
+            "--seconds",
+            "3",
+            "--cpus",
+            "0.5,1",
+            "--requests",
+            "10",
+            "--fast",
+            "--curve",
+            path_str(&curve),
+        ];
+        let calibrated = daemon.deployer().types(&words);
+        over.store(true, Ordering::SeqCst);
+        (calibrated, talking.join())
+    });
+    let (said, heard) = talked.map_err(|_| anyhow::anyhow!("the robot panicked"))??;
+    ensure!(said == heard, "the robot said {said:?} and heard {heard:?}");
+    let calibration = calibration(&calibrated?.succeeded()?.stdout)?;
+    ensure!(
+        calibration["inputs"][0]["topic"] == "/teller/say",
+        "{calibration:#}"
+    );
+    ensure!(
+        calibration["points"][1]["answered"] == 10,
+        "{calibration:#}"
+    );
+    none_is_left(&daemon, "teller_py")?;
+    // Its own servant is as it was.
+    let servant = daemon.servant_of("teller_py", "talker")?;
+    ensure!(
+        servant["phase"] == "ready" && servant["connections"] == 1,
+        "{servant:#}"
+    );
+    Ok(())
+}
+
+pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
+    let daemon = world().with(PEOPLE)?;
+    let place = world().directory("gone")?;
+    frames(place.path())?;
+    // Would take minutes.
+    let mut going = Command::new(support::binaries::path("cloudroidctl"))
+        .env("CLOUDROID_HOME", &daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .args([
+            "calibrate",
+            "opencv_apps",
+            "--cpus",
+            "0.05",
+            "--requests",
+            "1000",
+        ])
+        .arg("--frames")
+        .arg(place.path())
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()?;
+    let seen = support::until("a servant that is measured", || {
+        let found = measured(&daemon, "opencv_apps")?;
+        Ok(if found.is_empty() {
+            Err("none".to_owned())
+        } else {
+            Ok(())
+        })
+    });
+    going.kill()?;
+    going.wait()?;
+    seen?;
+    none_is_left(&daemon, "opencv_apps")
+}
