@@ -263,10 +263,12 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// A call is over when everybody who was asked has spoken; inputs stay until their patience ends, because
-    /// further outputs may come.
+    /// further outputs may come. One that the cloud could not be asked counts at T_max and stays until then.
     pub(crate) fn close_call(&mut self, id: RequestId) {
-        let over =
-            |record: &Record<P>| record.is_call() && !record.is_open() && record.awaits_nobody();
+        let counts = |record: &Record<P>| record.judged || record.cloud != Leg::NotAsked;
+        let over = |record: &Record<P>| {
+            record.is_call() && !record.is_open() && record.awaits_nobody() && counts(record)
+        };
         if self.requests.get(&id).is_some_and(over) {
             self.requests.remove(&id);
         }

@@ -70,6 +70,8 @@ pub struct Decider {
     state: LocalState,
     /// The algorithm's last word: is it to answer requests.
     wanted: bool,
+    /// It is wanted because the cloud was never reached, whatever Q is.
+    alone: bool,
     /// The first late request has been seen, and Q was not full since.
     sign: bool,
     fed: bool,
@@ -84,6 +86,7 @@ impl Decider {
             warm: sla.warm,
             state: LocalState::Stopped,
             wanted: false,
+            alone: false,
             sign: false,
             fed: false,
         }
@@ -129,7 +132,8 @@ impl Decider {
         events
     }
 
-    /// What follows from Q and the link; `link`: it has not been away for too long.
+    /// What follows from Q and the link; `link`: it has not been away for too long. Where Q decides, that is said of a
+    /// link that was never there.
     pub fn decide(&mut self, satisfaction: &Satisfaction, link: bool) -> Vec<Event> {
         let mut events = Vec::new();
         if self.local == Local::None || self.state == LocalState::Missing {
@@ -141,6 +145,13 @@ impl Decider {
         let why = if self.by_link {
             self.wanted = !link;
             if link { Why::LinkUp } else { Why::LinkDown }
+        } else if !link {
+            self.wanted = true;
+            self.alone = true;
+            Why::LinkDown
+        } else if std::mem::take(&mut self.alone) {
+            self.wanted = satisfaction.wants_local();
+            Why::LinkUp
         } else {
             if satisfaction.wants_local() {
                 self.wanted = true;
@@ -214,7 +225,7 @@ mod tests {
     #[test]
     fn cold_is_started_fed_and_stopped() {
         let mut decider = decider("local = 'cold'");
-        let mut q = Satisfaction::new(4.0, 4.0);
+        let mut q = Satisfaction::new(4.0, 4.0, 16.0);
         assert!(
             decider.decide(&q, true).is_empty(),
             "at the threshold nothing changes"
@@ -235,7 +246,7 @@ mod tests {
     #[test]
     fn warm_runs_at_once_and_is_only_fed() {
         let mut decider = decider("local = 'warm'");
-        let mut q = Satisfaction::new(5.0, 4.0);
+        let mut q = Satisfaction::new(5.0, 4.0, 16.0);
         assert_eq!(decider.decide(&q, true), [Event::Start(Why::Warm)]);
         decider.reported(LocalState::Ready);
         assert!(decider.decide(&q, true).is_empty());
@@ -249,7 +260,7 @@ mod tests {
     #[test]
     fn warm_may_wait_for_the_first_sign() {
         let mut decider = decider("local = 'warm'\nwarm = 'first-sign'");
-        let mut q = Satisfaction::new(15.0, 4.0);
+        let mut q = Satisfaction::new(15.0, 4.0, 16.0);
         assert!(decider.decide(&q, true).is_empty());
         judged(&mut q, None);
         decider.late();
@@ -267,7 +278,7 @@ mod tests {
     #[test]
     fn stateful_takes_over_only_while_the_link_is_down() {
         let mut decider = decider("mode = 'stateful'\nlocal = 'warm'");
-        let mut q = Satisfaction::new(5.0, 4.0);
+        let mut q = Satisfaction::new(5.0, 4.0, 16.0);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
         decider.reported(LocalState::Ready);
         for _ in 0..5 {
@@ -279,9 +290,28 @@ mod tests {
     }
 
     #[test]
+    fn a_cloud_that_was_never_reached_is_stood_in_for_whatever_q_is() {
+        let mut decider = decider("local = 'cold'");
+        let mut q = Satisfaction::new(8.0, 4.0, 16.0);
+        assert_eq!(decider.decide(&q, false), [Event::Start(Why::LinkDown)]);
+        decider.reported(LocalState::Ready);
+        assert_eq!(decider.decide(&q, false), [Event::Feed(Why::LinkDown)]);
+        let back = [Event::StopFeeding(Why::LinkUp), Event::Stop(Why::LinkUp)];
+        assert_eq!(decider.decide(&q, true), back);
+        // Where the cloud kept no promise meanwhile it goes on, and Q decides.
+        decider.decide(&q, false);
+        decider.reported(LocalState::Ready);
+        decider.decide(&q, false);
+        judged(&mut q, None);
+        judged(&mut q, None);
+        assert!(decider.decide(&q, true).is_empty());
+        assert!(decider.is_fed());
+    }
+
+    #[test]
     fn an_absent_original_is_said_once() {
         let mut decider = decider("local = 'cold'");
-        let mut q = Satisfaction::new(4.0, 4.0);
+        let mut q = Satisfaction::new(4.0, 4.0, 16.0);
         judged(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
         assert_eq!(names(&decider.reported(LocalState::Missing)), ["missing"]);
@@ -294,7 +324,7 @@ mod tests {
     #[test]
     fn after_a_crash_it_is_fed_again_when_ready() {
         let mut decider = decider("local = 'cold'");
-        let mut q = Satisfaction::new(4.0, 4.0);
+        let mut q = Satisfaction::new(4.0, 4.0, 16.0);
         judged(&mut q, None);
         decider.decide(&q, true);
         decider.reported(LocalState::Ready);

@@ -46,7 +46,9 @@ pub struct Governor<P> {
     meter: Option<Metered>,
     pairs: Vec<Stream>,
     link: bool,
-    /// The link is down, and where no time was promised it has been for long enough.
+    /// It was up before.
+    reached: bool,
+    /// The link has been down for so long that the local original is to stand in whatever Q is.
     away: bool,
     /// When it will have been.
     away_at: Option<Instant>,
@@ -69,13 +71,14 @@ impl<P: Clone> Governor<P> {
             cloud: meter,
         };
         Self {
-            satisfaction: Satisfaction::new(sla.initial, sla.threshold),
+            satisfaction: Satisfaction::new(sla.initial, sla.threshold, sla.cap),
             decider: Decider::new(&sla),
             arbiter: Arbiter::new(limits),
             meter: Meter::new(&sla).map(metered),
             pairs: pairs.into_iter().map(Stream::new).collect(),
             link: false,
-            away: !sla.is_of_link(),
+            reached: false,
+            away: sla.mode == Mode::Stateful && !sla.is_of_link(),
             away_at: None,
             counts: Counts::default(),
             phases: PhaseBook::default(),
@@ -279,6 +282,7 @@ impl<P: Clone> Governor<P> {
         if std::mem::replace(&mut self.link, true) {
             return;
         }
+        self.reached = true;
         self.away = false;
         self.away_at = None;
         if self.sla.is_of_link() {
@@ -290,6 +294,9 @@ impl<P: Clone> Governor<P> {
         if anew {
             self.arbiter.turn(Side::Cloud, &Leg::Lost, &next);
         } else {
+            for id in self.arbiter.select(|record| record.cloud == Leg::Lost) {
+                self.judge(id, None);
+            }
             let reason = Leg::Failed("the servant was lost with the link".into());
             for id in self.arbiter.turn(Side::Cloud, &Leg::Lost, &reason) {
                 self.fail_if_hopeless(id);
@@ -299,7 +306,8 @@ impl<P: Clone> Governor<P> {
         self.give_waiting(now, Side::Cloud);
     }
 
-    /// The link is down: what is in flight counts as late, and goes to the local original if that runs.
+    /// The link is down. What is in flight may be answered in time yet when the link is back, so it counts as late at
+    /// T_max only; it goes to the local original if that is fed.
     pub fn link_down(&mut self, now: Instant) {
         self.tick(now);
         if !std::mem::replace(&mut self.link, false) {
@@ -307,9 +315,6 @@ impl<P: Clone> Governor<P> {
         }
         self.left_alone(now);
         let lost = self.arbiter.turn(Side::Cloud, &Leg::Asked, &Leg::Lost);
-        for id in &lost {
-            self.judge(*id, None);
-        }
         self.decide(now);
         for id in lost {
             self.fail_if_hopeless(id);
@@ -350,7 +355,7 @@ impl<P: Clone> Governor<P> {
         }
         let mut stop = false;
         let (overdue, forgotten) = self.arbiter.expire(now);
-        for id in overdue {
+        for id in overdue.iter().copied() {
             self.judge(id, None);
             for stream in &mut self.pairs {
                 for side in 0..2 {
@@ -363,7 +368,12 @@ impl<P: Clone> Governor<P> {
                 self.counts.unanswered_in_time += 1;
                 stop = true;
             }
+        }
+        // The local original may be wanted because of them.
+        self.decide(now);
+        for id in overdue {
             self.fail_if_hopeless(id);
+            self.arbiter.close_call(id);
         }
         for (id, record) in forgotten {
             self.forget(id, record);

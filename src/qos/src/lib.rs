@@ -49,6 +49,6 @@ pub use pair::{Correlation, Pair};
 pub use phases::{PhaseBook, Phases, Quantiles};
 pub use report::{Counts, Report, TimedEvent};
 pub use request::{Failure, Key, Leg, RequestId, Side, Sides, Stamp};
-pub use satisfaction::{Satisfaction, Step};
+pub use satisfaction::{DEFAULT_CAP, Satisfaction, Step};
 pub use sla::{Local, Measure, Mode, SafeStop, Sla, Warm};
 pub use sla_error::SlaError;

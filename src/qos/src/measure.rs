@@ -5,6 +5,9 @@ use std::time::{Duration, Instant};
 
 use crate::sla::{Measure, Sla};
 
+/// An output that comes at T_max is still in time.
+const PAST: Duration = Duration::from_nanos(1);
+
 /// Turns one side's outputs on one topic into times for the satisfaction algorithm.
 ///
 /// - Frames per second: T is the mean interval of the last `over` frames.
@@ -16,7 +19,7 @@ use crate::sla::{Measure, Sla};
 pub struct Meter {
     kind: Kind,
     t_max: Duration,
-    /// When the next missing output counts; none before the start.
+    /// When the next missing output counts: right after T has passed T_max. None before the start.
     deadline: Option<Instant>,
     /// What is awaited was counted as missing already; when it comes it must not count again.
     counted: bool,
@@ -61,7 +64,7 @@ impl Meter {
 
     /// Outputs are to come from now on. Later calls change nothing.
     pub fn start(&mut self, now: Instant) {
-        self.deadline.get_or_insert(now + self.t_max);
+        self.deadline.get_or_insert(now + self.t_max + PAST);
     }
 
     /// Nobody waits for outputs any more (no subscriber, say); what was seen is forgotten.
@@ -92,14 +95,14 @@ impl Meter {
                 let next = arrivals.len().min(*over);
                 let used = next as u32 * self.t_max;
                 let due = arrivals[arrivals.len() - next] + used;
-                self.deadline = Some(due.max(now + self.t_max));
+                self.deadline = Some(due.max(now + self.t_max) + PAST);
                 let intervals = arrivals.len() as u32 - 1;
                 (intervals > 0).then(|| (now - arrivals[0]) / intervals)
             }
             Kind::Age { born } => {
                 let this = now.checked_sub(age).unwrap_or(now);
                 let before = born.replace(this).filter(|_| !counted);
-                self.deadline = Some((this + self.t_max).max(now));
+                self.deadline = Some((this + self.t_max + PAST).max(now));
                 before.map(|before| now - before)
             }
         }
@@ -143,18 +146,19 @@ mod tests {
             meter("measure.frames_per_second = { output = '/m', desire = 10, min = 4, over = 2 }");
         let start = Instant::now();
         meter.start(start);
-        assert_eq!(meter.missed(start + 249 * MS), 0);
-        assert_eq!(meter.output(start + 249 * MS, Duration::ZERO), None);
+        assert_eq!(meter.missed(start + 250 * MS), 0, "it is still in time");
+        assert_eq!(meter.output(start + 250 * MS, Duration::ZERO), None);
         assert_eq!(
             meter.output(start + 329 * MS, Duration::ZERO),
-            Some(80 * MS)
+            Some(79 * MS)
         );
         assert_eq!(
             meter.output(start + 449 * MS, Duration::ZERO),
-            Some(100 * MS)
+            Some(99_500 * MS / 1000)
         );
-        // 329 and 449 are two arrivals; with one more their mean passes 250 ms at 329 + 500.
-        assert_eq!(meter.deadline(), Some(start + 829 * MS));
+        // 329 and 449 are two arrivals; with one more their mean is 250 ms at 329 + 500.
+        assert_eq!(meter.missed(start + 829 * MS), 0, "it is still in time");
+        assert_eq!(meter.deadline(), Some(start + 829 * MS + PAST));
         assert_eq!(meter.missed(start + 1100 * MS), 2);
         // The gap was counted twice already; the frame that ends it begins a new mean.
         assert_eq!(meter.output(start + 1100 * MS, Duration::ZERO), None);
@@ -171,8 +175,8 @@ mod tests {
         meter.start(start);
         assert_eq!(meter.output(start + 500 * MS, 200 * MS), None);
         assert_eq!(meter.output(start + 1200 * MS, 100 * MS), Some(900 * MS));
-        assert_eq!(meter.missed(start + 2099 * MS), 0);
-        assert_eq!(meter.missed(start + 2100 * MS), 1);
+        assert_eq!(meter.missed(start + 2100 * MS), 0);
+        assert_eq!(meter.missed(start + 2100 * MS + PAST), 1);
         assert_eq!(meter.output(start + 2200 * MS, Duration::ZERO), None);
         assert_eq!(
             meter.output(start + 2300 * MS, Duration::ZERO),

@@ -2,18 +2,24 @@
 
 use std::time::Duration;
 
+/// The cap of Q in thresholds, where an SLA gives none.
+pub const DEFAULT_CAP: f64 = 4.0;
+
 /// Q and what moves it.
 ///
 /// After each request, T being the cloud's completion time: T ≤ T_desire adds 2, T ≤ T_max adds 1, anything later
 /// halves Q. Below the threshold Q_t the local original is wanted, above it is not; at Q_t nothing changes.
 ///
-/// Q stays below 4·Q_t. Without that bound a long good time would delay the switch: a surplus of s needs log2(s)
-/// late requests to be forgotten. Below 4·Q_t any two late requests in a row bring Q below Q_t.
+/// Q stays below a cap, 4·Q_t unless the SLA says otherwise. Without it a long good time would delay the switch: a surplus
+/// of s needs log2(s) late requests to be forgotten. Below 2^n·Q_t any n late requests in a row bring Q below Q_t.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Satisfaction {
     q: f64,
     threshold: f64,
-    cap: f64,
+    /// The greatest value that Q takes.
+    most: f64,
+    /// From here on nothing points to trouble.
+    full: f64,
 }
 
 /// What one request did to Q.
@@ -28,14 +34,15 @@ pub enum Step {
 }
 
 impl Satisfaction {
-    /// Starts at `initial`, or right below 4·`threshold` where `initial` is more. Both are positive and finite (an
-    /// [`Sla`](crate::Sla) has checked that).
-    pub fn new(initial: f64, threshold: f64) -> Self {
-        let cap = below(4.0 * threshold);
+    /// Starts at `initial`, or right below `cap` where `initial` is more. All are positive, `cap` is greater than
+    /// `threshold` and may be infinite (an [`Sla`](crate::Sla) has checked that).
+    pub fn new(initial: f64, threshold: f64, cap: f64) -> Self {
+        let most = below(cap);
         Self {
-            q: initial.min(cap),
+            q: initial.min(most),
             threshold,
-            cap,
+            most,
+            full: most.min(below(DEFAULT_CAP * threshold)),
         }
     }
 
@@ -47,8 +54,8 @@ impl Satisfaction {
             _ => Step::Late,
         };
         self.q = match step {
-            Step::Desired => (self.q + 2.0).min(self.cap),
-            Step::Accepted => (self.q + 1.0).min(self.cap),
+            Step::Desired => (self.q + 2.0).min(self.most),
+            Step::Accepted => (self.q + 1.0).min(self.most),
             Step::Late => self.q / 2.0,
         };
         step
@@ -74,14 +81,14 @@ impl Satisfaction {
         self.q > self.threshold
     }
 
-    /// Q is as high as it gets.
+    /// Q is as high as it gets, or at the default cap where the cap is higher.
     pub fn is_full(&self) -> bool {
-        self.q >= self.cap
+        self.q >= self.full
     }
 }
 
-/// The greatest number below `x`, which is positive (`f64::next_down` is newer than this crate's minimum Rust).
-fn below(x: f64) -> f64 {
+/// The greatest finite number below `x`, which is positive (`f64::next_down` is newer than this crate's minimum Rust).
+pub(crate) fn below(x: f64) -> f64 {
     f64::from_bits(x.to_bits() - 1)
 }
 
@@ -99,7 +106,7 @@ mod tests {
 
     #[test]
     fn each_request_moves_q_as_published() {
-        let mut satisfaction = Satisfaction::new(8.0, 4.0);
+        let mut satisfaction = Satisfaction::new(8.0, 4.0, 16.0);
         assert_eq!(satisfaction.observe(ms(100), DESIRE, MAX), Step::Desired);
         assert_eq!(satisfaction.q(), 10.0);
         assert_eq!(satisfaction.observe(ms(101), DESIRE, MAX), Step::Accepted);
@@ -117,7 +124,7 @@ mod tests {
 
     #[test]
     fn at_the_threshold_nothing_changes() {
-        let satisfaction = Satisfaction::new(4.0, 4.0);
+        let satisfaction = Satisfaction::new(4.0, 4.0, 16.0);
         assert!(!satisfaction.wants_local());
         assert!(!satisfaction.wants_cloud_alone());
     }
@@ -125,14 +132,15 @@ mod tests {
     proptest! {
         #[test]
         fn q_stays_within_its_bounds(
-            initial in 0.001f64..1e9, threshold in 0.001f64..1e6, times in prop::collection::vec(prop::option::of(0u64..500), 0..300)
+            initial in 0.001f64..1e9, threshold in 0.001f64..1e6, factor in 1.01f64..100.0,
+            times in prop::collection::vec(prop::option::of(0u64..500), 0..300)
         ) {
-            let mut satisfaction = Satisfaction::new(initial, threshold);
+            let mut satisfaction = Satisfaction::new(initial, threshold, factor * threshold);
             for t in times {
                 let before = satisfaction.q();
                 let step = satisfaction.observe(t.map(Duration::from_millis), DESIRE, MAX);
                 let after = satisfaction.q();
-                prop_assert!((0.0..4.0 * threshold).contains(&after), "Q {after}");
+                prop_assert!((0.0..factor * threshold).contains(&after), "Q {after}");
                 match step {
                     Step::Late => prop_assert_eq!(after, before / 2.0),
                     _ => prop_assert!(after >= before),
@@ -144,7 +152,7 @@ mod tests {
         fn two_late_requests_in_a_row_always_suffice(
             threshold in 0.001f64..1e6, good in 0usize..1000
         ) {
-            let mut satisfaction = Satisfaction::new(threshold, threshold);
+            let mut satisfaction = Satisfaction::new(threshold, threshold, DEFAULT_CAP * threshold);
             for _ in 0..good {
                 satisfaction.observe(ms(1), DESIRE, MAX);
             }

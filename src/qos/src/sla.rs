@@ -21,6 +21,8 @@ use written::Written;
 /// t_max = 0.3                # maximal acceptable response time
 /// threshold = 4.0            # Q_t: below it the local original is wanted
 /// initial = 8.0              # Q at the beginning; 2·Q_t where it is not given
+/// cap = 16.0                 # Q stays below it; 4·Q_t where it is not given, inf as the algorithm was published
+/// unreached = 3              # without the cloud from the beginning: seconds after which the local original stands in
 /// mode = "stateless"         # or "stateful": the local original only while the link is down
 /// local = "cold"             # or "warm", or "none"
 /// answers = ["/image -> /people_detect/found"]
@@ -38,6 +40,12 @@ pub struct Sla {
     pub threshold: f64,
     /// Q at the beginning.
     pub initial: f64,
+    /// Q stays below it; may be infinite.
+    pub cap: f64,
+    /// Where a time is promised: until the cloud is reached for the first time, the local original stands in after so long.
+    /// Nothing can be asked then, because nobody knows yet what the node registers.
+    #[serde(serialize_with = "seconds")]
+    pub unreached: Duration,
     /// Whether requests depend on one another.
     pub mode: Mode,
     /// How the local original is kept.

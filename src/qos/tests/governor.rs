@@ -267,7 +267,8 @@ fn the_link_is_lost_while_the_local_original_runs() {
     let id = robot.call("sum");
     robot.after(10);
     robot.governor.link_down(robot.now);
-    assert_eq!(robot.effects(), ["feed", "sum to Local"]);
+    assert!(robot.after(290).is_empty(), "it may be answered in time");
+    assert_eq!(robot.after(1), ["feed", "sum to Local"]);
     assert_eq!(
         robot.governor.answered(robot.now, Side::Local, id),
         Verdict::Deliver
@@ -277,11 +278,80 @@ fn the_link_is_lost_while_the_local_original_runs() {
         robot.governor.answered(robot.now, Side::Cloud, id),
         Verdict::Drop
     );
-    assert_eq!(
-        robot.q(),
-        2.5,
-        "lost with the link: late already, whatever comes"
+    assert_eq!(robot.q(), 2.5, "late once, whatever comes");
+}
+
+#[test]
+fn a_blip_of_the_link_counts_for_nothing_where_the_answers_come_in_time() {
+    let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 5}"#));
+    robot.image(1, "first");
+    robot.image(2, "second");
+    let sum = robot.call("sum");
+    robot.after(10);
+    robot.governor.link_down(robot.now);
+    robot.image(3, "third");
+    let late = robot.call("later sum");
+    // The way to the cloud keeps inputs in their order; a call is not made before it can be.
+    assert_eq!(robot.after(50), ["third to Cloud"]);
+    assert_eq!(robot.q(), 5.0);
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(robot.after(20), ["later sum to Cloud"]);
+    for number in 1..=3 {
+        assert_eq!(robot.found(Side::Cloud, number), Verdict::Deliver);
+    }
+    for id in [sum, late] {
+        let verdict = robot.governor.answered(robot.now, Side::Cloud, id);
+        assert_eq!(verdict, Verdict::Deliver);
+    }
+    assert!(
+        robot.after(10_000).is_empty(),
+        "the original is not started"
     );
+    assert_eq!(robot.q(), 15.0);
+    let counts = robot.governor.report(robot.now).counts;
+    assert_eq!((counts.requests, counts.desired, counts.late), (5, 5, 0));
+}
+
+#[test]
+fn what_a_blip_delays_beyond_t_max_counts_once_each() {
+    let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 15}"#));
+    robot.image(1, "first");
+    robot.governor.link_down(robot.now);
+    robot.after(200);
+    robot.image(2, "second");
+    robot.after(101);
+    assert_eq!(robot.q(), 7.5, "the first is late, the second is not");
+    robot.governor.link_up(robot.now, true);
+    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
+    assert_eq!(robot.found(Side::Cloud, 2), Verdict::Deliver);
+    assert_eq!(robot.q(), 8.5);
+    robot.after(10_000);
+    assert_eq!(robot.q(), 8.5);
+}
+
+#[test]
+fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
+    let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 5}"#));
+    robot.governor.link_down(robot.now);
+    robot.input("a");
+    robot.after(20);
+    robot.input("b");
+    robot.after(20);
+    robot.governor.link_up(robot.now, true);
+    assert!(robot.after(20).is_empty(), "the link has kept them");
+    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    robot.after(10_000);
+    let counts = robot.governor.report(robot.now).counts;
+    assert_eq!((counts.requests, counts.late), (1, 0));
+    // A servant that is new is given what it can answer in time.
+    robot.governor.link_down(robot.now);
+    robot.input("c");
+    assert_eq!(robot.effects(), ["c to Cloud"]);
+    robot.governor.link_up(robot.now, false);
+    assert_eq!(robot.effects(), ["c to Cloud"]);
+    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    assert_eq!(robot.governor.report(robot.now).counts.late, 0);
 }
 
 #[test]
@@ -447,7 +517,8 @@ fn frames_per_second_start_the_local_original_and_stop_the_robot() {
     }
     assert_eq!(robot.q(), 9.0);
     // Q 9, 4.5, 2.25
-    assert_eq!(robot.after(400), ["safe stop"]);
+    assert!(robot.after(400).is_empty(), "a frame now would be in time");
+    assert_eq!(robot.after(1), ["safe stop"]);
     assert_eq!(robot.after(250), ["safe stop", "start"]);
     robot.governor.local(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["feed"]);
@@ -570,6 +641,36 @@ fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
         "{started:?}"
     );
     assert_eq!(governor.deadline(), None, "said once");
+}
+
+#[test]
+fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
+    let sla = json(r#"{"t_desire": 0.1, "t_max": 0.3, "unreached": "500ms"}"#);
+    let mut governor =
+        Governor::<&str>::new(Sla::parse(sla).unwrap(), Vec::new(), Limits::default());
+    let now = Instant::now();
+    let said = |governor: &mut Governor<&str>| {
+        let effects = std::iter::from_fn(|| governor.next_effect());
+        let events = effects.filter_map(|effect| match effect {
+            Effect::Event(event) => Some(event),
+            _ => None,
+        });
+        events.collect::<Vec<_>>()
+    };
+    governor.begin(now);
+    governor.tick(now + 499 * MS);
+    assert!(said(&mut governor).is_empty());
+    governor.tick(now + 500 * MS);
+    assert_eq!(said(&mut governor), [Event::Start(Why::LinkDown)]);
+    governor.local(now + 600 * MS, LocalState::Ready);
+    assert_eq!(said(&mut governor), [Event::Feed(Why::LinkDown)]);
+    governor.link_up(now + 700 * MS, false);
+    let back = [Event::StopFeeding(Why::LinkUp), Event::Stop(Why::LinkUp)];
+    assert_eq!(said(&mut governor), back);
+    // From now on Q decides.
+    governor.link_down(now + 800 * MS);
+    governor.tick(now + 80_000 * MS);
+    assert!(said(&mut governor).is_empty());
 }
 
 #[test]

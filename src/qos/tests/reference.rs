@@ -1,12 +1,14 @@
 //! Decisions match the algorithm as it was published, written down as plainly as possible, with the bound on Q that ours has
 //! (see `Satisfaction`). Without the bound it is as published; until that Q reaches the bound the two are the same, and after
-//! it the bound only makes the local original start earlier.
+//! it the bound only makes the local original start earlier. What T is under each measure is written down here once more,
+//! millisecond by millisecond.
 
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
-use qos::{Effect, Event, Governor, Limits, LocalState, Side, Sla};
+use qos::{Effect, Event, Governor, Limits, LocalState, Side, Sla, Stamp};
 
 const T_DESIRE: u64 = 100;
 const T_MAX: u64 = 300;
@@ -16,6 +18,8 @@ const BOUND: f64 = 4.0 * THRESHOLD;
 
 /// The published algorithm. `t` is in milliseconds.
 struct Reference {
+    /// T_desire and T_max.
+    times: (u64, u64),
     q: f64,
     /// Q is never above it; infinite as published.
     most: f64,
@@ -29,6 +33,7 @@ impl Reference {
         // Before any request: the promise may be broken from the beginning.
         let running = q < THRESHOLD;
         Reference {
+            times: (T_DESIRE, T_MAX),
             q,
             most,
             running,
@@ -37,9 +42,9 @@ impl Reference {
     }
 
     fn request_done(&mut self, t: u64) {
-        if t <= T_DESIRE {
+        if t <= self.times.0 {
             self.q += 2.0;
-        } else if t <= T_MAX {
+        } else if t <= self.times.1 {
             self.q += 1.0;
         } else {
             self.q /= 2.0;
@@ -54,6 +59,10 @@ impl Reference {
             self.log.push("stop");
         }
     }
+}
+
+fn below(x: f64) -> f64 {
+    f64::from_bits(x.to_bits() - 1)
 }
 
 fn take(governor: &mut Governor<u32>, now: Instant, log: &mut Vec<&'static str>) {
@@ -85,7 +94,7 @@ proptest! {
         });
         let mut governor = Governor::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
         let mut published = Reference::new(initial, f64::INFINITY);
-        let mut bounded = Reference::new(initial, f64::from_bits(BOUND.to_bits() - 1));
+        let mut bounded = Reference::new(initial, below(BOUND));
         let mut now = Instant::now();
         let mut log = vec![];
         governor.link_up(now, false);
@@ -113,6 +122,329 @@ proptest! {
             }
             prop_assert!(bounded.running || !published.running, "it starts later than published");
             now += Duration::from_millis(5);
+        }
+    }
+}
+
+/// Where `up` says for each millisecond whether the link is up: the first one from `at` on in which it is.
+fn first_up(up: &[bool], at: u64) -> Option<u64> {
+    (at..up.len() as u64).find(|at| up[*at as usize])
+}
+
+/// The link over time, from the lengths of its good and its bad times.
+fn link(times: &[(u64, u64)], length: u64) -> Vec<bool> {
+    let spans = times.iter();
+    let mut up: Vec<bool> = spans
+        .flat_map(|(good, bad)| {
+            let good = std::iter::repeat_n(true, *good as usize);
+            good.chain(std::iter::repeat_n(false, *bad as usize))
+        })
+        .take(length as usize)
+        .collect();
+    up.resize(length as usize, true);
+    up
+}
+
+fn sla(written: serde_json::Value) -> Sla {
+    Sla::parse(written).unwrap()
+}
+
+/// A governor that lives millisecond by millisecond.
+struct World {
+    governor: Governor<u32>,
+    begun: Instant,
+    log: Vec<&'static str>,
+    /// What the cloud was given.
+    given: Vec<u32>,
+}
+
+impl World {
+    fn new(sla: Sla) -> World {
+        let pairs = vec!["/image -> /found by stamp".parse().unwrap()];
+        // An output may have been born before the beginning.
+        let begun = Instant::now() + Duration::from_secs(1000);
+        let mut world = World {
+            governor: Governor::new(sla, pairs, Limits::default()),
+            begun,
+            log: vec![],
+            given: vec![],
+        };
+        world.governor.begin(begun);
+        world.obey(begun);
+        world
+    }
+
+    fn obey(&mut self, now: Instant) {
+        while let Some(effect) = self.governor.next_effect() {
+            match effect {
+                Effect::Event(Event::Start(_)) => {
+                    self.log.push("start");
+                    self.governor.local(now, LocalState::Ready);
+                }
+                Effect::Event(Event::Stop(_)) => self.log.push("stop"),
+                Effect::Give {
+                    side: Side::Cloud,
+                    payload,
+                    ..
+                } => self.given.push(payload),
+                _ => {}
+            }
+        }
+    }
+
+    /// All that is due at this millisecond.
+    fn tick(&mut self, at: u64) -> Instant {
+        let now = self.begun + Duration::from_millis(at);
+        while self.governor.deadline().is_some_and(|due| due <= now) {
+            self.governor.tick(now);
+            self.obey(now);
+        }
+        now
+    }
+
+    fn q(&self) -> f64 {
+        self.governor.satisfaction().q()
+    }
+}
+
+fn stamp(number: u32) -> Stamp {
+    Stamp {
+        secs: number + 1,
+        nsecs: 0,
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(80) })]
+
+    /// Requests that overlap, over a link that is lost and found again: each counts once, by the time that it took.
+    #[test]
+    fn requests_at_the_same_time_over_a_link_that_is_lost(
+        initial in 0.5f64..20.0,
+        factor in prop_oneof![Just(f64::INFINITY), 1.1f64..10.0],
+        // The pause before it, how long the cloud takes, whether it is a call.
+        requests in prop::collection::vec((0u64..150, 1u64..450, any::<bool>()), 1..50),
+        times in prop::collection::vec((0u64..800, 1u64..500), 0..8),
+    ) {
+        let cap = factor * THRESHOLD;
+        let mut sla = sla(serde_json::json!({
+            "t_desire": 0.1, "t_max": 0.3, "threshold": THRESHOLD, "initial": initial, "local": "cold"
+        }));
+        sla.cap = cap;
+        let mut asked = 0;
+        let requests: Vec<(u64, u64, bool)> = requests.into_iter().map(|(pause, takes, call)| {
+            asked += pause;
+            (asked, takes, call)
+        }).collect();
+        let length = asked + 2000;
+        let up = link(&times, length);
+        // When each answer comes: the request reaches the cloud when there is a link, and so does the answer the robot.
+        let arrivals: Vec<u64> = requests.iter().map(|(asked, takes, _)| {
+            let reached = first_up(&up, *asked);
+            reached.and_then(|reached| first_up(&up, reached + takes)).unwrap_or(u64::MAX)
+        }).collect();
+        let mut reference = Reference::new(initial, below(cap));
+        let mut world = World::new(sla);
+        world.governor.link_up(world.begun, false);
+        let (call, image): (Arc<str>, Arc<str>) = ("/add".into(), "/image".into());
+        let mut ids = vec![None; requests.len()];
+        // What the cloud was given and has not answered, and since when it has that.
+        let mut open: BTreeMap<u32, Option<u64>> = BTreeMap::new();
+        for at in 0..length {
+            let now = world.tick(at);
+            let is_up = up[at as usize];
+            if is_up {
+                world.governor.link_up(now, true);
+            } else {
+                world.governor.link_down(now);
+            }
+            world.obey(now);
+            for number in std::mem::take(&mut world.given) {
+                open.entry(number).or_default();
+            }
+            for (number, reached) in open.iter_mut().filter(|_| is_up) {
+                let (_, takes, is_call) = requests[*number as usize];
+                if at < *reached.get_or_insert(at) + takes {
+                    continue;
+                }
+                // It stays, and is not answered again.
+                *reached = Some(u64::MAX / 2);
+                if is_call {
+                    let _ = world.governor.answered(now, Side::Cloud, ids[*number as usize].unwrap());
+                } else {
+                    let key = stamp(*number).into();
+                    let _ = world.governor.output(now, Side::Cloud, "/found", Some(key), Duration::ZERO);
+                }
+            }
+            world.obey(now);
+            for number in 0..requests.len() {
+                let (asked, _, is_call) = requests[number];
+                if asked != at {
+                    continue;
+                }
+                let payload = number as u32;
+                if is_call {
+                    ids[number] = Some(world.governor.call(now, &call, payload));
+                } else {
+                    world.governor.input(now, &image, Some(stamp(payload).into()), payload);
+                }
+            }
+            world.obey(now);
+            for number in std::mem::take(&mut world.given) {
+                open.entry(number).or_insert(is_up.then_some(at));
+            }
+            // As it was published, late ones first: they were so a nanosecond after the last millisecond.
+            let times = |late: bool| requests.iter().zip(&arrivals).filter_map(move |((asked, ..), arrival)| {
+                let in_time = *arrival <= asked + T_MAX;
+                let due = if in_time { *arrival } else { asked + T_MAX + 1 };
+                (due == at && late != in_time).then(|| due - asked)
+            });
+            for t in times(true).chain(times(false)) {
+                reference.request_done(t);
+            }
+            prop_assert_eq!(world.q(), reference.q, "at {} ms", at);
+            prop_assert_eq!(&world.log, &reference.log, "at {} ms", at);
+        }
+    }
+
+    /// Frames per second: T is the mean time of the last frames.
+    #[test]
+    fn frames(
+        initial in 0.5f64..20.0,
+        over in 1usize..6,
+        pauses in prop::collection::vec(prop_oneof![5 => 1u64..400, 1 => 400u64..2000], 1..60),
+    ) {
+        let mut world = World::new(sla(serde_json::json!({
+            "measure": {"frames_per_second": {"output": "/found", "desire": 10, "min": 4, "over": over}},
+            "threshold": THRESHOLD, "initial": initial, "local": "cold",
+        })));
+        const LONGEST: u64 = 250;
+        let mut reference = Reference::new(initial, below(BOUND));
+        reference.times = (T_DESIRE, LONGEST);
+        world.governor.link_up(world.begun, false);
+        world.governor.wanted(world.begun, "/found", true);
+        let mut due: VecDeque<u64> = pauses.iter().scan(0, |at, pause| {
+            *at += pause;
+            Some(*at)
+        }).collect();
+        let mut frames: Vec<u64> = vec![];
+        // When the frame that is awaited was last counted as missing.
+        let mut counted: Option<u64> = None;
+        for at in 0..due.back().unwrap() + 1000 {
+            let now = world.tick(at);
+            let misses = match (counted, frames.last()) {
+                (Some(counted), _) => at - counted >= LONGEST,
+                (None, None) => at > LONGEST,
+                (None, Some(last)) => {
+                    let mean_of = over.min(frames.len());
+                    let took = at - frames[frames.len() - mean_of];
+                    took > mean_of as u64 * LONGEST && at - last > LONGEST
+                }
+            };
+            if misses {
+                counted = Some(at);
+                reference.request_done(LONGEST + 1);
+            }
+            if due.front() == Some(&at) {
+                due.pop_front();
+                let _ = world.governor.output(now, Side::Cloud, "/found", None, Duration::ZERO);
+                world.obey(now);
+                if counted.take().is_some() {
+                    frames.clear();
+                }
+                frames.push(at);
+                let mean_of = over.min(frames.len() - 1) as u64;
+                if mean_of > 0 {
+                    let took = at - frames[frames.len() - 1 - mean_of as usize];
+                    // A whole millisecond more where a part of one is.
+                    reference.request_done(took.div_ceil(mean_of));
+                }
+            }
+            prop_assert_eq!(world.q(), reference.q, "at {} ms", at);
+            prop_assert_eq!(&world.log, &reference.log, "at {} ms", at);
+        }
+    }
+
+    /// Age: T is how old an output has become when the next one comes.
+    #[test]
+    fn ages(
+        initial in 0.5f64..20.0,
+        outputs in prop::collection::vec((1u64..300, prop_oneof![5 => 0u64..200, 1 => 200u64..900]), 1..60),
+    ) {
+        let mut world = World::new(sla(serde_json::json!({
+            "measure": {"age": {"output": "/found", "desire": 0.1, "max": 0.3}},
+            "threshold": THRESHOLD, "initial": initial, "local": "cold",
+        })));
+        let mut reference = Reference::new(initial, below(BOUND));
+        world.governor.link_up(world.begun, false);
+        world.governor.wanted(world.begun, "/found", true);
+        let mut due: VecDeque<(u64, u64)> = outputs.iter().scan(0, |at, (pause, age)| {
+            *at += pause;
+            Some((*at, *age))
+        }).collect();
+        let mut born: Option<i64> = None;
+        let mut counted: Option<u64> = None;
+        for at in 0..due.back().unwrap().0 + 1000 {
+            let now = world.tick(at);
+            let is_missing = |born: Option<i64>, counted: Option<u64>| match (counted, born) {
+                (Some(counted), _) => at - counted >= T_MAX,
+                (None, born) => at as i64 - born.unwrap_or(0) > T_MAX as i64,
+            };
+            if is_missing(born, counted) {
+                counted = Some(at);
+                reference.request_done(T_MAX + 1);
+            }
+            if due.front().is_some_and(|due| due.0 == at) {
+                let age = due.pop_front().unwrap().1;
+                let aged = Duration::from_millis(age);
+                let _ = world.governor.output(now, Side::Cloud, "/found", None, aged);
+                world.obey(now);
+                let before = born.replace(at as i64 - age as i64);
+                if let Some(before) = before.filter(|_| counted.take().is_none()) {
+                    reference.request_done((at as i64 - before) as u64);
+                }
+                counted = None;
+                // It may be too old when it comes.
+                world.tick(at);
+                if is_missing(born, counted) {
+                    counted = Some(at);
+                    reference.request_done(T_MAX + 1);
+                }
+            }
+            prop_assert_eq!(world.q(), reference.q, "at {} ms", at);
+            prop_assert_eq!(&world.log, &reference.log, "at {} ms", at);
+        }
+    }
+
+    /// No time is promised: the link alone decides.
+    #[test]
+    fn the_link_alone(times in prop::collection::vec((1u64..2000, 1u64..2000), 1..12)) {
+        const AFTER: u64 = 1000;
+        let mut world = World::new(sla(serde_json::json!({"measure": {"link": {"after": 1}}})));
+        let length = times.iter().map(|(down, up)| down + up).sum::<u64>();
+        let down = link(&times, length);
+        let (mut log, mut since) = (vec![], Some(0));
+        for at in 0..length {
+            let now = world.tick(at);
+            if since.is_some_and(|since| at == since + AFTER) {
+                log.push("start");
+            }
+            match (since, down[at as usize]) {
+                (None, true) => {
+                    world.governor.link_down(now);
+                    since = Some(at);
+                }
+                (Some(lost), false) => {
+                    world.governor.link_up(now, true);
+                    if at >= lost + AFTER {
+                        log.push("stop");
+                    }
+                    since = None;
+                }
+                _ => {}
+            }
+            world.obey(now);
+            prop_assert_eq!(&world.log, &log, "at {} ms", at);
         }
     }
 }

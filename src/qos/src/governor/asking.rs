@@ -10,12 +10,16 @@ impl<P: Clone> Governor<P> {
     /// A request was opened: ask whom there is.
     pub(super) fn asked(&mut self, now: Instant, id: RequestId) {
         self.counts.requests += 1;
-        for side in self.asked_sides() {
-            self.ask(now, id, side);
+        let sides = self.asked_sides();
+        for side in &sides {
+            self.ask(now, id, *side);
         }
-        if !self.link {
-            // The cloud cannot have it, so its time is beyond any T_max already now.
-            self.judge(id, None);
+        let waits = |record: &Record<P>| !record.is_call();
+        if sides.is_empty() && self.arbiter.get(id).is_some_and(waits) {
+            // The way to the cloud keeps it in order with what awaits no answer. A call waits here: it may fail before the
+            // link is back, and must not be done then.
+            self.ask(now, id, Side::Cloud);
+            self.arbiter.turn(Side::Cloud, &Leg::Asked, &Leg::Lost);
         }
         self.decide(now);
     }
@@ -30,11 +34,10 @@ impl<P: Clone> Governor<P> {
             .collect()
     }
 
-    /// Who is given what awaits no answer. Where no time was promised the way to the cloud takes it while the link is
-    /// down, as long as nobody stands in.
+    /// Who is given what awaits no answer. While the link is down and nobody stands in, the way to the cloud takes it.
     pub(super) fn told_sides(&self) -> Vec<Side> {
         let sides = self.asked_sides();
-        if sides.is_empty() && self.sla.is_of_link() {
+        if sides.is_empty() {
             return vec![Side::Cloud];
         }
         sides

@@ -6,17 +6,22 @@ use super::{EVENTS, Effect, Governor, UNMATCHED};
 use crate::decider::Event;
 use crate::pair::Correlation;
 use crate::request::{Leg, Side};
-use crate::sla::Measure;
+use crate::sla::{Measure, Mode};
 
 impl<P: Clone> Governor<P> {
-    /// The link is down from now on. Where no time was promised it may come back before that means anything.
+    /// The link is down from now on. Where no time was promised, or nothing can be asked yet, it may come before that
+    /// means anything; where one was, Q decides.
     pub(super) fn left_alone(&mut self, now: Instant) {
-        match self.sla.measure {
-            Measure::Link { after } => {
-                self.away_at = Some(now + after);
+        match (&self.sla.measure, self.sla.mode) {
+            (Measure::Link { after }, _) => {
+                self.away_at = Some(now + *after);
                 self.decider.late();
             }
-            _ => self.away = true,
+            (_, Mode::Stateful) => self.away = true,
+            (_, Mode::Stateless) if !self.reached => {
+                self.away_at = Some(now + self.sla.unreached);
+            }
+            (_, Mode::Stateless) => {}
         }
     }
 

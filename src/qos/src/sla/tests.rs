@@ -9,9 +9,17 @@ fn two_times_are_enough() {
     let sla = parse("t_desire = 0.1\nt_max = '300ms'").unwrap();
     assert_eq!(sla.t_desire, Duration::from_millis(100));
     assert_eq!(sla.t_max, Duration::from_millis(300));
-    assert_eq!((sla.threshold, sla.initial), (4.0, 8.0));
+    assert_eq!((sla.threshold, sla.initial, sla.cap), (4.0, 8.0, 16.0));
     assert_eq!((sla.mode, sla.local), (Mode::Stateless, Local::Cold));
     assert_eq!(sla.answers, None);
+}
+
+#[test]
+fn the_cap_follows_the_threshold_unless_it_is_given() {
+    let cap = |more: &str| parse(&format!("t_desire = 1\nt_max = 1\n{more}")).map(|sla| sla.cap);
+    assert_eq!(cap("threshold = 3"), Ok(12.0));
+    assert_eq!(cap("threshold = 3\ncap = 5"), Ok(5.0));
+    assert_eq!(cap("cap = inf"), Ok(f64::INFINITY));
 }
 
 #[test]
@@ -72,6 +80,13 @@ fn what_is_wrong_is_named_with_its_field() {
             "initial",
             "positive",
         ),
+        (
+            "t_desire = 1\nt_max = 1\nthreshold = 3\ncap = 3",
+            "cap",
+            "not above threshold (3)",
+        ),
+        ("t_desire = 1\nt_max = 1\ncap = nan", "cap", "NaN"),
+        ("t_desire = 1\nt_max = 1\ncap = -inf", "cap", "not above"),
         ("t_desire = 1\nt_max = 1\nmode = 'x'", "mode", "stateless"),
         ("t_desire = 1\nt_max = 1\nlocal = 'hot'", "local", "warm"),
         ("t_desire = 1\nt_max = 1\nwarm = 'at-once'", "warm", "local"),

@@ -1,12 +1,14 @@
 //! An SLA as it is written, and what must hold of it.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use serde::Deserialize;
 
 use super::span::{LONGEST, Span, interval, positive};
 use super::{Local, Measure, Mode, SafeStop, Sla, Times, Warm};
 use crate::pair::Pair;
+use crate::satisfaction::{DEFAULT_CAP, below};
 use crate::sla_error::SlaError;
 
 #[derive(Deserialize)]
@@ -17,6 +19,8 @@ pub(super) struct Written {
     #[serde(default = "default_threshold")]
     threshold: f64,
     initial: Option<f64>,
+    cap: Option<f64>,
+    unreached: Option<Span>,
     #[serde(default)]
     mode: Mode,
     #[serde(default)]
@@ -73,6 +77,9 @@ struct WrittenTimes {
     t_max: Span,
 }
 
+/// Servants that start take about as long.
+const UNREACHED: Duration = Duration::from_secs(3);
+
 fn default_threshold() -> f64 {
     4.0
 }
@@ -86,6 +93,17 @@ impl Written {
         positive("threshold", self.threshold)?;
         let initial = self.initial.unwrap_or(2.0 * self.threshold);
         positive("initial", initial)?;
+        let cap = self.cap.unwrap_or(DEFAULT_CAP * self.threshold);
+        // Q must be able to rise above the threshold, or the local original would never be stopped.
+        if cap.is_nan() || below(cap) <= self.threshold {
+            return Err(SlaError::new(
+                "cap",
+                format!(
+                    "{cap} is not above threshold ({}); raise it, or remove it for {DEFAULT_CAP} times the threshold",
+                    self.threshold
+                ),
+            ));
+        }
         if self.warm.is_some() && self.local != Local::Warm {
             return Err(SlaError::new(
                 "warm",
@@ -136,6 +154,11 @@ impl Written {
             t_max: times.t_max,
             threshold: self.threshold,
             initial,
+            cap,
+            unreached: match self.unreached {
+                Some(span) => span.check("unreached")?,
+                None => UNREACHED.max(times.t_max),
+            },
             mode: self.mode,
             local: self.local,
             warm: self.warm.unwrap_or_default(),
