@@ -272,9 +272,16 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
     for words in [
         "robot failover-lost: /people_detect: the local original takes over: the link is down",
         "robot failover-lost: /people_detect: the local original hands back: the link is up again",
+        // Stateful: each has pictures in its state that the other was not given.
+        "robot failover-lost: /people_detect: the local original goes on without what it was not given: ",
+        "robot failover-lost: /people_detect: the cloud goes on without what it was not given: ",
     ] {
         ensure!(listed.stdout.contains(words), "{words}: {}", listed.stdout);
     }
+    let lost = " of /image since ";
+    ensure!(listed.stdout.contains(lost), "{}", listed.stdout);
+    scene.explains("the cloud goes on without what it was not given")?;
+    scene.diagnosed(&mut diagnostics, "lost at the last hand-over")?;
     ensure!(
         scene.answers.values().all(|times| *times == 1),
         "{:?}",

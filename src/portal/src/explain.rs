@@ -27,6 +27,8 @@ const QUEUED: f64 = 0.25;
 /// Milliseconds: less is no queue.
 const QUEUE: f64 = 5.0;
 const LEFT_OUT: f64 = 0.1;
+/// The event of a stateful hand-over.
+const STATE_LOST: &str = "state-lost";
 
 /// Explains one robot.
 pub async fn robot(
@@ -176,6 +178,16 @@ fn causes(servants: &[Served], events: &[Event]) -> Vec<Cause> {
         for link in &served.links {
             of_link(served, link, &mut say);
         }
+    }
+    // Only the last one: what was lost before that is of an earlier state.
+    let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);
+    if let Some(lost) = lost {
+        say(
+            Weight::Hint,
+            lost.message.clone(),
+            "where that matters begin anew: start its nodes again, or set local = \"none\" so that the cloud alone answers"
+                .to_owned(),
+        );
     }
     causes.sort_by_key(|cause| cause.weight);
     causes
@@ -606,6 +618,37 @@ mod tests {
         let causes = causes(&[], &[event]);
         assert_eq!(causes[0].weight, Weight::Blocks);
         assert!(causes[0].what.ends_with("the servant ran out of memory"));
+    }
+
+    #[test]
+    fn what_a_hand_over_has_lost_is_named() {
+        let event = |kind: &str, message: &str| Event {
+            id: 1,
+            time: 0,
+            level: api::Level::Warning,
+            kind: kind.into(),
+            service: None,
+            servant: None,
+            robot: Some("rover".into()),
+            message: message.into(),
+        };
+        let events = [
+            event("state-lost", "the first"),
+            event("state-lost", "the cloud goes on without 3 of /scan"),
+            event("local-hands-back", "the link is up again"),
+        ];
+        let causes = causes(&[], &events);
+        let lost: Vec<_> = causes
+            .iter()
+            .filter(|cause| cause.weight == Weight::Hint)
+            .collect();
+        assert_eq!(lost.len(), 1);
+        assert_eq!(lost[0].what, "the cloud goes on without 3 of /scan");
+        assert!(
+            lost[0].next.contains("local = \"none\""),
+            "{}",
+            lost[0].next
+        );
     }
 
     #[test]

@@ -39,6 +39,9 @@ pub struct Report {
     pub phases: Vec<Quantiles>,
     /// The last decisions, the newest last.
     pub events: Vec<TimedEvent>,
+    /// Stateful: what was lost at the last hand-over, and how many seconds ago that was.
+    #[serde(default)]
+    pub lost: Option<(f64, String)>,
     /// One sentence: who answers, and why.
     pub summary: String,
 }

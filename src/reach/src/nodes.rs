@@ -29,13 +29,14 @@ const DECISIONS: (u32, Duration) = (60, Duration::from_secs(60));
 const WORDS: usize = 400;
 
 /// Kinds of a robot's decisions that are known.
-const KINDS: [&str; 6] = [
+const KINDS: [&str; 7] = [
     "local-takes-over",
     "local-hands-back",
     "local-answers-too",
     "cloud-answers-alone",
     "local-missing",
     "local-crashed",
+    "state-lost",
 ];
 
 /// The nodes of one servant.

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, Outcome, Pair, Phases,
-    RequestId, SafeStop, Side, Sla, Verdict,
+    Channel, Effect, Event, Failure, Governor, HandOver, Ledger, Limits, LocalState, Mode, Outcome,
+    Pair, Phases, RequestId, SafeStop, Side, Sla, Verdict, Why,
 };
 use ros::bus::{BusError, Message, PeerId};
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -40,6 +40,8 @@ pub trait Application: Send + Sync + 'static {
     fn safe_stop(&self, stop: &SafeStop);
     /// A decision about the local original.
     fn decided(&self, event: &Event);
+    /// A stateful service: who goes on, and without what.
+    fn handed_over(&self, over: &HandOver);
     /// How a request went.
     fn told(&self, outcome: &Outcome);
 }
@@ -69,6 +71,10 @@ pub struct Keeper {
 struct State {
     governor: Governor<Payload>,
     stamps: Stamps,
+    /// Of a stateful service: what each side was given.
+    ledger: Option<Ledger>,
+    /// What was lost at the last hand-over.
+    lost: Option<(Instant, String)>,
     callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
 }
 
@@ -85,7 +91,10 @@ impl Keeper {
         let (original, news) = original.unzip();
         let promised = !sla.is_of_link();
         let safe_stop = sla.safe_stop.clone();
+        let ledger = (sla.mode == Mode::Stateful).then(Ledger::default);
         let state = State {
+            ledger,
+            lost: None,
             governor: Governor::new(sla, pairs, Limits::default()),
             stamps: Stamps::default(),
             callers: HashMap::new(),
@@ -148,6 +157,9 @@ impl Keeper {
             }
         }
         self.with(|state, now| {
+            if let Some(ledger) = state.ledger.as_mut().filter(|_| !message.latching) {
+                ledger.told(now, topic);
+            }
             let key = state.stamps.key(&message);
             state
                 .governor
@@ -162,6 +174,13 @@ impl Keeper {
             return original.latch(topic, &message);
         }
         self.with(|state, now| {
+            let has = state.governor.sides().cloud;
+            if let Some(ledger) = &mut state.ledger {
+                ledger.told(now, topic);
+                if has {
+                    ledger.given(Side::Cloud, topic);
+                }
+            }
             state
                 .governor
                 .overheard(now, topic, Payload::Input(message));
@@ -183,6 +202,9 @@ impl Keeper {
     ) -> Result<Bytes, String> {
         let (sender, answer) = oneshot::channel();
         let id = self.with(|state, now| {
+            if let Some(ledger) = &mut state.ledger {
+                ledger.told(now, service);
+            }
             let id = state.governor.call(now, service, Payload::Call(request));
             state.callers.insert(id, sender);
             id
@@ -210,7 +232,12 @@ impl Keeper {
 
     /// The link is up; `resumed`: what was sent will be answered yet.
     pub fn link_up(&self, resumed: bool) {
-        self.with(|state, now| state.governor.link_up(now, resumed));
+        self.with(|state, now| {
+            if let Some(ledger) = &mut state.ledger {
+                ledger.link_up(resumed);
+            }
+            state.governor.link_up(now, resumed);
+        });
     }
 
     /// The link is down.
@@ -229,7 +256,12 @@ impl Keeper {
 
     /// How it stands.
     pub fn report(&self) -> qos::Report {
-        self.state.lock().governor.report(Instant::now())
+        let (state, now) = (self.state.lock(), Instant::now());
+        let lost = state.lost.as_ref();
+        qos::Report {
+            lost: lost.map(|(at, text)| ((now - *at).as_secs_f64(), text.clone())),
+            ..state.governor.report(now)
+        }
     }
 
     fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
@@ -282,9 +314,10 @@ impl Keeper {
     }
 
     fn change<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
-        let (result, effects) = {
+        let (result, effects, over) = {
             let mut state = self.state.lock();
-            let result = change(&mut state, Instant::now());
+            let now = Instant::now();
+            let result = change(&mut state, now);
             let effects: Vec<_> = std::iter::from_fn(|| state.governor.next_effect()).collect();
             for effect in &effects {
                 if let Effect::Fail {
@@ -294,10 +327,14 @@ impl Keeper {
                     state.reply(*request, Err(reason.clone()));
                 }
             }
-            (result, effects)
+            let over = state.hands_over(now, &effects);
+            (result, effects, over)
         };
         for effect in effects {
             self.carry_out(effect);
+        }
+        if let Some(over) = over {
+            self.robot.handed_over(&over);
         }
         result
     }
@@ -372,6 +409,33 @@ impl Keeper {
 }
 
 impl State {
+    /// Notes who is given what, and tells what is lost where one side goes on in place of the other.
+    fn hands_over(&mut self, now: Instant, effects: &[Effect<Payload>]) -> Option<HandOver> {
+        let ledger = self.ledger.as_mut()?;
+        let mut to = None;
+        for effect in effects {
+            match effect {
+                Effect::Give {
+                    payload: Payload::Input(message),
+                    ..
+                } if message.latching => {}
+                Effect::Give {
+                    side,
+                    channel: Channel::Topic(name) | Channel::Call(name),
+                    ..
+                } => ledger.given(*side, name),
+                Effect::Event(Event::Start(_) | Event::Crashed(_)) => ledger.original_begins(),
+                Effect::Event(Event::Feed(Why::LinkDown)) => to = Some(Side::Local),
+                Effect::Event(Event::StopFeeding(Why::LinkUp)) => to = Some(Side::Cloud),
+                _ => {}
+            }
+        }
+        // All that was given at this moment counts as given before.
+        let over = ledger.hands_over(now, to?)?;
+        self.lost = Some((now, over.to_string()));
+        Some(over)
+    }
+
     fn reply(&mut self, id: RequestId, answer: Result<Bytes, String>) {
         if let Some(caller) = self.callers.remove(&id) {
             let _ = caller.send(answer);

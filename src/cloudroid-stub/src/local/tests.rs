@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use qos::{Event, LocalState, Outcome, RequestId, SafeStop, Sla};
+use qos::{Event, HandOver, LocalState, Outcome, RequestId, SafeStop, Sla};
 use ros::bus::{Bus, GlobalParameters, Message, ParamValue, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
@@ -268,6 +268,52 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides() {
 }
 
 #[tokio::test]
+async fn a_stateful_hand_over_says_what_is_lost() {
+    let sla = serde_json::json!({"t_desire": 10, "t_max": 20, "mode": "stateful"});
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let cloud = Arc::new(Silent::default());
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec![],
+        Some(an_original(setting(&["patient"]), robot().await).await),
+        cloud.clone(),
+        Arc::new(Listener(told)),
+    );
+    keeper.link_up(false);
+    let topic: Arc<str> = "/ns/in".into();
+    // What is latched reaches both: nothing of it is lost.
+    keeper.input(&topic, latched("/map_server", "map"));
+    for _ in 0..3 {
+        keeper.input(&topic, string("scan"));
+    }
+    let mut heard = Vec::new();
+    let mut until = async |wanted: &str| {
+        while heard.last().map(String::as_str) != Some(wanted) {
+            heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
+        }
+    };
+    keeper.link_down();
+    until("local lacks 3 of /ns/in").await;
+    let lost = keeper.report().lost.unwrap().1;
+    assert!(
+        lost.contains("the local original goes on without"),
+        "{lost}"
+    );
+    for _ in 0..2 {
+        keeper.input(&topic, string("another scan"));
+    }
+    keeper.link_up(true);
+    until("cloud lacks 2 of /ns/in").await;
+    // The servant that comes now is another one.
+    keeper.link_down();
+    until("feed").await;
+    keeper.link_up(false);
+    until("cloud lacks 5 of /ns/in").await;
+    let lost = keeper.report().lost.unwrap().1;
+    assert!(lost.contains("a new servant goes on without"), "{lost}");
+}
+
+#[tokio::test]
 async fn where_nothing_is_promised_a_missing_original_is_told_when_it_is_needed() {
     let sla = serde_json::json!({"measure": {"link": {"after": 0.02}}});
     let (told, mut hears) = mpsc::unbounded_channel();
@@ -433,6 +479,14 @@ impl Application for Listener {
         let _ = self.0.send(name.to_lowercase());
     }
 
+    fn handed_over(&self, over: &HandOver) {
+        let missed = over.missed.iter();
+        let missed = missed.map(|missed| format!("{} of {}", missed.count, missed.name));
+        let missed = missed.collect::<Vec<_>>().join(", ");
+        let to = format!("{:?}", over.to).to_lowercase();
+        let _ = self.0.send(format!("{to} lacks {missed}"));
+    }
+
     fn told(&self, _: &Outcome) {}
 }
 
@@ -495,7 +549,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
 
 #[tokio::test]
 async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
-    let sla = serde_json::json!({"t_desire": 10, "t_max": 20, "local": "warm", "initial": 5});
+    let sla = serde_json::json!({"t_desire": 0.05, "t_max": 0.1, "local": "warm", "initial": 5});
     let (told, mut hears) = mpsc::unbounded_channel();
     let cloud = Arc::new(Silent::default());
     let keeper = Keeper::start(

@@ -135,6 +135,10 @@ fn values(report: &Report) -> Vec<(String, String)> {
     let all = all.chain(promise).chain(standing).chain(late);
     let mut values: Vec<(String, String)> =
         all.map(|(key, value)| (key.to_owned(), value)).collect();
+    if let Some((ago, lost)) = &report.lost {
+        let key = format!("lost at the last hand-over, {ago:.0} s ago");
+        values.push((key, lost.clone()));
+    }
     for pair in &report.pairs {
         values.push(("request".to_owned(), pair.clone()));
     }

@@ -9,7 +9,8 @@ use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
-    Correlation, Event, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side, Sla, Topic, Warm,
+    Correlation, Event, HandOver, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side, Sla,
+    Topic, Warm,
 };
 use ros::bus::{Bus, Message, WireType};
 use serde_json::json;
@@ -333,6 +334,14 @@ impl Application for Way {
             .and_then(|mirror| mirror.promise.get())
         {
             promise.reports.note(outcome);
+        }
+    }
+
+    fn handed_over(&self, over: &HandOver) {
+        tracing::warn!("{over}");
+        let mirror = self.0.upgrade();
+        if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
+            promise.reports.handed_over(over);
         }
     }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use link::control::{Decision, FromRobot, Request};
 use link::record::Data;
 use parking_lot::Mutex;
-use qos::{Channel, Event, Outcome, Phases, Side, Why};
+use qos::{Channel, Event, HandOver, Outcome, Phases, Side, Why};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::Mirror;
@@ -68,9 +68,22 @@ impl Reports {
 impl Reports {
     /// Something was decided about the local original.
     pub fn decided(&self, event: &Event) {
-        let Some(decision) = decision(event) else {
-            return;
-        };
+        if let Some(decision) = decision(event) {
+            self.tell(decision);
+        }
+    }
+
+    /// One side goes on in place of the other, without some of what that was given.
+    pub fn handed_over(&self, over: &HandOver) {
+        self.tell(Decision {
+            kind: "state-lost".to_owned(),
+            warning: true,
+            text: over.to_string(),
+            ago: 0.0,
+        });
+    }
+
+    fn tell(&self, decision: Decision) {
         let mut decisions = self.decisions.lock();
         if decisions.len() == DECISIONS {
             decisions.pop_front();

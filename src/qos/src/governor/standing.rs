@@ -32,6 +32,7 @@ impl<P: Clone> Governor<P> {
             counts: self.counts,
             phases: self.phases.quantiles(),
             events: self.events.iter().map(event).collect(),
+            lost: None,
             summary: self.summary(),
         }
     }
