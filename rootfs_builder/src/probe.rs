@@ -35,6 +35,10 @@ use tokio::time::Instant;
 
 use feed::Feed;
 
+/// Messages of an output that are kept between two looks.
+const KEPT: usize = 8;
+/// Messages of an output that were longer than the one before, from which on it grows.
+const LONGER: u32 = 3;
 /// Each round gives what the one before has made a node ask for.
 const MOST_ROUNDS: usize = 12;
 
@@ -172,6 +176,8 @@ pub struct Found {
     pub interface: Interface,
     /// Things to know that are no failure.
     pub warnings: Vec<String>,
+    /// Outputs whose messages became longer and longer.
+    pub growing: Vec<String>,
 }
 
 /// Looks. `exited` resolves when a node ends that should not, with what is to be said about it.
@@ -216,6 +222,7 @@ async fn look(
         tried: BTreeSet::new(),
         eager: BTreeSet::new(),
         latched: BTreeSet::new(),
+        lengths: BTreeMap::new(),
     };
     if !settle::still(&mut look.watch, options).await? {
         look.warnings.push(format!(
@@ -259,6 +266,8 @@ async fn look(
     }
     incomplete::warn(&mut found, options, &mut feed);
     found.warnings.splice(..0, look.warnings);
+    let grown = look.lengths.into_iter().filter(|(_, of)| of.is_growth());
+    found.growing = grown.map(|(topic, _)| topic).collect();
     Ok(found)
 }
 
@@ -274,6 +283,30 @@ struct Look<'a> {
     tried: BTreeSet<String>,
     eager: BTreeSet<String>,
     latched: BTreeSet<String>,
+    /// Of each output's messages.
+    lengths: BTreeMap<String, Lengths>,
+}
+
+/// How the length of a topic's messages changes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Lengths {
+    last: Option<usize>,
+    grown: u32,
+    shrunk: bool,
+}
+
+impl Lengths {
+    fn note(&mut self, length: usize) {
+        if let Some(last) = self.last.replace(length) {
+            self.grown += u32::from(length > last);
+            self.shrunk |= length < last;
+        }
+    }
+
+    /// A counter in a text becomes longer now and then; what gathers becomes so with each input.
+    fn is_growth(&self) -> bool {
+        self.grown >= LONGER && !self.shrunk
+    }
 }
 
 impl Look<'_> {
@@ -296,7 +329,7 @@ impl Look<'_> {
             for topic in &new {
                 match self
                     .bus
-                    .subscribe(topic, WireType::any(), Qos::keep_last(1))
+                    .subscribe(topic, WireType::any(), Qos::keep_last(KEPT))
                     .await
                 {
                     Ok(subscription) => {
@@ -323,10 +356,12 @@ impl Look<'_> {
 
     async fn describe(&mut self, feed: &Feed<'_>) -> Result<Found, ProbeError> {
         for (topic, subscription) in &mut self.subscriptions {
-            if let Some(message) = subscription.messages.try_recv()
-                && message.latching
-            {
-                self.latched.insert(topic.clone());
+            while let Some(message) = subscription.messages.try_recv() {
+                if message.latching {
+                    self.latched.insert(topic.clone());
+                }
+                let lengths = self.lengths.entry(topic.clone()).or_default();
+                lengths.note(message.bytes.len());
             }
         }
         let seen = describe::Seen {

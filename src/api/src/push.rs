@@ -60,6 +60,9 @@ pub struct PushOptions {
     /// Answers depend on earlier requests: robots' local originals answer only while there is no link.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub stateful: bool,
+    /// They do not, says the deployer: the push does not ask.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub stateless: bool,
     /// What was pushed, in words, kept with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,

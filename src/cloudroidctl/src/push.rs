@@ -64,9 +64,10 @@ pub struct Push {
     #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
     /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
-    /// down, and hands back. Without this, both may be asked and the first answer is taken.
-    #[arg(long)]
-    stateful: bool,
+    /// down, and hands back. Without this, both may be asked and the first answer is taken. =false says that each answer
+    /// stands alone where the push would ask.
+    #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true", value_name = "BOOL")]
+    stateful: Option<bool>,
     #[command(flatten)]
     limits: LimitFlags,
     #[command(flatten)]
@@ -189,7 +190,8 @@ impl Push {
                 volumes: self.volumes.clone(),
                 egress: self.egress.clone(),
             },
-            stateful: self.stateful,
+            stateful: self.stateful == Some(true),
+            stateless: self.stateful == Some(false),
             source,
         })
     }
@@ -269,6 +271,24 @@ mod tests {
             "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "source": "--apt opencv_apps"
         });
         assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
+    }
+
+    #[test]
+    fn whether_answers_depend_on_earlier_ones_may_be_said_or_left_open() {
+        for (line, said) in [
+            ("./pkg", (false, false)),
+            ("--stateful ./pkg", (true, false)),
+            ("./pkg --stateful=false", (false, true)),
+            ("./pkg --stateful=true", (true, false)),
+        ] {
+            let options = parse(line).and_then(|push| Ok(push.options().expect("no file is read")));
+            let options = options.expect(line);
+            assert_eq!((options.stateful, options.stateless), said, "{line}");
+        }
+        assert_eq!(
+            parse("./pkg --stateful=maybe").expect_err("no").exit_code(),
+            2
+        );
     }
 
     #[test]

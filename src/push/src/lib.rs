@@ -22,6 +22,7 @@ mod probe;
 mod publish;
 mod receive;
 mod request;
+mod stateful;
 mod supplement;
 
 use std::path::{Path, PathBuf};
@@ -219,6 +220,12 @@ impl Pusher {
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         interface_limits::check_interface(&interface)?;
+        if !(options.stateful || options.stateless) {
+            let signs = stateful::signs(&interface, &found.growing);
+            if let Some(question) = stateful::question(&signs) {
+                report.warning(question).await;
+            }
+        }
         let record = RevisionRecord {
             service: name.clone(),
             number: 0,

@@ -205,6 +205,7 @@ fn options() -> PushOptions {
             egress: all("example.org:80"),
         },
         stateful: true,
+        stateless: true,
         source: "--apt x".into(),
     }
 }

@@ -1,0 +1,147 @@
+//! Guesses from an interface whether answers depend on earlier inputs: the deployer is asked, nothing is decided here.
+
+use package::interface::{Direction, Interface, Topic};
+
+/// Types that hold what was gathered of many inputs.
+const MAPS: [&str; 5] = [
+    "nav_msgs/OccupancyGrid",
+    "map_msgs/ProjectedMap",
+    "octomap_msgs/Octomap",
+    "grid_map_msgs/GridMap",
+    "nav_msgs/GetMapResult",
+];
+
+/// What points to state, a phrase each; `growing` are outputs whose messages became longer and longer.
+pub(super) fn signs(interface: &Interface, growing: &[String]) -> Vec<String> {
+    let of = |direction: Direction| {
+        let topics = interface.topics.iter();
+        topics.filter(move |topic| topic.direction == direction)
+    };
+    // What nothing is given to has nothing to remember: a map server, say.
+    let is_given = of(Direction::Input).any(|topic| !is_transforms(topic));
+    if !is_given {
+        return Vec::new();
+    }
+    let sign = |topic: &Topic| {
+        let name = &topic.name;
+        if topic.latched && MAPS.contains(&topic.type_name.as_str()) {
+            Some(format!(
+                "{name} is a map, and latched ({})",
+                topic.type_name
+            ))
+        } else if name == "/tf" {
+            Some("it publishes transforms on /tf".to_owned())
+        } else if growing.contains(name) {
+            Some(format!("messages of {name} became longer and longer"))
+        } else {
+            None
+        }
+    };
+    of(Direction::Output).filter_map(sign).collect()
+}
+
+/// The question to the deployer; none where nothing points to state.
+pub(super) fn question(signs: &[String]) -> Option<String> {
+    if signs.is_empty() {
+        return None;
+    }
+    Some(format!(
+        "do answers depend on earlier inputs? it looks so: {}. If they do, push again with --stateful: then a robot's local \
+         original answers only while the link is down, and each hand-over tells what is lost. If not, --stateful=false \
+         says so",
+        signs.join("; ")
+    ))
+}
+
+fn is_transforms(topic: &Topic) -> bool {
+    matches!(topic.name.as_str(), "/tf" | "/tf_static")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(name: &str, type_name: &str, direction: Direction, latched: bool) -> Topic {
+        Topic {
+            name: name.into(),
+            type_name: type_name.into(),
+            md5: String::new(),
+            direction,
+            nodes: Vec::new(),
+            latched,
+            lazy: false,
+        }
+    }
+
+    fn of(topics: Vec<Topic>, growing: &[&str]) -> Vec<String> {
+        let interface = Interface {
+            topics,
+            ..Interface::default()
+        };
+        let growing: Vec<String> = growing.iter().map(|name| (*name).to_owned()).collect();
+        signs(&interface, &growing)
+    }
+
+    #[test]
+    fn maps_transforms_and_what_grows_point_to_state() {
+        use Direction::{Input, Output};
+        let scan = || topic("/scan", "sensor_msgs/LaserScan", Input, false);
+        let map = |latched| topic("/map", "nav_msgs/OccupancyGrid", Output, latched);
+        let tf = |direction| topic("/tf", "tf2_msgs/TFMessage", direction, false);
+        let path = || topic("/path", "nav_msgs/Path", Output, false);
+        for (what, topics, growing, words) in [
+            (
+                "gmapping",
+                vec![scan(), tf(Input), map(true), tf(Output)],
+                vec![],
+                vec!["/map is a map", "on /tf"],
+            ),
+            (
+                "a costmap, made anew each time",
+                vec![scan(), map(false)],
+                vec![],
+                vec![],
+            ),
+            ("a map server", vec![map(true)], vec![], vec![]),
+            (
+                "a publisher of fixed transforms",
+                vec![tf(Output)],
+                vec![],
+                vec![],
+            ),
+            (
+                "who hears transforms alone",
+                vec![tf(Input), map(true)],
+                vec![],
+                vec![],
+            ),
+            (
+                "a trajectory",
+                vec![scan(), path()],
+                vec!["/path"],
+                vec!["messages of /path became longer"],
+            ),
+            ("a plan", vec![scan(), path()], vec![], vec![]),
+        ] {
+            let found = of(topics, &growing);
+            assert_eq!(found.len(), words.len(), "{what}: {found:?}");
+            for (found, words) in found.iter().zip(words) {
+                assert!(found.contains(words), "{what}: {found}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_question_says_what_was_found_and_what_to_type() {
+        assert_eq!(question(&[]), None);
+        let asked = question(&["it publishes transforms on /tf".into()]).unwrap();
+        for words in [
+            "do answers depend on earlier inputs?",
+            "on /tf",
+            "--stateful:",
+            "--stateful=false",
+        ] {
+            assert!(asked.contains(words), "{asked}");
+        }
+    }
+}
