@@ -122,7 +122,9 @@ fn main() -> ExitCode {
         ],
         stories![fallback:
             an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back,
-            a_server_that_was_never_reached_is_stood_in_for,
+            a_server_that_was_never_reached_is_stood_in_for_until_it_comes,
+            a_promise_holds_without_a_server_too_until_it_comes,
+            a_blip_of_the_link_starts_nothing_and_loses_nothing,
             an_untouched_stub_can_be_told_to_leave_the_original_alone,
         ],
         stories![grants:

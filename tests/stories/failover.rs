@@ -180,7 +180,9 @@ impl Scene {
 }
 
 pub fn a_slow_network_costs_few_requests() -> Verdict {
-    let more = format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
+    // A servant that is slow to start is not what this is about.
+    let more =
+        format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0");
     let mut scene = Scene::new("failover-slow", &more)?;
     for _ in 0..3 {
         let number = scene.asks();
@@ -293,7 +295,7 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
 pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Verdict {
     let rate = 1.0 / T_MAX;
     let more = format!(
-        "local = \"cold\"\nframes_per_second = {rate}\n\
+        "local = \"cold\"\nframes_per_second = {rate}\nfallback_after = 300.0\n\
          safe_stop = {{ topic = \"/cmd_vel\", type = \"geometry_msgs/Twist\", message = {{ linear = {{ x = -0.5 }} }} }}"
     );
     let mut scene = Scene::new("failover-frames", &more)?;
@@ -318,9 +320,13 @@ pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Verdict {
 }
 
 pub fn outputs_that_become_too_old_wake_the_original() -> Verdict {
-    let more = format!("local = \"cold\"\nage = {T_MAX:?}");
+    let desired = T_MAX / 2.0;
+    let more = format!(
+        "local = \"cold\"\nage = {T_MAX:?}\ndesired_age = {desired:?}\nfallback_after = 300.0"
+    );
     let mut scene = Scene::new("failover-age", &more)?;
     scene.explains_link("age", T_MAX * 1e3)?;
+    scene.explains_link("desired_age", desired * 1e3)?;
     // Stamps are when a picture was taken: those of our pictures are of 1970, and any answer to them is too old.
     let number = scene.asks();
     scene.hears(number)?;
@@ -336,7 +342,9 @@ pub fn outputs_that_become_too_old_wake_the_original() -> Verdict {
 }
 
 pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Verdict {
-    let more = format!("local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}");
+    let more = format!(
+        "local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0"
+    );
     let mut scene = Scene::new("failover-sign", &more)?;
     let number = scene.asks();
     scene.hears(number)?;

@@ -10,7 +10,9 @@ use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 use support::Verdict;
 use support::cable::{Badness, Cable};
+use support::cutter::Cutter;
 use support::daemon::Daemon;
+use support::people;
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
 use support::world::{LOCALISER, world};
@@ -150,8 +152,19 @@ impl Robot {
 
     /// Stub and original as they are installed on a robot.
     fn starts(&self, daemon: &Daemon, robot: &str, server: &str) -> anyhow::Result<Running> {
+        self.starts_with(daemon, robot, server, "")
+    }
+
+    /// With these lines in `stub.toml`.
+    fn starts_with(
+        &self,
+        daemon: &Daemon,
+        robot: &str,
+        server: &str,
+        settings: &str,
+    ) -> anyhow::Result<Running> {
         let (service, package, node) = (LOCALISER.name, "localiser_py", "localiser.py");
-        let overlay = self.site.installs(daemon, service, "")?;
+        let overlay = self.site.installs(daemon, service, settings)?;
         let original = (package, node);
         let workspace: PathBuf = self
             .site
@@ -266,6 +279,12 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
         cable.restore()?;
         says(&stub, back, before + round)?;
         robot.is_found((1, 1), &stub)?;
+        // The cloud's last pose has taken the place of the original's.
+        let newcomer = robot.site.node(&format!("/later{round}"))?;
+        let mut late = robot.site.hears(&newcomer, "/localiser/pose")?;
+        let pose = robot.site.next(&mut late)?;
+        let x = pose.bytes.len() - 56;
+        ensure!(pose.bytes[x..x + 8] == 0.75_f64.to_le_bytes(), "{pose:?}");
     }
     let events = daemon.deployer().asks(&["events", "-n", "10000"])?;
     let mine = events.as_array().context("a list")?.iter();
@@ -278,14 +297,88 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
     Ok(())
 }
 
-pub fn a_server_that_was_never_reached_is_stood_in_for() -> Verdict {
+pub fn a_server_that_was_never_reached_is_stood_in_for_until_it_comes() -> Verdict {
     let daemon = world().with(LOCALISER)?;
     let mut robot = Robot::new()?;
-    // Nobody listens there.
-    let stub = robot.starts(&daemon, "fallback-never", "127.0.0.1:1")?;
+    let way = Cutter::new(&daemon.address, 0, 1, 1)?;
+    way.cut(true);
+    let stub = robot.starts(&daemon, "fallback-never", &way.server.to_string())?;
     says(&stub, "no link: ", 1)?;
     robot.is_found((6, 6), &stub)?;
-    ensure!(stub.said().contains("why=LinkDown"), "{}", stub.said());
+    says(&stub, "the local original answers, too why=LinkDown", 1)?;
+    ensure!(!stub.said().contains("linked to"), "{}", stub.said());
+    way.cut(false);
+    says(&stub, "the cloud answers alone why=LinkUp", 1)?;
+    says(&stub, "the local original is stopped why=LinkUp", 1)?;
+    robot.is_found((1, 1), &stub)
+}
+
+pub fn a_promise_holds_without_a_server_too_until_it_comes() -> Verdict {
+    let daemon = world().with(LOCALISER)?;
+    let mut robot = Robot::new()?;
+    let way = Cutter::new(&daemon.address, 0, 1, 1)?;
+    way.cut(true);
+    // Nobody can ask for anything before somebody has registered what the node listens to.
+    let settings = "desire = 20.0\nmax = 20.0\nfallback_after = 1.0\n";
+    let server = way.server.to_string();
+    let stub = robot.starts_with(&daemon, "fallback-promise", &server, settings)?;
+    says(&stub, "the local original answers, too why=LinkDown", 1)?;
+    robot.is_found((6, 6), &stub)?;
+    ensure!(!stub.said().contains("linked to"), "{}", stub.said());
+    way.cut(false);
+    says(&stub, "linked to", 1)?;
+    // What nobody could answer in time has made it doubt the cloud: it is asked until it is trusted.
+    let deadline = Instant::now() + PATIENCE;
+    while !stub.said().contains("the local original is stopped") {
+        robot.is_found((1, 1), &stub)?;
+        ensure!(Instant::now() < deadline, "{}", stub.said());
+    }
+    robot.is_found((2, 4), &stub)
+}
+
+pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing() -> Verdict {
+    let daemon = world().with(LOCALISER)?;
+    let mut robot = Robot::new()?;
+    let way = Cutter::new(&daemon.address, 0, 1, 1)?;
+    // One late request would start the original, and nothing is late within five minutes.
+    let settings = "desire = 300.0\nmax = 300.0\nfallback_after = 300.0\nthreshold = 4.0\ninitial = 5.0\ncap = 6.0\n";
+    let server = way.server.to_string();
+    let stub = robot.starts_with(&daemon, "fallback-blip", &server, settings)?;
+    says(&stub, "linked to", 1)?;
+    robot.site.connected(&*robot.scan, 1)?;
+    robot.is_found((2, 4), &stub)?;
+    for round in 0..20_u32 {
+        let number = 1_000_000 + round;
+        // Now it is on its way when the link is lost, now it is asked while there is none.
+        if round % 2 == 0 {
+            robot.scan.publish(scan(number, (1, 1)));
+        }
+        way.cut(true);
+        std::thread::sleep(Duration::from_millis(50));
+        if round % 2 == 1 {
+            robot.scan.publish(scan(number, (1, 1)));
+        }
+        way.cut(false);
+        loop {
+            let pose = robot.site.next(&mut robot.poses);
+            let pose = pose.with_context(|| format!("scan {number}:\n{}", stub.said()))?;
+            let answered = people::number(&pose).context("a stamp")?;
+            if answered == number {
+                break;
+            }
+            // Before the first round several scans were shown.
+            ensure!(round == 0 && answered < 1_000_000, "{answered} came again");
+        }
+    }
+    let said = stub.said();
+    ensure!(said.contains("was lost"), "it was not cut: {said}");
+    ensure!(!said.contains("the local original is started"), "{said}");
+    let path = "/api/v1/robots/fallback-blip/explain";
+    let link = daemon.awaits(path, "twenty requests, all told", |explained| {
+        let link = &explained["servants"][0]["links"][0];
+        (link["requests"].as_u64() >= Some(21)).then(|| link.clone())
+    })?;
+    ensure!(link["late"] == 0 && link["local"] == 0, "{link:#}");
     Ok(())
 }
 

@@ -55,7 +55,7 @@ impl Cutter {
         self.shared.state().draw();
     }
 
-    /// Cuts what is connected now; with `closed`, nobody gets through from now on.
+    /// Cuts what is connected now; with `closed` nobody gets through from now on, without it whoever comes next does.
     pub fn cut(&self, closed: bool) {
         self.shared.closed.store(closed, Ordering::Relaxed);
         self.shared.state().cut();

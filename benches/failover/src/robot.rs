@@ -123,7 +123,7 @@ fn start(site: &Site, daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Run
         return people::original(site, daemon, service);
     }
     let settings = format!(
-        "local = \"{}\"\ndesire = {:?}\nmax = {:?}",
+        "local = \"{}\"\ndesire = {:?}\nmax = {:?}\nfallback_after = 300.0",
         plan.local, plan.times.0, plan.times.1
     );
     let robot = format!("failover-{}", plan.local);

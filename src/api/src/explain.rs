@@ -87,9 +87,15 @@ pub struct Link {
     /// The least rate of an output, where that is promised instead: frames per second.
     #[serde(default)]
     pub frames_per_second: Option<f64>,
+    /// The rate that is wished for, where it is another.
+    #[serde(default)]
+    pub desired_frames_per_second: Option<f64>,
     /// The greatest age of an output, where that is promised instead.
     #[serde(default)]
     pub age: Option<f64>,
+    /// The age that is wished for, where it is another.
+    #[serde(default)]
+    pub desired_age: Option<f64>,
     /// Where no time is promised: seconds for which the link is down before the local original takes over. Such links have no
     /// Q, and none of their requests counts as late.
     #[serde(default)]

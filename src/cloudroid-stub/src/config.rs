@@ -11,10 +11,15 @@
 //! max = 0.30           # T_max, seconds: the longest that is acceptable
 //! threshold = 4.0      # Q_t: below it the local original is started
 //! initial = 8.0        # Q at the beginning; 2·Q_t where absent
+//! cap = 16.0           # Q stays below it; 4·Q_t where absent, inf for no bound
 //! frames_per_second = 5.0   # instead of desire and max: least rate of an output
+//! desired_frames_per_second = 10.0   # the rate that is wished for; frames_per_second where absent
 //! age = 0.5            # instead of desire and max, seconds: greatest age that an output reaches
-//! output = "/people"   # which output those two are about; the one that answers the node's requests where absent
+//! desired_age = 0.2    # the age that is wished for; age where absent
+//! output = "/people"   # which output those are about; the one that answers the node's requests where absent
 //! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
+//! # The same for several, with other times than desire and max for those that need them: inputs, services and actions.
+//! requests = ["/image -> /people", { request = "/plan", desire = 1.0, max = 5.0 }]
 //!
 //! fallback_after = 3.0 # where no time, rate or age is promised: seconds for which the link is down before the local
 //!                      # original takes over, until the link is up again
@@ -37,6 +42,7 @@
 //! parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
 
 mod parameters;
+mod requests;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -49,6 +55,7 @@ use toml::{Table, Value};
 use crate::address::Address;
 
 pub use parameters::{Group, groups};
+pub use requests::Requests;
 
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
@@ -88,18 +95,30 @@ pub struct Config {
     /// Q at the beginning.
     #[serde(default)]
     pub initial: Option<f64>,
+    /// Q stays below it; may be infinite.
+    #[serde(default)]
+    pub cap: Option<f64>,
     /// Least rate of an output.
     #[serde(default)]
     pub frames_per_second: Option<f64>,
+    /// The rate that is wished for.
+    #[serde(default)]
+    pub desired_frames_per_second: Option<f64>,
     /// Greatest age of an output in seconds.
     #[serde(default)]
     pub age: Option<f64>,
+    /// The age that is wished for, seconds.
+    #[serde(default)]
+    pub desired_age: Option<f64>,
     /// What those two are about.
     #[serde(default)]
     pub output: Option<String>,
     /// `auto`, or `INPUT -> OUTPUT`.
     #[serde(default)]
     pub request: Option<String>,
+    /// The same for several, with times of their own.
+    #[serde(default)]
+    pub requests: Option<Requests>,
     /// Seconds for which the link is down before the local original takes over, where no time, rate or age is promised.
     #[serde(default = "fallback_after")]
     pub fallback_after: f64,
@@ -322,7 +341,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 22] = [
+pub const KEYS: [&str; 26] = [
     "server",
     "service",
     "token",
@@ -333,10 +352,14 @@ pub const KEYS: [&str; 22] = [
     "max",
     "threshold",
     "initial",
+    "cap",
     "frames_per_second",
+    "desired_frames_per_second",
     "age",
+    "desired_age",
     "output",
     "request",
+    "requests",
     "fallback_after",
     "call_limit",
     "local",
@@ -382,7 +405,9 @@ impl Config {
             ("desire", self.desire),
             ("max", self.max),
             ("age", self.age),
+            ("desired_age", self.desired_age),
             ("frames_per_second", self.frames_per_second),
+            ("desired_frames_per_second", self.desired_frames_per_second),
             ("threshold", self.threshold),
             ("initial", self.initial),
             ("fallback_after", Some(self.fallback_after)),
@@ -402,13 +427,34 @@ impl Config {
             let reason = format!("is {quality}; it should be a number from 1 to 100");
             return wrong("quality", reason);
         }
-        match (self.desire, self.max) {
-            (Some(desire), Some(max)) if desire > max => wrong(
-                "desire",
-                format!("({desire} s) is greater than max ({max} s); lower it, or raise max"),
-            ),
-            _ => Ok(()),
+        if let Some(cap) = self.cap.filter(|cap| cap.is_nan() || *cap <= 0.0) {
+            let reason = format!("is {cap}; it should be a number greater than threshold");
+            return wrong("cap", reason);
         }
+        if let (Some(desired), Some(least)) =
+            (self.desired_frames_per_second, self.frames_per_second)
+        {
+            if desired < least {
+                let reason = format!(
+                    "({desired}) is less than frames_per_second ({least}), which is the least that will do; raise it, or lower frames_per_second"
+                );
+                return wrong("desired_frames_per_second", reason);
+            }
+        }
+        for (key, desired, (other, most)) in [
+            ("desire", self.desire, ("max", self.max)),
+            ("desired_age", self.desired_age, ("age", self.age)),
+        ] {
+            if let (Some(desired), Some(most)) = (desired, most) {
+                if desired > most {
+                    let reason = format!(
+                        "({desired} s) is greater than {other} ({most} s); lower it, or raise {other}"
+                    );
+                    return wrong(key, reason);
+                }
+            }
+        }
+        Ok(())
     }
 
     /// What must hold once all that say something have been heard.
@@ -419,6 +465,19 @@ impl Config {
         };
         if self.quality.is_some() && self.codec != Codec::Jpeg {
             return without("quality", "codec = \"jpeg\"");
+        }
+        if self.request.is_some() && self.requests.is_some() {
+            let reason = "and requests are both given; remove one".to_owned();
+            return Err(Wrong {
+                key: "request",
+                reason,
+            });
+        }
+        if self.desired_frames_per_second.is_some() && self.frames_per_second.is_none() {
+            return without("desired_frames_per_second", "frames_per_second");
+        }
+        if self.desired_age.is_some() && self.age.is_none() {
+            return without("desired_age", "age");
         }
         match (self.desire, self.max) {
             (Some(_), None) => without("desire", "max"),

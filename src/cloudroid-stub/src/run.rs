@@ -82,7 +82,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     let config = with_parameters(config, &*bus, &robot.node).await?;
     if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
         tracing::warn!(
-            "fallback_after is not looked at where desire and max, a rate or an age are given: those decide when the local original answers"
+            "fallback_after counts only until the server is reached for the first time where desire and max, a rate or an age are given: then those decide when the local original answers"
         );
     }
     let mut shutdown = bus.shutdown_requested();
@@ -243,7 +243,9 @@ fn sla(config: &Config) -> Sla {
         desire: config.desire,
         max: config.max,
         frames_per_second: config.frames_per_second,
+        desired_frames_per_second: config.desired_frames_per_second,
         age: config.age,
+        desired_age: config.desired_age,
         threshold: config.threshold,
         fallback_after: (!config.promises() && config.local != Local::None)
             .then_some(config.fallback_after),

@@ -79,8 +79,16 @@ fn promise(link: &Link) -> String {
         return format!("no time promised, fallback {after:.1} s after the link is lost");
     }
     match (link.frames_per_second, link.age) {
-        (Some(rate), _) => format!("at least {rate} frames a second{threshold}"),
-        (None, Some(_)) => format!("at most {} old{threshold}", millis(link.age)),
+        (Some(rate), _) => {
+            let desired = link.desired_frames_per_second;
+            let desired = desired.map_or_else(String::new, |rate| format!(", {rate} wished for"));
+            format!("at least {rate} frames a second{desired}{threshold}")
+        }
+        (None, Some(_)) => {
+            let desired = link.desired_age.map(|_| millis(link.desired_age));
+            let desired = desired.map_or_else(String::new, |age| format!(", {age} wished for"));
+            format!("at most {} old{desired}{threshold}", millis(link.age))
+        }
         (None, None) => format!(
             "T_desire {}, T_max {}{threshold}",
             millis(link.desire),

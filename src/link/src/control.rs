@@ -93,8 +93,12 @@ pub struct Sla {
     pub max: Option<f64>,
     /// Least rate of an output.
     pub frames_per_second: Option<f64>,
+    /// The rate that is wished for.
+    pub desired_frames_per_second: Option<f64>,
     /// Greatest age of an output.
     pub age: Option<f64>,
+    /// The age that is wished for.
+    pub desired_age: Option<f64>,
     /// Q_t, which has no unit.
     pub threshold: Option<f64>,
     /// Nothing is promised: the local original stands in so long after the link was lost.

@@ -121,7 +121,9 @@ fn link(status: LinkStatus) -> Link {
         max,
         threshold: status.sla.threshold,
         frames_per_second: status.sla.frames_per_second,
+        desired_frames_per_second: status.sla.desired_frames_per_second,
         age: status.sla.age.map(millis),
+        desired_age: status.sla.desired_age.map(millis),
         fallback_after: status.sla.fallback_after.map(millis),
         satisfaction: requests
             .last()

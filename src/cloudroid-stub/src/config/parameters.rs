@@ -60,11 +60,15 @@ impl Config {
         }
         let config: Config = table.clone().try_into()?;
         if let Err(wrong) = config.check().and_then(|()| config.check_whole()) {
-            let both = ["desire", "max"].contains(&wrong.key);
-            let other = if wrong.key == "max" { "desire" } else { "max" };
-            let giver = givers
-                .get(wrong.key)
-                .or_else(|| givers.get(other).filter(|_| both));
+            let other = match wrong.key {
+                "desire" => "max",
+                "max" => "desire",
+                "desired_age" => "age",
+                "desired_frames_per_second" => "frames_per_second",
+                "request" => "requests",
+                _ => "",
+            };
+            let giver = givers.get(wrong.key).or_else(|| givers.get(other));
             match giver {
                 Some(giver) => bail!("parameter {giver}: {wrong} (rosparam delete {giver})"),
                 None => return Err(wrong.into()),
@@ -181,6 +185,25 @@ mod tests {
             (
                 vec![("local", text("hot"))],
                 vec!["local is \"hot\"", "first-sign"],
+            ),
+            (
+                vec![
+                    ("desired_frames_per_second", one.clone()),
+                    ("frames_per_second", two.clone()),
+                ],
+                vec!["(1) is less than frames_per_second (2)", "raise it"],
+            ),
+            (
+                vec![("desired_age", two.clone()), ("age", one.clone())],
+                vec!["desired_age (2 s) is greater than age (1 s)"],
+            ),
+            (
+                vec![("desired_age", two.clone())],
+                vec!["desired_age is given without age"],
+            ),
+            (
+                vec![("request", text("auto")), ("requests", text("/a -> /b"))],
+                vec!["both given"],
             ),
             (
                 vec![("max", ParamValue::List(vec![]))],

@@ -79,6 +79,8 @@ fn nonsense_is_named() {
         ("max", "nan", "max is NaN"),
         ("desire", "-1", "desire is -1"),
         ("age", "inf", "age is inf"),
+        ("cap", "-1", "cap is -1"),
+        ("desired_age", "nan", "desired_age is NaN"),
         ("codec", "mpeg", "mpeg"),
         (
             "quality",
@@ -118,6 +120,7 @@ fn what_comments_show_as_defaults_are_the_defaults() {
     let sla = qos::Sla::parse(sla).unwrap();
     defaults.insert("threshold".to_owned(), sla.threshold.into());
     defaults.insert("initial".to_owned(), sla.initial.into());
+    defaults.insert("cap".to_owned(), sla.cap.into());
     defaults.insert("request".to_owned(), "auto".into());
     // What they show beside defaults is by way of example.
     defaults.retain(|key, _| !["server", "service", "nodes"].contains(&key));

@@ -54,18 +54,30 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
             )
         }
         (Some(least), None) => {
-            let measure = json!({"output": output, "desire": least, "min": least});
+            let desire = config.desired_frames_per_second.unwrap_or(least);
+            let measure = json!({"output": output, "desire": desire, "min": least});
             sla.insert("measure".into(), json!({"frames_per_second": measure}));
         }
         (None, Some(age)) => {
-            let measure = json!({"output": output, "desire": age, "max": age});
+            let desire = config.desired_age.unwrap_or(age);
+            let measure = json!({"output": output, "desire": desire, "max": age});
             sla.insert("measure".into(), json!({"age": measure}));
         }
     }
-    for (name, value) in [("threshold", config.threshold), ("initial", config.initial)] {
+    // JSON has no infinity.
+    let cap = config.cap.filter(|cap| cap.is_finite());
+    for (name, value) in [
+        ("threshold", config.threshold),
+        ("initial", config.initial),
+        ("cap", cap),
+    ] {
         if let Some(value) = value {
             sla.insert(name.into(), value.into());
         }
+    }
+    if config.promises() {
+        let unreached = config.fallback_after.max(config.longest().unwrap_or(0.0));
+        sla.insert("unreached".into(), unreached.into());
     }
     let mode = if config.stateful {
         Mode::Stateful
@@ -90,7 +102,21 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
     {
         sla.insert("answers".into(), json!([request]));
     }
+    if let Some(requests) = &config.requests {
+        let meaning = requests.read()?;
+        if let Some(answers) = meaning.answers {
+            sla.insert("answers".into(), json!(answers));
+        }
+        let times = meaning.times.into_iter();
+        let times = times
+            .map(|(name, (desire, max))| (name, json!({"t_desire": desire, "t_max": max})))
+            .collect();
+        sla.insert("requests".into(), serde_json::Value::Object(times));
+    }
     let mut sla = Sla::parse(serde_json::Value::Object(sla))?;
+    if config.cap == Some(f64::INFINITY) {
+        sla.cap = f64::INFINITY;
+    }
     sla.safe_stop = config.safe_stop.as_ref().map(|stop| match stop {
         config::SafeStop::Message(stop) => stop.clone(),
         // Its type is known once the node has advertised it.
@@ -179,18 +205,7 @@ impl Mirror {
                 let found = wire_type(&output.type_name, &output.md5);
                 known.outputs.insert(output.topic.clone(), found);
             }
-            let mut found = match qos::find(
-                &topics(&known.inputs),
-                &topics(&known.outputs),
-                promise.answers.as_deref(),
-            ) {
-                Ok(found) => found,
-                Err(reason) => {
-                    // The rest of the interface may not be known yet.
-                    tracing::debug!(reason, "no requests yet");
-                    qos::Found::default()
-                }
-            };
+            let mut found = known.find(promise.answers.as_deref());
             if promise.of_link {
                 // A goal is done by one side or the other; of all else only who speaks counts.
                 let of_action = |pair: &Pair| pair.by == Some(Correlation::Goal);
@@ -217,6 +232,24 @@ impl Mirror {
         if let Err(error) = promise.keeper.learn(pairs, interface).await {
             tracing::warn!("the local original cannot be fed: {error:#}");
         }
+    }
+}
+
+impl Known {
+    /// Pairs what is known; each of `answers` whose topics are known already: the rest may come.
+    fn find(&self, answers: Option<&[Pair]>) -> qos::Found {
+        let (inputs, outputs) = (topics(&self.inputs), topics(&self.outputs));
+        let Some(answers) = answers else {
+            return qos::find(&inputs, &outputs, None).unwrap_or_default();
+        };
+        let mut found = qos::Found::default();
+        for pair in answers {
+            match qos::find(&inputs, &outputs, Some(std::slice::from_ref(pair))) {
+                Ok(one) => found.pairs.extend(one.pairs),
+                Err(reason) => tracing::debug!(reason, "no request yet"),
+            }
+        }
+        found
     }
 }
 
@@ -409,9 +442,16 @@ mod tests {
         assert_eq!((times.measure, times.mode), (Measure::Rrt, Mode::Stateful));
         let frames = promised("frames_per_second = 4.0").unwrap().unwrap();
         assert_eq!(frames.t_max.as_millis(), 250);
+        assert_eq!(frames.t_desire, frames.t_max, "as ever: kept or not");
+        let band = promised("frames_per_second = 4.0\ndesired_frames_per_second = 10").unwrap();
+        let band = band.map(|sla| (sla.t_desire.as_millis(), sla.t_max.as_millis()));
+        assert_eq!(band, Some((100, 250)));
         let age = promised("age = 2.0\noutput = '/map'").unwrap().unwrap();
         let output = "/map".to_owned();
         assert_eq!(age.measure, Measure::Age { output });
+        let band = promised("age = 2.0\ndesired_age = 0.5").unwrap();
+        let band = band.map(|sla| (sla.t_desire.as_millis(), sla.t_max.as_millis()));
+        assert_eq!(band, Some((500, 2000)));
         for (lines, named) in [
             ("age = 2.0\nfps = 1", "fps"),
             ("age = 2.0\nframes_per_second = 1.0", "both"),
@@ -421,6 +461,53 @@ mod tests {
             let error = format!("{:#}", promised(lines).unwrap_err());
             assert!(error.contains(named), "{error}");
         }
+    }
+
+    #[test]
+    fn requests_and_the_cap_are_as_written() {
+        let lines = "desire = 0.1\nmax = 0.3\nthreshold = 2\n";
+        let own = |more: &str| promised(&format!("{lines}{more}")).map(Option::unwrap);
+        assert_eq!(own("").unwrap().cap, 8.0);
+        assert_eq!(own("cap = 5").unwrap().cap, 5.0);
+        assert_eq!(own("cap = inf").unwrap().cap, f64::INFINITY);
+        let low = format!("{:#}", own("cap = 2").unwrap_err());
+        assert!(low.contains("cap: 2 is not above threshold (2)"), "{low}");
+        let pairs = "requests = ['/a -> /b', { request = '/c -> /d', desire = 1, max = 2 }, { request = '/s', desire = 3, max = 4 }]";
+        let sla = own(pairs).unwrap();
+        let answers = sla.answers.as_ref().unwrap();
+        let shown: Vec<String> = answers.iter().map(ToString::to_string).collect();
+        assert_eq!(shown, ["/a -> /b", "/c -> /d"]);
+        let max = |name: &str| sla.times(name).t_max.as_millis();
+        assert_eq!(
+            (max("/a"), max("/c"), max("/s"), max("/else")),
+            (300, 2000, 4000, 300)
+        );
+        let swapped = own("requests = [{ request = '/s', desire = 4, max = 3 }]").unwrap_err();
+        let swapped = format!("{swapped:#}");
+        assert!(swapped.contains("requests./s.t_max"), "{swapped}");
+    }
+
+    #[test]
+    fn requests_are_known_one_by_one() {
+        let mut known = Known::default();
+        let pairs = ["/a -> /b", "/c -> /d"].map(|pair| pair.parse().unwrap());
+        let topic = |name: &str| (name.to_owned(), WireType::named("std_msgs/String"));
+        known.inputs.extend([topic("/a"), topic("/c")]);
+        known.outputs.extend([topic("/b")]);
+        let found = |known: &Known| {
+            let found = known.find(Some(&pairs));
+            found
+                .pairs
+                .iter()
+                .map(ToString::to_string)
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(found(&known), ["/a -> /b by arrival"]);
+        known.outputs.extend([topic("/d")]);
+        assert_eq!(
+            found(&known),
+            ["/a -> /b by arrival", "/c -> /d by arrival"]
+        );
     }
 
     #[test]
