@@ -52,6 +52,8 @@ mod patience;
 mod portal;
 #[path = "stories/push.rs"]
 mod push;
+#[path = "stories/queue.rs"]
+mod queue;
 #[path = "stories/readiness.rs"]
 mod readiness;
 #[path = "stories/refusals.rs"]
@@ -237,6 +239,11 @@ fn main() -> ExitCode {
             what_package_xml_forgot_is_named_and_added,
             a_revision_is_rolled_back,
             five_packaged_nodes_answer,
+        ],
+        stories![queue:
+            who_finds_no_room_is_told_its_place_and_then_why_it_is_refused,
+            robots_of_a_higher_class_go_first,
+            a_probe_gives_way_to_a_robot,
         ],
         stories![readiness:
             a_node_that_is_slow_is_waited_for_until_its_interface_is_there,

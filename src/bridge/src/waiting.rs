@@ -10,6 +10,7 @@ use budget::Budget;
 use bytes::Bytes;
 use rosbridge::{Format, Level, Op, Status};
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::mpsc;
 use tokio::time::{Sleep, timeout};
 use ws::{Message, WebSocket, WsError, frame};
 
@@ -75,11 +76,28 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Waiting<S> {
     /// # Errors
     /// The client left before; says how. `ready` has been dropped by then.
     pub async fn until<T>(&mut self, ready: impl Future<Output = T>) -> Result<T, SessionEnd> {
+        self.until_told(ready, mpsc::channel(1).1).await
+    }
+
+    /// The same; what comes from `news` meanwhile is told by status messages at level warning.
+    ///
+    /// # Errors
+    /// As of [`Waiting::until`].
+    pub async fn until_told<T>(
+        &mut self,
+        ready: impl Future<Output = T>,
+        mut news: mpsc::Receiver<String>,
+    ) -> Result<T, SessionEnd> {
         let left = {
             let mut ready = pin!(ready);
             let either = poll_fn(|cx| {
                 if let Poll::Ready(value) = ready.as_mut().poll(cx) {
                     return Poll::Ready(Ok(value));
+                }
+                while self.socket.queued() < ANSWERS
+                    && let Poll::Ready(Some(words)) = news.poll_recv(cx)
+                {
+                    self.report(Level::Warning, &words);
                 }
                 self.step(cx).map(Err)
             });

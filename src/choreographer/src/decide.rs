@@ -7,8 +7,12 @@
 //! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
 //! | [`terms`] | which limits a robot's servant is promised | what the robot states, classes, the service, caps |
 //! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
-//! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue |
-//! | [`capacity`] | which idle servants end for those who wait | what they lack, all servants |
+//! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue and its priorities |
+//! | [`capacity`] | which idle servants end for those who wait, which pushes give way | what they lack, all servants |
+//! | [`stall`] | whether the machine admits anybody | what the kernel tells of memory and swap |
+//! | [`controller`] | `cpu.max` and `cpu.weight` of servants at work | promises, measured times, what is used and held up |
+//! | [`fit`] | whether one more servant would fit, and what that costs | the same as admission; what others use |
+//! | [`shares`] | who gets how much of what does not suffice | a floor and a wish of each |
 //! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
 //! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
 //! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
@@ -22,10 +26,14 @@ pub(crate) mod adoption;
 mod amount;
 pub(crate) mod calibration;
 pub(crate) mod capacity;
+pub mod controller;
 pub(crate) mod demand;
+pub(crate) mod fit;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;
 pub(crate) mod placement;
+mod shares;
+pub(crate) mod stall;
 pub(crate) mod terms;
 pub(crate) mod warm_pool;
 

@@ -13,7 +13,7 @@ use crate::Error;
 use crate::decide::admission::Refused;
 use crate::decide::demand::Asked;
 use crate::lives::Inner;
-use crate::lives::waiting::Promise;
+use crate::lives::waiting::{Promise, Standing};
 use store::{NewEvent, RevisionRecord};
 
 /// Why a servant failed.
@@ -78,6 +78,7 @@ pub struct Handle {
     pub revision: Arc<RevisionRecord>,
     /// When it was asked for.
     pub created: Millis,
+    stands: watch::Sender<Option<Standing>>,
     life: watch::Sender<Life>,
     asked: Mutex<Asked>,
     limits_turn: tokio::sync::Mutex<()>,
@@ -109,6 +110,7 @@ impl Handle {
             anonymous,
             revision,
             created,
+            stands: watch::Sender::new(None),
             life: watch::Sender::new(Life {
                 phase: Phase::Requested,
                 failure: None,
@@ -173,6 +175,16 @@ impl Handle {
 
     pub(crate) fn set_promise(&self, promise: Promise) {
         let _ = self.promise.set(promise);
+    }
+
+    /// Where it stands among those that wait to be admitted, now and later; none where it does not wait.
+    pub fn watch_standing(&self) -> watch::Receiver<Option<Standing>> {
+        self.stands.subscribe()
+    }
+
+    /// Where that is told.
+    pub(crate) fn stands(&self) -> watch::Sender<Option<Standing>> {
+        self.stands.clone()
     }
 
     /// What its events are about.

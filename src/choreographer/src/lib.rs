@@ -44,7 +44,7 @@ mod options;
 mod request;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use api::Phase;
@@ -54,9 +54,11 @@ use parking_lot::Mutex;
 use reach::{Material, Opener, Pace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
+use tokio::sync::watch;
 
 pub use decide::Amount;
-pub use decide::admission::Refused;
+pub use decide::admission::{Place, Refused};
+pub use decide::controller;
 pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
 pub use handle::{Handle, Lease};
@@ -64,12 +66,12 @@ pub use limits::engine_limits;
 pub use lives::calibration::Requests;
 pub use lives::capture::Bounds;
 pub use lives::limits::Unchanged;
-pub use lives::waiting::{Admission, Permit};
+pub use lives::waiting::{Admission, Permit, Standing};
 pub use memory::{Memory, MemoryOptions};
 pub use options::{Class, DEFAULT_CLASS, Options};
 pub use request::ServantRequest;
 
-use decide::admission;
+use decide::admission::Ask;
 use decide::placement::Placement;
 use handle::Anew;
 use lives::Inner;
@@ -109,6 +111,8 @@ impl Choreographer {
             opener,
             admission,
             request_times: Arc::default(),
+            recent: Arc::default(),
+            moves: AtomicU64::new(0),
             servants: Mutex::default(),
             warm_pool: WarmPool::default(),
             incomplete: Mutex::default(),
@@ -251,6 +255,16 @@ impl Choreographer {
         warm_pool::end_all(&self.inner).await;
     }
 
+    /// Looks after the machine from now on, and moves cores where that is wanted; comes back at once.
+    pub fn keep_watch(&self) {
+        tokio::spawn(lives::controller::watch(Arc::clone(&self.inner)));
+    }
+
+    /// So often cores were moved.
+    pub fn moves(&self) -> u64 {
+        self.inner.moves.load(Ordering::Relaxed)
+    }
+
     /// How long requests of robots take.
     pub fn request_times(&self) -> &RequestTimes {
         &self.inner.request_times
@@ -271,21 +285,28 @@ impl Choreographer {
         &self.inner.admission
     }
 
-    /// Room for something that is started like a servant of these limits. Calls `on_wait` when there is none at once.
+    /// Room for something of a push that is started like a servant of these limits: the memory of those, and the cores that
+    /// are set aside for servants that ask for none, since robots go before it there. Calls `on_wait` when there is none at
+    /// once. When [`Permit::is_needed`] comes back, a robot waits for it.
     pub async fn admit_like_a_servant(
         &self,
         asked: &api::Limits,
         deadline: Duration,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Error> {
-        let wanted = self.inner.promised(asked);
+        let cpus = self.inner.options.reserve_cpus;
+        let wanted = self.inner.promised(&api::Limits {
+            cpus: Some(asked.cpus.map_or(cpus, |asked| asked.min(cpus))),
+            ..*asked
+        });
         let make_room = || {
             on_wait();
             self.inner.make_room();
         };
         let admission = &self.inner.admission;
+        let stands = watch::Sender::new(None);
         Ok(admission
-            .admit(wanted, admission::Class::Push, deadline, make_room)
+            .admit(Ask::push(wanted), deadline, stands, make_room)
             .await?)
     }
 

@@ -1,21 +1,24 @@
 //! The tasks that carry out what was decided: one for each servant ([`driver`]), which alone changes its state, and one that
-//! keeps the warm pool ([`warm_pool`]). Servants of an earlier daemon are taken over here ([`adoption`]).
+//! keeps the warm pool ([`warm_pool`]), and one that looks at the machine and moves cores ([`controller`]). Servants of an earlier daemon are taken over here ([`adoption`]).
 
 mod adoption;
 pub(crate) mod calibration;
 pub(crate) mod capture;
+pub(crate) mod controller;
 pub(crate) mod driver;
+mod fit;
 mod lifetime;
 pub(crate) mod limits;
 mod nodes;
 mod reaching;
+mod recent;
 mod starting;
 pub(crate) mod waiting;
 pub(crate) mod warm_pool;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use catalogue::Catalogue;
 use parking_lot::Mutex;
@@ -24,12 +27,14 @@ use servant::engine::Engine;
 use store::{Journal, RevisionRecord, State};
 
 use crate::Error;
+use crate::decide::capacity::Room;
 use crate::decide::demand::{self, Asked};
 use crate::decide::terms::{Offer, terms};
 use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
+use recent::Recent;
 use waiting::Admission;
 use warm_pool::WarmPool;
 
@@ -43,6 +48,9 @@ pub(crate) struct Inner {
     pub(crate) opener: Arc<dyn Opener>,
     pub(crate) admission: Admission,
     pub(crate) request_times: Arc<RequestTimes>,
+    pub(crate) recent: Arc<Recent>,
+    /// So often the controller has changed what a servant has.
+    pub(crate) moves: AtomicU64,
     pub(crate) memory: SharedMemory,
     pub(crate) servants: Mutex<Servants>,
     pub(crate) warm_pool: WarmPool,
@@ -115,11 +123,14 @@ impl Inner {
         }
     }
 
-    /// Ends idle servants for those who wait for capacity.
+    /// Ends idle servants, and has pushes give way, for those who wait for capacity.
     pub(crate) fn make_room(&self) {
         let servants = self.servants.lock();
         let all = servants.all.values().map(|handle| self.facts(handle));
-        servants.end(capacity::make_room(self.admission.lacking(), all));
+        let (lacking, pushes) = self.admission.lacking();
+        let Room { ends, give_way } = capacity::make_room(lacking, all, &pushes);
+        servants.end(ends);
+        self.admission.give_way(&give_way);
     }
 
     /// Takes the servant out of reach if nobody is connected; true when so.

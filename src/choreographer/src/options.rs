@@ -13,6 +13,10 @@ pub struct Options {
     pub limits: Limits,
     /// Classes that robots may name, by name. [`DEFAULT_CLASS`] is that of robots that name none.
     pub classes: BTreeMap<String, Class>,
+    /// Cores that there are for servants, whatever is promised of them.
+    pub cores: f64,
+    /// Cores are moved between servants while they work.
+    pub controller: bool,
     /// Cores promised to a servant whose push asked for none.
     pub reserve_cpus: f64,
     /// Bytes of memory promised to a servant whose push asked for none.

@@ -5,6 +5,7 @@ use in_memory::MemoryEngine;
 use super::*;
 use store::{Plan, RevisionRecord, State};
 
+mod controller;
 mod servants;
 mod terms;
 
@@ -34,6 +35,8 @@ fn options() -> Options {
     Options {
         limits: api::Limits::default(),
         classes: Default::default(),
+        cores: 2.0,
+        controller: true,
         reserve_cpus: 0.01,
         reserve_memory: memory,
         deadline: Duration::from_secs(10),
@@ -104,11 +107,12 @@ async fn as_many_idle_servants_end_as_it_takes() {
     assert!(!ending(&oldest), "nobody waits");
     let wanted = Amount::new(1.0, 0);
     let deadline = Duration::from_secs(1);
-    let waiting = inner
-        .admission
-        .admit(wanted, admission::Class::Robot, deadline, || {
-            inner.make_room()
-        });
+    let waiting = inner.admission.admit(
+        Ask::robot(wanted, 0),
+        deadline,
+        watch::Sender::new(None),
+        || inner.make_room(),
+    );
     let refused = waiting.await;
     assert!(refused.is_err(), "none of them ends in this test");
     assert!(
@@ -118,11 +122,12 @@ async fn as_many_idle_servants_end_as_it_takes() {
     assert!(!ending(&newest) && !ending(&busy), "more is not needed");
     // One that waited for more than is idle finds the next as soon as that is idle.
     let wanted = Amount::new(2.0, 0);
-    let waiting = inner
-        .admission
-        .admit(wanted, admission::Class::Robot, deadline, || {
-            inner.make_room()
-        });
+    let waiting = inner.admission.admit(
+        Ask::robot(wanted, 0),
+        deadline,
+        watch::Sender::new(None),
+        || inner.make_room(),
+    );
     let left = async {
         tokio::time::sleep(deadline / 2).await;
         assert!(ending(&newest) && !ending(&busy));

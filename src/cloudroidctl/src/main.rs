@@ -8,6 +8,7 @@ mod client;
 mod doctor;
 mod events;
 mod explain;
+mod fit;
 mod limits;
 mod logs;
 mod output;
@@ -75,6 +76,7 @@ enum Verb {
     Try(Box<trial::Try>),
     Calibrate(Box<calibrate::Calibrate>),
     Explain(explain::Explain),
+    Fit(fit::Fit),
     Status(status::Status),
     Doctor(doctor::Doctor),
 }
@@ -121,6 +123,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Try(verb) => verb.run(&client, format).await,
         Verb::Calibrate(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
+        Verb::Fit(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
     }

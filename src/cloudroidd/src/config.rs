@@ -97,12 +97,26 @@ impl fmt::Display for IsolationMode {
 pub struct Capacity {
     /// Cores to promise; all of the machine's by default.
     pub cpus: Option<f64>,
+    /// How often each core may be promised, on the average. Memory is promised once.
+    pub overcommit: f64,
+    /// Whether cores are moved between servants while they work.
+    pub controller: Controller,
     /// Memory to promise; nine tenths of the machine's by default.
     pub memory: Option<Size>,
     /// Robots that may wait for capacity.
     pub queue: usize,
     /// How long each may wait.
     pub deadline: Time,
+}
+
+/// Whether the controller works.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Controller {
+    /// Those near what their robots accept at most get what others do not need.
+    On,
+    /// Limits stay as they were asked for.
+    Off,
 }
 
 /// The life of a servant.
@@ -245,6 +259,8 @@ impl Default for Capacity {
     fn default() -> Self {
         Capacity {
             cpus: None,
+            overcommit: 1.0,
+            controller: Controller::On,
             memory: None,
             queue: 64,
             deadline: Time::seconds(10),
@@ -357,6 +373,27 @@ impl Class {
     }
 }
 
+impl Capacity {
+    /// Beyond this nobody has what was promised.
+    const MOST_OVERCOMMIT: f64 = 100.0;
+
+    fn check(&self) -> anyhow::Result<()> {
+        let most = Self::MOST_OVERCOMMIT;
+        if !(1.0..=most).contains(&self.overcommit) {
+            bail!(
+                "overcommit = {} is not between 1 and {most}; 1 promises each core once, 1.5 promises half of them twice",
+                self.overcommit
+            );
+        }
+        Ok(())
+    }
+
+    /// Cores that there are for servants.
+    pub fn cores(&self) -> f64 {
+        self.cpus.unwrap_or_else(machine_cores)
+    }
+}
+
 impl Push {
     fn check(&self) -> anyhow::Result<()> {
         if self.at_once == 0 {
@@ -460,6 +497,9 @@ impl Config {
         reach::egress::check(&self.allow.egress)
             .context("egress in [allow] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
+        self.capacity
+            .check()
+            .context("[capacity] of the configuration")?;
         if let Some(service) = &self.default_service {
             catalogue::names::service(service).context("default_service of the configuration")?;
         }

@@ -223,6 +223,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     supervision::ready();
     app.catalogue.complete().await?;
     app.choreographer.keep_warm_pool();
+    app.choreographer.keep_watch();
     asked.cancelled().await;
     supervision::stopping();
     wiring::drain(&app, config.keeps_servants()).await;

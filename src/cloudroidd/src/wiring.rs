@@ -19,7 +19,7 @@ use store::{Journal, State};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::config::{self, Config, IsolationMode};
+use crate::config::{Config, IsolationMode};
 use crate::home::Home;
 use crate::{bases, doctor, supervision};
 
@@ -51,7 +51,7 @@ pub fn build(
     let memory = promised
         .memory
         .map_or_else(supervision::machine_memory, |size| size.0);
-    let capacity = Amount::new(promised.cpus.unwrap_or_else(config::machine_cores), memory);
+    let capacity = Amount::new(promised.cores() * promised.overcommit, memory);
     let choreographer = Choreographer::new(
         config.choreographer(),
         Arc::clone(&state),

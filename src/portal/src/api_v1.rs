@@ -1,5 +1,6 @@
 //! `/api/v1`: what cloudroidctl and the page ask.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
@@ -169,6 +170,55 @@ enum Kind {
     Bag,
     /// A picture (PNG).
     Image,
+}
+
+/// What a robot would state; auxiliary parameters are `aux.KEY`.
+#[derive(Debug, Deserialize, IntoParams)]
+pub struct Statement {
+    /// T_desire, such as `100ms`.
+    rrt: Option<String>,
+    /// T_max.
+    max_rrt: Option<String>,
+    /// Frames per second.
+    fps: Option<String>,
+    /// Age of an output.
+    age: Option<String>,
+    /// A class of the configuration.
+    class: Option<String>,
+    /// Cores outright.
+    cpus: Option<String>,
+    /// Memory outright.
+    memory: Option<String>,
+    #[serde(flatten)]
+    #[param(ignore)]
+    others: BTreeMap<String, String>,
+}
+
+impl Statement {
+    fn read(self) -> Result<api::Stated, Error> {
+        let known = [
+            ("rrt", self.rrt),
+            ("max_rrt", self.max_rrt),
+            ("fps", self.fps),
+            ("age", self.age),
+            ("class", self.class),
+            ("cpus", self.cpus),
+            ("memory", self.memory),
+        ];
+        let known = known
+            .into_iter()
+            .filter_map(|(key, value)| Some((key.to_owned(), value?)));
+        api::Stated::read(known.chain(self.others)).map_err(Error::Unstatable)
+    }
+}
+
+/// Whether one more servant of a service would fit.
+pub async fn fit(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Query(statement): Query<Statement>,
+) -> Answer<api::Fit> {
+    Ok(Json(app.choreographer.fit(&name, statement.read()?).await?))
 }
 
 /// What a service makes of a recording or a picture, and how fast.

@@ -173,6 +173,20 @@ fn capacity(out: &mut String, choreographer: &Choreographer) {
     for (name, help, value) in rows {
         gauge(out, name, help, [(String::new(), value)]);
     }
+    let stalled = choreographer.admission().stalled().is_some();
+    gauge(
+        out,
+        "cloudroid_stalled",
+        "1 while nobody is admitted since the machine stalls.",
+        [(String::new(), f64::from(u8::from(stalled)))],
+    );
+    family(
+        out,
+        "cloudroid_moves_total",
+        "counter",
+        "How often the controller changed cpu.max or cpu.weight of a servant.",
+        [(String::new(), choreographer.moves() as f64)],
+    );
 }
 
 async fn usage(out: &mut String, handles: &[Arc<Handle>]) {

@@ -2,6 +2,7 @@
 //!
 //! Where tokens are configured, a client without one can only send `auth`: it gets no servant and no information before.
 
+use std::pin::pin;
 use std::sync::Arc;
 
 use api::Stated;
@@ -18,6 +19,7 @@ use hyper_util::rt::TokioIo;
 use reach::{Reach, Stream};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
+use tokio::sync::mpsc;
 
 use super::guard::{self, Caller, Peer};
 use super::{App, auth, handshake, page};
@@ -31,6 +33,8 @@ const TRY_AGAIN_LATER: u16 = 1013;
 const POLICY: u16 = 1008;
 /// Bytes that a robot's stub may send before its servant is there.
 const STUB_AHEAD: usize = 64 * 1024;
+/// Words about where a robot stands that may wait to be sent.
+const NEWS: usize = 4;
 
 /// `/`: the page, or the default service.
 pub async fn root(
@@ -177,10 +181,13 @@ async fn connect(
     if caller.trusted && app.state.service_package(&asked.service)?.is_none() {
         return Err(app.catalogue.unknown(&asked.service)?.into());
     }
-    // Who has shown a token is told by status when there is no room; who has not must be let in to show one.
+    // Who has not shown a token must be let in to show one. Where there is no room, a stub is told by the HTTP status; a robot
+    // that speaks rosbridge alone is let in, and told by status messages where it stands, and why it is refused.
     let lease = if caller.trusted {
         let lease = lease(&app, &asked, &caller)?;
-        lease.admitted().await?;
+        if asked.link {
+            lease.admitted().await?;
+        }
         Some(lease)
     } else {
         None
@@ -324,8 +331,9 @@ async fn session(
     let budget = memory.client(&caller.peer.client(asked.robot.as_deref()));
     let mut waiting =
         Waiting::new(io, &read_ahead, app.choreographer.bridge_options()).within(&budget);
-    let taking = servant(&app, &asked, &caller, lease);
-    let (lease, reach) = match waiting.until(taking).await {
+    let (news, told) = mpsc::channel(NEWS);
+    let taking = servant(&app, &asked, &caller, lease, &news);
+    let (lease, reach) = match waiting.until_told(taking, told).await {
         Ok(Ok(taken)) => taken,
         Ok(Err(error)) => return waiting.refuse(TRY_AGAIN_LATER, &error.in_a_line()).await,
         // With its lease its place in the queue is given up, and the servant that only it could have used.
@@ -370,17 +378,36 @@ async fn servant(
     asked: &Asked,
     caller: &Caller,
     lease: Option<Lease>,
+    news: &mpsc::Sender<String>,
 ) -> Result<(Lease, Arc<dyn Reach>), Error> {
     let lease = match lease {
         Some(lease) => lease,
-        None => {
-            let lease = self::lease(app, asked, caller)?;
-            lease.admitted().await?;
-            lease
-        }
+        None => self::lease(app, asked, caller)?,
     };
+    admitted(&lease, news).await?;
     let reach = lease.ready().await?;
     Ok((lease, reach))
+}
+
+/// Waits until there is room, and tells where the robot stands meanwhile, whenever that changes.
+async fn admitted(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), choreographer::Error> {
+    let mut standing = lease.handle().watch_standing();
+    let mut admitted = pin!(lease.admitted());
+    loop {
+        let stands = standing
+            .borrow_and_update()
+            .as_ref()
+            .map(ToString::to_string);
+        if let Some(stands) = stands {
+            // One that does not read is told the next time.
+            let _ = news.try_send(stands);
+        }
+        tokio::select! {
+            biased;
+            admitted = &mut admitted => return admitted,
+            Ok(()) = standing.changed() => {}
+        }
+    }
 }
 
 /// A connection of a robot's stub.

@@ -134,6 +134,17 @@ pub const ROUTES: &[Route] = &[
         get(api_v1::interface)
     })
     .described(|| operation("interface", "The interface with all definitions.").answers_object()),
+    at("GET", "/api/v1/services/{name}/fit", Token, || {
+        get(api_v1::fit)
+    })
+    .described(|| {
+        operation(
+            "fit",
+            "Whether one more servant would fit, what it would cost the others, and how many more would.",
+        )
+        .asks::<api_v1::Statement>()
+        .answers::<api::Fit>()
+    }),
     at("POST", "/api/v1/services/{name}/rollback", Token, || {
         post(api_v1::rollback)
     })

@@ -152,6 +152,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
             .iter()
             .cloned()
             .chain(app.state.unwritable())
+            .chain(app.choreographer.admission().stalled())
             .collect(),
     })
 }

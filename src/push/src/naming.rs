@@ -19,7 +19,7 @@ use servant::engine::Servant;
 use tokio::time::timeout;
 
 use super::Pusher;
-use super::probe::{self, NODE};
+use super::probe::{self, Alive, NODE};
 use crate::Error;
 use store::Plan;
 
@@ -35,6 +35,7 @@ pub(super) async fn settle(
     built: &BuildOutcome,
     plan: &mut Plan,
     options: &PushOptions,
+    alive: &Alive,
 ) -> Result<(), Error> {
     let planned = built.plan.nodes.iter().enumerate();
     let unnamed: Vec<usize> = planned
@@ -56,7 +57,7 @@ pub(super) async fn settle(
         .collect();
     let mut spec = probe::spec(pusher, id, built, &alone, options);
     spec.id = format!("{id}-names");
-    let (servant, trial) = probe::start(pusher, spec).await?;
+    let (servant, trial) = probe::start(pusher, spec, alive).await?;
     let ros = built.flavour.ros.bus();
     let found = look(pusher, &servant, ros, &alone, &unnamed).await;
     trial.end().await?;

@@ -12,6 +12,7 @@ use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::Spec;
+use tokio::sync::mpsc;
 use tokio_util::task::TaskTracker;
 
 use super::request::Reporter;
@@ -22,10 +23,16 @@ use store::Plan;
 
 /// The name of the looking node.
 pub(super) const NODE: &str = "/cloudroid_probe";
+/// As of a build: servants go before it where cores do not suffice.
+const WEIGHT: u64 = 20;
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
 
-/// Starts the image once and records what it shows.
+/// Held by whatever is there of what was started.
+pub(super) type Alive = mpsc::Sender<()>;
+
+/// Starts the image once and records what it shows. Where a robot needs its room meanwhile, it is ended, and begins again
+/// when there is room.
 pub(super) async fn interface(
     pusher: &Pusher,
     id: &str,
@@ -34,11 +41,45 @@ pub(super) async fn interface(
     options: &PushOptions,
     report: &Reporter,
 ) -> Result<Found, Error> {
-    let _room = room(pusher, options, report).await?;
-    naming::settle(pusher, id, built, plan, options).await?;
+    loop {
+        let room = room(pusher, options, report).await?;
+        let (alive, mut gone) = mpsc::channel(1);
+        let tried = {
+            // What it learns counts when it was there to the end.
+            let mut plan = plan.clone();
+            let found = tokio::select! {
+                biased;
+                found = shown(pusher, id, built, &mut plan, options, &alive) => Some(found?),
+                () = room.is_needed() => None,
+            };
+            found.map(|found| (found, plan))
+        };
+        if let Some((found, settled)) = tried {
+            *plan = settled;
+            return Ok(found);
+        }
+        let words = "a robot needs its room: it is ended, and started again when there is room";
+        report.step(words).await;
+        // What was started is being ended by a task: its room is given back when nothing is left of it.
+        drop(alive);
+        let _ = gone.recv().await;
+        drop(room);
+    }
+}
+
+/// What the image shows when it is started.
+async fn shown(
+    pusher: &Pusher,
+    id: &str,
+    built: &BuildOutcome,
+    plan: &mut Plan,
+    options: &PushOptions,
+    alive: &Alive,
+) -> Result<Found, Error> {
+    naming::settle(pusher, id, built, plan, options, alive).await?;
     let plan = &*plan;
     let spec = self::spec(pusher, id, built, plan, options);
-    let (servant, trial) = start(pusher, spec).await?;
+    let (servant, trial) = start(pusher, spec, alive).await?;
     let unmet = servant
         .enforced()
         .unmet(&choreographer::engine_limits(&options.limits));
@@ -57,13 +98,19 @@ pub(super) async fn interface(
 
 /// Starts it; it is ended however the trial is dropped: a push can be cancelled at any await. Starting itself is not
 /// interrupted, because what is half-started has no handle to end it by.
-pub(super) async fn start(pusher: &Pusher, spec: Spec) -> Result<(Arc<dyn Servant>, Trial), Error> {
+pub(super) async fn start(
+    pusher: &Pusher,
+    spec: Spec,
+    alive: &Alive,
+) -> Result<(Arc<dyn Servant>, Trial), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
+    let alive = alive.clone();
     let starting = pusher.tasks.spawn(async move {
         let servant = engine.start(spec).await?;
         let trial = Trial {
             servant: Some(Arc::clone(&servant)),
             tasks,
+            alive,
         };
         Ok::<_, servant::Error>((servant, trial))
     });
@@ -242,9 +289,10 @@ pub(super) fn spec(
     Spec {
         id: format!("{id}-probe"),
         image: built.image.to_string(),
-        limits: choreographer::engine_limits(
-            &options.limits.or(pusher.choreographer.default_limits()),
-        ),
+        limits: choreographer::engine_limits(&options.limits.or(api::Limits {
+            cpu_weight: Some(WEIGHT),
+            ..pusher.choreographer.default_limits()
+        })),
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         grants: plan.grants.clone(),
@@ -256,6 +304,7 @@ pub(super) fn spec(
 pub(super) struct Trial {
     servant: Option<Arc<dyn Servant>>,
     tasks: TaskTracker,
+    alive: Alive,
 }
 
 impl Trial {
@@ -272,7 +321,9 @@ impl Drop for Trial {
         let Some(servant) = self.servant.take() else {
             return;
         };
+        let alive = self.alive.clone();
         self.tasks.spawn(async move {
+            let _alive = alive;
             if let Err(error) = servant.stop().await {
                 tracing::error!("the probe {} could not be ended: {error}", servant.id());
             }

@@ -1,10 +1,18 @@
 //! Who is admitted, who waits and who is refused: each servant is promised some cores and memory, and no more is promised
-//! than the machine has.
+//! than there is.
+//!
+//! Robots that wait are served in the order of their priorities, and those of one priority in the order in which they came. One
+//! that was overtaken [`OVERTAKEN`] times goes before all who came after it, whatever their priority (bounded overtaking, as
+//! it is asked of fair locks): so none waits for ever. Whoever is first blocks those behind it, or big servants would wait for
+//! ever. Pushes come after all robots.
 
-use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::Amount;
+use super::capacity::Lacking;
+
+/// So often may one that waits be overtaken.
+pub const OVERTAKEN: u32 = 8;
 
 /// Why a servant, or more for one, is not admitted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -38,24 +46,93 @@ pub enum Refused {
         waiting: usize,
     },
     /// No capacity came free until the deadline.
-    #[error("this machine is full; no room came free within {} s", waited.as_secs())]
+    #[error("this machine is full; no room came free within {} s{}", waited.as_secs(), at(place))]
     Deadline {
         /// So long was waited.
         waited: Duration,
+        /// Where it stood in the end; none of what is no robot's.
+        place: Option<Place>,
     },
+    /// The machine stalls; until the deadline that did not end.
+    #[error("{why}; this did not end within {} s{}", waited.as_secs(), at(place))]
+    Stalled {
+        /// What it waits for, in words.
+        why: String,
+        /// So long was waited.
+        waited: Duration,
+        /// Where it stood in the end; none of what is no robot's.
+        place: Option<Place>,
+    },
+    /// The machine stalls: a servant that runs is promised no more.
+    #[error("{why}: no servant is promised more meanwhile")]
+    NoMoreNow {
+        /// What it waits for, in words.
+        why: String,
+    },
+}
+
+/// Behind a refusal: where it stood.
+fn at(place: &Option<Place>) -> String {
+    place.map_or_else(String::new, |place| format!("; it was {place}"))
+}
+
+/// Where a robot stands among those that wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// From 1 on.
+    pub place: usize,
+    /// So many wait.
+    pub of: usize,
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "number {} of {} that wait", self.place, self.of)
+    }
 }
 
 /// Names one who asks for admission.
 pub type Ticket = u64;
 
-/// Who asks, and how long it is willing to stand back.
+/// What asks, and how long it is willing to stand back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Class {
-    /// A servant of a robot. None is overtaken by another robot, or big servants would wait for ever.
+pub enum Origin {
+    /// A servant of a robot.
     Robot,
     /// Work that is nobody's robot, such as a push: whoever waits and fits goes before it, or a big one would keep robots
-    /// waiting; and it takes no robot's place in the queue.
+    /// waiting; it takes no robot's place in the queue, and gives back what it has when a robot needs it.
     Push,
+}
+
+/// What is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Ask {
+    /// So much.
+    pub wanted: Amount,
+    /// For whom.
+    pub origin: Origin,
+    /// Robots of a higher one go first; 0 where nothing else is said. Pushes have none.
+    pub priority: i32,
+}
+
+impl Ask {
+    /// For a robot of this priority.
+    pub fn robot(wanted: Amount, priority: i32) -> Ask {
+        Ask {
+            wanted,
+            origin: Origin::Robot,
+            priority,
+        }
+    }
+
+    /// For a push.
+    pub fn push(wanted: Amount) -> Ask {
+        Ask {
+            wanted,
+            origin: Origin::Push,
+            priority: 0,
+        }
+    }
 }
 
 /// What is decided of one who asks.
@@ -81,8 +158,22 @@ pub struct Admitted {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Waiter {
     ticket: Ticket,
-    wanted: Amount,
-    class: Class,
+    ask: Ask,
+    /// So many who came later were admitted before it.
+    overtaken: u32,
+}
+
+impl Waiter {
+    fn is_robot(&self) -> bool {
+        self.ask.origin == Origin::Robot
+    }
+
+    /// Those with less go first; of the same, those who came first.
+    fn rank(&self) -> (bool, bool, std::cmp::Reverse<i32>) {
+        let patient = self.overtaken < OVERTAKEN;
+        let priority = if patient { self.ask.priority } else { 0 };
+        (!self.is_robot(), patient, std::cmp::Reverse(priority))
+    }
 }
 
 /// What the machine has, what of it is promised, and who waits for it.
@@ -91,9 +182,11 @@ pub struct Book {
     capacity: Amount,
     promised: Amount,
     /// In the order in which they came.
-    waiting: VecDeque<Waiter>,
+    waiting: Vec<Waiter>,
     /// Most robots that may wait.
     queue: usize,
+    /// Why nobody is admitted now.
+    stalled: Option<String>,
 }
 
 impl Book {
@@ -102,8 +195,9 @@ impl Book {
         Book {
             capacity,
             promised: Amount::NONE,
-            waiting: VecDeque::new(),
+            waiting: Vec::new(),
             queue,
+            stalled: None,
         }
     }
 
@@ -122,25 +216,56 @@ impl Book {
         self.waiting.len()
     }
 
+    /// Why nobody is admitted now.
+    pub fn stalled(&self) -> Option<&str> {
+        self.stalled.as_deref()
+    }
+
     fn free(&self) -> Amount {
         self.capacity.minus(self.promised)
     }
 
-    fn robots(&self) -> usize {
-        let waiting = self.waiting.iter();
-        waiting
-            .filter(|waiter| waiter.class == Class::Robot)
-            .count()
+    /// Where robots that wait stand.
+    pub fn places(&self) -> impl Iterator<Item = (Ticket, Place)> + '_ {
+        let robots = self
+            .in_turn()
+            .into_iter()
+            .filter(|waiter| waiter.is_robot());
+        let of = self
+            .waiting
+            .iter()
+            .filter(|waiter| waiter.is_robot())
+            .count();
+        robots
+            .zip(1..)
+            .map(move |(waiter, place)| (waiter.ticket, Place { place, of }))
     }
 
-    /// How much more would have to be free for all who wait.
-    pub fn lacking(&self) -> Amount {
-        self.wanted_by(|_| true).minus(self.free())
+    /// Those who wait, as they are to be admitted.
+    fn in_turn(&self) -> Vec<Waiter> {
+        let mut turn = self.waiting.clone();
+        turn.sort_by_key(Waiter::rank);
+        turn
+    }
+
+    /// How much more would have to be free.
+    pub fn lacking(&self) -> Lacking {
+        let free = self.free();
+        let first = self.in_turn().into_iter().find(Waiter::is_robot);
+        Lacking {
+            all: self.wanted_by(|_| true).minus(free),
+            first_robot: first.map_or(Amount::NONE, |first| first.ask.wanted.minus(free)),
+        }
+    }
+
+    /// What robots that wait asked for.
+    pub fn wanted_by_robots(&self) -> Amount {
+        self.wanted_by(Waiter::is_robot)
     }
 
     fn wanted_by(&self, who: impl Fn(&Waiter) -> bool) -> Amount {
         let waiting = self.waiting.iter().filter(|waiter| who(waiter));
-        waiting.fold(Amount::NONE, |sum, waiter| sum.plus(waiter.wanted))
+        waiting.fold(Amount::NONE, |sum, waiter| sum.plus(waiter.ask.wanted))
     }
 
     /// Refuses what would not fit on an empty machine.
@@ -152,29 +277,32 @@ impl Book {
         }
     }
 
-    /// `ticket` asks for `wanted`.
-    pub fn ask(&mut self, ticket: Ticket, wanted: Amount, class: Class) -> Verdict {
-        if let Err(refused) = self.check(wanted) {
-            return Verdict::Refused(refused);
+    /// `ticket` asks. With the answer come those who are admitted since they were overtaken once more.
+    pub fn ask(&mut self, ticket: Ticket, ask: Ask) -> (Verdict, Vec<Admitted>) {
+        if let Err(refused) = self.check(ask.wanted) {
+            return (Verdict::Refused(refused), Vec::new());
         }
-        let robots = self.robots();
-        let first = match class {
-            Class::Robot => robots == 0,
-            Class::Push => self.waiting.is_empty(),
-        };
-        if first && wanted.fits(self.free()) {
-            self.promise(wanted);
-            return Verdict::Admitted;
-        }
-        if class == Class::Robot && robots >= self.queue {
-            return Verdict::Refused(Refused::QueueFull { waiting: robots });
-        }
-        self.waiting.push_back(Waiter {
+        let waiter = Waiter {
             ticket,
-            wanted,
-            class,
-        });
-        Verdict::Waits
+            ask,
+            overtaken: 0,
+        };
+        let robots = self.waiting.iter().filter(|one| one.is_robot()).count();
+        self.waiting.push(waiter);
+        let mut admitted = self.admit();
+        let own = admitted.iter().position(|one| one.ticket == ticket);
+        let verdict = match own {
+            Some(own) => {
+                admitted.remove(own);
+                Verdict::Admitted
+            }
+            None if waiter.is_robot() && robots >= self.queue => {
+                self.waiting.retain(|one| one.ticket != ticket);
+                Verdict::Refused(Refused::QueueFull { waiting: robots })
+            }
+            None => Verdict::Waits,
+        };
+        (verdict, admitted)
     }
 
     /// Promises `amount` even where it is not free: to a servant that runs already.
@@ -194,44 +322,70 @@ impl Book {
         self.admit()
     }
 
+    /// From now on nobody is admitted, for this reason, or all who fit are again; gives those who are.
+    pub fn stall(&mut self, why: Option<String>) -> Vec<Admitted> {
+        self.stalled = why;
+        self.admit()
+    }
+
     /// A servant is promised `wanted` instead of `promised`, if what is more is free and no robot waits for it; gives those
     /// who are admitted for what is less.
     pub fn change(&mut self, promised: Amount, wanted: Amount) -> Result<Vec<Admitted>, Refused> {
         let others = self.promised.minus(promised);
-        let spoken_for = self.wanted_by(|waiter| waiter.class == Class::Robot);
-        let free = self.capacity.minus(others).minus(spoken_for);
+        let free = self.capacity.minus(others).minus(self.wanted_by_robots());
         let free = free.max(promised);
         if !wanted.fits(free) {
             return Err(Refused::NoMore { wanted, free });
+        }
+        if let Some(why) = self.stalled.clone().filter(|_| !wanted.fits(promised)) {
+            return Err(Refused::NoMoreNow { why });
         }
         self.promised = others.plus(wanted);
         Ok(self.admit())
     }
 
-    /// Admits from the queue's head as far as there is capacity.
+    /// Admits those who wait in their turn as far as there is capacity.
     fn admit(&mut self) -> Vec<Admitted> {
         let mut admitted = Vec::new();
-        let mut blocked = false;
-        for waiter in std::mem::take(&mut self.waiting) {
-            if !blocked && waiter.wanted.fits(self.free()) {
-                self.promise(waiter.wanted);
-                admitted.push(Admitted {
-                    ticket: waiter.ticket,
-                    amount: waiter.wanted,
-                });
-                continue;
+        while let Some(ticket) = self.next() {
+            // Those behind it came later.
+            let Some(at) = self.waiting.iter().position(|one| one.ticket == ticket) else {
+                break;
+            };
+            let waiter = self.waiting.remove(at);
+            for earlier in &mut self.waiting[..at] {
+                earlier.overtaken += 1;
             }
-            blocked |= waiter.class == Class::Robot;
-            self.waiting.push_back(waiter);
+            self.promise(waiter.ask.wanted);
+            admitted.push(Admitted {
+                ticket,
+                amount: waiter.ask.wanted,
+            });
         }
         admitted
+    }
+
+    /// Who is admitted next, if anybody.
+    fn next(&self) -> Option<Ticket> {
+        if self.stalled.is_some() || self.waiting.is_empty() {
+            return None;
+        }
+        for waiter in self.in_turn() {
+            if waiter.ask.wanted.fits(self.free()) {
+                return Some(waiter.ticket);
+            }
+            if waiter.is_robot() || waiter.overtaken >= OVERTAKEN {
+                return None;
+            }
+        }
+        None
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use Class::{Push, Robot};
+    use Origin::{Push, Robot};
 
     fn cores(cpus: f64) -> Amount {
         Amount::new(cpus, 0)
@@ -248,10 +402,25 @@ mod tests {
         admitted.into_iter().map(|one| one.ticket).collect()
     }
 
+    fn ask(book: &mut Book, ticket: Ticket, cpus: f64, origin: Origin) -> Verdict {
+        asks(book, ticket, cpus, origin, 0)
+    }
+
+    fn asks(book: &mut Book, ticket: Ticket, cpus: f64, origin: Origin, priority: i32) -> Verdict {
+        let ask = Ask {
+            wanted: cores(cpus),
+            origin,
+            priority,
+        };
+        let (verdict, others) = book.ask(ticket, ask);
+        assert!(others.is_empty(), "{others:?}");
+        verdict
+    }
+
     #[test]
     fn who_asks_is_admitted_waits_or_is_refused() {
         let full = Verdict::Refused(Refused::QueueFull { waiting: 1 });
-        for (promised, waits, wanted, class, expected) in [
+        for (promised, waits, wanted, origin, expected) in [
             (0.0, None, 2.0, Robot, Verdict::Admitted),
             (1.5, None, 0.5, Robot, Verdict::Admitted),
             (1.5, None, 0.6, Robot, Verdict::Waits),
@@ -259,26 +428,31 @@ mod tests {
             (1.5, Some((1.0, Robot)), 0.5, Robot, full),
             (1.5, Some((1.0, Push)), 0.5, Robot, Verdict::Admitted),
             (1.5, Some((1.0, Push)), 1.0, Robot, Verdict::Waits),
-            (1.5, Some((1.0, Push)), 0.5, Push, Verdict::Waits),
+            (1.5, Some((1.0, Push)), 0.6, Push, Verdict::Waits),
+            (1.5, Some((1.0, Push)), 0.5, Push, Verdict::Admitted),
             (1.5, Some((1.0, Robot)), 0.5, Push, Verdict::Waits),
             (0.0, None, 0.5, Push, Verdict::Admitted),
         ] {
             let mut book = machine(1, promised);
-            if let Some((wanted, class)) = waits {
-                assert_eq!(book.ask(1, cores(wanted), class), Verdict::Waits);
+            if let Some((wanted, origin)) = waits {
+                assert_eq!(ask(&mut book, 1, wanted, origin), Verdict::Waits);
             }
-            let verdict = book.ask(2, cores(wanted), class);
-            assert_eq!(verdict, expected, "{promised} {waits:?} {wanted} {class:?}");
+            let verdict = ask(&mut book, 2, wanted, origin);
+            assert_eq!(
+                verdict, expected,
+                "{promised} {waits:?} {wanted} {origin:?}"
+            );
         }
-        let verdict = machine(1, 0.0).ask(1, Amount::new(0.0, 1001), Robot);
+        let ask = Ask::robot(Amount::new(0.0, 1001), 0);
+        let (verdict, _) = machine(1, 0.0).ask(1, ask);
         assert!(matches!(verdict, Verdict::Refused(Refused::TooBig { .. })));
     }
 
     #[test]
     fn small_ones_do_not_overtake_a_big_one() {
         let mut book = machine(4, 1.0);
-        assert_eq!(book.ask(1, cores(2.0), Robot), Verdict::Waits);
-        assert_eq!(book.ask(2, cores(0.5), Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 1, 2.0, Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 2, 0.5, Robot), Verdict::Waits);
         assert!(book.release(cores(0.5)).is_empty());
         assert_eq!(tickets(book.release(cores(0.5))), [1]);
         assert_eq!(tickets(book.release(cores(2.0))), [2]);
@@ -287,21 +461,93 @@ mod tests {
     #[test]
     fn who_gives_up_lets_the_next_in() {
         let mut book = machine(4, 1.0);
-        assert_eq!(book.ask(1, cores(2.0), Robot), Verdict::Waits);
-        assert_eq!(book.ask(2, cores(0.5), Robot), Verdict::Waits);
-        assert_eq!(book.lacking(), cores(1.5));
+        assert_eq!(ask(&mut book, 1, 2.0, Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 2, 0.5, Robot), Verdict::Waits);
+        assert_eq!(book.lacking().all, cores(1.5));
+        assert_eq!(book.lacking().first_robot, cores(1.0));
         assert_eq!(tickets(book.leave(1)), [2]);
-        assert_eq!((book.waiting(), book.lacking()), (0, Amount::NONE));
+        assert_eq!((book.waiting(), book.lacking()), (0, Lacking::default()));
     }
 
     #[test]
     fn robots_that_fit_go_before_a_push_that_does_not() {
         let mut book = machine(1, 1.5);
-        assert_eq!(book.ask(1, cores(2.0), Push), Verdict::Waits);
-        assert_eq!(book.ask(2, cores(1.0), Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 1, 2.0, Push), Verdict::Waits);
+        assert_eq!(ask(&mut book, 2, 1.0, Robot), Verdict::Waits);
+        assert_eq!(book.lacking().first_robot, cores(0.5));
         assert_eq!(tickets(book.release(cores(0.5))), [2]);
         assert!(book.release(cores(1.0)).is_empty());
         assert_eq!(tickets(book.release(cores(1.0))), [1]);
+    }
+
+    #[test]
+    fn robots_of_a_higher_priority_go_first() {
+        let mut book = machine(8, 2.0);
+        for (ticket, cpus, priority) in [(1, 1.0, 0), (2, 1.0, 5), (3, 1.0, 5), (4, 0.5, -1)] {
+            let verdict = asks(&mut book, ticket, cpus, Robot, priority);
+            assert_eq!(verdict, Verdict::Waits);
+        }
+        let places: Vec<_> = book
+            .places()
+            .map(|(ticket, place)| (place.place, ticket))
+            .collect();
+        assert_eq!(places, [(1, 2), (2, 3), (3, 1), (4, 4)]);
+        assert_eq!(
+            book.places().next().map(|one| one.1.to_string()).as_deref(),
+            Some("number 1 of 4 that wait")
+        );
+        assert_eq!(tickets(book.release(cores(1.0))), [2]);
+        // One that is first and fits goes before all who wait.
+        assert!(book.release(cores(0.5)).is_empty());
+        assert_eq!(asks(&mut book, 5, 0.5, Robot, 9), Verdict::Admitted);
+        assert_eq!(tickets(book.release(cores(2.0))), [3, 1]);
+    }
+
+    #[test]
+    fn nobody_is_overtaken_for_ever() {
+        let mut book = machine(64, 2.0);
+        assert_eq!(ask(&mut book, 0, 1.0, Robot), Verdict::Waits);
+        for ticket in 1..=u64::from(OVERTAKEN) + 3 {
+            assert_eq!(asks(&mut book, ticket, 1.0, Robot, 9), Verdict::Waits);
+        }
+        let mut before = Vec::new();
+        loop {
+            let admitted = tickets(book.release(cores(1.0)));
+            if admitted.contains(&0) {
+                break;
+            }
+            before.extend(admitted);
+        }
+        assert_eq!(before, (1..=u64::from(OVERTAKEN)).collect::<Vec<_>>());
+        // The last one that overtakes it lets it in.
+        let mut book = machine(64, 2.0);
+        assert_eq!(asks(&mut book, 0, 0.1, Robot, 0), Verdict::Waits);
+        assert_eq!(asks(&mut book, 1, 1.0, Robot, 5), Verdict::Waits);
+        assert!(book.release(cores(0.4)).is_empty(), "the first one blocks");
+        let last = u64::from(OVERTAKEN) + 1;
+        for ticket in 2..last {
+            assert_eq!(asks(&mut book, ticket, 0.01, Robot, 9), Verdict::Admitted);
+        }
+        let (verdict, others) = book.ask(last, Ask::robot(cores(0.01), 9));
+        assert_eq!((verdict, tickets(others)), (Verdict::Admitted, vec![0]));
+    }
+
+    #[test]
+    fn a_machine_that_stalls_admits_nobody() {
+        let mut book = machine(4, 0.0);
+        assert!(book.stall(Some("it swaps".into())).is_empty());
+        assert_eq!(ask(&mut book, 1, 1.0, Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 2, 0.1, Push), Verdict::Waits);
+        assert!(book.release(Amount::NONE).is_empty() && book.leave(9).is_empty());
+        assert_eq!(book.stalled(), Some("it swaps"));
+        book.promise(cores(0.5));
+        let why = "it swaps".to_owned();
+        assert_eq!(
+            book.change(cores(0.5), cores(0.6)),
+            Err(Refused::NoMoreNow { why })
+        );
+        assert_eq!(book.change(cores(0.5), cores(0.4)), Ok(vec![]));
+        assert_eq!(tickets(book.stall(None)), [1, 2]);
     }
 
     #[test]
@@ -313,7 +559,7 @@ mod tests {
         let wanted = cores(1.6);
         let refused = book.change(cores(1.5), wanted);
         assert_eq!(refused, Err(Refused::NoMore { wanted, free }));
-        assert_eq!(book.ask(1, cores(1.0), Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 1, 1.0, Robot), Verdict::Waits);
         let admitted = book.change(cores(1.5), cores(0.1)).expect("less");
         assert_eq!(tickets(admitted), [1]);
         assert_eq!(book.promised(), cores(1.6));
@@ -325,7 +571,7 @@ mod tests {
     #[test]
     fn a_promise_does_not_grow_by_what_robots_wait_for() {
         let mut book = machine(4, 1.0);
-        assert_eq!(book.ask(1, cores(1.5), Robot), Verdict::Waits);
+        assert_eq!(ask(&mut book, 1, 1.5, Robot), Verdict::Waits);
         let wanted = cores(1.1);
         let free = Amount::new(1.0, 1000);
         let refused = book.change(cores(1.0), wanted);
@@ -333,7 +579,7 @@ mod tests {
         // Of what nobody waits for it may have more.
         assert_eq!(book.change(cores(1.0), free), Ok(vec![]));
         let mut book = machine(4, 1.0);
-        assert_eq!(book.ask(1, cores(1.5), Push), Verdict::Waits);
+        assert_eq!(ask(&mut book, 1, 1.5, Push), Verdict::Waits);
         assert_eq!(book.change(cores(1.0), wanted), Ok(vec![]));
     }
 }

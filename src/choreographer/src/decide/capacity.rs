@@ -1,15 +1,50 @@
-//! Which servants are ended so that others find capacity.
+//! Which idle servants are ended, and which pushes give back what they have, so that others find capacity.
 
+use super::admission::Ticket;
 use super::{Amount, End, Servant};
 
-/// Idle servants to end, those first that have been idle longest, until there will be capacity for all who wait: they
-/// lack `lacking`.
+/// How much more would have to be free.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Lacking {
+    /// For all who wait.
+    pub all: Amount,
+    /// For the robot that is first.
+    pub first_robot: Amount,
+}
+
+/// A push that was admitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Push {
+    /// Which.
+    pub ticket: Ticket,
+    /// What it is promised.
+    pub has: Amount,
+    /// It was told to give that back.
+    pub gives_way: bool,
+}
+
+/// What is done for those who wait.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Room<'a> {
+    /// Servants to end.
+    pub ends: Vec<End<'a>>,
+    /// Pushes that are to give back what they have.
+    pub give_way: Vec<Ticket>,
+}
+
+/// Idle servants to end, those first that have been idle longest, until there will be capacity for all who wait. Where that is
+/// not enough for the robot that is first, pushes give way whose capacity makes up for it, those first that came last.
 pub fn make_room<'a>(
-    mut lacking: Amount,
+    lacking: Lacking,
     servants: impl Iterator<Item = Servant<'a>>,
-) -> Vec<End<'a>> {
+    pushes: &[Push],
+) -> Room<'a> {
+    let Lacking {
+        all: mut lacking,
+        mut first_robot,
+    } = lacking;
     if lacking == Amount::NONE {
-        return Vec::new();
+        return Room::default();
     }
     let mut idle = Vec::new();
     for servant in servants {
@@ -19,9 +54,14 @@ pub fn make_room<'a>(
         if servant.ending {
             // What it has is about to be free.
             lacking = lacking.minus(has);
+            first_robot = first_robot.minus(has);
         } else if let Some(until) = servant.idle_until {
             idle.push((until, servant.id, has));
         }
+    }
+    for push in pushes.iter().filter(|push| push.gives_way) {
+        lacking = lacking.minus(push.has);
+        first_robot = first_robot.minus(push.has);
     }
     idle.sort_unstable_by_key(|(until, id, _)| (*until, *id));
     let mut ends = Vec::new();
@@ -29,11 +69,25 @@ pub fn make_room<'a>(
         // It may have none of what is lacking.
         if lacking.minus(has) != lacking {
             lacking = lacking.minus(has);
+            first_robot = first_robot.minus(has);
             let reason = "its room was needed";
             ends.push(End { id, reason });
         }
     }
-    ends
+    let mut stay: Vec<&Push> = pushes.iter().filter(|push| !push.gives_way).collect();
+    stay.sort_unstable_by_key(|push| std::cmp::Reverse(push.ticket));
+    let mut give_way = Vec::new();
+    for push in stay {
+        if first_robot.minus(push.has) != first_robot {
+            first_robot = first_robot.minus(push.has);
+            give_way.push(push.ticket);
+        }
+    }
+    if first_robot != Amount::NONE {
+        // It would be in vain.
+        give_way.clear();
+    }
+    Room { ends, give_way }
 }
 
 #[cfg(test)]
@@ -81,17 +135,64 @@ mod tests {
                 millicpus: lacking,
                 memory: 0,
             };
-            let ends = make_room(lacking, idle.into_iter().chain(extra));
-            let ids: Vec<&str> = ends.iter().map(|end| end.id).collect();
+            let lacking = Lacking {
+                all: lacking,
+                ..Lacking::default()
+            };
+            let room = make_room(lacking, idle.into_iter().chain(extra), &[]);
+            let ids: Vec<&str> = room.ends.iter().map(|end| end.id).collect();
             assert_eq!(ids, expected, "{lacking:?}");
         }
-        let memory = Amount {
-            millicpus: 0,
-            memory: 1,
+        let lacking = Lacking {
+            all: Amount {
+                millicpus: 0,
+                memory: 1,
+            },
+            ..Lacking::default()
         };
-        assert!(
-            make_room(memory, idle.into_iter()).is_empty(),
-            "none has any"
-        );
+        let room = make_room(lacking, idle.into_iter(), &[]);
+        assert_eq!(room, Room::default(), "none has any");
+    }
+
+    #[test]
+    fn pushes_give_way_to_the_first_robot_where_that_helps() {
+        let push = |ticket, memory, gives_way| Push {
+            ticket,
+            has: Amount {
+                millicpus: 10,
+                memory,
+            },
+            gives_way,
+        };
+        let idle = servant("idle", 100, Some(1));
+        let idle = Servant {
+            promised: Some(Amount::new(0.1, 50)),
+            ..idle
+        };
+        let pushes = [push(1, 500, false), push(2, 300, false)];
+        let leaving = [push(1, 500, false), push(2, 300, true)];
+        for (lacks, pushes, expected) in [
+            (0, pushes, vec![]),
+            // An idle servant is ended first.
+            (50, pushes, vec![]),
+            (51, pushes, vec![2]),
+            (350, pushes, vec![2]),
+            (351, pushes, vec![2, 1]),
+            (850, pushes, vec![2, 1]),
+            (851, pushes, vec![]),
+            (350, leaving, vec![]),
+            (351, leaving, vec![1]),
+        ] {
+            let first_robot = Amount {
+                millicpus: 0,
+                memory: lacks,
+            };
+            let lacking = Lacking {
+                all: first_robot.plus(Amount::new(0.0, 1000)),
+                first_robot,
+            };
+            let room = make_room(lacking, [idle].into_iter(), &pushes);
+            assert_eq!(room.give_way, expected, "{lacks} {pushes:?}");
+        }
     }
 }

@@ -15,7 +15,7 @@ use super::nodes::Nodes;
 use super::waiting::Permit;
 use super::warm_pool::{self, Warm};
 use super::{Inner, starting};
-use crate::decide::admission::Class;
+use crate::decide::admission::Ask;
 use crate::handle::{Failure, Handle};
 use crate::with_last_words;
 
@@ -208,10 +208,10 @@ async fn run(
 
 async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
     let deadline = inner.options.deadline;
-    let wanted = inner.promised(&handle.asked());
+    let ask = Ask::robot(inner.promised(&handle.asked()), handle.priority());
     let make_room = || inner.make_room();
     let admission = &inner.admission;
-    let admitted = admission.admit(wanted, Class::Robot, deadline, make_room);
+    let admitted = admission.admit(ask, deadline, handle.stands(), make_room);
     admitted.await.map_err(Failure::Full)
 }
 

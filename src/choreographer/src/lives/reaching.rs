@@ -1,6 +1,7 @@
 //! Reaching what runs in a container: what is recorded of its revision, and what it tells of itself.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use api::Level;
 use catalogue::{Catalogue, Known};
@@ -10,6 +11,7 @@ use servant::engine::Servant;
 use store::{Journal, NewEvent, RevisionRecord};
 
 use super::Inner;
+use super::recent::Recent;
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
@@ -31,6 +33,7 @@ pub(crate) async fn open(
         catalogue: Arc::clone(&inner.catalogue),
         journal: inner.journal.clone(),
         request_times: Arc::clone(&inner.request_times),
+        recent: Arc::clone(&inner.recent),
     };
     let recorded = Box::pin(recorded(inner, revision));
     let opener = &inner.opener;
@@ -73,6 +76,7 @@ struct Reports {
     catalogue: Arc<Catalogue>,
     journal: Journal,
     request_times: Arc<RequestTimes>,
+    recent: Arc<Recent>,
 }
 
 impl Observer for Reports {
@@ -95,5 +99,6 @@ impl Observer for Reports {
 
     fn measured(&self, request: &Request) {
         self.request_times.note(&self.revision.service, request);
+        self.recent.note(&self.id, request, Instant::now());
     }
 }

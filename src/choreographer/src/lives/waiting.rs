@@ -1,14 +1,18 @@
-//! Carries out what is decided of admission: keeps the book under a lock, and has those who wait wait.
+//! Carries out what is decided of admission: keeps the book under a lock, has those who wait wait, and tells them where they
+//! stand.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
 use parking_lot::Mutex;
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
+use tokio_util::sync::CancellationToken;
 
 use crate::decide::Amount;
-use crate::decide::admission::{Admitted, Book, Class, Refused, Ticket, Verdict};
+use crate::decide::admission::{Admitted, Ask, Book, Origin, Place, Refused, Ticket, Verdict};
+use crate::decide::capacity::{Lacking, Push};
 
 /// The machine's capacity for servants, shared by all who ask for some.
 #[derive(Clone)]
@@ -19,13 +23,50 @@ pub struct Admission {
 struct Desk {
     book: Book,
     /// Where those who wait are told.
-    doors: HashMap<Ticket, oneshot::Sender<Permit>>,
+    doors: HashMap<Ticket, Door>,
+    /// Pushes that were admitted.
+    pushes: HashMap<Ticket, Working>,
     tickets: Ticket,
+}
+
+struct Door {
+    opens: oneshot::Sender<Permit>,
+    origin: Origin,
+    stands: watch::Sender<Option<Standing>>,
+}
+
+struct Working {
+    has: Amount,
+    gives_way: CancellationToken,
+}
+
+/// Where a robot stands that waits, and why nobody is admitted, if so.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Standing {
+    /// Its place.
+    pub place: Place,
+    /// What the machine itself waits for, in words.
+    pub stalled: Option<String>,
+}
+
+impl fmt::Display for Standing {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.stalled {
+            Some(why) => write!(
+                out,
+                "{why}, and admits nobody meanwhile; this robot is {}",
+                self.place
+            ),
+            None => write!(out, "this machine is full; this robot is {}", self.place),
+        }
+    }
 }
 
 /// A promise kept until dropped.
 pub struct Permit {
     promise: Promise,
+    /// A push's.
+    work: Option<(Ticket, CancellationToken)>,
 }
 
 /// How much is promised by a permit. Promises nothing once that is dropped.
@@ -40,6 +81,14 @@ impl Permit {
     /// How much it promises, to be changed.
     pub fn promise(&self) -> Promise {
         self.promise.clone()
+    }
+
+    /// Comes back when a robot needs what a push was promised: it is to be given back soon, and asked for again.
+    pub async fn is_needed(&self) {
+        match &self.work {
+            Some((_, gives_way)) => gives_way.cancelled().await,
+            None => std::future::pending().await,
+        }
     }
 }
 
@@ -62,8 +111,8 @@ impl Promise {
     }
 }
 
-impl std::fmt::Debug for Permit {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Debug for Permit {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.debug_tuple("Permit").finish_non_exhaustive()
     }
 }
@@ -71,6 +120,9 @@ impl std::fmt::Debug for Permit {
 impl Drop for Permit {
     fn drop(&mut self) {
         let Promise { amount, admission } = &self.promise;
+        if let Some((ticket, _)) = self.work {
+            admission.desk.lock().pushes.remove(&ticket);
+        }
         admission.decide(|book| {
             let amount = amount.lock().take().unwrap_or_default();
             ((), book.release(amount))
@@ -84,6 +136,7 @@ impl Admission {
         let desk = Desk {
             book: Book::new(capacity, queue),
             doors: HashMap::new(),
+            pushes: HashMap::new(),
             tickets: 0,
         };
         Admission {
@@ -91,30 +144,51 @@ impl Admission {
         }
     }
 
-    /// Decides and records in one go; then gives those who were admitted for it their permits.
+    /// Decides and records in one go; then gives those who were admitted for it their permits, and tells the others where
+    /// they stand.
     fn decide<T>(&self, decision: impl FnOnce(&mut Book) -> (T, Vec<Admitted>)) -> T {
         let mut desk = self.desk.lock();
         let (outcome, admitted) = decision(&mut desk.book);
-        let told: Vec<_> = admitted
-            .into_iter()
-            .map(|one| (desk.doors.remove(&one.ticket), self.permit(one.amount)))
-            .collect();
+        let told = self.admitted(&mut desk, admitted);
+        desk.tell();
         drop(desk);
-        // Handing over may drop the permit at once (nobody waits any more), which locks the desk again.
-        for (door, permit) in told {
-            if let Some(door) = door {
-                let _ = door.send(permit);
-            }
-        }
+        hand_over(told);
         outcome
     }
 
-    fn permit(&self, amount: Amount) -> Permit {
-        let promise = Promise {
+    /// Permits for those who were admitted, and where to hand them over.
+    fn admitted(&self, desk: &mut Desk, admitted: Vec<Admitted>) -> Vec<(Option<Door>, Permit)> {
+        let mut told = Vec::new();
+        for Admitted { ticket, amount } in admitted {
+            // One that stops waiting just now has none any more.
+            let door = desk.doors.remove(&ticket);
+            let origin = door.as_ref().map_or(Origin::Robot, |door| door.origin);
+            told.push((door, self.permit(desk, ticket, origin, amount)));
+        }
+        told
+    }
+
+    fn permit(&self, desk: &mut Desk, ticket: Ticket, origin: Origin, has: Amount) -> Permit {
+        let work = (origin == Origin::Push).then(|| {
+            let gives_way = CancellationToken::new();
+            let working = Working {
+                has,
+                gives_way: gives_way.clone(),
+            };
+            desk.pushes.insert(ticket, working);
+            (ticket, gives_way)
+        });
+        Permit {
+            promise: self.promise(has),
+            work,
+        }
+    }
+
+    fn promise(&self, amount: Amount) -> Promise {
+        Promise {
             amount: Arc::new(Mutex::new(Some(amount))),
             admission: self.clone(),
-        };
-        Permit { promise }
+        }
     }
 
     /// What there is, what is promised of it, and how many wait.
@@ -124,9 +198,41 @@ impl Admission {
         (book.capacity(), book.promised(), book.waiting())
     }
 
-    /// How much more would have to be free for all who wait.
-    pub(crate) fn lacking(&self) -> Amount {
-        self.desk.lock().book.lacking()
+    /// Why nobody is admitted now, if so.
+    pub fn stalled(&self) -> Option<String> {
+        self.desk.lock().book.stalled().map(str::to_owned)
+    }
+
+    /// From now on nobody is admitted, for this reason, or those who fit are again; whether that is new.
+    pub(crate) fn stall(&self, why: Option<String>) -> bool {
+        self.decide(|book| {
+            let new = book.stalled().is_some() != why.is_some();
+            (new, book.stall(why))
+        })
+    }
+
+    /// The book as it is now.
+    pub(crate) fn book(&self) -> Book {
+        self.desk.lock().book.clone()
+    }
+
+    /// How much more would have to be free for those who wait, and what pushes have.
+    pub(crate) fn lacking(&self) -> (Lacking, Vec<Push>) {
+        let desk = self.desk.lock();
+        let pushes = desk.pushes.iter().map(|(ticket, working)| Push {
+            ticket: *ticket,
+            has: working.has,
+            gives_way: working.gives_way.is_cancelled(),
+        });
+        (desk.book.lacking(), pushes.collect())
+    }
+
+    /// Asks these pushes for what they have.
+    pub(crate) fn give_way(&self, pushes: &[Ticket]) {
+        let desk = self.desk.lock();
+        for push in pushes.iter().filter_map(|ticket| desk.pushes.get(ticket)) {
+            push.gives_way.cancel();
+        }
     }
 
     /// Refuses what would never fit.
@@ -137,35 +243,101 @@ impl Admission {
     /// Takes `wanted` even where it is not free: for servants that run already.
     pub(crate) fn adopt(&self, wanted: Amount) -> Permit {
         self.desk.lock().book.promise(wanted);
-        self.permit(wanted)
+        Permit {
+            promise: self.promise(wanted),
+            work: None,
+        }
     }
 
-    /// Takes `wanted`, waiting at most `deadline`. Calls `on_wait` when it is not to be had at once.
+    /// Takes what is asked for, waiting at most `deadline`, and tells by `stands` where it stands meanwhile. Calls `on_wait`
+    /// when it is not to be had at once.
     pub(crate) async fn admit(
         &self,
-        wanted: Amount,
-        class: Class,
+        ask: Ask,
         deadline: Duration,
+        stands: watch::Sender<Option<Standing>>,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Refused> {
+        let standing = stands.subscribe();
         let (_waiting, admitted) = {
             let mut desk = self.desk.lock();
             desk.tickets += 1;
             let ticket = desk.tickets;
-            match desk.book.ask(ticket, wanted, class) {
-                Verdict::Admitted => return Ok(self.permit(wanted)),
-                Verdict::Refused(refused) => return Err(refused),
-                Verdict::Waits => {}
+            let (verdict, others) = desk.book.ask(ticket, ask);
+            let told = self.admitted(&mut desk, others);
+            let outcome = match verdict {
+                Verdict::Admitted => {
+                    Err(Ok(self.permit(&mut desk, ticket, ask.origin, ask.wanted)))
+                }
+                Verdict::Refused(refused) => Err(Err(refused)),
+                Verdict::Waits => {
+                    let (opens, admitted) = oneshot::channel();
+                    let door = Door {
+                        opens,
+                        origin: ask.origin,
+                        stands,
+                    };
+                    desk.doors.insert(ticket, door);
+                    desk.tell();
+                    Ok((ticket, admitted))
+                }
+            };
+            drop(desk);
+            hand_over(told);
+            match outcome {
+                Ok((ticket, admitted)) => {
+                    let admission = self;
+                    (Waiting { admission, ticket }, admitted)
+                }
+                Err(at_once) => return at_once,
             }
-            let (door, admitted) = oneshot::channel();
-            desk.doors.insert(ticket, door);
-            let admission = self;
-            (Waiting { admission, ticket }, admitted)
         };
         on_wait();
         match tokio::time::timeout(deadline, admitted).await {
             Ok(Ok(permit)) => Ok(permit),
-            _ => Err(Refused::Deadline { waited: deadline }),
+            _ => {
+                let standing = standing.borrow().clone();
+                Err(late(deadline, standing, self.stalled()))
+            }
+        }
+    }
+}
+
+/// Not under the lock: a permit may be dropped at once, since nobody waits any more.
+fn hand_over(told: Vec<(Option<Door>, Permit)>) {
+    for (door, permit) in told {
+        if let Some(door) = door {
+            door.stands.send_replace(None);
+            let _ = door.opens.send(permit);
+        }
+    }
+}
+
+/// What is told to one who waited in vain.
+fn late(waited: Duration, standing: Option<Standing>, stalled: Option<String>) -> Refused {
+    let place = standing.map(|standing| standing.place);
+    match stalled {
+        Some(why) => Refused::Stalled { why, waited, place },
+        None => Refused::Deadline { waited, place },
+    }
+}
+
+impl Desk {
+    /// Tells robots that wait where they stand now, where that has changed.
+    fn tell(&self) {
+        for (ticket, place) in self.book.places() {
+            let Some(door) = self.doors.get(&ticket) else {
+                continue;
+            };
+            let stands = Some(Standing {
+                place,
+                stalled: self.book.stalled().map(str::to_owned),
+            });
+            door.stands.send_if_modified(|before| {
+                let changed = *before != stands;
+                *before = stands;
+                changed
+            });
         }
     }
 }
@@ -178,8 +350,10 @@ struct Waiting<'a> {
 
 impl Drop for Waiting<'_> {
     fn drop(&mut self) {
-        self.admission.desk.lock().doors.remove(&self.ticket);
+        let door = self.admission.desk.lock().doors.remove(&self.ticket);
         self.admission.decide(|book| ((), book.leave(self.ticket)));
+        // A permit that was handed over to nobody is dropped with it, which locks the desk.
+        drop(door);
     }
 }
 
@@ -200,8 +374,9 @@ mod tests {
         patience: Duration,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Refused> {
-        let wanted = Amount::new(cpus, 0);
-        room.admit(wanted, Class::Robot, patience, on_wait).await
+        let ask = Ask::robot(Amount::new(cpus, 0), 0);
+        room.admit(ask, patience, watch::Sender::new(None), on_wait)
+            .await
     }
 
     #[tokio::test(start_paused = true)]
@@ -227,8 +402,8 @@ mod tests {
         let small = robot(&room, 0.5, SECOND * 5, || {});
         let (big, small) = tokio::join!(big, small);
         assert_eq!(
-            big.expect_err("never free"),
-            Refused::Deadline { waited: SECOND }
+            big.expect_err("never free").to_string(),
+            "this machine is full; no room came free within 1 s; it was number 1 of 2 that wait"
         );
         small.expect("fits once the big one has gone");
         assert_eq!(room.look().2, 0, "nobody waits any more");
@@ -252,6 +427,87 @@ mod tests {
             assert_eq!(room.look().1, Amount::new(1.0, 0));
         }
         assert_eq!((room.look().1, room.look().2), (Amount::NONE, 0));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_waits_is_told_where_it_stands() {
+        let room = machine();
+        let all = robot(&room, 2.0, SECOND, || {}).await.expect("it is free");
+        let wait = |priority| {
+            let (room, stands) = (room.clone(), watch::Sender::new(None));
+            let watched = stands.subscribe();
+            let ask = Ask::robot(Amount::new(1.0, 0), priority);
+            let waiting =
+                tokio::spawn(async move { room.admit(ask, SECOND * 60, stands, || {}).await });
+            (watched, waiting)
+        };
+        let told = |stands: &mut watch::Receiver<Option<Standing>>| {
+            stands.borrow_and_update().as_ref().map(Standing::to_string)
+        };
+        let (mut first, first_waits) = wait(0);
+        first.changed().await.expect("it is told");
+        let words = told(&mut first).unwrap_or_default();
+        assert_eq!(
+            words,
+            "this machine is full; this robot is number 1 of 1 that wait"
+        );
+        let (mut second, second_waits) = wait(1);
+        second.changed().await.expect("it is told");
+        assert!(told(&mut second).is_some_and(|words| words.contains("number 1 of 2")));
+        first.changed().await.expect("it was overtaken");
+        assert!(told(&mut first).is_some_and(|words| words.contains("number 2 of 2")));
+        assert!(room.stall(Some("this machine swaps".into())));
+        assert!(
+            !room.stall(Some("this machine swaps more".into())),
+            "that is not new"
+        );
+        drop(all);
+        first.changed().await.expect("the machine stalls");
+        let words = told(&mut first).unwrap_or_default();
+        assert!(
+            words.starts_with("this machine swaps more, and admits nobody meanwhile"),
+            "{words}"
+        );
+        assert!(room.stall(None));
+        first_waits.await.expect("no panic").expect("it fits");
+        second_waits.await.expect("no panic").expect("it fits");
+        assert_eq!(told(&mut first), None);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_waits_in_vain_for_a_machine_that_stalls_is_told_that() {
+        let room = machine();
+        room.stall(Some("this machine swaps".into()));
+        let refused = robot(&room, 1.0, SECOND, || {})
+            .await
+            .expect_err("nobody is admitted");
+        assert_eq!(
+            refused.to_string(),
+            "this machine swaps; this did not end within 1 s; it was number 1 of 1 that wait"
+        );
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_push_is_told_when_a_robot_needs_what_it_has() {
+        let room = machine();
+        let push = Ask::push(Amount::new(0.0, 600));
+        let push = room.admit(push, SECOND, watch::Sender::new(None), || {});
+        let push = push.await.expect("it is free");
+        let robot = Ask::robot(Amount::new(0.0, 500), 0);
+        let waits = room.admit(robot, SECOND * 60, watch::Sender::new(None), || {
+            let (lacking, pushes) = room.lacking();
+            assert_eq!(lacking.first_robot, Amount::new(0.0, 100));
+            assert_eq!(pushes.len(), 1);
+            room.give_way(&[pushes[0].ticket]);
+            assert!(room.lacking().1[0].gives_way);
+        });
+        let gives = async {
+            push.is_needed().await;
+            drop(push);
+        };
+        let (robot, ()) = tokio::join!(waits, gives);
+        let _robot = robot.expect("the push gave way");
+        assert!(room.lacking().1.is_empty());
     }
 
     #[tokio::test]

@@ -4,7 +4,7 @@ use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{Class, Config, NonFinite, Push};
+use super::{Class, Config, Controller, NonFinite, Push, machine_cores};
 use crate::supervision::machine_memory;
 
 /// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
@@ -24,6 +24,8 @@ impl Config {
                 .iter()
                 .map(|(name, class)| (name.clone(), of(class)))
                 .collect(),
+            cores: self.capacity.cores().min(machine_cores()),
+            controller: self.capacity.controller == Controller::On,
             reserve_cpus: servant.reserve_cpus,
             reserve_memory: servant.reserve_memory.0,
             deadline: self.capacity.deadline.0,

@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use super::{SERVICES, Step};
-use crate::decide::admission::{Admitted, Book, Class, Ticket, Verdict};
+use crate::decide::admission::{Admitted, Ask, Book, OVERTAKEN, Ticket, Verdict};
+use crate::decide::capacity::{Push, Room};
 use crate::decide::lifetime::{Need, Stage, Tenancy, needed};
 use crate::decide::placement::{Placement, place};
 use crate::decide::warm_pool::{Wanted, Warm, deserving, stale};
@@ -87,6 +88,21 @@ impl Pooled {
     }
 }
 
+/// A push that waits, or is promised something.
+#[derive(Default)]
+struct Pushing {
+    promised: Option<Amount>,
+    gives_way: bool,
+}
+
+/// A robot in the line.
+struct Stands {
+    ticket: Ticket,
+    priority: i32,
+    /// So many who came later were admitted before it.
+    overtaken: u32,
+}
+
 pub(super) struct Machine {
     began: Instant,
     now: Instant,
@@ -94,12 +110,12 @@ pub(super) struct Machine {
     servants: Vec<Lives>,
     /// By service and robot: the ids of those that may be given.
     given: BTreeMap<(usize, usize), String>,
-    pushes: BTreeMap<Ticket, Option<Amount>>,
+    pushes: BTreeMap<Ticket, Pushing>,
     pool: Vec<Pooled>,
     asked_for: Vec<String>,
     revisions: [u64; SERVICES.len()],
     /// Robots that wait, as they came.
-    line: Vec<Ticket>,
+    line: Vec<Stands>,
     made: u64,
     /// Containers that a robot was given.
     used: BTreeSet<String>,
@@ -146,21 +162,23 @@ impl Machine {
         servant.ending = true;
         let (queued, ticket) = (servant.stage == Stage::Queued, servant.ticket);
         if queued {
-            self.line.retain(|one| *one != ticket);
+            self.line.retain(|one| one.ticket != ticket);
             let admitted = self.book.leave(ticket);
             self.admitted(admitted);
         }
     }
 
-    /// Those who waited are admitted: robots in the order in which they came.
+    /// Those who waited are admitted: robots of one priority in the order in which they came, and none is overtaken for ever.
     fn admitted(&mut self, admitted: Vec<Admitted>) {
         for Admitted { ticket, amount } in admitted {
+            assert_eq!(self.book.stalled(), None);
             if let Some(push) = self.pushes.get_mut(&ticket) {
-                *push = Some(amount);
+                push.promised = Some(amount);
                 continue;
             }
-            assert_eq!(self.line.first(), Some(&ticket), "a robot was overtaken");
-            self.line.remove(0);
+            let at = self.line.iter().position(|one| one.ticket == ticket);
+            let stood = self.line.remove(at.expect("who waits is in the line"));
+            self.overtakes(at.unwrap_or_default(), stood.priority);
             let servant = self.servants.iter_mut().find(|one| one.ticket == ticket);
             let servant = servant.expect("who waits is there");
             assert!(!servant.ending, "it waits no longer");
@@ -169,24 +187,63 @@ impl Machine {
         }
     }
 
+    /// One of this priority goes before those who came before it, who are the first of the line.
+    fn overtakes(&mut self, earlier: usize, priority: i32) {
+        for one in &mut self.line[..earlier] {
+            assert!(one.priority < priority, "a robot was overtaken");
+            one.overtaken += 1;
+            assert!(one.overtaken <= OVERTAKEN, "a robot waits for ever");
+        }
+    }
+
     fn make_room(&mut self) {
         let lacking = self.book.lacking();
         let began = self.began;
-        let decide =
-            || capacity::make_room(lacking, self.servants.iter().map(|it| it.facts(began)));
-        let ends = decide();
-        assert_eq!(ends, decide(), "the same facts, another decision");
-        let having = |ids: &[End<'_>]| {
+        let pushes: Vec<Push> = self
+            .pushes
+            .iter()
+            .filter_map(|(ticket, push)| {
+                Some(Push {
+                    ticket: *ticket,
+                    has: push.promised?,
+                    gives_way: push.gives_way,
+                })
+            })
+            .collect();
+        let decide = || {
+            let servants = self.servants.iter().map(|it| it.facts(began));
+            capacity::make_room(lacking, servants, &pushes)
+        };
+        let Room { ends, give_way } = decide();
+        assert_eq!(ends, decide().ends, "the same facts, another decision");
+        let having = |ids: &[End<'_>], pushes: &[Ticket]| {
             let all = self.servants.iter();
             let free = all.filter(|it| it.ending || ids.iter().any(|end| end.id == it.id));
-            free.filter_map(|it| it.promised)
-                .fold(Amount::NONE, Amount::plus)
+            let free = free.filter_map(|it| it.promised);
+            let leave = self.pushes.iter();
+            let leave = leave.filter(|(ticket, it)| it.gives_way || pushes.contains(ticket));
+            let leave = leave.filter_map(|(_, it)| it.promised);
+            free.chain(leave).fold(Amount::NONE, Amount::plus)
         };
         if let Some((_, others)) = ends.split_last() {
             assert_ne!(
-                lacking.minus(having(others)),
+                lacking.all.minus(having(others, &[])),
                 Amount::NONE,
                 "one end too many"
+            );
+        }
+        let first = lacking.first_robot;
+        let every: Vec<Ticket> = self.pushes.keys().copied().collect();
+        assert!(
+            first.minus(having(&ends, &give_way)) == Amount::NONE
+                || first.minus(having(&ends, &every)) != Amount::NONE,
+            "a push keeps a robot from being admitted"
+        );
+        if let Some((_, others)) = give_way.split_last() {
+            assert_ne!(
+                first.minus(having(&ends, others)),
+                Amount::NONE,
+                "one push too many"
             );
         }
         let ids: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
@@ -195,6 +252,11 @@ impl Machine {
             assert!(servant.connections == 0 && servant.stage == Stage::Ready);
             self.end(&id);
         }
+        for ticket in give_way {
+            if let Some(push) = self.pushes.get_mut(&ticket) {
+                push.gives_way = true;
+            }
+        }
     }
 
     /// How much more would have to be free for all robots that wait.
@@ -202,12 +264,12 @@ impl Machine {
         let waiting = self
             .servants
             .iter()
-            .filter(|it| self.line.contains(&it.ticket));
+            .filter(|it| self.line.iter().any(|one| one.ticket == it.ticket));
         let wanted = waiting.fold(Amount::NONE, |sum, it| sum.plus(it.wants));
         wanted.minus(self.book.capacity().minus(self.book.promised()))
     }
 
-    fn asks(&mut self, service: usize, robot: usize) {
+    fn asks(&mut self, service: usize, robot: usize, priority: i32) {
         let began = self.began;
         let key = (service, robot);
         let name = SERVICES[service].0;
@@ -251,14 +313,19 @@ impl Machine {
             warm.id
         });
         let wants = cores(SERVICES[service].1);
-        let promised = match self.book.ask(ticket, wants, Class::Robot) {
+        let (verdict, others) = self.book.ask(ticket, Ask::robot(wants, priority));
+        let promised = match verdict {
             Verdict::Admitted => {
-                assert!(self.line.is_empty(), "robots were overtaken");
+                self.overtakes(self.line.len(), priority);
                 Some(wants)
             }
             Verdict::Waits => None,
-            Verdict::Refused(_) => return,
+            Verdict::Refused(_) => {
+                assert_eq!(others, [], "nobody was overtaken");
+                return;
+            }
         };
+        self.admitted(others);
         let id = warm.unwrap_or(fresh);
         self.given.insert(key, id.clone());
         self.servants.push(Lives {
@@ -278,7 +345,11 @@ impl Machine {
             ending: false,
         });
         if promised.is_none() {
-            self.line.push(ticket);
+            self.line.push(Stands {
+                ticket,
+                priority,
+                overtaken: 0,
+            });
             self.make_room();
         }
     }
@@ -322,7 +393,11 @@ impl Machine {
 
     pub(super) fn takes(&mut self, step: Step) {
         match step {
-            Step::Asks { service, robot } => self.asks(service, robot),
+            Step::Asks {
+                service,
+                robot,
+                priority,
+            } => self.asks(service, robot, priority),
             Step::Leaves(which) => {
                 let used = self.servants.iter_mut().filter(|it| it.connections > 0);
                 if let Some(servant) = nth(used, which) {
@@ -386,23 +461,40 @@ impl Machine {
             }
             Step::Pushes(size) => {
                 let (ticket, _) = self.name();
-                match self.book.ask(ticket, cores(size), Class::Push) {
-                    Verdict::Admitted => drop(self.pushes.insert(ticket, Some(cores(size)))),
-                    Verdict::Waits => {
-                        self.pushes.insert(ticket, None);
-                        self.make_room();
+                let (verdict, others) = self.book.ask(ticket, Ask::push(cores(size)));
+                let promised = match verdict {
+                    Verdict::Admitted => {
+                        assert!(self.line.is_empty(), "a push goes before a robot");
+                        Some(cores(size))
                     }
-                    Verdict::Refused(_) => assert!(size > 4000, "it would fit"),
-                }
+                    Verdict::Waits => None,
+                    Verdict::Refused(_) => {
+                        assert!(size > 4000, "it would fit");
+                        return;
+                    }
+                };
+                let push = Pushing {
+                    promised,
+                    gives_way: false,
+                };
+                self.pushes.insert(ticket, push);
+                self.admitted(others);
+                self.make_room();
             }
             Step::Pushed(which) => {
                 if let Some(ticket) = nth(self.pushes.keys().copied(), which) {
-                    let admitted = match self.pushes.remove(&ticket).flatten() {
+                    let push = self.pushes.remove(&ticket).unwrap_or_default();
+                    let admitted = match push.promised {
                         Some(amount) => self.book.release(amount),
                         None => self.book.leave(ticket),
                     };
                     self.admitted(admitted);
+                    self.make_room();
                 }
+            }
+            Step::Stalls(stalls) => {
+                let admitted = self.book.stall(stalls.then(|| "it swaps".to_owned()));
+                self.admitted(admitted);
             }
             Step::Published(service) => self.revisions[service] += 1,
             Step::Tidied => self.tidy(),
@@ -444,7 +536,7 @@ impl Machine {
 
     pub(super) fn holds(&self) {
         let servants = self.servants.iter().filter_map(|it| it.promised);
-        let pushes = self.pushes.values().filter_map(|promised| *promised);
+        let pushes = self.pushes.values().filter_map(|push| push.promised);
         let promised = servants.chain(pushes).fold(Amount::NONE, Amount::plus);
         assert_eq!(self.book.promised(), promised);
         assert!(
@@ -452,10 +544,18 @@ impl Machine {
             "more is promised than there is"
         );
         assert!(self.line.len() <= QUEUE);
-        let waiting = self.pushes.values().filter(|it| it.is_none()).count();
+        let waiting = self
+            .pushes
+            .values()
+            .filter(|it| it.promised.is_none())
+            .count();
         assert_eq!(self.book.waiting(), self.line.len() + waiting);
         let free = self.book.capacity().minus(promised);
-        if let Some(first) = self.line.first() {
+        let places: Vec<(Ticket, usize)> =
+            self.book.places().map(|one| (one.0, one.1.place)).collect();
+        assert_eq!(places.len(), self.line.len());
+        let first = places.first().filter(|_| self.book.stalled().is_none());
+        if let Some((first, _)) = first {
             let first = self.servants.iter().find(|it| it.ticket == *first);
             let first = first.expect("who waits is there");
             assert!(!first.wants.fits(free), "it waits for what is free");
@@ -472,13 +572,18 @@ impl Machine {
 
     /// All that are admitted leave, one after the other.
     pub(super) fn empties(&mut self) {
+        self.takes(Step::Stalls(false));
         for _ in 0..1000 {
-            let push = self.pushes.iter().find(|it| it.1.is_some()).map(|it| *it.0);
+            let push = self.pushes.iter().find(|it| it.1.promised.is_some());
+            let push = push.map(|it| *it.0);
             let lives = self.servants.iter().find(|it| it.promised.is_some());
             let lives = lives.map(|it| (it.id.clone(), it.ending));
             match (push, lives) {
                 (Some(_), _) => self.takes(Step::Pushed(
-                    self.pushes.values().take_while(|it| it.is_none()).count(),
+                    self.pushes
+                        .values()
+                        .take_while(|it| it.promised.is_none())
+                        .count(),
                 )),
                 (None, Some((id, ending))) => {
                     if !ending {

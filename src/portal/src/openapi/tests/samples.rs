@@ -7,10 +7,10 @@ use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Top
 use api::push::Layer;
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
-    CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Doctor, Event,
-    Grants, Isolation, Level, Limits, LogLine, Measure, Node, Phase, Pressure, Problem, PushEvent,
-    PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Size, Sla, Span,
-    Stated, Status, Stopped, Stream, Terms, Usage, Volume,
+    CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor,
+    Event, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, Phase, Pressure, Problem,
+    PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Size, Sla,
+    Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -341,9 +341,36 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
         (name, serde_json::to_value(value).expect("plain data"))
     }
+    let fits = Fit {
+        cpus: 1.5,
+        memory: Size(1),
+        free_cpus: 1.5,
+        free_memory: Size(1),
+        waiting: 1,
+        stalled: some("it swaps"),
+        now: false,
+        ends: all("x"),
+        lacking_cpus: 1.5,
+        lacking_memory: Size(1),
+        costs: vec![Cost {
+            servant: "x".into(),
+            service: "x".into(),
+            robot: "x".into(),
+            cpus: 1.5,
+            left: 0.5,
+        }],
+        more: Some(1),
+    };
+    let bare = Fit {
+        stalled: None,
+        more: None,
+        ..fits.clone()
+    };
     let mut samples = vec![
         sample("CalibrationOptions", calibration_options()),
         sample("CalibrationOptions", CalibrationOptions::default()),
+        sample("Fit", fits),
+        sample("Fit", bare),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
         sample("Explanation", explanation()),

@@ -1,0 +1,165 @@
+//! Cores that are moved while servants work, and a machine that stalls, told with the engine in memory.
+
+use link::control::Request;
+
+use super::servants::World;
+use super::*;
+
+/// A servant that is ready, of a robot that states this.
+async fn ready(daemon: &Choreographer, robot: &str, query: &[(&str, &str)]) -> Lease {
+    let stated = api::Stated::read(query.iter().copied()).expect("valid");
+    let request = ServantRequest::new("greet", robot).stating(stated);
+    let lease = daemon.ensure(request).expect("a lease");
+    lease.ready().await.expect("ready");
+    lease
+}
+
+fn cpus(lease: &Lease) -> Option<f64> {
+    let container = lease.handle().container().expect("it runs");
+    container.enforced().limits.cpus
+}
+
+/// Its robot's requests take so long, all of it in the cloud.
+fn takes(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
+    let request = Request {
+        total: Some(milliseconds),
+        compute: milliseconds,
+        ..Request::default()
+    };
+    let now = tokio::time::Instant::now().into_std();
+    for _ in 0..3 {
+        let recent = &daemon.inner.recent;
+        recent.note(&lease.handle().id, &request, now);
+    }
+}
+
+/// Seconds pass until it has as many cores as wanted, in each of which its requests take so long.
+async fn until(
+    daemon: &Choreographer,
+    lease: &Lease,
+    milliseconds: f64,
+    wanted: impl Fn(f64) -> bool,
+) {
+    for _ in 0..120 {
+        takes(daemon, lease, milliseconds);
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        if cpus(lease).is_some_and(&wanted) {
+            return;
+        }
+    }
+    panic!("it has {:?} cores", cpus(lease));
+}
+
+#[tokio::test(start_paused = true)]
+async fn one_that_is_near_gets_more_than_its_promise_and_gives_it_back() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    daemon.keep_watch();
+    // So little that it is held up by it, whatever it uses.
+    let near = [("cpus", "0.02"), ("max_rrt", "100ms")];
+    let near = ready(&daemon, "near", &near).await;
+    let other = ready(&daemon, "other", &[("cpus", "0.5")]).await;
+    assert_eq!(cpus(&near), Some(0.02));
+    until(&daemon, &near, 95.0, |cpus| cpus > 0.02).await;
+    let told = world.told("cores-moved");
+    let words = told.last().map(String::as_str).unwrap_or_default();
+    assert!(words.contains("cpu.max 0.02 → 0.12 cores"), "{words}");
+    assert!(words.contains("95 ms of the 100 ms"), "{words}");
+    assert!(daemon.moves() > 0);
+    until(&daemon, &near, 5.0, |cpus| cpus == 0.02).await;
+    assert_eq!(cpus(&other), Some(0.5), "nobody has less than was promised");
+    assert_eq!(
+        daemon.admission().look().1.cpus(),
+        0.52,
+        "promises are as they were"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn without_a_controller_limits_stay_as_they_were_asked_for() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon_with(|options| options.controller = false);
+    daemon.keep_watch();
+    let near = [("cpus", "0.02"), ("max_rrt", "100ms")];
+    let near = ready(&daemon, "near", &near).await;
+    for _ in 0..30 {
+        takes(&daemon, &near, 99.0);
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    assert_eq!((cpus(&near), daemon.moves()), (Some(0.02), 0));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_machine_that_stalls_admits_nobody_and_says_so() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let inner = &daemon.inner;
+    inner.note_stall(Some("this machine swaps".to_owned()));
+    inner.note_stall(Some("this machine swaps still".to_owned()));
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
+    let mut standing = lease.handle().watch_standing();
+    standing
+        .wait_for(|standing| {
+            let words = standing.as_ref().map(ToString::to_string);
+            words.is_some_and(|words| {
+                words.contains("swaps still") && words.contains("number 1 of 1")
+            })
+        })
+        .await
+        .expect("it is told");
+    let fit = daemon.fit("greet", api::Stated::default()).await;
+    let fit = fit.expect("a service");
+    assert_eq!((fit.now, fit.stalled.is_some()), (false, true));
+    inner.note_stall(None);
+    lease.ready().await.expect("it is admitted");
+    let told = (
+        world.told("machine-stalled"),
+        world.told("machine-recovered"),
+    );
+    assert_eq!((told.0.len(), told.1.len()), (1, 1), "{told:?}");
+    assert!(
+        told.0[0].starts_with("this machine swaps; no servant"),
+        "{told:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_would_fit_is_told_with_what_it_costs() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| {
+        record.plan.limits.cpus = Some(0.75);
+    });
+    let daemon = world.daemon();
+    let fit = async |query: &[(&str, &str)]| {
+        let stated = api::Stated::read(query.iter().copied()).expect("valid");
+        daemon.fit("greet", stated).await.expect("a service")
+    };
+    let plain = fit(&[]).await;
+    assert_eq!((plain.now, plain.more, plain.cpus), (true, Some(2), 0.75));
+    assert_eq!(fit(&[("cpus", "2")]).await.more, Some(1));
+    let lease = ready(&daemon, "r1", &[]).await;
+    assert_eq!(fit(&[]).await.more, Some(1));
+    let big = fit(&[("cpus", "1.5")]).await;
+    assert_eq!(
+        (big.now, big.lacking_cpus, big.ends.len()),
+        (false, 0.25, 0)
+    );
+    let id = lease.handle().id.clone();
+    drop(lease);
+    let idle = daemon.servant(&id).expect("it lives");
+    while idle.idle_until().is_none() {
+        tokio::task::yield_now().await;
+    }
+    let big = fit(&[("cpus", "1.5")]).await;
+    assert_eq!(
+        (big.now, big.lacking_cpus, big.ends),
+        (false, 0.0, vec![id])
+    );
+    let unknown = daemon.fit("nothing", api::Stated::default()).await;
+    assert!(matches!(unknown, Err(Error::Catalogue(_))));
+}

@@ -1,0 +1,191 @@
+//! `fit`: whether one more servant of a service would fit.
+
+use api::Size;
+
+use crate::client::{Client, escaped};
+use crate::output::{self, Format, Table};
+
+/// Say whether one more robot would find room, what it would cost the others, and how many more would fit.
+#[derive(Debug, clap::Args)]
+pub struct Fit {
+    /// The service.
+    service: String,
+    /// Request response time that the robot wishes for, such as 100ms.
+    #[arg(long, value_name = "TIME")]
+    rrt: Option<String>,
+    /// The longest that it accepts.
+    #[arg(long, value_name = "TIME")]
+    max_rrt: Option<String>,
+    /// Frames per second that it wishes for.
+    #[arg(long, value_name = "RATE")]
+    fps: Option<String>,
+    /// Age of an output that it wishes for, such as 200ms.
+    #[arg(long, value_name = "TIME")]
+    age: Option<String>,
+    /// Its class.
+    #[arg(long, value_name = "NAME")]
+    class: Option<String>,
+    /// Cores that it asks for outright.
+    #[arg(long, value_name = "N")]
+    cpus: Option<f64>,
+    /// Memory that it asks for outright.
+    #[arg(long, value_name = "SIZE")]
+    memory: Option<Size>,
+}
+
+impl Fit {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let fit: api::Fit = client.get(&self.path()).await?;
+        match format {
+            Format::Json => output::json(&fit),
+            Format::Table => print(&self.service, &fit),
+        }
+    }
+
+    fn path(&self) -> String {
+        let stated = [
+            ("rrt", self.rrt.clone()),
+            ("max_rrt", self.max_rrt.clone()),
+            ("fps", self.fps.clone()),
+            ("age", self.age.clone()),
+            ("class", self.class.clone()),
+            ("cpus", self.cpus.map(|cpus| cpus.to_string())),
+            ("memory", self.memory.map(|memory| memory.to_string())),
+        ];
+        let stated: Vec<String> = stated
+            .into_iter()
+            .filter_map(|(key, value)| Some(format!("{key}={}", escaped(&value?))))
+            .collect();
+        let path = format!("/api/v1/services/{}/fit", escaped(&self.service));
+        match stated.is_empty() {
+            true => path,
+            false => format!("{path}?{}", stated.join("&")),
+        }
+    }
+}
+
+fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
+    output::line(&in_words(service, fit))?;
+    if fit.costs.is_empty() {
+        return Ok(());
+    }
+    output::line("\nif it used all of that, these would have less than they use now")?;
+    let mut table = Table::new(&["SERVANT", "ROBOT", "CORES", "LEFT"]);
+    for cost in &fit.costs {
+        table.row([
+            cost.servant.clone(),
+            cost.robot.clone(),
+            format!("{:.2}", cost.cpus),
+            format!("{:.2}", cost.left),
+        ]);
+    }
+    table.print()
+}
+
+/// The answer in sentences.
+fn in_words(service: &str, fit: &api::Fit) -> String {
+    let wanted = format!(
+        "one more servant of {service} is promised {} cores and {} of memory",
+        fit.cpus, fit.memory
+    );
+    let lacks = fit.lacking_cpus > 0.0 || fit.lacking_memory > Size(0);
+    let answer = match (&fit.stalled, fit.now) {
+        (Some(why), _) => format!("it would wait: {why}"),
+        (None, true) => "it would be started at once".to_owned(),
+        (None, false) if lacks => format!(
+            "it would wait: {} cores and {} are lacking, and {} wait already",
+            fit.lacking_cpus, fit.lacking_memory, fit.waiting
+        ),
+        (None, false) => format!(
+            "it would be started when these have ended, which are idle: {}",
+            fit.ends.join(", ")
+        ),
+    };
+    let more = match fit.more {
+        None => "as many as one likes would fit".to_owned(),
+        Some(0) => "none would fit beside those that are in use".to_owned(),
+        Some(1) => "1 would fit, and no further one".to_owned(),
+        Some(more) => format!("{more} would fit, and no further one"),
+    };
+    format!(
+        "{wanted}; {} cores and {} are free\n{answer}\n{more}",
+        fit.free_cpus, fit.free_memory
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fit() -> api::Fit {
+        api::Fit {
+            cpus: 1.0,
+            memory: Size(64 << 20),
+            free_cpus: 0.5,
+            free_memory: Size(1 << 30),
+            waiting: 2,
+            stalled: None,
+            now: false,
+            ends: vec!["a-1".into()],
+            lacking_cpus: 0.0,
+            lacking_memory: Size(0),
+            costs: Vec::new(),
+            more: Some(1),
+        }
+    }
+
+    #[test]
+    fn every_answer_has_its_words() {
+        let lacking = api::Fit {
+            lacking_cpus: 0.5,
+            more: Some(0),
+            ..fit()
+        };
+        let now = api::Fit {
+            now: true,
+            more: None,
+            ..fit()
+        };
+        let stalled = api::Fit {
+            stalled: Some("this machine swaps".into()),
+            ..now.clone()
+        };
+        for (fit, words) in [
+            (
+                fit(),
+                "1 cores and 64M of memory; 0.5 cores and 1G are free",
+            ),
+            (fit(), "idle: a-1\n1 would fit"),
+            (
+                lacking,
+                "0.5 cores and 0 are lacking, and 2 wait already\nnone would fit",
+            ),
+            (now, "at once\nas many"),
+            (stalled, "it would wait: this machine swaps"),
+        ] {
+            let said = in_words("a", &fit);
+            assert!(said.contains(words), "{said}");
+        }
+    }
+
+    #[test]
+    fn what_the_robot_states_is_asked_for() {
+        use clap::Parser;
+        #[derive(Parser)]
+        struct Line {
+            #[command(flatten)]
+            fit: Fit,
+        }
+        let line = [
+            "fit", "a b", "--rrt", "100ms", "--memory", "1G", "--class", "x&y",
+        ];
+        let line = Line::parse_from(line);
+        assert_eq!(
+            line.fit.path(),
+            "/api/v1/services/a%20b/fit?rrt=100ms&class=x%26y&memory=1G"
+        );
+        let line = Line::parse_from(["fit", "a"]);
+        assert_eq!(line.fit.path(), "/api/v1/services/a/fit");
+    }
+}
