@@ -9,9 +9,10 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, Digest, GoalEnd,
-    GoalEvents, Graph, Matched, Message, MessageSender, Outcome, Peer, PeerId, Publisher, Qos,
-    RosVersion, ServiceHandler, ServiceType, Subscription, TopicNodes, WireType, message_queue,
+    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
+    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, Outcome, Peer, PeerId, Publisher,
+    Qos, RosVersion, ServiceHandler, ServiceType, Subscription, TopicNodes, WireType,
+    message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
@@ -389,6 +390,7 @@ impl Bus for MemoryBus {
             Ok(answer) => answer.map_err(|reason| BusError::CallFailed {
                 service: service.to_owned(),
                 reason,
+                fate: CallFate::Answered,
             }),
             Err(_) => Err(BusError::Timeout {
                 what: format!("service {service}"),

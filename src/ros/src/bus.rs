@@ -25,7 +25,7 @@ mod queue;
 mod types;
 
 pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, Outcome};
-pub use error::BusError;
+pub use error::{BusError, CallFate};
 pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
 pub use matched::{Matched, Peer, PeerId, reaches};

@@ -2,6 +2,17 @@
 
 use std::time::Duration;
 
+/// Whether a call that failed was carried out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CallFate {
+    /// The server answered that it failed.
+    Answered,
+    /// The server did not take it.
+    NotTaken,
+    /// The server went away before it answered: nobody knows.
+    Unknown,
+}
+
 /// What can go wrong on a bus.
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
@@ -31,7 +42,14 @@ pub enum BusError {
         service: String,
         /// What the server said.
         reason: String,
+        /// Whether it may have been carried out.
+        fate: CallFate,
     },
+    /// It is not shown to this robot, which shares the nodes with others.
+    #[error(
+        "{0} is not offered: robots share this service, and use its services and actions alone"
+    )]
+    NotShared(String),
     /// No answer in time.
     #[error("{what} did not answer within {after:?}")]
     Timeout {

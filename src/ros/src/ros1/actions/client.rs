@@ -13,7 +13,8 @@ use tokio::time::timeout;
 
 use super::messages::{self, GoalId, Status};
 use crate::bus::{
-    ActionClient, BusError, GoalEnd, GoalEvents, Matched, Outcome, Publisher, Subscription,
+    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Matched, Outcome, Publisher,
+    Subscription,
 };
 use crate::codec::Time;
 use crate::ros1::bus::Inner;
@@ -119,6 +120,7 @@ impl ActionClient for Client {
                 return Err(BusError::CallFailed {
                     service: format!("action {}", shared.name),
                     reason: reason.clone(),
+                    fate: CallFate::NotTaken,
                 });
             }
             shared.takes_goals().await;

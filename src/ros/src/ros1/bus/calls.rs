@@ -13,7 +13,7 @@ use super::link::broken;
 use super::registrar::Kind;
 use super::services::LABEL;
 use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Digest, Graph, ServiceProvider, ServiceType};
+use crate::bus::{BusError, CallFate, Digest, Graph, ServiceProvider, ServiceType};
 use crate::ros1::names::PeerUri;
 use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
 
@@ -124,14 +124,22 @@ pub(super) async fn call(
                     return answer.map_err(|reason| BusError::CallFailed {
                         service: service.to_owned(),
                         reason,
+                        fate: CallFate::Answered,
                     });
                 }
                 Err(CallError::NotTaken) if reused => {}
-                Err(CallError::Broken(error)) => return Err(broken(service, error)),
+                Err(CallError::Broken(error)) if !matches!(error, Error::Io(_)) => {
+                    return Err(broken(service, error));
+                }
                 Err(error) => {
+                    let fate = match error {
+                        CallError::NotTaken => CallFate::NotTaken,
+                        _ => CallFate::Unknown,
+                    };
                     return Err(BusError::CallFailed {
                         service: service.to_owned(),
                         reason: error.to_string(),
+                        fate,
                     });
                 }
             }
@@ -218,6 +226,7 @@ async fn open(
         Ok(Err(Error::Refused(reason))) => Err(BusError::CallFailed {
             service: service.to_owned(),
             reason,
+            fate: CallFate::NotTaken,
         }),
         Ok(Err(error)) => Err(broken(&what(), error)),
         Err(_) => Err(BusError::Timeout {
