@@ -14,6 +14,7 @@
 
 pub mod egress;
 mod ends;
+pub mod group;
 pub mod links;
 mod local;
 pub mod master;
@@ -122,6 +123,8 @@ impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 /// all this is forwarded.
 #[async_trait]
 pub trait Reach: Send + Sync + 'static {
+    /// Its ROS, for a group whose servants answer together.
+    fn bus(&self) -> Arc<dyn Bus>;
     /// Nodes, topics and services as they are registered, now and later.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Speaks rosbridge with a client that has waited for the servant, until it ends.

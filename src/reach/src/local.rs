@@ -134,6 +134,10 @@ struct LocalReach {
 
 #[async_trait]
 impl Reach for LocalReach {
+    fn bus(&self) -> Arc<dyn Bus> {
+        Arc::clone(&self.bus)
+    }
+
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {
         self.bus.graph()
     }

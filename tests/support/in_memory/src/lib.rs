@@ -6,6 +6,8 @@
 #![forbid(unsafe_code)]
 
 mod engine;
+#[path = "../../memory_bus.rs"]
+mod memory_bus;
 mod process;
 mod reached;
 mod servants;

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use ros::bus::{Graph, TopicNodes};
+use ros::bus::{Bus, Graph, ServiceHandler, ServiceType, TopicNodes};
+use servant::engine::Servant;
 use servant::spec::NodeSpec;
 
 use crate::servants::MemoryServant;
@@ -37,6 +38,29 @@ impl Process {
                 ..std::mem::take(ends)
             };
         });
+    }
+
+    /// Serves a service for as long as what this gives lives.
+    pub async fn serve(
+        &self,
+        service: &str,
+        type_name: &str,
+        handler: Arc<dyn ServiceHandler>,
+    ) -> Box<dyn Send + Sync> {
+        let node = self.servant.system.join(&self.node.name);
+        let of = ServiceType::new(type_name, "*");
+        let served = node.serve(service, of, handler).await;
+        let served = served.unwrap_or_else(|error| panic!("{error}"));
+        let name = self.node.name.clone();
+        self.register(|graph| {
+            graph.services.insert(service.to_owned(), name);
+        });
+        Box::new((served, node))
+    }
+
+    /// The id of its servant.
+    pub fn servant(&self) -> &str {
+        self.servant.id()
     }
 
     /// Takes memory until the node ends. The node is killed where its servant has not so much left.

@@ -13,7 +13,7 @@ use reach::{
     Error, Look, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded, Replay, Stream,
     Tenant,
 };
-use ros::bus::{Graph, RosVersion};
+use ros::bus::{Bus, Graph, RosVersion};
 use servant::engine::Servant;
 use tokio::sync::watch;
 
@@ -75,6 +75,10 @@ impl MemoryReach {
 
 #[async_trait]
 impl Reach for MemoryReach {
+    fn bus(&self) -> Arc<dyn Bus> {
+        self.servant.system.join("/cloudroid_bridge")
+    }
+
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {
         self.servant.graph.subscribe()
     }

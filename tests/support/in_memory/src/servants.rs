@@ -15,6 +15,7 @@ use servant::spec::{Limits, NodeSpec, Spec};
 use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::engine::World;
+use crate::memory_bus::MemorySystem;
 use crate::process::Process;
 
 /// Events that a slow listener may be behind, and lines that may wait for a reader.
@@ -33,6 +34,8 @@ pub struct MemoryServant {
     /// Tasks of nodes.
     tasks: watch::Sender<usize>,
     pub(crate) graph: watch::Sender<Arc<Graph>>,
+    /// Where services of its nodes are called.
+    pub(crate) system: Arc<MemorySystem>,
 }
 
 /// What is known of a node.
@@ -85,6 +88,7 @@ impl MemoryServant {
             oom_kills: Mutex::default(),
             tasks: watch::Sender::default(),
             graph: watch::Sender::default(),
+            system: Arc::default(),
         })
     }
 
@@ -263,6 +267,7 @@ impl MemoryServant {
             for ends in next.topics.values_mut() {
                 ends.publishers.retain(|node| node != name);
             }
+            next.services.retain(|_, node| node != name);
             *graph = Arc::new(next);
         });
         let mut for_good = false;

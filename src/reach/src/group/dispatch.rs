@@ -1,0 +1,427 @@
+//! Which servant of a group works at which request: the one with the fewest requests under way. Pure: what comes in are
+//! requests, answers, and servants that come and go; what goes out are orders.
+//!
+//! ```text
+//!            no servant has a free place        every servant that had it was lost
+//!               ┌───────────────┐         ┌───────────────(idempotent)──────────────┐
+//!  asked for ──▶ waits ──────────▶ under way at 1 … `replicas` servants ──▶ answered, once
+//!                                         └──────▶ failed, with the reason
+//! ```
+//!
+//! - A servant has at most [`Rules::window`] calls under way; the rest wait here, so that what waits is lost with no servant,
+//!   and goes to a servant that is added meanwhile. Robots that wait have turns: one with a thousand calls holds nobody up.
+//! - A servant carries out goals of one action for one robot at a time, since most action servers take one goal and give up
+//!   the one before for it: another robot's goal would end this robot's. A robot's next goal goes where its goal is, so that
+//!   the node treats both as it would if it were this robot's alone.
+//! - A request that a lost servant had may have been carried out: it is asked again where the service is idempotent, at most
+//!   [`ATTEMPTS`] times in all (it may be what ends the servants), and fails elsewhere. One that a servant did not take waits
+//!   for its next turn.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+
+use ros::turns::Turns;
+
+/// How many servants in all may be lost with a request before it fails.
+pub const ATTEMPTS: usize = 3;
+
+/// A request.
+pub type Ticket = u64;
+/// A servant of the group.
+pub type Member = u64;
+/// A robot of the group.
+pub type Robot = u64;
+
+/// What is asked for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Kind {
+    /// A call of a service.
+    Call,
+    /// A goal of the action of this name.
+    Goal(Arc<str>),
+}
+
+/// What the deployer decided of the group.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Rules {
+    /// Calls that one servant has under way at most; 0 counts as 1.
+    pub window: usize,
+    /// Servants that work at the same call at most; 0 counts as 1.
+    pub replicas: usize,
+    /// A request may be carried out twice.
+    pub idempotent: bool,
+}
+
+/// What is to be done.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Order {
+    /// Have this servant work at the request.
+    Ask(Ticket, Member),
+    /// What this servant answers to the request does not matter any more.
+    Drop(Ticket, Member),
+    /// The request has failed: the servant was lost while it worked at it.
+    Fail(Ticket, Lost),
+}
+
+/// Why a request fails.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lost {
+    /// The service is not idempotent.
+    NotAskedAgain,
+    /// It was asked as often as may be.
+    AskedOften,
+}
+
+/// How a servant's work at a request has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// With an answer, be it that it failed.
+    Answered,
+    /// The servant did not take it: it was certainly not carried out.
+    NotTaken,
+    /// The servant went away: it may have been carried out.
+    Lost,
+}
+
+/// How much is to be done.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Load {
+    /// Requests that wait for a servant.
+    pub waiting: usize,
+    /// Requests at which at least one servant works.
+    pub under_way: usize,
+}
+
+/// Calls, or the goals of one action.
+type Lane = u32;
+const CALLS: Lane = 0;
+
+#[derive(Debug)]
+struct Request {
+    robot: Robot,
+    lane: Lane,
+    /// Servants that work at it.
+    at: BTreeSet<Member>,
+    /// Servants that were lost with it.
+    lost: usize,
+}
+
+#[derive(Debug, Default)]
+struct Servant {
+    calls: usize,
+    /// By action, the robot whose goals it carries out, and how many.
+    goals: BTreeMap<Lane, (Robot, usize)>,
+    /// It gets no more.
+    retired: bool,
+    /// It does not take requests at the moment.
+    paused: bool,
+    /// Requests that it was ever asked.
+    asked: u64,
+}
+
+impl Servant {
+    fn load(&self) -> usize {
+        self.calls + self.goals.values().map(|(_, count)| count).sum::<usize>()
+    }
+}
+
+/// The requests of one group.
+#[derive(Debug)]
+pub struct Dispatcher {
+    rules: Rules,
+    tickets: Ticket,
+    actions: BTreeMap<Arc<str>, Lane>,
+    servants: BTreeMap<Member, Servant>,
+    requests: BTreeMap<Ticket, Request>,
+    waiting: BTreeMap<(Robot, Lane), VecDeque<Ticket>>,
+    turns: Turns<(Robot, Lane)>,
+}
+
+impl Dispatcher {
+    /// One without servants and requests.
+    pub fn new(rules: Rules) -> Dispatcher {
+        Dispatcher {
+            rules: Rules {
+                window: rules.window.max(1),
+                replicas: rules.replicas.max(1),
+                // Whoever lets two servants work at a call lets it be carried out twice.
+                idempotent: rules.idempotent || rules.replicas > 1,
+            },
+            tickets: 0,
+            actions: BTreeMap::new(),
+            servants: BTreeMap::new(),
+            requests: BTreeMap::new(),
+            waiting: BTreeMap::new(),
+            turns: Turns::default(),
+        }
+    }
+
+    /// A servant can be asked from now on.
+    pub fn join(&mut self, member: Member) -> Vec<Order> {
+        self.servants.entry(member).or_default();
+        self.next()
+    }
+
+    /// A servant is asked no more; what it works at it ends.
+    pub fn retire(&mut self, member: Member) -> Vec<Order> {
+        if let Some(servant) = self.servants.get_mut(&member) {
+            servant.retired = true;
+        }
+        // A call that waited for it, too, now has as many servants as there are.
+        self.next()
+    }
+
+    /// Asks a servant no more until it is [resumed](Self::resume).
+    fn pause(&mut self, member: Member) {
+        if let Some(servant) = self.servants.get_mut(&member) {
+            servant.paused = true;
+        }
+    }
+
+    /// A servant that did not take a request is asked again.
+    pub fn resume(&mut self, member: Member) -> Vec<Order> {
+        if let Some(servant) = self.servants.get_mut(&member) {
+            servant.paused = false;
+        }
+        self.next()
+    }
+
+    /// A servant is gone, with what it worked at.
+    pub fn leave(&mut self, member: Member) -> Vec<Order> {
+        self.servants.remove(&member);
+        let had = self.requests.iter();
+        let had: Vec<Ticket> = had
+            .filter(|(_, request)| request.at.contains(&member))
+            .map(|(ticket, _)| *ticket)
+            .collect();
+        let mut orders = Vec::new();
+        for ticket in had.into_iter().rev() {
+            orders.push(Order::Drop(ticket, member));
+            self.lost(ticket, member, &mut orders);
+        }
+        orders.extend(self.next());
+        orders
+    }
+
+    /// A robot asks for something.
+    pub fn ask(&mut self, robot: Robot, kind: &Kind) -> (Ticket, Vec<Order>) {
+        self.tickets += 1;
+        let ticket = self.tickets;
+        let lane = match kind {
+            Kind::Call => CALLS,
+            Kind::Goal(action) => {
+                let next = self.actions.len() as Lane + 1;
+                *self.actions.entry(Arc::clone(action)).or_insert(next)
+            }
+        };
+        let request = Request {
+            robot,
+            lane,
+            at: BTreeSet::new(),
+            lost: 0,
+        };
+        self.requests.insert(ticket, request);
+        let queue = self.waiting.entry((robot, lane)).or_default();
+        queue.push_back(ticket);
+        self.turns.join((robot, lane));
+        (ticket, self.next())
+    }
+
+    /// A servant's work at a request has ended. Whether that is the request's answer, and what is to be done.
+    pub fn ended(&mut self, ticket: Ticket, member: Member, end: End) -> (bool, Vec<Order>) {
+        let known = self.requests.get(&ticket);
+        if !known.is_some_and(|request| request.at.contains(&member)) {
+            return (false, Vec::new());
+        }
+        let mut orders = Vec::new();
+        match end {
+            End::Answered => {
+                let mut others = self.remove(ticket);
+                others.remove(&member);
+                orders.extend(others.into_iter().map(|other| Order::Drop(ticket, other)));
+            }
+            End::NotTaken => {
+                self.pause(member);
+                self.release(ticket, member);
+                self.again(ticket, &mut orders);
+            }
+            End::Lost => self.lost(ticket, member, &mut orders),
+        }
+        orders.extend(self.next());
+        (end == End::Answered, orders)
+    }
+
+    /// Nobody waits for the request's answer any more.
+    pub fn withdraw(&mut self, ticket: Ticket) -> Vec<Order> {
+        let at = self.remove(ticket).into_iter();
+        let mut orders: Vec<Order> = at.map(|member| Order::Drop(ticket, member)).collect();
+        orders.extend(self.next());
+        orders
+    }
+
+    /// How much is to be done now.
+    pub fn load(&self) -> Load {
+        let waiting = self.waiting.values().map(VecDeque::len).sum();
+        Load {
+            waiting,
+            under_way: self.requests.len() - waiting,
+        }
+    }
+
+    /// Requests that a servant works at.
+    pub fn load_of(&self, member: Member) -> usize {
+        self.servants.get(&member).map_or(0, Servant::load)
+    }
+
+    /// Forgets a request; gives those that worked at it.
+    fn remove(&mut self, ticket: Ticket) -> BTreeSet<Member> {
+        let at = match self.requests.get(&ticket) {
+            Some(request) => request.at.clone(),
+            None => return BTreeSet::new(),
+        };
+        for member in &at {
+            self.release(ticket, *member);
+        }
+        self.unqueue(ticket);
+        self.requests.remove(&ticket);
+        at
+    }
+
+    /// A servant does not work at a request any more.
+    fn release(&mut self, ticket: Ticket, member: Member) {
+        let Some(request) = self.requests.get_mut(&ticket) else {
+            return;
+        };
+        if !request.at.remove(&member) {
+            return;
+        }
+        let Some(servant) = self.servants.get_mut(&member) else {
+            return;
+        };
+        if request.lane == CALLS {
+            servant.calls -= 1;
+        } else if let Some((_, count)) = servant.goals.get_mut(&request.lane) {
+            *count -= 1;
+            if *count == 0 {
+                servant.goals.remove(&request.lane);
+            }
+        }
+    }
+
+    /// A servant was lost with a request.
+    fn lost(&mut self, ticket: Ticket, member: Member, orders: &mut Vec<Order>) {
+        self.release(ticket, member);
+        if let Some(request) = self.requests.get_mut(&ticket) {
+            request.lost += 1;
+        }
+        self.again(ticket, orders);
+    }
+
+    /// A request at which nobody works any more waits again, before its robot's others, or fails.
+    fn again(&mut self, ticket: Ticket, orders: &mut Vec<Order>) {
+        let Some(request) = self.requests.get(&ticket) else {
+            return;
+        };
+        if !request.at.is_empty() {
+            return;
+        }
+        let why = match request.lost {
+            0 => None,
+            _ if !self.rules.idempotent => Some(Lost::NotAskedAgain),
+            lost => (lost >= ATTEMPTS).then_some(Lost::AskedOften),
+        };
+        if let Some(why) = why {
+            self.requests.remove(&ticket);
+            orders.push(Order::Fail(ticket, why));
+            return;
+        }
+        let key = (request.robot, request.lane);
+        self.waiting.entry(key).or_default().push_front(ticket);
+        self.turns.join(key);
+    }
+
+    /// A request does not wait any more.
+    fn unqueue(&mut self, ticket: Ticket) {
+        let Some(request) = self.requests.get(&ticket) else {
+            return;
+        };
+        let key = (request.robot, request.lane);
+        if let Some(queue) = self.waiting.get_mut(&key) {
+            queue.retain(|other| *other != ticket);
+            if queue.is_empty() {
+                self.waiting.remove(&key);
+                self.turns.forget(key);
+            }
+        }
+    }
+
+    /// Those that can be asked in this lane now for this robot, the best first; empty if they are too few.
+    fn places(&self, robot: Robot, lane: Lane) -> Vec<Member> {
+        let mut open: Vec<(Member, &Servant)> = self
+            .servants
+            .iter()
+            .filter(|(_, servant)| !servant.retired && !servant.paused)
+            .map(|(member, servant)| (*member, servant))
+            .collect();
+        let wanted = match lane {
+            CALLS => self.rules.replicas.min(open.len()),
+            _ => 1,
+        };
+        if lane == CALLS {
+            open.retain(|(_, servant)| servant.calls < self.rules.window);
+        } else {
+            let of = |servant: &Servant| servant.goals.get(&lane).map(|(robot, _)| *robot);
+            match open.iter().find(|(_, servant)| of(servant) == Some(robot)) {
+                Some((member, _)) => return vec![*member],
+                None => open.retain(|(_, servant)| of(servant).is_none()),
+            }
+        }
+        if open.len() < wanted.max(1) {
+            return Vec::new();
+        }
+        open.sort_by_key(|(member, servant)| (servant.load(), servant.asked, *member));
+        open.truncate(wanted);
+        open.into_iter().map(|(member, _)| member).collect()
+    }
+
+    /// Has servants work at what waits, as far as they can.
+    fn next(&mut self) -> Vec<Order> {
+        let mut orders = Vec::new();
+        let mut turns = std::mem::take(&mut self.turns);
+        while let Some(key) = turns.take(|(robot, lane)| !self.places(*robot, *lane).is_empty()) {
+            let places = self.places(key.0, key.1);
+            let queue = self.waiting.get_mut(&key);
+            let Some(ticket) = queue.and_then(VecDeque::pop_front) else {
+                continue;
+            };
+            if self.waiting.get(&key).is_some_and(VecDeque::is_empty) {
+                self.waiting.remove(&key);
+                turns.forget(key);
+            } else {
+                turns.join(key);
+            }
+            for member in places {
+                self.begin(ticket, key, member);
+                orders.push(Order::Ask(ticket, member));
+            }
+        }
+        self.turns = turns;
+        orders
+    }
+
+    fn begin(&mut self, ticket: Ticket, (robot, lane): (Robot, Lane), member: Member) {
+        if let Some(request) = self.requests.get_mut(&ticket) {
+            request.at.insert(member);
+        }
+        if let Some(servant) = self.servants.get_mut(&member) {
+            servant.asked += 1;
+            match lane {
+                CALLS => servant.calls += 1,
+                _ => servant.goals.entry(lane).or_insert((robot, 0)).1 += 1,
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,404 @@
+use proptest::prelude::*;
+
+use super::*;
+
+const RULES: Rules = Rules {
+    window: 2,
+    replicas: 1,
+    idempotent: false,
+};
+
+fn group(rules: Rules, members: u64) -> Dispatcher {
+    let mut group = Dispatcher::new(rules);
+    for member in 1..=members {
+        assert_eq!(group.join(member), []);
+    }
+    group
+}
+
+fn goal() -> Kind {
+    Kind::Goal("/count".into())
+}
+
+#[test]
+fn the_servant_with_the_fewest_requests_is_asked() {
+    let mut group = group(RULES, 2);
+    assert_eq!(group.ask(7, &Kind::Call), (1, vec![Order::Ask(1, 1)]));
+    assert_eq!(group.ask(7, &Kind::Call), (2, vec![Order::Ask(2, 2)]));
+    assert_eq!(group.ended(2, 2, End::Answered), (true, vec![]));
+    assert_eq!(group.ask(8, &Kind::Call), (3, vec![Order::Ask(3, 2)]));
+    // Of two that have as many, the one that was asked less often.
+    assert_eq!(group.ended(3, 2, End::Answered), (true, vec![]));
+    assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
+    assert_eq!(group.ask(8, &Kind::Call), (4, vec![Order::Ask(4, 1)]));
+}
+
+#[test]
+fn what_finds_no_place_waits_and_robots_have_turns() {
+    let mut group = group(RULES, 1);
+    for _ in 0..5 {
+        group.ask(1, &Kind::Call);
+    }
+    group.ask(2, &Kind::Call);
+    let load = Load {
+        waiting: 4,
+        under_way: 2,
+    };
+    assert_eq!(group.load(), load);
+    // The greedy one's third, then the other's, then the rest.
+    let next = |group: &mut Dispatcher, ended| group.ended(ended, 1, End::Answered).1;
+    assert_eq!(next(&mut group, 1), [Order::Ask(3, 1)]);
+    assert_eq!(next(&mut group, 2), [Order::Ask(6, 1)]);
+    assert_eq!(next(&mut group, 3), [Order::Ask(4, 1)]);
+    // A servant that is added takes what waits.
+    assert_eq!(group.join(2), [Order::Ask(5, 2)]);
+}
+
+#[test]
+fn a_servant_carries_out_goals_of_one_robot_at_a_time() {
+    let mut group = group(RULES, 2);
+    assert_eq!(group.ask(1, &goal()).1, [Order::Ask(1, 1)]);
+    assert_eq!(group.ask(2, &goal()).1, [Order::Ask(2, 2)]);
+    assert_eq!(group.ask(3, &goal()).1, []);
+    // A robot's next goal goes where its goal is: the node knows what that means.
+    assert_eq!(group.ask(2, &goal()).1, [Order::Ask(4, 2)]);
+    assert_eq!(group.ended(2, 2, End::Answered).1, []);
+    assert_eq!(group.ended(4, 2, End::Answered).1, [Order::Ask(3, 2)]);
+    // Another action is another matter.
+    let other = Kind::Goal("/dock".into());
+    assert_eq!(group.ask(4, &other).1, [Order::Ask(5, 1)]);
+}
+
+#[test]
+fn what_a_lost_servant_had_fails_or_is_asked_again() {
+    let mut strict = group(RULES, 2);
+    strict.ask(1, &Kind::Call);
+    let orders = strict.leave(1);
+    let fails = [Order::Drop(1, 1), Order::Fail(1, Lost::NotAskedAgain)];
+    assert_eq!(orders, fails);
+    assert_eq!(strict.ended(1, 1, End::Answered), (false, vec![]), "late");
+
+    let rules = Rules {
+        idempotent: true,
+        ..RULES
+    };
+    let mut group = group(rules, 4);
+    group.ask(1, &Kind::Call);
+    assert_eq!(group.leave(1), [Order::Drop(1, 1), Order::Ask(1, 2)]);
+    assert_eq!(
+        group.ended(1, 2, End::Lost),
+        (false, vec![Order::Ask(1, 3)])
+    );
+    // It may be this request that ends them.
+    let (_, orders) = group.ended(1, 3, End::Lost);
+    assert_eq!(orders, [Order::Fail(1, Lost::AskedOften)]);
+}
+
+#[test]
+fn what_was_not_taken_waits_for_a_servant_that_takes_it() {
+    let mut group = group(RULES, 2);
+    group.ask(1, &Kind::Call);
+    assert_eq!(group.ended(1, 1, End::NotTaken).1, [Order::Ask(1, 2)]);
+    assert_eq!(group.ended(1, 2, End::NotTaken).1, []);
+    assert_eq!(group.load().waiting, 1);
+    assert_eq!(group.resume(1), [Order::Ask(1, 1)]);
+}
+
+#[test]
+fn of_replicas_the_first_answer_counts() {
+    let rules = Rules {
+        replicas: 2,
+        ..RULES
+    };
+    let mut group = group(rules, 1);
+    // There is one only.
+    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(1, 1)]);
+    group.join(2);
+    let (ticket, orders) = group.ask(1, &Kind::Call);
+    assert_eq!(orders, [Order::Ask(ticket, 2), Order::Ask(ticket, 1)]);
+    let answered = group.ended(ticket, 1, End::Answered);
+    assert_eq!(answered, (true, vec![Order::Drop(ticket, 2)]));
+    assert_eq!(group.ended(ticket, 2, End::Answered), (false, vec![]));
+    // One that is lost leaves it to the other; then it is asked again.
+    let (ticket, _) = group.ask(1, &Kind::Call);
+    assert_eq!(group.ended(ticket, 2, End::Lost), (false, vec![]));
+    let (_, orders) = group.ended(ticket, 1, End::Lost);
+    assert_eq!(orders.len(), 2, "{orders:?}");
+}
+
+#[test]
+fn a_retired_servant_ends_what_it_has_and_gets_no_more() {
+    let mut group = group(RULES, 2);
+    group.ask(1, &Kind::Call);
+    assert_eq!(group.retire(1), []);
+    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(2, 2)]);
+    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(3, 2)]);
+    assert_eq!(group.ask(1, &Kind::Call).1, [], "though it has a place");
+    assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
+    assert_eq!(group.load_of(1), 0);
+}
+
+/// What happens to a group. Numbers choose one of what there is, if there is any.
+#[derive(Debug, Clone)]
+enum Step {
+    Joins,
+    Leaves(usize),
+    Retires(usize),
+    Resumes(usize),
+    Asks { robot: Robot, action: usize },
+    Ends(usize, End),
+    Withdraws(usize),
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    let any = 0usize..64;
+    let end = prop_oneof![
+        6 => Just(End::Answered),
+        1 => Just(End::NotTaken),
+        1 => Just(End::Lost),
+    ];
+    prop_oneof![
+        2 => Just(Step::Joins),
+        1 => any.clone().prop_map(Step::Leaves),
+        1 => any.clone().prop_map(Step::Retires),
+        1 => any.clone().prop_map(Step::Resumes),
+        10 => (0u64..4, 0usize..4).prop_map(|(robot, action)| Step::Asks { robot, action }),
+        8 => (any.clone(), end).prop_map(|(which, end)| Step::Ends(which, end)),
+        1 => any.prop_map(Step::Withdraws),
+    ]
+}
+
+/// A request as its robot and the servants see it.
+#[derive(Debug)]
+struct Seen {
+    robot: Robot,
+    kind: Kind,
+    at: BTreeSet<Member>,
+    lost: usize,
+    over: bool,
+}
+
+/// The world around a dispatcher.
+struct World {
+    rules: Rules,
+    group: Dispatcher,
+    members: BTreeMap<Member, bool>,
+    joined: Member,
+    paused: BTreeSet<Member>,
+    seen: BTreeMap<Ticket, Seen>,
+}
+
+impl World {
+    fn carry_out(&mut self, orders: Vec<Order>) {
+        for order in orders {
+            match order {
+                Order::Ask(ticket, member) => {
+                    assert_eq!(self.members.get(&member), Some(&false), "it is asked");
+                    assert!(!self.paused.contains(&member), "it does not take any");
+                    let seen = self.seen.get_mut(&ticket).expect("asked for");
+                    assert!(!seen.over, "{ticket} is over");
+                    assert!(seen.at.insert(member), "{ticket} is there already");
+                    assert!(seen.lost == 0 || self.rules.idempotent, "asked again");
+                    assert!(seen.lost < ATTEMPTS);
+                }
+                Order::Drop(ticket, member) => {
+                    self.seen
+                        .get_mut(&ticket)
+                        .expect("asked for")
+                        .at
+                        .remove(&member);
+                }
+                Order::Fail(ticket, why) => {
+                    let seen = self.seen.get_mut(&ticket).expect("asked for");
+                    assert!(!seen.over && seen.at.is_empty() && seen.lost > 0);
+                    assert_eq!(why == Lost::NotAskedAgain, !self.rules.idempotent);
+                    seen.over = true;
+                }
+            }
+        }
+    }
+
+    fn takes(&mut self, step: Step) {
+        match step {
+            Step::Joins if self.members.len() < 6 => {
+                self.joined += 1;
+                self.members.insert(self.joined, false);
+                let orders = self.group.join(self.joined);
+                self.carry_out(orders);
+            }
+            Step::Joins => {}
+            Step::Leaves(which) => {
+                let Some(member) = nth(self.members.keys(), which) else {
+                    return;
+                };
+                self.members.remove(&member);
+                self.paused.remove(&member);
+                for seen in self
+                    .seen
+                    .values_mut()
+                    .filter(|seen| seen.at.contains(&member))
+                {
+                    seen.lost += 1;
+                }
+                let orders = self.group.leave(member);
+                self.carry_out(orders);
+            }
+            Step::Retires(which) => {
+                if let Some(member) = nth(self.members.keys(), which) {
+                    self.members.insert(member, true);
+                    let orders = self.group.retire(member);
+                    self.carry_out(orders);
+                }
+            }
+            Step::Resumes(which) => {
+                if let Some(member) = nth(self.paused.iter(), which) {
+                    self.paused.remove(&member);
+                    let orders = self.group.resume(member);
+                    self.carry_out(orders);
+                }
+            }
+            Step::Asks { robot, action } => {
+                let kind = match action {
+                    0 | 1 => Kind::Call,
+                    number => Kind::Goal(format!("/{number}").into()),
+                };
+                let (ticket, orders) = self.group.ask(robot, &kind);
+                let seen = Seen {
+                    robot,
+                    kind,
+                    at: BTreeSet::new(),
+                    lost: 0,
+                    over: false,
+                };
+                assert!(self.seen.insert(ticket, seen).is_none(), "given twice");
+                self.carry_out(orders);
+            }
+            Step::Ends(which, end) => {
+                let works = self.seen.iter();
+                let works =
+                    works.flat_map(|(ticket, seen)| seen.at.iter().map(|at| (*ticket, *at)));
+                let works: Vec<_> = works.collect();
+                let Some((ticket, member)) = works.get(which % works.len().max(1)).copied() else {
+                    return;
+                };
+                let seen = self.seen.get_mut(&ticket).expect("asked for");
+                seen.at.remove(&member);
+                match end {
+                    End::NotTaken => drop(self.paused.insert(member)),
+                    End::Lost => seen.lost += 1,
+                    End::Answered => {
+                        assert!(!seen.over, "answered twice");
+                        seen.over = true;
+                    }
+                }
+                let (counts, orders) = self.group.ended(ticket, member, end);
+                assert_eq!(counts, end == End::Answered);
+                self.carry_out(orders);
+            }
+            Step::Withdraws(which) => {
+                let open = self.seen.iter().filter(|(_, seen)| !seen.over);
+                let Some(ticket) = nth(open.map(|(ticket, _)| ticket), which) else {
+                    return;
+                };
+                self.seen.get_mut(&ticket).expect("asked for").over = true;
+                let orders = self.group.withdraw(ticket);
+                self.carry_out(orders);
+            }
+        }
+    }
+
+    fn holds(&self) {
+        let open: Vec<&Seen> = self.seen.values().filter(|seen| !seen.over).collect();
+        for seen in self.seen.values().filter(|seen| seen.over) {
+            assert!(seen.at.is_empty(), "nobody waits for it");
+        }
+        let able = |member: &&Member| !self.members[*member] && !self.paused.contains(*member);
+        for member in self.members.keys() {
+            let here: Vec<&&Seen> = open
+                .iter()
+                .filter(|seen| seen.at.contains(member))
+                .collect();
+            assert_eq!(self.group.load_of(*member), here.len());
+            let calls = here.iter().filter(|seen| seen.kind == Kind::Call).count();
+            assert!(calls <= self.rules.window, "{calls} calls");
+            for seen in &here {
+                let crosses = |other: &&&Seen| other.kind == seen.kind && other.robot != seen.robot;
+                let goal = seen.kind != Kind::Call;
+                assert!(!goal || !here.iter().any(crosses), "of two robots");
+            }
+        }
+        let waiting = open.iter().filter(|seen| seen.at.is_empty());
+        let count = waiting.clone().count();
+        assert_eq!(self.group.load().waiting, count);
+        assert_eq!(self.group.load().under_way, open.len() - count);
+        // Nothing waits for what could be asked.
+        for seen in waiting {
+            let able: Vec<&Member> = self.members.keys().filter(able).collect();
+            let free = able.iter().filter(|member| {
+                let mut here = open.iter().filter(|other| other.at.contains(**member));
+                match seen.kind {
+                    Kind::Call => {
+                        here.filter(|other| other.kind == Kind::Call).count() < self.rules.window
+                    }
+                    _ => here.all(|other| other.kind != seen.kind || other.robot == seen.robot),
+                }
+            });
+            let wanted = match seen.kind {
+                Kind::Call => self.rules.replicas.min(able.len()).max(1),
+                _ => 1,
+            };
+            assert!(free.count() < wanted, "{seen:?} waits");
+        }
+        for seen in &open {
+            let most = if seen.kind == Kind::Call {
+                self.rules.replicas
+            } else {
+                1
+            };
+            assert!(seen.at.len() <= most);
+        }
+    }
+}
+
+fn nth<'a>(keys: impl Iterator<Item = &'a u64>, which: usize) -> Option<u64> {
+    let keys: Vec<u64> = keys.copied().collect();
+    keys.get(which % keys.len().max(1)).copied()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(300) })]
+    #[test]
+    fn each_request_is_answered_once_or_fails_with_a_reason_and_none_crosses_robots(
+        steps in prop::collection::vec(step(), 1..150),
+        window in 1usize..4,
+        replicas in 1usize..4,
+        idempotent: bool,
+    ) {
+        let idempotent = idempotent || replicas > 1;
+        let rules = Rules { window, replicas, idempotent };
+        let mut world = World {
+            rules,
+            group: Dispatcher::new(rules),
+            members: BTreeMap::new(),
+            joined: 0,
+            paused: BTreeSet::new(),
+            seen: BTreeMap::new(),
+        };
+        for step in steps {
+            world.takes(step);
+            world.holds();
+        }
+        // With a servant that works, everything ends.
+        while let Some(member) = world.members.keys().next().copied() {
+            world.takes(Step::Leaves(0));
+            prop_assert!(!world.members.contains_key(&member));
+        }
+        world.takes(Step::Joins);
+        for _ in 0..world.seen.len() {
+            world.takes(Step::Ends(0, End::Answered));
+            world.holds();
+        }
+        prop_assert!(world.seen.values().all(|seen| seen.over));
+        prop_assert_eq!(world.group.load(), Load::default());
+    }
+}
