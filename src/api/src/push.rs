@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::grants::Grants;
+use crate::group::Shared;
 use crate::limits::{Caps, Limits};
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
@@ -63,6 +64,9 @@ pub struct PushOptions {
     /// They do not, says the deployer: the push does not ask.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub stateless: bool,
+    /// Robots share its servants; none: each robot has a servant of its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shared: Option<Shared>,
     /// What was pushed, in words, kept with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,

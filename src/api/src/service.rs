@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
+use crate::group::{Group, Shared};
 use crate::interface::Interface;
 use crate::limits::Limits;
 
@@ -50,6 +51,12 @@ pub struct ServiceDetail {
     pub nodes: Vec<Node>,
     /// The current revision's interface.
     pub interface: Interface,
+    /// Robots share servants of the current revision so; none: each has a servant of its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shared: Option<Shared>,
+    /// Servants that robots share now, of each revision that has any.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub groups: Vec<Group>,
 }
 
 /// One push that succeeded.

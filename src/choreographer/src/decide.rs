@@ -16,6 +16,7 @@
 //! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
 //! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
 //! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
+//! | [`group`] | how many servants answer the robots that share a service | their requests, how long these take, bounds, the time |
 //! | [`warm_pool`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
 //! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
 //!
@@ -29,6 +30,7 @@ pub(crate) mod capacity;
 pub mod controller;
 pub(crate) mod demand;
 pub(crate) mod fit;
+pub(crate) mod group;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;
 pub(crate) mod placement;

@@ -61,7 +61,7 @@ impl Life {
         }
     }
 
-    fn is_over(&self) -> bool {
+    pub(crate) fn is_over(&self) -> bool {
         self.failure.is_some() || self.phase >= Phase::Draining
     }
 }

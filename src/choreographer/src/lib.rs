@@ -72,7 +72,7 @@ pub use options::{Class, DEFAULT_CLASS, Options};
 pub use request::ServantRequest;
 
 use decide::admission::Ask;
-use decide::placement::Placement;
+use decide::placement::{Placement, place};
 use handle::Anew;
 use lives::Inner;
 use lives::driver::{self, Beginning};
@@ -115,6 +115,7 @@ impl Choreographer {
             moves: AtomicU64::new(0),
             servants: Mutex::default(),
             warm_pool: WarmPool::default(),
+            groups: Default::default(),
             incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
         };
@@ -142,7 +143,14 @@ impl Choreographer {
             }
             let terms = inner.terms(&request.statement(), &revision);
             let has = servants.given.get(&key).map(|handle| inner.facts(handle));
-            let (placement, warm) = inner.warm_pool.place(has.as_ref(), &revision);
+            let (placement, warm) = match revision.plan.shared {
+                None => inner.warm_pool.place(has.as_ref(), &revision),
+                // A place in a group needs no container.
+                Some(_) => (
+                    place(has.as_ref(), None, revision.number, &revision.image),
+                    None,
+                ),
+            };
             let ends = match placement {
                 Placement::Keep(id) => {
                     let lease = Lease::new(Arc::clone(&servants.all[id]));

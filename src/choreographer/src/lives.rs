@@ -7,6 +7,7 @@ pub(crate) mod capture;
 pub(crate) mod controller;
 pub(crate) mod driver;
 mod fit;
+pub(crate) mod group;
 mod lifetime;
 pub(crate) mod limits;
 mod nodes;
@@ -35,6 +36,7 @@ use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
 use recent::Recent;
+use group::Groups;
 use waiting::Admission;
 use warm_pool::WarmPool;
 
@@ -54,6 +56,7 @@ pub(crate) struct Inner {
     pub(crate) memory: SharedMemory,
     pub(crate) servants: Mutex<Servants>,
     pub(crate) warm_pool: WarmPool,
+    pub(crate) groups: Groups,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,

@@ -6,6 +6,7 @@ use super::*;
 use store::{Plan, RevisionRecord, State};
 
 mod controller;
+mod groups;
 mod servants;
 mod terms;
 

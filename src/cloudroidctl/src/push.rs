@@ -2,6 +2,7 @@
 
 mod archive;
 mod progress;
+mod shared;
 
 use std::path::PathBuf;
 
@@ -13,6 +14,7 @@ use hyper::Method;
 use crate::client::{self, Client, escaped};
 use crate::limits::{CapFlags, LimitFlags};
 use crate::output::Format;
+use crate::push::shared::SharedFlags;
 use crate::services;
 use progress::Progress;
 
@@ -68,6 +70,8 @@ pub struct Push {
     /// stands alone where the push would ask.
     #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true", value_name = "BOOL")]
     stateful: Option<bool>,
+    #[command(flatten)]
+    shared: SharedFlags,
     #[command(flatten)]
     limits: LimitFlags,
     #[command(flatten)]
@@ -192,6 +196,7 @@ impl Push {
             },
             stateful: self.stateful == Some(true),
             stateless: self.stateful == Some(false),
+            shared: self.shared.asked(),
             source,
         })
     }

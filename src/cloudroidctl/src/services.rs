@@ -1,6 +1,6 @@
 //! `services`: what is published.
 
-use api::{ServiceDetail, ServiceSummary};
+use api::{Group, ServiceDetail, ServiceSummary, Shared};
 
 use crate::client::{Client, escaped};
 use crate::output::{self, Format, Table};
@@ -122,6 +122,12 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
             revision.image.chars().take("sha256:".len() + 12).collect(),
         ]);
     }
+    if let Some(shared) = &service.shared {
+        output::line(&shared_in_words(shared))?;
+    }
+    for group in &service.groups {
+        output::line(&group_in_words(group))?;
+    }
     for table in [
         &nodes,
         &topics,
@@ -137,6 +143,46 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+fn shared_in_words(shared: &Shared) -> String {
+    let mut words = format!("robots share {} to {} servants", shared.min, shared.max);
+    if shared.replicas > 1 {
+        words += &format!(", {} at each call", shared.replicas);
+    } else if shared.idempotent {
+        words += ", requests are asked again";
+    }
+    words
+}
+
+fn group_in_words(group: &Group) -> String {
+    let Group {
+        revision,
+        robots,
+        answered,
+        failed,
+        asked_again,
+        wasted,
+        waiting,
+        ..
+    } = group;
+    let ready = group
+        .servants
+        .iter()
+        .filter(|one| one.ready && !one.retiring)
+        .count();
+    let under_way: usize = group.servants.iter().map(|one| one.under_way).sum();
+    let mut words = format!(
+        "revision {revision}: {robots} robots at {ready} of {} servants; {under_way} requests under way, {waiting} waiting; {answered} answered, {failed} failed, {asked_again} asked again",
+        group.servants.len()
+    );
+    if *wasted > 0 {
+        words += &format!("; {wasted} of {} answers wasted", answered + wasted);
+    }
+    if let Some(mean) = group.mean_ms {
+        words += &format!("; {mean:.1} ms in the mean");
+    }
+    words
 }
 
 fn shortened(value: &serde_json::Value) -> String {

@@ -34,6 +34,7 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
         [(String::new(), services.len() as f64)],
     );
     servants(&mut out, &app.choreographer);
+    shared(&mut out, &app.choreographer, &services);
     let (pushes, failed) = app.pusher.counts();
     family(
         &mut out,
@@ -69,6 +70,48 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
         .prometheus(&mut out, exists);
     usage(&mut out, &app.choreographer.servants()).await;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], out).into_response())
+}
+
+/// What robots share.
+fn shared(out: &mut String, choreographer: &Choreographer, services: &[String]) {
+    let (mut requests, mut waiting, mut ready) = (Vec::new(), Vec::new(), Vec::new());
+    for service in services {
+        for group in choreographer.groups(service) {
+            let revision = group.revision.to_string();
+            let of = [("service", service.as_str()), ("revision", &revision)];
+            for (outcome, count) in [
+                ("answered", group.answered),
+                ("failed", group.failed),
+                ("asked_again", group.asked_again),
+                ("wasted", group.wasted),
+            ] {
+                let of = labels(&[of[0], of[1], ("outcome", outcome)]);
+                requests.push((of, count as f64));
+            }
+            waiting.push((labels(&of), group.waiting as f64));
+            let count = group.servants.iter().filter(|one| one.ready).count();
+            ready.push((labels(&of), count as f64));
+        }
+    }
+    family(
+        out,
+        "cloudroid_shared_requests_total",
+        "counter",
+        "Requests to servants that robots share, by what became of them; wasted: work of replicas that nobody needed.",
+        requests,
+    );
+    gauge(
+        out,
+        "cloudroid_shared_waiting",
+        "Requests that wait for a servant that robots share.",
+        waiting,
+    );
+    gauge(
+        out,
+        "cloudroid_shared_servants",
+        "Servants that robots share and that answer.",
+        ready,
+    );
 }
 
 fn servants(out: &mut String, choreographer: &Choreographer) {

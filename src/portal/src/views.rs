@@ -59,6 +59,8 @@ pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
             })
             .collect(),
         interface: interface(&current.interface),
+        shared: current.plan.shared,
+        groups: app.choreographer.groups(name),
     })
 }
 

@@ -23,6 +23,7 @@ mod publish;
 mod receive;
 mod request;
 mod stateful;
+mod shared;
 mod supplement;
 
 use std::path::{Path, PathBuf};
@@ -226,6 +227,9 @@ impl Pusher {
                 report.warning(question).await;
             }
         }
+        if plan.shared.is_some() {
+            shared::check_interface(&interface)?;
+        }
         let record = RevisionRecord {
             service: name.clone(),
             number: 0,
@@ -317,6 +321,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
         // A launch file says itself which nodes come again.
         restart: options.launch.is_none(),
         stateful: options.stateful,
+        shared: options.shared,
     }
 }
 

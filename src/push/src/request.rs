@@ -12,7 +12,7 @@ use store::NewEvent;
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::{Archive, Error, Pusher, receive};
+use super::{Archive, Error, Pusher, receive, shared};
 
 /// Tells the client what is being done. It may have gone away: that cancels the push by itself.
 #[derive(Clone)]
@@ -95,6 +95,7 @@ impl Pusher {
             .map_err(|error| Error::Options(error.to_string()))?;
         check_caps(options).map_err(Error::Options)?;
         self.choreographer.check_grants(&options.grants)?;
+        shared::check_options(options)?;
         Ok(self.choreographer.check_limits(&options.limits)?)
     }
 

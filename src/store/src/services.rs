@@ -75,6 +75,9 @@ pub struct Plan {
     /// Answers depend on earlier requests: stubs are told.
     #[serde(default)]
     pub stateful: bool,
+    /// Robots share its servants; none: each robot has a servant of its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shared: Option<api::Shared>,
 }
 
 impl State {

@@ -14,7 +14,7 @@ use super::lifetime::{interface_there, unneeded};
 use super::nodes::Nodes;
 use super::waiting::Permit;
 use super::warm_pool::{self, Warm};
-use super::{Inner, starting};
+use super::{Inner, group, starting};
 use crate::decide::admission::Ask;
 use crate::handle::{Failure, Handle};
 use crate::with_last_words;
@@ -109,6 +109,9 @@ async fn live(
     beginning: &mut Beginning,
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
+    if let Some(rules) = handle.revision.plan.shared.filter(|_| handle.is_place()) {
+        return group::sit(inner, handle, rules).await;
+    }
     let (container, reach, fresh) = match beginning {
         Beginning::Asked(warm) => {
             let permit = tokio::select! {

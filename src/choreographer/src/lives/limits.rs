@@ -84,6 +84,11 @@ impl Inner {
             terms,
             ..before.clone()
         };
+        if handle.is_place() {
+            // It has no container; what it wishes of its SLA, the group heeds.
+            handle.set_asked(after);
+            return Ok(());
+        }
         let (earlier, told) = (before.limits(), after.terms.clone());
         let change = changed(&earlier, &after.limits());
         if let (Some(wanted), Some(container)) = (change.memory, handle.container())

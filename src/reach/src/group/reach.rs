@@ -2,7 +2,6 @@
 
 use std::sync::{Arc, Weak};
 
-use api::trial::Trial;
 use async_trait::async_trait;
 use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use link::session::Lost;
@@ -13,7 +12,7 @@ use tokio::sync::watch;
 
 use super::Group;
 use crate::links::LinkStatus;
-use crate::trial::{self, Material};
+use crate::trial::{self, Material, Pace, Replay};
 use crate::{Error, Reach, Stream, Tenant};
 
 /// One robot's place in a group: a bridge of its own, so that its clients share what rosbridge has for clients of one robot,
@@ -66,13 +65,14 @@ impl Reach for Seat {
         self.bridge.metrics()
     }
 
-    async fn trial(
+    async fn replay(
         &self,
         service: &str,
         interface: &Interface,
-        material: Material,
-    ) -> Result<Trial, Error> {
-        trial::attempt(&self.bus, service, interface, material).await
+        material: &Material,
+        pace: &Pace,
+    ) -> Result<Replay, Error> {
+        trial::replay(&self.bus, service, interface, material, pace).await
     }
 
     fn bind(&self, _tenant: Weak<dyn Tenant>) {}

@@ -174,6 +174,23 @@ fn detail() -> ServiceDetail {
                 nodes: all("/n"),
             }],
         },
+        shared: Some(api::Shared::default()),
+        groups: vec![api::Group {
+            revision: 1,
+            robots: 2,
+            servants: vec![api::GroupServant {
+                id: "x-1".into(),
+                ready: true,
+                retiring: false,
+                under_way: 1,
+            }],
+            waiting: 0,
+            answered: 1,
+            failed: 0,
+            asked_again: 0,
+            wasted: 0,
+            mean_ms: Some(1.5),
+        }],
     }
 }
 
@@ -206,6 +223,7 @@ fn options() -> PushOptions {
         },
         stateful: true,
         stateless: true,
+        shared: Some(api::Shared::default()),
         source: "--apt x".into(),
     }
 }

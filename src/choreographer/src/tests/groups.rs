@@ -1,0 +1,318 @@
+//! Services that robots share, told with the engine in memory.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::AtomicUsize;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use futures_util::future::join_all;
+use in_memory::Process;
+use ros::bus::{Bus, BusError, ServiceHandler};
+use tokio::sync::Semaphore;
+
+use super::servants::World;
+use super::*;
+
+const LONG: Duration = Duration::from_secs(600);
+
+/// Answers what it was asked, with its servant's id; each answer takes a permit.
+struct Echo {
+    servant: String,
+    answers: Arc<Semaphore>,
+    asked: Arc<AtomicUsize>,
+}
+
+#[async_trait]
+impl ServiceHandler for Echo {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        self.asked.fetch_add(1, Ordering::SeqCst);
+        self.answers.acquire().await.expect("open").forget();
+        let request = String::from_utf8_lossy(&request);
+        Ok(format!("{request} {}", self.servant).into())
+    }
+}
+
+/// A world in which `/echo` can be called, as often as there are permits.
+struct Shop {
+    world: World,
+    answers: Arc<Semaphore>,
+    asked: Arc<AtomicUsize>,
+}
+
+impl Shop {
+    fn new(shared: api::Shared) -> Shop {
+        let world = World::new();
+        let (answers, asked) = (Arc::new(Semaphore::new(0)), Arc::<AtomicUsize>::default());
+        let (gives, counts) = (Arc::clone(&answers), Arc::clone(&asked));
+        world.engine.program("/echo", move |process: Process| {
+            let echo = Echo {
+                servant: process.servant().to_owned(),
+                answers: Arc::clone(&gives),
+                asked: Arc::clone(&counts),
+            };
+            async move {
+                let _served = process.serve("/echo", "x_msgs/Echo", Arc::new(echo)).await;
+                std::future::pending().await
+            }
+        });
+        world.publish("echo", "/echo", |record| {
+            let service = serde_json::json!({ "name": "/echo", "type": "x_msgs/Echo", "md5": "*" });
+            record.interface.topics.clear();
+            record.interface.services = vec![serde_json::from_value(service).expect("a service")];
+            record.plan.shared = Some(shared);
+            record.plan.limits.cpus = Some(0.1);
+        });
+        Shop {
+            world,
+            answers,
+            asked,
+        }
+    }
+}
+
+impl Shop {
+    /// Ends a servant as a failing machine would; comes back when the group knows.
+    async fn loses(&self, servant: &str) {
+        let container = self.world.engine.servant(servant).expect("it runs");
+        container.fail("its power went");
+        while self.world.told("shared-servant-lost").is_empty() {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    }
+}
+
+/// A robot that has come.
+async fn robot(daemon: &Choreographer, name: &str) -> (Lease, Arc<dyn Bus>) {
+    let lease = daemon
+        .ensure(ServantRequest::new("echo", name))
+        .expect("a lease");
+    let bus = lease.ready().await.expect("ready").bus();
+    (lease, bus)
+}
+
+async fn call(bus: &Arc<dyn Bus>, words: &str) -> Result<String, String> {
+    let answer = bus.call("/echo", Bytes::from(words.to_owned()), LONG).await;
+    let answer = answer.map_err(|error: BusError| error.to_string())?;
+    Ok(String::from_utf8_lossy(&answer).into_owned())
+}
+
+/// Waits until the group is so.
+async fn until(daemon: &Choreographer, is: impl Fn(&api::Group) -> bool) -> api::Group {
+    loop {
+        let groups = daemon.groups("echo");
+        if let Some(group) = groups.into_iter().find(|group| is(group)) {
+            return group;
+        }
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+fn ready(group: &api::Group) -> usize {
+    group
+        .servants
+        .iter()
+        .filter(|servant| servant.ready)
+        .count()
+}
+
+#[tokio::test(start_paused = true)]
+async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() {
+    let shop = Shop::new(api::Shared {
+        min: 2,
+        max: 2,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon();
+    let robots = (0..20).map(|number| {
+        let daemon = daemon.clone();
+        async move { robot(&daemon, &format!("r{number}")).await }
+    });
+    let robots = join_all(robots).await;
+    let group = until(&daemon, |group| ready(group) == 2).await;
+    assert_eq!((group.robots, shop.world.engine.servants().len()), (20, 2));
+    let calls = robots.iter().enumerate().flat_map(|(number, (_, bus))| {
+        (0..5).map(move |call| (format!("r{number} c{call}"), Arc::clone(bus)))
+    });
+    let calls = calls.map(|(words, bus)| async move { (call(&bus, &words).await, words) });
+    let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
+    // Some are answered, some under way, the others wait.
+    shop.answers.add_permits(30);
+    until(&daemon, |group| group.answered == 30).await;
+    let victim = &shop.world.engine.servants()[0];
+    let container = shop.world.engine.servant(victim).expect("it runs");
+    container.fail("its power went");
+    until(&daemon, |group| ready(group) == 2 && group.failed > 0).await;
+    shop.answers.add_permits(1000);
+    let answers = calls.await.expect("no panic");
+    let mut failed = 0;
+    let mut by: BTreeMap<String, usize> = BTreeMap::new();
+    for (answer, words) in answers {
+        match answer {
+            Ok(answer) => {
+                let (said, servant) = answer.rsplit_once(' ').expect("words");
+                assert_eq!(said, words, "it is another's");
+                *by.entry(servant.to_owned()).or_default() += 1;
+            }
+            Err(reason) => {
+                assert!(
+                    reason.contains(victim) && reason.contains("--idempotent"),
+                    "{reason}"
+                );
+                assert!(reason.contains("SIGKILL"), "{reason}");
+                failed += 1;
+            }
+        }
+    }
+    // What the lost one had; nothing of what waited.
+    assert_eq!(failed, 8);
+    assert_eq!(by.values().sum::<usize>(), 92);
+    assert_eq!(by.len(), 3, "{by:?}");
+    assert_eq!(shop.asked.load(Ordering::SeqCst), 100);
+    assert_eq!(shop.world.told("shared-servant-lost").len(), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_lost_servant_had_is_asked_again_where_that_may_be() {
+    let shop = Shop::new(api::Shared {
+        min: 2,
+        max: 2,
+        idempotent: true,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon();
+    let (_lease, bus) = robot(&daemon, "r1").await;
+    until(&daemon, |group| ready(group) == 2).await;
+    let calls = (0..10).map(|number| {
+        let bus = Arc::clone(&bus);
+        async move { call(&bus, &number.to_string()).await }
+    });
+    let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
+    until(&daemon, |group| {
+        group.servants.iter().all(|it| it.under_way == 5)
+    })
+    .await;
+    let victim = &shop.world.engine.servants()[0];
+    shop.loses(victim).await;
+    shop.answers.add_permits(100);
+    for answer in calls.await.expect("no panic") {
+        assert!(answer.is_ok(), "{answer:?}");
+    }
+    let group = until(&daemon, |_| true).await;
+    assert_eq!(
+        (group.answered, group.failed, group.asked_again),
+        (10, 0, 5)
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_group_grows_under_load_and_shrinks_after_it() {
+    let shop = Shop::new(api::Shared {
+        max: 3,
+        calls: 2,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon();
+    let (lease, bus) = robot(&daemon, "r1").await;
+    assert_eq!(shop.world.engine.servants().len(), 1);
+    let calls = (0..20).map(|number| {
+        let bus = Arc::clone(&bus);
+        async move { call(&bus, &number.to_string()).await }
+    });
+    let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
+    let group = until(&daemon, |group| ready(group) == 3).await;
+    assert_eq!(group.waiting, 14, "each works at two");
+    let grown = shop.world.told("shared-servant");
+    assert!(
+        grown[1].contains("requests at a time are many"),
+        "{grown:?}"
+    );
+    shop.answers.add_permits(100);
+    assert!(calls.await.expect("no panic").iter().all(Result::is_ok));
+    until(&daemon, |group| group.servants.len() == 1).await;
+    let shrunk = shop.world.told("shared-servant-retires");
+    assert_eq!(shrunk.len(), 2, "{shrunk:?}");
+    // The last one works until the robot stays away.
+    assert!(call(&bus, "still").await.is_ok());
+    drop(lease);
+    while !shop.world.engine.servants().is_empty() {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    assert!(daemon.groups("echo").is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
+    let shop = Shop::new(api::Shared {
+        min: 2,
+        max: 2,
+        replicas: 2,
+        idempotent: true,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon();
+    let (_lease, bus) = robot(&daemon, "r1").await;
+    until(&daemon, |group| ready(group) == 2).await;
+    let calls = tokio::spawn({
+        let bus = Arc::clone(&bus);
+        async move { call(&bus, "one").await }
+    });
+    while shop.asked.load(Ordering::SeqCst) < 2 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    shop.answers.add_permits(1);
+    assert!(calls.await.expect("no panic").is_ok());
+    // One hangs for ever, and ends: nobody notices.
+    let calls = tokio::spawn({
+        let bus = Arc::clone(&bus);
+        async move { call(&bus, "two").await }
+    });
+    until(&daemon, |group| {
+        group.servants.iter().all(|it| it.under_way == 1)
+    })
+    .await;
+    let victim = &shop.world.engine.servants()[0];
+    shop.loses(victim).await;
+    shop.answers.add_permits(100);
+    assert!(calls.await.expect("no panic").is_ok());
+    let group = until(&daemon, |group| group.answered == 2).await;
+    assert_eq!((group.failed, group.asked_again, group.wasted), (0, 0, 1));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_group_that_does_not_start_says_why_and_is_started_anew() {
+    let shop = Shop::new(api::Shared::default());
+    shop.world
+        .engine
+        .breaks("sha256:echo", "the registry is away");
+    let daemon = shop.world.daemon();
+    let lease = daemon
+        .ensure(ServantRequest::new("echo", "r1"))
+        .expect("a lease");
+    let refused = lease
+        .ready()
+        .await
+        .err()
+        .expect("it cannot start")
+        .to_string();
+    assert!(refused.contains("the registry is away"), "{refused}");
+    lease.handle().ended().await;
+    let lease = daemon
+        .ensure(ServantRequest::new("echo", "r1"))
+        .expect("a lease");
+    assert!(lease.ready().await.is_err(), "it was tried again");
+    assert_eq!(shop.world.engine.started().len(), 2);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_daemon_that_comes_after_uses_the_servants_that_are_there() {
+    let shop = Shop::new(api::Shared::default());
+    let first = shop.world.daemon();
+    let (_lease, _bus) = robot(&first, "r1").await;
+    let servants = shop.world.engine.servants();
+    let second = shop.world.daemon();
+    assert_eq!(second.adopt().await.expect("adopted"), 1);
+    let (_lease, bus) = robot(&second, "r1").await;
+    shop.answers.add_permits(1);
+    assert!(call(&bus, "again").await.is_ok());
+    assert_eq!(shop.world.engine.servants(), servants);
+}

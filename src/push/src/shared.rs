@@ -1,0 +1,101 @@
+//! What a push must be for robots to share the service.
+
+use api::PushOptions;
+use package::interface::Interface;
+use reach::group::shareable;
+
+use crate::Error;
+
+/// Servants of one service at most, and calls of one servant.
+const MOST: u32 = 64;
+
+/// Refuses numbers of servants that contradict each other.
+pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
+    let Some(shared) = &options.shared else {
+        return Ok(());
+    };
+    let refused = |words: String| Err(Error::Options(words));
+    if options.stateful {
+        return refused(
+            "--stateful and --shared exclude each other: answers that depend on earlier requests depend on other robots' requests where robots share a servant".to_owned(),
+        );
+    }
+    let (min, max) = (shared.min, shared.max);
+    if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
+        return refused(format!(
+            "--min {min} and --max {max} should be 1 <= MIN <= MAX <= {MOST}"
+        ));
+    }
+    if !(1..=max).contains(&shared.replicas) {
+        return refused(format!(
+            "--replicas {} should be between 1 and --max, which is {max}",
+            shared.replicas
+        ));
+    }
+    if !(1..=MOST).contains(&shared.calls) {
+        return refused(format!(
+            "--calls {} should be between 1 and {MOST}",
+            shared.calls
+        ));
+    }
+    Ok(())
+}
+
+/// Refuses an interface that robots cannot share, with what was found.
+pub(crate) fn check_interface(interface: &Interface) -> Result<(), Error> {
+    shareable::check(interface).map_err(|error| Error::Failed {
+        message: error.to_string(),
+        next: Some(
+            "push it without --shared, then each robot has a servant of its own; or push only the nodes that answer services and actions, with --node".to_owned(),
+        ),
+        log: Vec::new(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use api::Shared;
+
+    use super::*;
+
+    #[test]
+    fn numbers_that_contradict_each_other_are_refused() {
+        let check = |shared: Shared, stateful| {
+            let options = PushOptions {
+                shared: Some(shared),
+                stateful,
+                ..PushOptions::default()
+            };
+            check_options(&options).err().map(|error| error.to_string())
+        };
+        let fine = Shared::default();
+        assert_eq!(check(fine, false), None);
+        for (shared, stateful, expected) in [
+            (fine, true, "--stateful and --shared"),
+            (Shared { min: 0, ..fine }, false, "--min 0"),
+            (Shared { min: 5, ..fine }, false, "--max 4"),
+            (Shared { max: 65, ..fine }, false, "--max 65"),
+            (
+                Shared {
+                    replicas: 0,
+                    ..fine
+                },
+                false,
+                "--replicas 0",
+            ),
+            (
+                Shared {
+                    replicas: 5,
+                    ..fine
+                },
+                false,
+                "--replicas 5",
+            ),
+            (Shared { calls: 0, ..fine }, false, "--calls 0"),
+        ] {
+            let refused = check(shared, stateful).expect("refused");
+            assert!(refused.contains(expected), "{refused}");
+        }
+        assert!(check_options(&PushOptions::default()).is_ok());
+    }
+}
