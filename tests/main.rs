@@ -60,6 +60,8 @@ mod readiness;
 mod refusals;
 #[path = "stories/shadowing.rs"]
 mod shadowing;
+#[path = "stories/sharing.rs"]
+mod sharing;
 #[path = "stories/survival.rs"]
 mod survival;
 #[path = "stories/tls.rs"]
@@ -268,6 +270,13 @@ fn main() -> ExitCode {
             two_sockets_of_one_robot_share_its_servant,
             nobody_takes_over_anothers_robot,
             an_answer_waits_for_one_big_message_at_most,
+        ],
+        stories![sharing:
+            twenty_robots_share_two_servants_and_one_of_these_is_killed,
+            a_shared_service_grows_under_load_and_shrinks_after_it,
+            goals_of_robots_do_not_meet,
+            what_robots_cannot_share_is_refused_with_what_was_found,
+            of_two_replicas_the_first_answers_and_the_cost_is_shown,
         ],
         stories![survival:
             what_cannot_be_removed_keeps_no_daemon_down,

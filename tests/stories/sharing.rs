@@ -1,0 +1,276 @@
+//! Services that robots share: their requests are spread over servants, and none sees another's.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::{Value, json};
+use support::Verdict;
+use support::daemon::Daemon;
+use support::robot::Robot;
+use support::world::world;
+
+const SERVICE: &str = "sharer_cpp";
+
+fn pushed(home: &str, config: &str, arguments: &[&str]) -> anyhow::Result<Daemon> {
+    let daemon = world().own(home).config(config).start()?;
+    let arguments = [&["--node", "sharer", "--shared"], arguments].concat();
+    daemon.deployer().pushes(SERVICE, &arguments)?.succeeded()?;
+    Ok(daemon)
+}
+
+fn robot(daemon: &Daemon, name: &str) -> anyhow::Result<Robot> {
+    daemon.robot(&format!("{SERVICE}?robot={name}"))
+}
+
+/// The group, once it is so.
+fn group(daemon: &Daemon, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+    daemon.awaits(&format!("/api/v1/services/{SERVICE}"), what, |service| {
+        service["groups"]
+            .as_array()?
+            .iter()
+            .find(|group| is(group))
+            .cloned()
+    })
+}
+
+fn ready(group: &Value) -> usize {
+    let servants = group["servants"].as_array();
+    servants.map_or(0, |all| {
+        all.iter().filter(|one| one["ready"] == true).count()
+    })
+}
+
+/// Ends a servant as a failing machine would.
+fn fails(daemon: &Daemon, id: &str) -> Verdict {
+    let runtime = daemon.home.join("servants").join(id).join("runtime.json");
+    let runtime: Value = serde_json::from_slice(&std::fs::read(runtime)?)?;
+    let shim = runtime["shim"]["pid"].as_i64().context("the shim's pid")?;
+    Ok(kill(Pid::from_raw(shim as i32), Signal::SIGKILL)?)
+}
+
+pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed() -> Verdict {
+    let daemon = Arc::new(pushed("sharing", "", &["--min", "2", "--max", "2"])?);
+    let mut robots = Vec::new();
+    for number in 0..20 {
+        robots.push((format!("r{number}"), robot(&daemon, &format!("r{number}"))?));
+    }
+    let before = group(&daemon, "two servants", |group| ready(group) == 2)?;
+    ensure!(before["robots"] == 20, "{before:#}");
+    let killed = Arc::new(AtomicBool::new(false));
+    let working: Vec<_> = robots
+        .into_iter()
+        .map(|(name, mut robot)| {
+            let killed = Arc::clone(&killed);
+            thread::spawn(move || -> anyhow::Result<Vec<Value>> {
+                let mut answers = Vec::new();
+                let mut after = 0;
+                // Until well after the end of that servant.
+                while after < 5 {
+                    after += usize::from(killed.load(Ordering::SeqCst));
+                    let who = format!("{name} {}", answers.len());
+                    let answer = robot.calls("/work", json!({"who": who, "seconds": 0.01}))?;
+                    if answer["result"] == true {
+                        ensure!(
+                            answer["values"]["who"] == who.as_str(),
+                            "not its own: {answer}"
+                        );
+                    }
+                    answers.push(answer);
+                }
+                // Of what was answered nothing comes twice, and nothing of another.
+                let more = robot.has_not_heard(|value| value["op"] == "service_response")?;
+                ensure!(more, "{name} was answered twice");
+                Ok(answers)
+            })
+        })
+        .collect();
+    let victim = group(&daemon, "work at both", |group| {
+        let servants = group["servants"].as_array();
+        servants.is_some_and(|all| all.iter().all(|one| one["under_way"].as_u64() > Some(0)))
+    })?;
+    let victim = victim["servants"][0]["id"]
+        .as_str()
+        .context("an id")?
+        .to_owned();
+    fails(&daemon, &victim)?;
+    group(&daemon, "another in its place", |group| {
+        ready(group) == 2 && !group["servants"].to_string().contains(&victim)
+    })?;
+    killed.store(true, Ordering::SeqCst);
+    let mut by: BTreeMap<String, usize> = BTreeMap::new();
+    for robot in working {
+        for answer in robot
+            .join()
+            .map_err(|_| anyhow::anyhow!("a robot panicked"))??
+        {
+            let place = match answer["result"] == true {
+                true => answer["values"]["where"].as_str(),
+                false => {
+                    let words = answer["values"].as_str().unwrap_or_default();
+                    ensure!(
+                        words.contains(&victim) && words.contains("--idempotent"),
+                        "{answer}"
+                    );
+                    Some("failed")
+                }
+            };
+            *by.entry(place.unwrap_or_default().to_owned()).or_default() += 1;
+        }
+    }
+    let failed = by.remove("failed").unwrap_or_default();
+    ensure!(
+        (1..=8).contains(&failed),
+        "{failed} failed: what it worked at"
+    );
+    ensure!(by.len() == 3, "two servants, and the one that came: {by:?}");
+    let after = group(&daemon, "what was counted", |_| true)?;
+    ensure!(after["failed"] == failed, "{after:#}");
+    Ok(())
+}
+
+pub fn a_shared_service_grows_under_load_and_shrinks_after_it() -> Verdict {
+    let daemon = pushed(
+        "sharing-scale",
+        "[servant]\ngrace = \"3s\"\n",
+        &["--max", "2", "--cpus", "0.2"],
+    )?;
+    let mut busy = (0..6)
+        .map(|number| robot(&daemon, &format!("r{number}")))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+    let deadline = std::time::Instant::now() + support::robot::PATIENCE;
+    loop {
+        for robot in &mut busy {
+            robot.says(
+                json!({"op": "call_service", "service": "/work", "args": {"seconds": 0.2}}),
+            )?;
+        }
+        for robot in &mut busy {
+            let answer = robot.hears("its answer", |value| value["op"] == "service_response")?;
+            ensure!(answer["result"] == true, "{answer}");
+        }
+        let service = daemon.api(&format!("/api/v1/services/{SERVICE}"))?;
+        if ready(&service["groups"][0]) == 2 {
+            break;
+        }
+        ensure!(std::time::Instant::now() < deadline, "{service:#}");
+    }
+    let few = group(&daemon, "one servant again", |group| {
+        group["servants"]
+            .as_array()
+            .is_some_and(|all| all.len() == 1)
+    })?;
+    ensure!(few["failed"] == 0, "{few:#}");
+    let answer = busy[0].calls("/work", json!({"who": "still", "seconds": 0.0}))?;
+    ensure!(answer["values"]["who"] == "still", "{answer}");
+    let events = daemon.deployer().types(&["events"])?.said();
+    for reason in [
+        "requests at a time are many for 1 servants",
+        "are few for 2 servants",
+    ] {
+        ensure!(events.contains(reason), "{events}");
+    }
+    Ok(())
+}
+
+pub fn goals_of_robots_do_not_meet() -> Verdict {
+    let daemon = pushed("sharing-goals", "", &["--max", "1"])?;
+    let mut one = robot(&daemon, "one")?;
+    let mut two = robot(&daemon, "two")?;
+    // One by the operations on actions, the other by actionlib's topics, as clients of ROS 1 do.
+    one.says(json!({
+        "op": "send_action_goal", "id": "first", "action": "/count", "action_type": "sharer_cpp/Count",
+        "args": {"who": "one", "to": 5}, "feedback": true,
+    }))?;
+    let feedback = one.hears("feedback", |value| value["op"] == "action_feedback")?;
+    ensure!(feedback["values"]["who"] == "one", "{feedback}");
+    for topic in ["feedback", "result", "status"] {
+        two.subscribes(&format!("/count/{topic}"))?;
+    }
+    two.says(
+        json!({"op": "advertise", "topic": "/count/goal", "type": "sharer_cpp/CountActionGoal"}),
+    )?;
+    two.says(json!({
+        "op": "publish", "topic": "/count/goal",
+        "msg": {"goal_id": {"id": "mine"}, "goal": {"who": "two", "to": 3}},
+    }))?;
+    let result = one.hears("its result", |value| value["op"] == "action_result")?;
+    ensure!(
+        result["values"] == json!({"who": "one", "all": [1, 2, 3, 4, 5]}),
+        "{result}"
+    );
+    let result = two.hears_on("/count/result")?;
+    ensure!(
+        result["result"] == json!({"who": "two", "all": [1, 2, 3]}),
+        "{result}"
+    );
+    ensure!(result["status"]["goal_id"]["id"] == "mine", "{result}");
+    let foreign = |value: &Value| {
+        value["topic"] == "/count/feedback" && value["msg"]["feedback"]["who"] != "two"
+            || value["topic"] == "/count/status" && value.to_string().contains("first")
+    };
+    ensure!(two.has_not_heard(foreign)?, "two heard of one's goal");
+    ensure!(
+        one.has_not_heard(|value| value["op"] == "publish")?,
+        "one heard of two's goal"
+    );
+    // Neither is shown what the node says to everybody.
+    two.subscribes("/rosout")?;
+    let refused = two.hears_status("/rosout")?;
+    ensure!(
+        refused["msg"]
+            .as_str()
+            .is_some_and(|words| words.contains("robots share")),
+        "{refused}"
+    );
+    Ok(())
+}
+
+pub fn what_robots_cannot_share_is_refused_with_what_was_found() -> Verdict {
+    let daemon = world().own("sharing-refused").start()?;
+    let refused = daemon
+        .deployer()
+        .pushes("greeter_cpp", &["--node", "greeter", "--shared"])?;
+    refused.failed_saying(&[
+        "robots cannot share it",
+        "it subscribes to",
+        "it publishes",
+        "without --shared",
+    ])?;
+    let refused = daemon.deployer().pushes(
+        SERVICE,
+        &["--node", "sharer", "--shared", "--min", "5", "--max", "2"],
+    )?;
+    refused.failed_saying(&["--min 5", "--max 2"])?;
+    ensure!(
+        daemon.deployer().asks(&["services"])? == json!([]),
+        "something was published"
+    );
+    Ok(())
+}
+
+pub fn of_two_replicas_the_first_answers_and_the_cost_is_shown() -> Verdict {
+    let daemon = pushed("sharing-replicas", "", &["--replicas", "2", "--max", "2"])?;
+    let mut robot = robot(&daemon, "one")?;
+    group(&daemon, "two servants", |group| ready(group) == 2)?;
+    for number in 0..5 {
+        let answer = robot.calls("/work", json!({"who": format!("{number}"), "seconds": 0.0}))?;
+        ensure!(answer["values"]["who"] == format!("{number}"), "{answer}");
+    }
+    let group = group(&daemon, "five answers", |group| group["answered"] == 5)?;
+    ensure!(group["wasted"] == 5 && group["failed"] == 0, "{group:#}");
+    let shown = daemon
+        .deployer()
+        .types(&["services", SERVICE])?
+        .succeeded()?;
+    ensure!(
+        shown.stdout.contains("5 of 10 answers wasted"),
+        "{}",
+        shown.stdout
+    );
+    Ok(())
+}
