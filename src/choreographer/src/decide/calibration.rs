@@ -147,7 +147,9 @@ pub(crate) fn with_margin(peak: Size) -> Size {
 
 /// To two digits, never down.
 fn rounded_up(milliseconds: f64) -> f64 {
-    let digit = 10f64.powf(milliseconds.max(1e-3).log10().floor() - 1.0);
+    // A time of nothing is none that anybody could ask for.
+    let milliseconds = milliseconds.max(1e-3);
+    let digit = 10f64.powf(milliseconds.log10().floor() - 1.0);
     let up = (milliseconds / digit).ceil() * digit;
     // What powers of ten left behind the digits.
     (up * 1e6).round() / 1e6
@@ -252,12 +254,14 @@ mod tests {
             .iter()
             .map(|row| {
                 let spread = row.spread.expect("measured");
-                (row.limits.cpus, row.value, spread.p50, spread.p95)
+                let micros = |seconds: f64| (seconds * 1e6).round() as u64;
+                let times = [row.value, spread.p50, spread.p95].map(micros);
+                (row.limits.cpus, times)
             })
             .collect();
         let expected = [
-            (Some(0.4), 0.1, 0.075, 0.1),
-            (Some(0.8), 0.062, 0.045, 0.0612),
+            (Some(0.4), [100_000, 75_000, 100_000]),
+            (Some(0.8), [62_000, 45_000, 61_200]),
         ];
         assert_eq!(told, expected);
         let row = &rows[0];

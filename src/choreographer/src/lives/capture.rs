@@ -7,8 +7,9 @@ use std::time::{Duration, SystemTime};
 use api::Phase;
 use api::calibration::TimeSpread;
 use budget::{Budget, Permit};
+use link::control::Request;
 use package::interface::Direction;
-use reach::{Material, Reach};
+use reach::Material;
 use ros::bag::Recorded;
 use ros::bus::{Bus, Qos, Subscription, WireType};
 use tokio::sync::mpsc;
@@ -60,9 +61,13 @@ impl Choreographer {
                 "robot {robot} sent nothing to {service} within {seconds} s; begin when it sends, or take a recording (--bag)"
             )));
         }
+        let links = handle
+            .reach()
+            .map(|reach| reach.links())
+            .unwrap_or_default();
         let requests = Requests {
             material: Material::Bag(messages),
-            network: handle.reach().and_then(|reach| between(&*reach)),
+            network: between(links.iter().flat_map(|link| &link.requests)),
         };
         Ok((requests, permit))
     }
@@ -86,11 +91,9 @@ fn not_served(service: &str, robot: &str) -> Error {
     ))
 }
 
-/// Serialising and the network, as the robot's stubs have measured them; none where it has no stub or has asked for nothing
-/// yet. Queues are left out: how long they are depends on the limits.
-fn between(reach: &dyn Reach) -> Option<TimeSpread> {
-    let links = reach.links();
-    let requests = links.iter().flat_map(|link| &link.requests);
+/// Serialising and the network, as the robot's stubs have measured them; none where it has no stub or was not answered yet. Queues
+/// are left out: how long they are depends on the limits.
+fn between<'a>(requests: impl Iterator<Item = &'a Request>) -> Option<TimeSpread> {
     let answered = requests.filter(|request| request.total.is_some());
     TimeSpread::of(answered.map(|it| it.serialise + it.up + it.down).collect())
 }
@@ -157,5 +160,32 @@ async fn hear(topic: Arc<str>, mut subscription: Subscription, heard: mpsc::Send
         if heard.send(recorded).await.is_err() {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_robots_network_is_what_is_neither_queue_nor_node() {
+        let request = |up, total| Request {
+            total,
+            serialise: 1.0,
+            up,
+            queue: 500.0,
+            compute: 900.0,
+            down: 2.0,
+            ..Request::default()
+        };
+        // One that the cloud never answered tells nothing of the way down.
+        let requests = [
+            request(4.0, Some(1407.0)),
+            request(800.0, None),
+            request(7.0, Some(1410.0)),
+        ];
+        let network = between(requests.iter()).expect("two were answered");
+        assert_eq!((network.p50, network.p95), (7.0, 10.0));
+        assert_eq!(between([].iter()), None);
     }
 }

@@ -154,7 +154,7 @@ mod tests {
         let (pictures, count) = Picture::read_all(&files).expect("pictures");
         let widths: Vec<u32> = pictures.iter().map(|picture| picture.width).collect();
         assert_eq!((widths, count), (vec![1, 2, 1], 3));
-        for bad in [&files[..files.len() - 1], &files[1..], &[]] {
+        for bad in [&files[..files.len() - 20], &files[1..], &[]] {
             let error = Picture::read_all(bad).err().map(|error| error.to_string());
             assert!(error.is_some_and(|text| text.contains("PNG")));
         }
