@@ -369,12 +369,6 @@ impl<P: Clone> Governor<P> {
                 stop = true;
             }
         }
-        // The local original may be wanted because of them.
-        self.decide(now);
-        for id in overdue {
-            self.fail_if_hopeless(id);
-            self.arbiter.close_call(id);
-        }
         for (id, record) in forgotten {
             self.forget(id, record);
         }
@@ -390,5 +384,10 @@ impl<P: Clone> Governor<P> {
             self.effects.push_back(Effect::SafeStop);
         }
         self.decide(now);
+        // The local original may be wanted because of them, and answer yet.
+        for id in overdue {
+            self.fail_if_hopeless(id);
+            self.arbiter.close_call(id);
+        }
     }
 }
