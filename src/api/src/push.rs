@@ -9,6 +9,7 @@ use crate::group::Shared;
 use crate::limits::{Caps, Limits};
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
+use crate::sla::Sla;
 
 /// What to make of the archive (`POST /api/v1/push?options=JSON`; the body is a tar, gzipped or not, and empty
 /// with `apt`).
@@ -55,6 +56,9 @@ pub struct PushOptions {
     /// The most that robots may ask for.
     #[serde(skip_serializing_if = "Caps::is_empty")]
     pub caps: Caps,
+    /// What stubs promise where their robot says nothing: `rrt` and `max_rrt` alone.
+    #[serde(skip_serializing_if = "Sla::is_empty")]
+    pub sla: Sla,
     /// What a servant is given beyond its container.
     #[serde(skip_serializing_if = "Grants::is_empty")]
     pub grants: Grants,

@@ -120,8 +120,15 @@ pub fn files(
         outsourced: &inventory.programs.keys().cloned().collect(),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
+        times: times(&revision.plan.sla),
     };
     compose(&about, contents).map_err(no_stub)
+}
+
+/// T_desire and T_max in seconds; where one of them is given it is both.
+fn times(sla: &api::Sla) -> Option<(f64, f64)> {
+    let (desire, max) = (sla.rrt.or(sla.max_rrt)?, sla.max_rrt.or(sla.rrt)?);
+    Some((desire.as_seconds(), max.as_seconds()))
 }
 
 /// The archive of a revision's stub, in a file that is gone when it is closed.

@@ -32,6 +32,13 @@
 //! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
 //! # The name that an executable's node has when none is given, where that is not the executable's.
 //! nodes = { "listener.py" = "listener" }
+//!
+//! # What the node in the cloud is to get, stated to the server with desire and max, or what else is promised:
+//! class = "interactive"   # a class that the server's operator has configured
+//! cpus = 1.5           # cores outright, whatever the server knows of what desire and max need
+//! memory = "1G"        # and memory
+//! aux = { width = 640 }   # what the service's deployer wants to know, such as the width of pictures
+//!
 //! stamps = "rewrite"   # "rewrite" to the cloud's clock and back, or "keep"
 //! codec = "auto"       # "none", "auto" (lossless), or "jpeg": pictures may lose detail where no lossless codec keeps up
 //!                      # with them or with T_max; "video" is the same as H.264, in programs that are built with it
@@ -53,6 +60,8 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::address::Address;
+use crate::revision::Defaults;
+use crate::terms::{self, Aux, Scalar};
 
 pub use parameters::{Group, groups};
 pub use requests::Requests;
@@ -134,6 +143,18 @@ pub struct Config {
     /// What is published when neither side answers in time.
     #[serde(default)]
     pub safe_stop: Option<SafeStop>,
+    /// A class of the server's configuration.
+    #[serde(default)]
+    pub class: Option<String>,
+    /// Cores that are asked for outright.
+    #[serde(default)]
+    pub cpus: Option<f64>,
+    /// Memory that is asked for outright.
+    #[serde(default)]
+    pub memory: Option<Scalar>,
+    /// Auxiliary parameters of the service's dictionary.
+    #[serde(default)]
+    pub aux: Option<Aux>,
     /// What becomes of stamps while the clocks of robot and cloud differ.
     #[serde(default)]
     pub stamps: Stamps,
@@ -180,6 +201,18 @@ impl Config {
     pub fn promises(&self) -> bool {
         let all = [self.desire, self.max, self.frames_per_second, self.age];
         all.iter().any(Option::is_some)
+    }
+
+    /// With what the service's deployer says of response times, where the robot promises nothing.
+    pub fn or(self, defaults: &Defaults) -> Config {
+        if self.promises() {
+            return self;
+        }
+        Config {
+            desire: defaults.desire,
+            max: defaults.max,
+            ..self
+        }
     }
 
     /// This robot's id.
@@ -341,7 +374,7 @@ fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 26] = [
+pub const KEYS: [&str; 30] = [
     "server",
     "service",
     "token",
@@ -365,6 +398,10 @@ pub const KEYS: [&str; 26] = [
     "local",
     "stateful",
     "safe_stop",
+    "class",
+    "cpus",
+    "memory",
+    "aux",
     "stamps",
     "codec",
     "quality",
@@ -419,6 +456,9 @@ impl Config {
                 );
                 return wrong(key, reason);
             }
+        }
+        if let Err((key, reason)) = terms::check(self) {
+            return wrong(key, reason);
         }
         if let Some(quality) = self
             .quality

@@ -23,6 +23,7 @@ use crate::connect;
 use crate::mirror::Mirror;
 use crate::run::session_options;
 use crate::stream::Stream;
+use crate::terms;
 
 /// For the portal to accept a connection.
 const CONNECT: Duration = Duration::from_secs(10);
@@ -143,7 +144,7 @@ struct Link<'a> {
 impl Link<'_> {
     /// One connection, from its handshake to its loss.
     async fn once(&mut self) -> Result<End, connect::Error> {
-        let socket = open(self.config).await?;
+        let socket = open(self.config, &self.hello.node.name).await?;
         self.carry(socket).await
     }
 
@@ -154,7 +155,7 @@ impl Link<'_> {
         let running = session.run(&mut socket, &**self.mirror);
         tokio::select! {
             lost = running => Ok(End::Lost(lost)),
-            fresh = standby(self.config, &session) => Ok(End::Replaced(Box::new(fresh))),
+            fresh = standby(self.config, &self.hello.node.name, &session) => Ok(End::Replaced(Box::new(fresh))),
         }
     }
 
@@ -229,8 +230,9 @@ impl Link<'_> {
     }
 }
 
-async fn open(config: &Config) -> Result<WebSocket<Stream>, connect::Error> {
-    let path = format!("/{}?robot={}", config.service, config.robot());
+async fn open(config: &Config, node: &str) -> Result<WebSocket<Stream>, connect::Error> {
+    let stated = terms::query(config, node);
+    let path = format!("/{}?robot={}{stated}", config.service, config.robot());
     let token = config
         .token()
         .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
@@ -238,7 +240,7 @@ async fn open(config: &Config) -> Result<WebSocket<Stream>, connect::Error> {
 }
 
 /// A connection beside the one that carries the session, once that has been silent and still is.
-async fn standby(config: &Config, session: &RobotSession) -> WebSocket<Stream> {
+async fn standby(config: &Config, node: &str, session: &RobotSession) -> WebSocket<Stream> {
     let mut up = session.up();
     loop {
         // The session lives as long as this.
@@ -247,7 +249,7 @@ async fn standby(config: &Config, session: &RobotSession) -> WebSocket<Stream> {
         let opening = async {
             loop {
                 sleep(STANDBY).await;
-                if let Ok(socket) = open(config).await {
+                if let Ok(socket) = open(config, node).await {
                     return socket;
                 }
             }

@@ -29,6 +29,7 @@ mod revision;
 mod robot;
 mod run;
 mod stream;
+mod terms;
 
 use std::process::ExitCode;
 

@@ -14,6 +14,18 @@ pub struct Revision {
     pub image: String,
     /// Executables that run in the cloud.
     pub outsourced: Vec<String>,
+    /// What holds where the robot says nothing.
+    pub defaults: Defaults,
+}
+
+/// What the service's deployer says of response times, in seconds; both or neither.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(default)]
+pub struct Defaults {
+    /// T_desire.
+    pub desire: Option<f64>,
+    /// T_max.
+    pub max: Option<f64>,
 }
 
 impl Revision {

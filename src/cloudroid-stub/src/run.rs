@@ -31,6 +31,7 @@ use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::resolver::RobotSockets;
+use crate::revision::Revision;
 use crate::robot::{Robot, usual_name};
 
 /// For the real node to end after it was told to. roslaunch escalates after 15 s.
@@ -80,6 +81,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         () = stopped(&mut stopping) => return Ok(End::Asked),
     };
     let config = with_parameters(config, &*bus, &robot.node).await?;
+    let config = config.or(&Revision::read(&asked.node.share).defaults);
     if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
         tracing::warn!(
             "fallback_after counts only until the server is reached for the first time where desire and max, a rate or an age are given: then those decide when the local original answers"

@@ -7,7 +7,7 @@ mod shared;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use api::{Grants, PushEvent, PushOptions, ServiceDetail, Volume};
+use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
 
@@ -76,6 +76,12 @@ pub struct Push {
     limits: LimitFlags,
     #[command(flatten)]
     caps: CapFlags,
+    /// T_desire of stubs whose robot promises nothing itself, such as 100ms.
+    #[arg(long, value_name = "TIME")]
+    rrt: Option<Span>,
+    /// T_max of such stubs; T_desire by default.
+    #[arg(long, value_name = "TIME")]
+    max_rrt: Option<Span>,
     /// Device by its name in the machine's CDI specifications, such as nvidia.com/gpu=0; may be given several times.
     #[arg(long = "device", value_name = "VENDOR/CLASS=NAME")]
     devices: Vec<String>,
@@ -189,6 +195,11 @@ impl Push {
             with: self.with.clone(),
             limits: self.limits.into(),
             caps: self.caps.into(),
+            sla: Sla {
+                rrt: self.rrt,
+                max_rrt: self.max_rrt,
+                ..Sla::default()
+            },
             grants: Grants {
                 devices: self.devices.clone(),
                 volumes: self.volumes.clone(),
@@ -264,7 +275,8 @@ mod tests {
         let push = parse(
             "--apt opencv_apps --name people --base b --node people_detect --node other/node --param debug_view=false \
              --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map eigen=libeigen3-dev \
-             --with opencv-data --cpus 1.5 --memory 512M --max-cpus 2 --max-memory 1G",
+             --with opencv-data --cpus 1.5 --memory 512M --max-cpus 2 --max-memory 1G \
+             --rrt 100ms --max-rrt 0.3",
         )
         .expect("valid");
         let options = push.options().expect("no file is read");
@@ -273,7 +285,7 @@ mod tests {
             "params": {"debug_view": false, "/rate": 1.5, "word": "hi", "list": [1, 2]},
             "remaps": {"image": "/camera/image"}, "map": {"eigen": "libeigen3-dev"}, "with": ["opencv-data"],
             "limits": {"cpus": 1.5, "memory": 536_870_912},
-            "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "source": "--apt opencv_apps"
+            "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "sla": {"rrt": "100ms", "max_rrt": "300ms"}, "source": "--apt opencv_apps"
         });
         assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
     }
@@ -335,6 +347,7 @@ mod tests {
             "./pkg --cpus 0",
             "./pkg --max-cpus 0",
             "./pkg --max-memory lots",
+            "./pkg --rrt soon",
             "./pkg --memory lots",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), 2, "{line}");

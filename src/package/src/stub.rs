@@ -52,6 +52,8 @@ pub struct About<'a> {
     pub interface: &'a Interface,
     /// Answers depend on earlier requests, as the deployer says.
     pub stateful: bool,
+    /// T_desire and T_max in seconds, as the deployer says, where a robot says nothing of its own.
+    pub times: Option<(f64, f64)>,
 }
 
 /// What the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a robot's

@@ -317,6 +317,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
         parameters: built.plan.parameters.clone(),
         limits: options.limits,
         caps: options.caps,
+        sla: options.sla,
         grants: options.grants.clone(),
         // A launch file says itself which nodes come again.
         restart: options.launch.is_none(),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use api::{Limits, PushEvent, PushOptions};
+use api::{Limits, PushEvent, PushOptions, Sla};
 use catalogue::names;
 use rootfs_builder::blocking;
 use store::NewEvent;
@@ -94,6 +94,7 @@ impl Pusher {
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
         check_caps(options).map_err(Error::Options)?;
+        check_sla(options).map_err(Error::Options)?;
         self.choreographer.check_grants(&options.grants)?;
         shared::check_options(options)?;
         Ok(self.choreographer.check_limits(&options.limits)?)
@@ -170,9 +171,26 @@ fn check_caps(options: &PushOptions) -> Result<(), String> {
     Ok(())
 }
 
+/// Refuses what stubs cannot promise by default.
+fn check_sla(options: &PushOptions) -> Result<(), String> {
+    let sla = &options.sla;
+    sla.check().map_err(|error| format!("--{error}"))?;
+    let times = Sla {
+        rrt: sla.rrt,
+        max_rrt: sla.max_rrt,
+        ..Sla::default()
+    };
+    match *sla == times {
+        true => Ok(()),
+        false => Err(
+            "sla says more than rrt and max_rrt; rates and ages are for the robot to say, in its stub.toml".into(),
+        ),
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use api::{Caps, Size};
+    use api::{Caps, Size, Span};
 
     use super::*;
 
@@ -211,5 +229,32 @@ mod tests {
             let refused = refused.expect_err(words);
             assert!(refused.starts_with(words), "{refused}");
         }
+    }
+
+    #[test]
+    fn what_stubs_cannot_promise_is_refused() {
+        let check = |sla| {
+            check_sla(&PushOptions {
+                sla,
+                ..PushOptions::default()
+            })
+        };
+        let times = |rrt: u64, max_rrt: u64| Sla {
+            rrt: Span::millis(rrt),
+            max_rrt: Span::millis(max_rrt),
+            ..Sla::default()
+        };
+        assert_eq!(check(times(100, 300)), Ok(()));
+        let refused = check(times(300, 100)).expect_err("in disorder");
+        assert!(
+            refused.starts_with("--rrt (300ms) is greater than"),
+            "{refused}"
+        );
+        let rate = Sla {
+            fps: Some(5.0),
+            ..times(100, 300)
+        };
+        let refused = check(rate).expect_err("a rate");
+        assert!(refused.contains("stub.toml"), "{refused}");
     }
 }

@@ -65,7 +65,7 @@ const RUNS: &str = "/cloudroid_runs";
 #[async_trait]
 pub trait Nodes: Send + Sync + 'static {
     /// Starts the node; comes back when its program runs, or says why it cannot.
-    async fn start(&self, node: &Node, sla: &Sla) -> Result<(), String>;
+    async fn start(&self, node: &Node) -> Result<(), String>;
     /// Sends it a signal.
     async fn signal(&self, node: &str, signal: i32) -> Result<(), String>;
     /// Waits for its end; at once if it does not run.
@@ -362,7 +362,7 @@ impl Hub {
                 let _ = parameters.set(&run_key, run).await;
             }
             self.nodes
-                .start(&hello.node, &hello.sla)
+                .start(&hello.node)
                 .await
                 .map_err(Refusal::final_)?;
         }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use api::Level;
 use async_trait::async_trait;
 use futures_util::FutureExt;
-use link::control::{Decision, Exit, Node, Request, Sla};
+use link::control::{Decision, Exit, Node, Request};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use servant::engine::{LogStart, NodeExit, Servant};
@@ -121,7 +121,7 @@ fn program<'a>(recorded: &'a Recorded, node: &Node) -> Option<&'a String> {
 
 #[async_trait]
 impl Nodes for LinkedNodes {
-    async fn start(&self, node: &Node, _sla: &Sla) -> Result<(), String> {
+    async fn start(&self, node: &Node) -> Result<(), String> {
         let tenant = self.tenant()?;
         self.observer.fits(node.revision, &node.image)?;
         let Some(program) = program(&self.recorded, node) else {

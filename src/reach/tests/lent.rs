@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::clock::now;
-use link::control::{Exit, FromCloud, FromRobot, Hello, Node, Served, Sla, Welcome};
+use link::control::{Exit, FromCloud, FromRobot, Hello, Node, Served, Welcome};
 use link::record::Record;
 use link::session::{receive_open, send_open};
 use link::{Handler, MAX_FRAME, MAX_RECORD, RobotSession, SessionOptions};
@@ -30,7 +30,7 @@ struct Still;
 
 #[async_trait]
 impl Nodes for Still {
-    async fn start(&self, _: &Node, _: &Sla) -> Result<(), String> {
+    async fn start(&self, _: &Node) -> Result<(), String> {
         Ok(())
     }
     async fn signal(&self, _: &str, _: i32) -> Result<(), String> {

@@ -66,6 +66,9 @@ pub struct Plan {
     /// The most that robots may ask for.
     #[serde(default, skip_serializing_if = "api::Caps::is_empty")]
     pub caps: api::Caps,
+    /// What stubs promise where their robot says nothing.
+    #[serde(default, skip_serializing_if = "api::Sla::is_empty")]
+    pub sla: api::Sla,
     /// What the push asked for beyond a container; whether it is allowed is looked at anew at each start.
     #[serde(default)]
     pub grants: api::Grants,

@@ -42,6 +42,14 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         architecture: &'a str,
         outsourced: &'a BTreeSet<String>,
         original: BTreeSet<&'a String>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        defaults: Option<Defaults>,
+    }
+    /// What holds where the robot says nothing: not in `stub.toml`, which an installation keeps.
+    #[derive(Serialize)]
+    struct Defaults {
+        desire: f64,
+        max: f64,
     }
     let revision = Revision {
         package: about.package,
@@ -51,6 +59,7 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         architecture: about.architecture,
         outsourced: about.outsourced,
         original: executables.difference(about.outsourced).collect(),
+        defaults: about.times.map(|(desire, max)| Defaults { desire, max }),
     };
     let text = toml::to_string(&revision).expect("texts and a number are TOML");
     format!(

@@ -74,6 +74,7 @@ fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
         outsourced: &outsourced,
         interface: &interface,
         stateful: true,
+        times: Some((0.1, 0.3)),
     };
     compose(&about, contents).expect("a stub")
 }
@@ -153,6 +154,12 @@ fn settings_and_origin_are_told_in_toml() {
     assert_eq!(revision["revision"].as_integer(), Some(3));
     assert_eq!(revision["outsourced"][0].as_str(), Some("node"));
     assert_eq!(revision["original"][0].as_str(), Some("helper_node"));
+    let defaults = &revision["defaults"];
+    assert_eq!(
+        (defaults["desire"].as_float(), defaults["max"].as_float()),
+        (Some(0.1), Some(0.3))
+    );
+    assert!(stub.get("desire").is_none(), "that is the robot's own");
 }
 
 #[test]
@@ -204,6 +211,7 @@ fn without_a_manifest_there_is_no_stub() {
         outsourced: &BTreeSet::new(),
         interface: &interface,
         stateful: true,
+        times: None,
     };
     let error = compose(&about, Contents::default()).expect_err("refused");
     assert!(error.to_string().contains("no package.xml of p"), "{error}");

@@ -26,7 +26,7 @@ impl Quiet {
 
 #[async_trait]
 impl Nodes for Quiet {
-    async fn start(&self, node: &Node, _: &Sla) -> Result<(), String> {
+    async fn start(&self, node: &Node) -> Result<(), String> {
         if self.is_stuck(&node.name) {
             std::future::pending::<()>().await;
         }

@@ -213,6 +213,11 @@ fn options() -> PushOptions {
             cpus: Some(2.0),
             memory: Some(Size(1 << 30)),
         },
+        sla: Sla {
+            rrt: Span::millis(100),
+            max_rrt: Span::millis(300),
+            ..Sla::default()
+        },
         grants: Grants {
             devices: all("nvidia.com/gpu=0"),
             volumes: vec![Volume {
