@@ -64,6 +64,8 @@ mod shadowing;
 mod sharing;
 #[path = "stories/survival.rs"]
 mod survival;
+#[path = "stories/terms.rs"]
+mod terms;
 #[path = "stories/tls.rs"]
 mod tls;
 #[path = "stories/tokens.rs"]
@@ -159,6 +161,10 @@ fn main() -> ExitCode {
             limits_are_changed_while_it_works,
             a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
             two_robots_see_nothing_of_each_other,
+        ],
+        stories![terms:
+            a_robot_is_given_what_its_sla_costs,
+            a_stub_states_what_its_robot_says_before_it_is_admitted,
         ],
         stories![launched:
             roslaunch_cannot_tell_the_stub_from_the_original,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 use crate::limits::Limits;
-use crate::sla::{AUX, Measure};
+use crate::sla::{AUX, Measure, Stated};
 
 /// With these limits, and up to these auxiliary parameters, a servant reaches this value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -65,6 +65,59 @@ pub struct NewRows {
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub replace: bool,
+}
+
+/// What a robot would get that states something, and why: `GET /api/v1/services/NAME/sla/explain?rrt=100ms`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct Explained {
+    /// The service.
+    pub service: String,
+    /// What was stated.
+    pub stated: Stated,
+    /// The class that the robot would be in.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub class: Option<String>,
+    /// Its priority.
+    pub priority: i32,
+    /// The limits that it would be promised; none where it would be refused.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limits: Option<Limits>,
+    /// How they follow, a sentence each.
+    pub why: Vec<String>,
+    /// Why it would be refused.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refused: Option<String>,
+    /// Rows next to those that are taken, in words.
+    pub next: Vec<String>,
+    /// Each measure of the SLA, with all rows.
+    pub goals: Vec<ExplainedGoal>,
+}
+
+/// One measure of an SLA.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct ExplainedGoal {
+    /// What is measured.
+    pub measure: Measure,
+    /// What is wished for: seconds, or frames per second.
+    pub desire: f64,
+    /// What is acceptable.
+    pub bound: f64,
+    /// All rows of that measure, the cheapest first.
+    pub rows: Vec<Considered>,
+}
+
+/// A row that was looked at.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct Considered {
+    /// The row.
+    pub row: Row,
+    /// It is taken.
+    pub taken: bool,
+    /// Why, or why not.
+    pub why: String,
 }
 
 /// What it is about, such as `rrt 100ms with aux.width=640`.

@@ -17,6 +17,7 @@
 //!
 //! Times are seconds, or text such as `100ms`. Keys of others (`robot`, `token`, `resume`) are not looked at.
 
+mod agreement;
 mod span;
 
 use std::collections::BTreeMap;
@@ -26,6 +27,8 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::size::Size;
+use agreement::rate;
+pub use agreement::{Goal, Measure, Sla};
 pub use span::{NotASpan, Span};
 
 /// What begins the key of an auxiliary parameter.
@@ -38,201 +41,6 @@ const LONGEST: usize = 64;
 /// Cores, and bytes of memory, outside of which no servant works.
 const CPUS: (f64, f64) = (0.01, 4096.0);
 const LEAST_MEMORY: Size = Size(4 << 20);
-/// Frames per second beyond which it is a mistake of units.
-const MOST_FPS: f64 = 1e6;
-
-/// What is to be kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum Measure {
-    /// The request response time, in seconds: less is better.
-    Rrt,
-    /// The rate of an output, in frames per second: more is better.
-    Fps,
-    /// The age of an output, in seconds: less is better.
-    Age,
-}
-
-impl Measure {
-    /// All of them.
-    pub const ALL: [Measure; 3] = [Measure::Rrt, Measure::Fps, Measure::Age];
-
-    /// Its key.
-    pub fn name(self) -> &'static str {
-        match self {
-            Measure::Rrt => "rrt",
-            Measure::Fps => "fps",
-            Measure::Age => "age",
-        }
-    }
-
-    /// Whether `value` is at least as good as `than`.
-    pub fn reaches(self, value: f64, than: f64) -> bool {
-        match self {
-            Measure::Rrt | Measure::Age => value <= than,
-            Measure::Fps => value >= than,
-        }
-    }
-
-    /// A value with its unit, as it is written behind the measure's key.
-    pub fn print(self, value: f64) -> String {
-        match (self, Span::seconds(value)) {
-            (Measure::Rrt | Measure::Age, Some(span)) => span.to_string(),
-            _ => value.to_string(),
-        }
-    }
-
-    /// Reads a value: seconds for times.
-    pub fn read(self, text: &str) -> Result<f64, String> {
-        match self {
-            Measure::Rrt | Measure::Age => text
-                .parse::<Span>()
-                .map(Span::as_seconds)
-                .map_err(|error| error.to_string()),
-            Measure::Fps => rate(text),
-        }
-    }
-}
-
-/// A service level agreement; nothing of it need be given.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(default, deny_unknown_fields)]
-pub struct Sla {
-    /// T_desire: the request response time that is wished for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
-    pub rrt: Option<Span>,
-    /// T_max: the longest that is acceptable.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
-    pub max_rrt: Option<Span>,
-    /// The rate of an output that is wished for, frames per second.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub fps: Option<f64>,
-    /// The least that is acceptable.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub min_fps: Option<f64>,
-    /// The age of an output that is wished for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
-    pub age: Option<Span>,
-    /// The greatest that is acceptable.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
-    pub max_age: Option<Span>,
-}
-
-/// One measure of an SLA.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Goal {
-    /// What is measured.
-    pub measure: Measure,
-    /// What is wished for: seconds, or frames per second.
-    pub desire: f64,
-    /// What is acceptable; never better than `desire`.
-    pub bound: f64,
-}
-
-impl Sla {
-    /// Whether nothing is given.
-    pub fn is_empty(&self) -> bool {
-        *self == Sla::default()
-    }
-
-    /// What is to be kept. Where one of desire and bound is given, it is both.
-    pub fn goals(&self) -> Vec<Goal> {
-        let seconds = |span: Option<Span>| span.map(Span::as_seconds);
-        let goal = |measure, desire: Option<f64>, bound: Option<f64>| {
-            let (desire, bound) = (desire.or(bound)?, bound.or(desire)?);
-            Some(Goal {
-                measure,
-                desire,
-                bound,
-            })
-        };
-        let all = [
-            goal(Measure::Rrt, seconds(self.rrt), seconds(self.max_rrt)),
-            goal(Measure::Fps, self.fps, self.min_fps),
-            goal(Measure::Age, seconds(self.age), seconds(self.max_age)),
-        ];
-        all.into_iter().flatten().collect()
-    }
-
-    /// Refuses an SLA that contradicts itself.
-    pub fn check(&self) -> Result<(), Unstatable> {
-        let refused = |key: &str, reason: String| Err(Unstatable::new(key, reason));
-        if let (Some(rrt), Some(max)) = (self.rrt, self.max_rrt)
-            && rrt > max
-        {
-            let reason =
-                format!("({rrt}) is greater than max_rrt ({max}); lower it, or raise max_rrt");
-            return refused("rrt", reason);
-        }
-        if let (Some(fps), Some(min)) = (self.fps, self.min_fps)
-            && fps < min
-        {
-            let reason =
-                format!("({fps}) is less than min_fps ({min}); raise it, or lower min_fps");
-            return refused("fps", reason);
-        }
-        if let (Some(age), Some(max)) = (self.age, self.max_age)
-            && age > max
-        {
-            let reason =
-                format!("({age}) is greater than max_age ({max}); lower it, or raise max_age");
-            return refused("age", reason);
-        }
-        for (key, value) in [("fps", self.fps), ("min_fps", self.min_fps)] {
-            if let Some(value) = value {
-                rate(&value.to_string()).map_err(|reason| Unstatable::new(key, reason))?;
-            }
-        }
-        Ok(())
-    }
-
-    /// The stricter of both, measure by measure.
-    pub fn stricter(self, other: Sla) -> Sla {
-        let (rrt, max_rrt) = stricter(
-            (self.rrt, self.max_rrt),
-            (other.rrt, other.max_rrt),
-            Span::min,
-        );
-        let (fps, min_fps) = stricter(
-            (self.fps, self.min_fps),
-            (other.fps, other.min_fps),
-            f64::max,
-        );
-        let (age, max_age) = stricter(
-            (self.age, self.max_age),
-            (other.age, other.max_age),
-            Span::min,
-        );
-        Sla {
-            rrt,
-            max_rrt,
-            fps,
-            min_fps,
-            age,
-            max_age,
-        }
-    }
-}
-
-/// A desire and a bound of one measure.
-type Pair<T> = (Option<T>, Option<T>);
-
-/// The better desire and the better bound of two.
-fn stricter<T: Copy>(one: Pair<T>, other: Pair<T>, better: fn(T, T) -> T) -> Pair<T> {
-    // Where one of desire and bound is given, it is both.
-    let whole = |(desire, bound): Pair<T>| Some((desire.or(bound)?, bound.or(desire)?));
-    match (whole(one), whole(other)) {
-        (Some(a), Some(b)) => (Some(better(a.0, b.0)), Some(better(a.1, b.1))),
-        (Some(_), None) => one,
-        (None, _) => other,
-    }
-}
 
 /// What a robot states.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -454,14 +262,6 @@ fn exact(size: Size) -> String {
         true => short,
         false => size.0.to_string(),
     }
-}
-
-fn rate(text: &str) -> Result<f64, String> {
-    let rate = text.parse().ok();
-    rate.filter(|rate| *rate > 0.0 && *rate <= MOST_FPS)
-        .ok_or_else(|| {
-            format!("= {text:?} is not a rate; write frames per second greater than 0, such as 10")
-        })
 }
 
 /// Refuses a name that no class can have.

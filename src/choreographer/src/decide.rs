@@ -5,6 +5,7 @@
 //! | file | decides | from |
 //! |---|---|---|
 //! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
+//! | [`dictionary`] | which row of a service's dictionary a goal of an SLA takes | rows, auxiliary parameters, caps |
 //! | [`terms`] | which limits a robot's servant is promised | what the robot states, classes, the service, caps |
 //! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
 //! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue and its priorities |
@@ -29,6 +30,7 @@ pub(crate) mod calibration;
 pub(crate) mod capacity;
 pub mod controller;
 pub(crate) mod demand;
+pub(crate) mod dictionary;
 pub(crate) mod fit;
 pub(crate) mod group;
 pub(crate) mod lifetime;

@@ -59,6 +59,7 @@ use tokio::sync::watch;
 pub use decide::Amount;
 pub use decide::admission::{Place, Refused};
 pub use decide::controller;
+pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
 pub use handle::{Handle, Lease};
@@ -73,6 +74,7 @@ pub use request::ServantRequest;
 
 use decide::admission::Ask;
 use decide::placement::{Placement, place};
+use decide::terms::explain;
 use handle::Anew;
 use lives::Inner;
 use lives::driver::{self, Beginning};
@@ -166,6 +168,7 @@ impl Choreographer {
                 Ok(terms) => terms,
                 Err(error) => {
                     inner.give_back(warm);
+                    inner.report_refused(&request, &error);
                     return Err(error);
                 }
             };
@@ -358,6 +361,17 @@ impl Choreographer {
         let robot = format!("~{why}-{}", names::random(6));
         let lease = self.ensure(ServantRequest::new(service, &robot).anonymous())?;
         Ok(Measured { lease })
+    }
+
+    /// What a robot would get that states this to a service, and why.
+    pub fn explain_terms(
+        &self,
+        service: &str,
+        stated: &api::Stated,
+    ) -> Result<api::dictionary::Explained, Error> {
+        let inner = &self.inner;
+        let revision = inner.catalogue.current(service)?;
+        inner.offering(&revision, |offer| explain(stated, offer))
     }
 
     /// Refuses limits that would never be admitted.

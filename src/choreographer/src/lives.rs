@@ -30,13 +30,14 @@ use store::{Journal, RevisionRecord, State};
 use crate::Error;
 use crate::decide::capacity::Room;
 use crate::decide::demand::{self, Asked};
+use crate::decide::dictionary::Aux;
 use crate::decide::terms::{Offer, terms};
 use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
-use recent::Recent;
 use group::Groups;
+use recent::Recent;
 use waiting::Admission;
 use warm_pool::WarmPool;
 
@@ -98,13 +99,27 @@ impl Inner {
         stated: &BTreeMap<String, api::Stated>,
         revision: &RevisionRecord,
     ) -> Result<api::Terms, Error> {
-        let offer = Offer {
+        self.offering(revision, |offer| Ok(terms(stated, offer)?))?
+    }
+
+    /// What terms for a servant of this revision are made from.
+    pub(crate) fn offering<T>(
+        &self,
+        revision: &RevisionRecord,
+        work: impl FnOnce(&Offer<'_>) -> T,
+    ) -> Result<T, Error> {
+        let options = &self.options;
+        let rows = self.state.dictionary(&revision.service)?;
+        Ok(work(&Offer {
             service: &revision.service,
             limits: revision.plan.limits,
             caps: revision.plan.caps,
-            classes: &self.options.classes,
-        };
-        Ok(terms(stated, &offer)?)
+            classes: &options.classes,
+            rows: &rows,
+            measured: &Aux::new(),
+            reserve: (options.reserve_cpus, options.reserve_memory),
+            capacity: self.admission.look().0,
+        }))
     }
 
     /// What is promised to a servant of these limits.

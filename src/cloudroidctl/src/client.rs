@@ -163,6 +163,18 @@ impl Client {
         read(self.send(Method::DELETE, path, empty()).await?).await
     }
 
+    /// `PUT path` with `body` as JSON.
+    pub async fn put<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &impl Serialize,
+    ) -> anyhow::Result<T> {
+        let body = Full::new(Bytes::from(serde_json::to_vec(body)?))
+            .map_err(|never| match never {})
+            .boxed_unsync();
+        read(self.send(Method::PUT, path, body).await?).await
+    }
+
     /// `POST path` with a JSON body.
     pub async fn post<T: DeserializeOwned>(
         &self,

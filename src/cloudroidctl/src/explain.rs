@@ -65,6 +65,12 @@ fn servant(served: &Served) -> anyhow::Result<()> {
         served.throttled * 100.0,
         output::limits(&servant.enforced.unwrap_or(servant.limits)),
     ))?;
+    if let Some(terms) = &servant.terms {
+        output::line(&format!("  stated: {}", output::terms(servant)))?;
+        for why in &terms.why {
+            output::line(&format!("  {why}"))?;
+        }
+    }
     served.links.iter().try_for_each(link)
 }
 

@@ -18,6 +18,7 @@ mod rollback;
 mod servants;
 mod services;
 mod set;
+mod sla;
 mod status;
 mod stop;
 mod stub;
@@ -69,6 +70,7 @@ enum Verb {
     Logs(logs::Logs),
     Events(events::Events),
     Set(set::Set),
+    Sla(sla::Sla),
     Stop(stop::Stop),
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
@@ -116,6 +118,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Logs(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
         Verb::Set(verb) => verb.run(&client, format).await,
+        Verb::Sla(verb) => verb.run(&client, format).await,
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,

@@ -3,7 +3,7 @@
 use std::io::{IsTerminal, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use api::{Limits, Millis};
+use api::{Limits, Millis, Servant};
 use serde::Serialize;
 
 use crate::terminal;
@@ -167,6 +167,21 @@ pub fn limits(limits: &Limits) -> String {
     } else {
         set.join(", ")
     }
+}
+
+/// What a servant's robot stated, and the rows that were taken for it, in a cell.
+pub fn terms(servant: &Servant) -> String {
+    let Some(terms) = &servant.terms else {
+        return String::new();
+    };
+    let mut said = vec![terms.stated_in_words()];
+    if let Some(class) = &terms.class {
+        said.push(format!("class {class}"));
+    }
+    let rows = terms.rows.iter();
+    said.extend(rows.map(|row| format!("row {} ({row})", row.id)));
+    said.retain(|part| !part.is_empty());
+    said.join(", ")
 }
 
 #[cfg(test)]

@@ -39,6 +39,7 @@ impl Servants {
             "THROTTLED",
             "PRESSURE",
             "LIMITS",
+            "STATED",
         ]);
         for servant in &servants {
             let usage = servant.usage.as_ref();
@@ -62,6 +63,7 @@ impl Servants {
                     .map(|usage| usage.pressure.map_or("unknown".to_owned(), pressure))
                     .unwrap_or_default(),
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
+                output::terms(servant),
             ]);
         }
         table.print()

@@ -22,7 +22,7 @@ use crate::app::App;
 use crate::errors::Error;
 use crate::views;
 
-type Answer<T> = Result<Json<T>, Error>;
+pub(super) type Answer<T> = Result<Json<T>, Error>;
 
 /// Lines of a log when nobody says how many.
 const LOG_LINES: usize = 10_000;
@@ -138,7 +138,12 @@ const LARGEST_TRIAL: usize = 512 << 20;
 const LARGEST_WORDS: usize = 64 << 10;
 
 /// A body, within what its sender may have held.
-async fn held(app: &App, caller: &Caller, body: Body, max: usize) -> Result<Held, Error> {
+pub(super) async fn held(
+    app: &App,
+    caller: &Caller,
+    body: Body,
+    max: usize,
+) -> Result<Held, Error> {
     let memory = app.choreographer.memory();
     let budget = memory.client(&caller.peer.client(None));
     body::read(body, max, &budget, memory.unfinished).await

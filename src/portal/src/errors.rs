@@ -18,6 +18,16 @@ pub enum Error {
         /// Those that are served.
         exists: Vec<String>,
     },
+    /// No such row of a service's dictionary.
+    #[error("the dictionary of {service} has no row {id:?}")]
+    UnknownRow {
+        /// The service.
+        service: String,
+        /// Asked for.
+        id: String,
+        /// Those that there are.
+        exists: Vec<String>,
+    },
     /// Nothing is served there.
     #[error("nothing is served at {path}")]
     UnknownPath {
@@ -93,8 +103,22 @@ impl Error {
     pub fn in_a_line(&self) -> String {
         match self.log() {
             Some(log) => with_last_words(&self.to_string(), log),
+            None if self.is_of_terms() => {
+                let next = self.next().unwrap_or_default();
+                format!("{self}; {next}")
+            }
             None => self.to_string(),
         }
+    }
+}
+
+impl Error {
+    /// Whether a robot is refused for what it states: then it is told in one line what it could.
+    fn is_of_terms(&self) -> bool {
+        matches!(
+            self.of_choreographer(),
+            Some(choreographer::Error::Terms(_) | choreographer::Error::NotResized { .. })
+        )
     }
 }
 
@@ -124,7 +148,7 @@ impl Error {
             next: self.next(),
             ..Problem::default()
         };
-        if let Error::UnknownRobot { exists, .. } = self {
+        if let Error::UnknownRobot { exists, .. } | Error::UnknownRow { exists, .. } = self {
             problem.exists = exists.clone();
         }
         if let Some(
@@ -186,6 +210,7 @@ impl Error {
         use StatusCode as S;
         match self {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
+            Error::UnknownRow { .. } => (S::NOT_FOUND, "unknown-row", "unknown row"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
             Error::BodyTooLarge { .. } | Error::TrialTooLarge { .. } => {
                 (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
@@ -215,6 +240,9 @@ impl Error {
                 "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
             }
             Error::Unstatable(_) => "see what can be stated in docs/robots.md".into(),
+            Error::UnknownRow { service, .. } => {
+                format!("see those that exist with: cloudroidctl sla list {service}")
+            }
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unauthorised(_) => {
                 "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
@@ -332,7 +360,10 @@ fn kind_of_terms(untenable: &Untenable) -> Kind {
     use StatusCode as S;
     match untenable {
         Untenable::UnknownClass { .. } => (S::BAD_REQUEST, "unknown-class", "unknown class"),
-        Untenable::Capped { .. } => (S::FORBIDDEN, "capped", "more than is allowed"),
+        Untenable::Capped { .. } | Untenable::Beyond { .. } => {
+            (S::FORBIDDEN, "capped", "more than is allowed")
+        }
+        Untenable::Unmet { .. } => (S::UNPROCESSABLE_ENTITY, "unmet", "cannot be reached"),
     }
 }
 
@@ -348,6 +379,16 @@ fn next_of_terms(untenable: &Untenable) -> String {
         Untenable::Capped { cap, .. } => {
             format!("state {}={} or less", cap.resource, cap.most)
         }
+        Untenable::Beyond {
+            fits: Some(fits), ..
+        }
+        | Untenable::Unmet {
+            fits: Some(fits), ..
+        } => format!("state what fits: {fits}"),
+        Untenable::Beyond { .. } => "state less, or have the operator raise the cap".into(),
+        Untenable::Unmet { service, .. } => format!(
+            "state resources outright (cpus, memory), or have the deployer add a row: cloudroidctl sla set {service}"
+        ),
     }
 }
 

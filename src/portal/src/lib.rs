@@ -16,6 +16,7 @@ mod app;
 mod auth;
 mod body;
 mod calibration;
+mod dictionary;
 mod errors;
 mod explain;
 mod guard;

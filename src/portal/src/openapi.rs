@@ -196,6 +196,7 @@ fn method(name: &str) -> Option<HttpMethod> {
         "GET" => HttpMethod::Get,
         "POST" => HttpMethod::Post,
         "PATCH" => HttpMethod::Patch,
+        "PUT" => HttpMethod::Put,
         "DELETE" => HttpMethod::Delete,
         _ => return None,
     })

@@ -3,13 +3,15 @@
 
 use axum::extract::{DefaultBodyLimit, OriginalUri};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{MethodRouter, any, delete, get, patch, post};
+use axum::routing::{MethodRouter, any, delete, get, patch, post, put};
 
 use std::sync::Arc;
 
 use utoipa::openapi::Required;
 
-use super::{App, api_v1, calibration, metrics, oci, openapi, page, push, robots, stubs};
+use super::{
+    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, push, robots, stubs,
+};
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
 
@@ -185,6 +187,42 @@ pub const ROUTES: &[Route] = &[
             Required::False,
         )
         .streams::<api::CalibrationEvent>()
+    }),
+    at("GET", "/api/v1/services/{name}/sla", Token, || {
+        get(dictionary::rows)
+    })
+    .described(|| {
+        operation(
+            "dictionary",
+            "Rows of the service's dictionary: what a measure of an SLA costs.",
+        )
+        .lists::<api::dictionary::Row>()
+    }),
+    at("PUT", "/api/v1/services/{name}/sla", Token, || {
+        put(dictionary::write)
+    })
+    .described(|| {
+        operation("writeDictionary", "Writes rows, all or none.")
+            .takes::<api::dictionary::NewRows>(Required::True)
+            .lists::<api::dictionary::Row>()
+    }),
+    at("GET", "/api/v1/services/{name}/sla/explain", Token, || {
+        get(dictionary::explain)
+    })
+    .described(|| {
+        operation(
+            "explainSla",
+            "What a robot would get that states this, and why. Auxiliary parameters are aux.KEY=VALUE.",
+        )
+        .asks::<dictionary::Stating>()
+        .answers::<api::dictionary::Explained>()
+    }),
+    at("DELETE", "/api/v1/services/{name}/sla/{id}", Token, || {
+        delete(dictionary::remove)
+    })
+    .described(|| {
+        operation("removeFromDictionary", "Removes a row; gives those that are left.")
+            .lists::<api::dictionary::Row>()
     }),
     at("GET", "/api/v1/servants", Token, || get(api_v1::servants))
         .described(|| operation("servants", "All servants.").lists::<api::Servant>()),

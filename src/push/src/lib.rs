@@ -22,8 +22,8 @@ mod probe;
 mod publish;
 mod receive;
 mod request;
-mod stateful;
 mod shared;
+mod stateful;
 mod supplement;
 
 use std::path::{Path, PathBuf};

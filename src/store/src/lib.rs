@@ -7,6 +7,7 @@
 //! another has locked the database ([`backlog`]); what promises something fails then.
 
 mod backlog;
+mod dictionary;
 mod events;
 mod journal;
 pub mod private;
@@ -33,11 +34,12 @@ pub use servants::ServantRecord;
 pub use services::{Plan, RevisionLine, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 4] = [
+const MIGRATIONS: [&str; 5] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
     include_str!("004-terms.sql"),
+    include_str!("005-dictionary.sql"),
 ];
 
 /// What can go wrong.

@@ -1,4 +1,5 @@
 use api::Level;
+use api::dictionary::{NewRows, Row};
 use package::inventory::Inventory;
 use ros::flavour::Flavour;
 
@@ -194,6 +195,53 @@ fn servants_are_remembered_until_they_end() {
     state.remove_servant("a-2");
     state.remove_servant("a-1");
     assert!(state.servants().expect("readable").is_empty());
+}
+
+#[test]
+fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
+    let (_directory, state) = state();
+    state
+        .publish(&revision("a", "sha256:1"), &Default::default())
+        .expect("published");
+    let row = |text: &str| serde_json::from_str::<Row>(text).expect("a row");
+    let new = |rows: Vec<Row>, replace| {
+        let written = state.write_dictionary("a", 3, &NewRows { rows, replace });
+        written.expect("written");
+        let rows = state.dictionary("a").expect("readable").into_iter();
+        rows.map(|row| (row.id, row.to_string(), row.limits.cpus, row.revision))
+            .collect::<Vec<_>>()
+    };
+    let wide = row(
+        r#"{"measure":"rrt","value":0.1,"aux":{"width":"640"},"limits":{"cpus":2},"spread":{"p50":0.05,"p95":0.1,"requests":9}}"#,
+    );
+    let fps = row(r#"{"measure":"fps","value":5,"limits":{"cpus":0.5,"memory":"1G"}}"#);
+    assert_eq!(
+        new(vec![wide.clone(), fps], false),
+        [
+            (1, "rrt 100ms with aux.width=640".into(), Some(2.0), Some(3)),
+            (2, "fps 5".into(), Some(0.5), Some(3)),
+        ]
+    );
+    let kept = &state.dictionary("a").expect("readable")[0];
+    assert_eq!(kept.spread, wide.spread);
+    // The same again takes its place.
+    let cheaper = row(r#"{"measure":"rrt","value":0.1,"aux":{"width":"640"},"limits":{"cpus":1}}"#);
+    let rows = new(vec![cheaper.clone()], false);
+    assert_eq!((rows.len(), rows[0].0, rows[0].2), (2, 1, Some(1.0)));
+    assert!(state.remove_from_dictionary("a", 2).expect("written"));
+    assert!(!state.remove_from_dictionary("a", 2).expect("it is gone"));
+    assert!(!state.remove_from_dictionary("b", 1).expect("another's"));
+    let rows = new(
+        vec![row(r#"{"measure":"age","value":1,"limits":{}}"#)],
+        true,
+    );
+    assert_eq!(rows[0].1, "age 1s");
+    assert!(
+        rows.len() == 1 && rows[0].0 > 2,
+        "numbers are not given twice: {rows:?}"
+    );
+    state.remove_service("a").expect("written");
+    assert_eq!(state.dictionary("a").expect("readable"), []);
 }
 
 #[test]

@@ -5,18 +5,30 @@
 //! strictest counts ([`Stated::with`]). The limits follow from, the first that says something:
 //!
 //! 1. `cpus` and `memory` that are stated outright,
-//! 2. the push of the service,
-//! 3. the limits of the class.
+//! 2. the rows of the service's dictionary that are taken for the goals of the SLA ([`super::dictionary`]); of several goals what is
+//!    enough for all,
+//! 3. the push of the service,
+//! 4. the limits of the class.
 //!
 //! An SLA by default is that of the class, where no SLA and no resources are stated. What is stated is bounded by the caps of
-//! the class and of the service; the deployer's own limits are not.
+//! the class and of the service; the deployer's own limits are not. A goal that the robot states and that cannot be met is
+//! refused, with what can be; one of its class, or beside resources that it states outright, is not: it gets the best there is.
+
+mod caps;
+mod explanation;
 
 use std::collections::BTreeMap;
-use std::fmt;
 
-use api::{Caps, Limits, Size, Sla, Stated, Terms};
+use api::dictionary::Row;
+use api::sla::Goal;
+use api::{Caps, Limits, Sla, Stated, Terms};
 
+use super::Amount;
+use super::dictionary::{Aux, Choice, Shelf, most};
 use crate::options::{Class, DEFAULT_CLASS};
+use caps::Bounds;
+pub use caps::{Cap, Capper};
+pub use explanation::explain;
 
 /// What terms are made from, beside what is stated.
 #[derive(Debug, Clone, Copy)]
@@ -29,44 +41,14 @@ pub struct Offer<'a> {
     pub caps: Caps,
     /// All classes, by name.
     pub classes: &'a BTreeMap<String, Class>,
-}
-
-/// Who bounds what a robot may ask for.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Capper {
-    /// A class, by its `max_cpus` or `max_memory`.
-    Class(String),
-    /// A service, by its push.
-    Service(String),
-}
-
-/// A bound of one resource, and whose it is.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Cap {
-    /// `cpus` or `memory`.
-    pub resource: &'static str,
-    /// The most, as it is written.
-    pub most: String,
-    /// Whose it is.
-    pub by: Capper,
-}
-
-impl fmt::Display for Cap {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Cap { resource, most, by } = self;
-        match by {
-            Capper::Class(name) => write!(
-                out,
-                "{most}, the max_{resource} of class {name} ([class.{name}] of the configuration)"
-            ),
-            Capper::Service(name) => {
-                write!(
-                    out,
-                    "{most}, the --max-{resource} with which {name} was pushed"
-                )
-            }
-        }
-    }
+    /// The service's dictionary.
+    pub rows: &'a [Row],
+    /// Auxiliary parameters that sessions of the robot have measured; what it states comes before.
+    pub measured: &'a Aux,
+    /// What is set aside for a servant for which nobody asks anything: cores and bytes.
+    pub reserve: (f64, u64),
+    /// What the machine has for servants.
+    pub capacity: Amount,
 }
 
 /// Why a robot cannot have a servant on its terms.
@@ -88,122 +70,239 @@ pub enum Untenable {
         /// What bounds it.
         cap: Cap,
     },
+    /// The row that would do is more than it may have.
+    #[error("{goal} needs {needs}, which is more {} than this robot may have: {cap}", cap.resource)]
+    Beyond {
+        /// What was stated, such as `rrt 100ms`.
+        goal: String,
+        /// Limits, and the row that says so.
+        needs: String,
+        /// What bounds them.
+        cap: Cap,
+        /// What would fit, as it would be stated.
+        fits: Option<String>,
+    },
+    /// No row does.
+    #[error("{service} does not reach {goal}{}: {}", for_what(assumed), best.as_deref().map_or("its dictionary has no row for it".to_owned(), |best| format!("the best that its dictionary knows is {best}")))]
+    Unmet {
+        /// The service.
+        service: String,
+        /// What was stated.
+        goal: String,
+        /// Auxiliary parameters for which there is none.
+        assumed: Aux,
+        /// The best that can be had, with the row that says so.
+        best: Option<String>,
+        /// What would fit, as it would be stated.
+        fits: Option<String>,
+    },
+}
+
+/// What follows from what is stated, beside the limits.
+struct Reading<'a> {
+    together: Stated,
+    class: Option<(&'a str, &'a Class)>,
+    bounds: Bounds,
+    /// Limits where neither resources nor rows say anything.
+    own: Limits,
+    aux: Aux,
+    sla: Sla,
+    /// A goal that cannot be met is refused.
+    strict: bool,
+}
+
+impl<'a> Reading<'a> {
+    fn of(stated: &BTreeMap<String, Stated>, offer: &Offer<'a>) -> Result<Reading<'a>, Untenable> {
+        let priority = |name: &str| offer.classes.get(name).map(|class| class.priority);
+        let prefer = |one: &str, other: &str| priority(one) > priority(other);
+        let together = stated
+            .values()
+            .cloned()
+            .reduce(|one, other| one.with(other, prefer))
+            .unwrap_or_default();
+        let class = class(together.class.as_deref(), offer.classes)?;
+        let by_class = class.map_or(Limits::default(), |(_, class)| class.limits);
+        let mut aux = offer.measured.clone();
+        aux.extend(together.aux.clone());
+        let direct = together.cpus.is_some() || together.memory.is_some();
+        let (sla, stated_sla) = match class {
+            Some((_, class)) if together.sla.is_empty() && !direct => (class.sla, false),
+            _ => (together.sla, true),
+        };
+        Ok(Reading {
+            bounds: Bounds::of(class, offer),
+            own: offer.limits.or(by_class),
+            strict: stated_sla && !direct,
+            together,
+            class,
+            aux,
+            sla,
+        })
+    }
+
+    fn shelf(&'a self, offer: &Offer<'a>) -> Shelf<'a> {
+        Shelf {
+            rows: offer.rows,
+            aux: &self.aux,
+            own: self.own,
+            reserve: offer.reserve,
+            capacity: offer.capacity,
+        }
+    }
+
+    /// Resources that are stated outright.
+    fn direct(&self) -> Limits {
+        Limits {
+            cpus: self.together.cpus,
+            memory: self.together.memory,
+            ..Limits::default()
+        }
+    }
 }
 
 /// The terms for what the clients of one robot state, by node. Same input, same output.
 pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Terms, Untenable> {
-    let priority = |name: &str| offer.classes.get(name).map(|class| class.priority);
-    let prefer = |one: &str, other: &str| priority(one) > priority(other);
-    let together = stated
-        .values()
-        .cloned()
-        .reduce(|one, other| one.with(other, prefer))
-        .unwrap_or_default();
-    let (name, class) = class(together.class.as_deref(), offer.classes)?;
+    let reading = Reading::of(stated, offer)?;
+    reading.bounds.check(&reading.together)?;
+    let (direct, own) = (reading.direct(), reading.own);
     let mut why = Vec::new();
-    check_caps(&together, name, class, offer)?;
-    let direct = Limits {
-        cpus: together.cpus,
-        memory: together.memory,
-        ..Limits::default()
-    };
     if direct != Limits::default() {
         why.push(format!("{} as stated", in_words(&direct)));
     }
-    let sla = sla(&together, class);
-    if !sla.is_empty() {
-        why.push(format!(
-            "{} has no dictionary: its own limits apply",
-            offer.service
-        ));
+    let (mut rows, mut by_rows): (Vec<Row>, Option<Limits>) = (Vec::new(), None);
+    for goal in reading.sla.goals() {
+        let shelf = reading.shelf(offer);
+        let choice = shelf.choose(&goal, |row| reading.bounds.against(row, &shelf).is_none());
+        let (row, reason) = match choice {
+            Choice::Silent => {
+                let name = goal.measure.name();
+                let service = offer.service;
+                why.push(format!(
+                    "the dictionary of {service} says nothing of {name}"
+                ));
+                continue;
+            }
+            Choice::Taken {
+                row,
+                desired,
+                assumed,
+            } => (row, taken(&goal, row, desired, &assumed)),
+            Choice::Unmet {
+                best: Some(row), ..
+            } if !reading.strict => (row, format!("{} is the best there is", named(row))),
+            Choice::Unmet { .. } if !reading.strict => {
+                why.push(format!("no row for {} applies", words_of(&goal)));
+                continue;
+            }
+            Choice::Unmet {
+                best,
+                beyond,
+                assumed,
+            } => return Err(unmet(&goal, best, beyond, assumed, offer, &reading)),
+        };
+        let enough = row.limits.or(own);
+        by_rows = Some(by_rows.map_or(enough, |sum| most(sum, enough)));
+        why.push(reason);
+        rows.push(row.clone());
     }
-    let by_class = class.map_or(Limits::default(), |class| class.limits);
     Ok(Terms {
         stated: stated.clone(),
-        class: name.map(str::to_owned),
-        priority: class.map_or(0, |class| class.priority),
-        rows: Vec::new(),
-        limits: direct.or(offer.limits).or(by_class),
+        class: reading.class.map(|(name, _)| name.to_owned()),
+        priority: reading.class.map_or(0, |(_, class)| class.priority),
+        rows,
+        limits: direct.or(by_rows.unwrap_or(own)),
         why,
     })
 }
 
-/// The SLA that counts: where neither one nor resources are stated, the class's.
-fn sla(stated: &Stated, class: Option<&Class>) -> Sla {
-    let says = !stated.sla.is_empty() || stated.cpus.is_some() || stated.memory.is_some();
-    match class {
-        Some(class) if !says => class.sla,
-        _ => stated.sla,
+/// Why a row is taken.
+fn taken(goal: &Goal, row: &Row, desired: bool, assumed: &Aux) -> String {
+    let reason = match desired {
+        true => "is the cheapest that reaches",
+        false => "is the best that is acceptable for",
+    };
+    let measure = goal.measure;
+    let wished = measure.print(goal.desire);
+    format!(
+        "{} {reason} {} {wished}{}",
+        named(row),
+        measure.name(),
+        for_what(assumed)
+    )
+}
+
+fn unmet(
+    goal: &Goal,
+    best: Option<&Row>,
+    beyond: Option<&Row>,
+    assumed: Aux,
+    offer: &Offer<'_>,
+    reading: &Reading<'_>,
+) -> Untenable {
+    let measure = goal.measure;
+    let fits = best.map(|row| format!("{}={}", measure.name(), measure.print(row.value)));
+    let goal = words_of(goal);
+    let shelf = reading.shelf(offer);
+    let beyond = beyond.and_then(|row| Some((row, reading.bounds.against(row, &shelf)?)));
+    match beyond {
+        Some((row, cap)) => Untenable::Beyond {
+            goal,
+            needs: named(row),
+            cap,
+            fits,
+        },
+        None => Untenable::Unmet {
+            service: offer.service.to_owned(),
+            goal,
+            assumed: match assumed.is_empty() {
+                true => reading.aux.clone(),
+                false => assumed,
+            },
+            best: best.map(named),
+            fits,
+        },
+    }
+}
+
+/// What of a goal must be kept.
+fn words_of(goal: &Goal) -> String {
+    let measure = goal.measure;
+    format!("{} {}", measure.name(), measure.print(goal.bound))
+}
+
+/// A row for people.
+pub(crate) fn named(row: &Row) -> String {
+    match in_words(&row.limits).as_str() {
+        "" => format!("row {} ({row}: the service's own limits)", row.id),
+        limits => format!("row {} ({row}: {limits})", row.id),
+    }
+}
+
+/// What was assumed of auxiliary parameters, behind what it is about.
+fn for_what(assumed: &Aux) -> String {
+    let pairs = assumed.iter();
+    let pairs: Vec<String> = pairs
+        .map(|(key, value)| format!("aux.{key}={value}"))
+        .collect();
+    match pairs.is_empty() {
+        true => String::new(),
+        false => format!(" with {}", pairs.join(" ")),
     }
 }
 
 /// The class that a robot is in: the one that it names, else the default one where there is one.
 fn class<'a>(
-    named: Option<&'a str>,
+    named: Option<&str>,
     classes: &'a BTreeMap<String, Class>,
-) -> Result<(Option<&'a str>, Option<&'a Class>), Untenable> {
-    match named {
-        Some(name) => match classes.get(name) {
-            Some(class) => Ok((Some(name), Some(class))),
-            None => Err(Untenable::UnknownClass {
-                name: name.to_owned(),
-                exists: classes.keys().cloned().collect(),
-            }),
-        },
-        None => {
-            let class = classes.get(DEFAULT_CLASS);
-            Ok((class.map(|_| DEFAULT_CLASS), class))
-        }
+) -> Result<Option<(&'a str, &'a Class)>, Untenable> {
+    let found = classes.get_key_value(named.unwrap_or(DEFAULT_CLASS));
+    match (named, found) {
+        (Some(name), None) => Err(Untenable::UnknownClass {
+            name: name.to_owned(),
+            exists: classes.keys().cloned().collect(),
+        }),
+        (_, found) => Ok(found.map(|(name, class)| (name.as_str(), class))),
     }
-}
-
-/// The tighter bounds of a class and a service, each with whose it is.
-#[derive(Debug, Clone, Default, PartialEq)]
-struct Bounds {
-    cpus: Option<(f64, Cap)>,
-    memory: Option<(Size, Cap)>,
-}
-
-fn bounds(name: Option<&str>, class: Option<&Class>, offer: &Offer<'_>) -> Bounds {
-    let of_class = class.map_or(Caps::default(), |class| class.caps);
-    let by_class = || Capper::Class(name.unwrap_or(DEFAULT_CLASS).to_owned());
-    let by_service = || Capper::Service(offer.service.to_owned());
-    let cap = |resource, most: String, by| Cap { resource, most, by };
-    let cpus = match (of_class.cpus, offer.caps.cpus) {
-        (Some(class), service) if service.is_none_or(|service| class <= service) => {
-            Some((class, cap("cpus", class.to_string(), by_class())))
-        }
-        (_, service) => service.map(|most| (most, cap("cpus", most.to_string(), by_service()))),
-    };
-    let memory = match (of_class.memory, offer.caps.memory) {
-        (Some(class), service) if service.is_none_or(|service| class <= service) => {
-            Some((class, cap("memory", class.to_string(), by_class())))
-        }
-        (_, service) => service.map(|most| (most, cap("memory", most.to_string(), by_service()))),
-    };
-    Bounds { cpus, memory }
-}
-
-fn check_caps(
-    stated: &Stated,
-    name: Option<&str>,
-    class: Option<&Class>,
-    offer: &Offer<'_>,
-) -> Result<(), Untenable> {
-    let bounds = bounds(name, class, offer);
-    if let (Some(asked), Some((most, cap))) = (stated.cpus, bounds.cpus)
-        && asked > most
-    {
-        let asked = asked.to_string();
-        return Err(Untenable::Capped { asked, cap });
-    }
-    if let (Some(asked), Some((most, cap))) = (stated.memory, bounds.memory)
-        && asked > most
-    {
-        let asked = asked.to_string();
-        return Err(Untenable::Capped { asked, cap });
-    }
-    Ok(())
 }
 
 /// Limits for people, by the names of the flags that set them.

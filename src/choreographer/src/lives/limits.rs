@@ -10,7 +10,8 @@ use crate::decide::demand::{Asked, with_weight};
 use crate::decide::terms::{Untenable, in_words};
 use crate::handle::Handle;
 use crate::limits::limits_of;
-use crate::{Choreographer, Error, engine_limits};
+use crate::{Choreographer, Error, ServantRequest, engine_limits};
+use store::NewEvent;
 
 /// Why a servant is not resized.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -55,6 +56,20 @@ impl Choreographer {
 }
 
 impl Inner {
+    /// Tells of a robot that is refused for what it states.
+    pub(crate) fn report_refused(&self, request: &ServantRequest, error: &Error) {
+        let message = format!(
+            "robot {} states {} to {} and is refused: {error}",
+            request.robot, request.stated, request.service
+        );
+        let about = NewEvent {
+            service: Some(&request.service),
+            servant: None,
+            robot: Some(&request.robot),
+        };
+        self.journal.warning("terms-refused", &message, &about);
+    }
+
     /// Gives a servant that runs what its robot states now, by one of its clients. Where that cannot be, it keeps what it
     /// has.
     pub(crate) async fn agree(
@@ -63,6 +78,15 @@ impl Inner {
         who: &str,
         stated: &Stated,
     ) -> Result<(), Error> {
+        let agreed = self.agreed(handle, who, stated).await;
+        if let Err(error @ Error::NotResized { .. }) = &agreed {
+            let (journal, message) = (&self.journal, error.to_string());
+            journal.warning("terms-refused", &message, &handle.about());
+        }
+        agreed
+    }
+
+    async fn agreed(&self, handle: &Handle, who: &str, stated: &Stated) -> Result<(), Error> {
         let _turn = handle.limits_turn().await;
         let before = handle.all_asked();
         let mut all = before.terms.stated.clone();

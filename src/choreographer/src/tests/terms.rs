@@ -84,6 +84,7 @@ async fn who_states_something_else_is_resized_in_place_or_told_what_would_fit() 
     assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5), "as it was");
     let stated = lease.handle().terms().stated_in_words();
     assert_eq!(stated, "cpus=1.5");
+    assert_eq!(world.told("terms-refused").len(), 1);
 }
 
 #[tokio::test(start_paused = true)]
@@ -174,6 +175,8 @@ async fn a_class_bounds_what_its_robots_state_and_ranks_them() {
     let refused = daemon.ensure(stating("r1", &[("cpus", "1.5")])).err();
     let refused = refused.expect("more than its class may have").to_string();
     assert!(refused.contains("max_cpus of class default"), "{refused}");
+    let told = world.told("terms-refused");
+    assert!(told[0].starts_with("robot r1 states cpus=1.5"), "{told:?}");
     let lease = ready(
         &daemon,
         stating("r1", &[("cpus", "1.5"), ("class", "urgent")]),
@@ -228,7 +231,58 @@ async fn a_warm_container_gets_what_its_robot_states() {
     }
     let lease = ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;
     assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
-    // The next one may be made already.
-    let first = &world.engine.started()[0].id;
-    assert_eq!(&lease.handle().id, first, "the warm one was used");
+    let first = &world.engine.started()[0];
+    assert_eq!(first.id, lease.handle().id, "the warm one was used");
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_sla_is_given_what_the_services_dictionary_says() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon_with(|options| options.reserve_cpus = 0.25);
+    let row = |millis: u64, cpus| api::dictionary::Row {
+        id: 0,
+        measure: api::Measure::Rrt,
+        value: millis as f64 / 1000.0,
+        aux: Default::default(),
+        limits: api::Limits {
+            cpus: Some(cpus),
+            ..api::Limits::default()
+        },
+        spread: None,
+        revision: None,
+        written: 0,
+    };
+    let rows = api::dictionary::NewRows {
+        rows: vec![row(50, 1.5), row(100, 0.5)],
+        replace: false,
+    };
+    let state = &daemon.inner.state;
+    state.write_dictionary("greet", 1, &rows).expect("written");
+    let one = ready(&daemon, stating("r1", &[("rrt", "100ms")])).await;
+    let plain = ready(&daemon, ServantRequest::new("greet", "r0")).await;
+    assert_eq!(enforced(&daemon, &one).await.0, Some(0.5));
+    assert_eq!(enforced(&daemon, &plain).await.0, None);
+    drop(plain);
+    let told = world.told("terms");
+    assert!(
+        told[0].contains("rrt=100ms") && told[0].contains("row 2"),
+        "{told:?}"
+    );
+    // It wishes for more.
+    let again = ready(&daemon, stating("r1", &[("rrt", "80ms")])).await;
+    assert_eq!(enforced(&daemon, &again).await.0, Some(1.5));
+    let terms = again.handle().terms();
+    assert_eq!(terms.rows[0].value, 0.05);
+    let impossible = daemon.ensure(stating("r2", &[("rrt", "10ms")])).err();
+    assert!(matches!(
+        impossible,
+        Some(Error::Terms(Untenable::Unmet { .. }))
+    ));
+    let impossible = daemon
+        .ensure(stating("r1", &[("rrt", "10ms")]))
+        .expect("a lease");
+    let refused = impossible.ready().await.err().expect("no row reaches it");
+    assert!(refused.to_string().contains("row 1"), "{refused}");
+    assert_eq!(enforced(&daemon, &again).await.0, Some(1.5), "as it was");
 }

@@ -1,3 +1,5 @@
+use api::{Measure, Size};
+
 use super::*;
 
 fn stated(query: &[(&str, &str)]) -> BTreeMap<String, Stated> {
@@ -42,7 +44,42 @@ fn offer(classes: &BTreeMap<String, Class>) -> Offer<'_> {
             memory: None,
         },
         classes,
+        rows: &[],
+        measured: &NOTHING,
+        reserve: (0.01, 64 << 20),
+        capacity: Amount {
+            millicpus: 8000,
+            memory: 16 << 30,
+        },
     }
+}
+
+static NOTHING: Aux = Aux::new();
+
+fn row(id: i64, measure: Measure, value: f64, cpus: f64, mib: Option<u64>) -> Row {
+    Row {
+        id,
+        measure,
+        value,
+        aux: Aux::new(),
+        limits: Limits {
+            cpus: Some(cpus),
+            memory: mib.map(|mib| Size(mib << 20)),
+            ..Limits::default()
+        },
+        spread: None,
+        revision: None,
+        written: 0,
+    }
+}
+
+fn rows() -> [Row; 4] {
+    [
+        row(1, Measure::Rrt, 0.05, 2.5, Some(1024)),
+        row(2, Measure::Rrt, 0.1, 1.0, Some(512)),
+        row(3, Measure::Rrt, 0.2, 0.5, None),
+        row(4, Measure::Fps, 10.0, 0.75, Some(768)),
+    ]
 }
 
 #[test]
@@ -142,4 +179,181 @@ fn the_clients_of_one_robot_get_what_the_strictest_needs() {
         terms.stated_in_words(),
         "/detector: class=default cpus=1; /tracker: class=urgent cpus=2 memory=1G"
     );
+}
+
+#[test]
+fn an_sla_is_given_what_its_row_says() {
+    let (rows, mut classes) = (rows(), classes());
+    let memory = |mib: u64| Some(Size(mib << 20));
+    let rows = &rows;
+    fn offered<'a>(rows: &'a [Row], classes: &'a BTreeMap<String, Class>) -> Offer<'a> {
+        Offer {
+            rows,
+            ..offer(classes)
+        }
+    }
+    for (query, cpus, mib, taken) in [
+        (&[("rrt", "100ms")][..], 1.0, memory(512), &[2][..]),
+        (
+            &[("rrt", "50ms"), ("max_rrt", "150ms")],
+            1.0,
+            memory(512),
+            &[2],
+        ),
+        (
+            &[("rrt", "50ms"), ("max_rrt", "150ms"), ("class", "urgent")],
+            2.5,
+            memory(1024),
+            &[1],
+        ),
+        // The row names no memory, and the push none either.
+        (&[("rrt", "250ms")], 0.5, None, &[3]),
+        // Enough for both.
+        (
+            &[("rrt", "100ms"), ("fps", "5"), ("class", "urgent")],
+            1.0,
+            memory(768),
+            &[2, 4],
+        ),
+        // Nothing is known of it: the push's own.
+        (&[("age", "1s")], 2.0, None, &[]),
+        // Resources outright come before.
+        (
+            &[("rrt", "100ms"), ("cpus", "0.25")],
+            0.25,
+            memory(512),
+            &[2],
+        ),
+        (&[("rrt", "1ms"), ("cpus", "0.25")], 0.25, memory(512), &[2]),
+    ] {
+        let terms = terms(&stated(query), &offered(rows, &classes)).expect("tenable");
+        let ids: Vec<i64> = terms.rows.iter().map(|row| row.id).collect();
+        assert_eq!(
+            (terms.limits.cpus, terms.limits.memory, &*ids),
+            (Some(cpus), mib, taken),
+            "{query:?} {:?}",
+            terms.why
+        );
+    }
+    // The class's SLA is that of robots that state nothing, and is no reason to refuse them.
+    let default = classes.get_mut("default").expect("it is there");
+    default.sla.rrt = api::Span::millis(60);
+    let told = terms(&stated(&[]), &offered(rows, &classes)).expect("tenable");
+    assert_eq!(
+        told.rows[0].id, 2,
+        "the best within the class's caps: {told:?}"
+    );
+    let told = terms(&stated(&[("cpus", "1")]), &offered(rows, &classes)).expect("tenable");
+    assert!(told.rows.is_empty(), "it states resources: {told:?}");
+}
+
+#[test]
+fn an_sla_that_cannot_be_kept_is_refused_with_what_can() {
+    let (rows, classes) = (rows(), classes());
+    let offer = Offer {
+        rows: &rows,
+        ..offer(&classes)
+    };
+    for (query, words) in [
+        (
+            &[("rrt", "50ms")][..],
+            "rrt 50ms needs row 1 (rrt 50ms: cpus 2.5, memory 1G), which is more cpus than this robot may have: 1, the max_cpus of class default ([class.default] of the configuration)",
+        ),
+        (
+            &[("rrt", "10ms"), ("max_rrt", "20ms"), ("class", "urgent")],
+            "detect does not reach rrt 20ms: the best that its dictionary knows is row 1 (rrt 50ms: cpus 2.5, memory 1G)",
+        ),
+    ] {
+        let refused = terms(&stated(query), &offer).expect_err(words);
+        assert_eq!(refused.to_string(), words);
+    }
+    let fits = |query: &[(&str, &str)]| match terms(&stated(query), &offer) {
+        Err(Untenable::Beyond { fits, .. } | Untenable::Unmet { fits, .. }) => fits,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(fits(&[("rrt", "50ms")]).as_deref(), Some("rrt=100ms"));
+    assert_eq!(
+        fits(&[("rrt", "1ms"), ("class", "urgent")]).as_deref(),
+        Some("rrt=50ms")
+    );
+    // What fits is tenable.
+    terms(&stated(&[("rrt", "100ms")]), &offer).expect("it was said so");
+    // Nothing was measured for such pictures.
+    let mut narrow = rows.clone();
+    for row in &mut narrow {
+        row.aux.insert("width".into(), "640".into());
+    }
+    let offer = Offer {
+        rows: &narrow,
+        ..offer
+    };
+    let refused = terms(&stated(&[("rrt", "100ms"), ("aux.width", "1920")]), &offer);
+    assert_eq!(
+        refused.expect_err("too wide").to_string(),
+        "detect does not reach rrt 100ms with aux.width=1920: its dictionary has no row for it"
+    );
+    // What a session has measured counts where the robot says nothing.
+    let measured = Aux::from([("width".to_owned(), "320".to_owned())]);
+    let offer = Offer {
+        measured: &measured,
+        ..offer
+    };
+    let told = terms(&stated(&[("rrt", "100ms")]), &offer).expect("narrow enough");
+    assert_eq!(told.rows[0].id, 2);
+    // A machine that is too small for the row is a cap, too.
+    let offer = Offer {
+        capacity: Amount::new(0.75, 1 << 30),
+        ..offer
+    };
+    let refused = terms(&stated(&[("rrt", "100ms")]), &offer).expect_err("too big");
+    assert!(
+        refused.to_string().ends_with(
+            "more cpus than this robot may have: 0.75, what this machine has for servants"
+        ),
+        "{refused}"
+    );
+}
+
+#[test]
+fn an_explanation_says_of_each_row_why() {
+    let (rows, classes) = (rows(), classes());
+    let offer = Offer {
+        rows: &rows,
+        ..offer(&classes)
+    };
+    let one = |query: &[(&str, &str)]| {
+        let stated = Stated::read(query.iter().copied()).expect("valid");
+        explain(&stated, &offer)
+    };
+    let explained = one(&[("rrt", "90ms"), ("max_rrt", "150ms")]);
+    assert_eq!(explained.limits.and_then(|limits| limits.cpus), Some(1.0));
+    let said: Vec<(i64, bool, &str)> = explained.goals[0]
+        .rows
+        .iter()
+        .map(|one| (one.row.id, one.taken, one.why.as_str()))
+        .collect();
+    assert_eq!(
+        said,
+        [
+            (3, false, "does not reach 150ms"),
+            (2, true, "taken"),
+            (
+                1,
+                false,
+                "needs more cpus than: 1, the max_cpus of class default ([class.default] of the configuration)"
+            ),
+        ]
+    );
+    assert_eq!(
+        explained.next,
+        [
+            "better: row 1 (rrt 50ms: cpus 2.5, memory 1G), more cpus than: 1, the max_cpus of class default ([class.default] of the configuration)",
+            "cheaper: row 3 (rrt 200ms: cpus 0.5)",
+        ]
+    );
+    let refused = one(&[("rrt", "10ms")]);
+    assert_eq!(refused.limits, None);
+    assert!(refused.refused.is_some_and(|why| why.contains("rrt 10ms")));
+    let unknown = one(&[("class", "nope")]);
+    assert!(unknown.refused.is_some_and(|why| why.contains("nope")));
 }

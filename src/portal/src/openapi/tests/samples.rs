@@ -1,7 +1,7 @@
 //! One value or more of every type that the document describes.
 
 use api::calibration::{Calibration, Point, Source, TimeSpread};
-use api::dictionary::{Row, Spread};
+use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use api::push::Layer;
@@ -115,6 +115,43 @@ fn row() -> Row {
         }),
         revision: Some(1),
         written: 1,
+    }
+}
+
+fn new_rows() -> NewRows {
+    let bare = Row {
+        id: 0,
+        aux: Default::default(),
+        spread: None,
+        revision: None,
+        ..row()
+    };
+    NewRows {
+        rows: vec![row(), bare],
+        replace: true,
+    }
+}
+
+fn explained() -> Explained {
+    Explained {
+        service: "x".into(),
+        stated: Stated::default(),
+        class: some("default"),
+        priority: 1,
+        limits: Some(limits()),
+        why: all("as stated"),
+        refused: some("there is none"),
+        next: all("better: row 2"),
+        goals: vec![ExplainedGoal {
+            measure: Measure::Fps,
+            desire: 5.0,
+            bound: 2.0,
+            rows: vec![Considered {
+                row: row(),
+                taken: true,
+                why: "taken".into(),
+            }],
+        }],
     }
 }
 
@@ -396,6 +433,11 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("Fit", bare),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
+        sample("Explained", explained()),
+        sample("Explained", Explained::default()),
+        sample("NewRows", new_rows()),
+        sample("NewRows", NewRows::default()),
+        sample("Row", row()),
         sample("Explanation", explanation()),
         sample("Limits", Limits::default()),
         sample("Problem", problem()),

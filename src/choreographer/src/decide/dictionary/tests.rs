@@ -1,0 +1,378 @@
+use api::Size;
+use proptest::prelude::*;
+
+use super::*;
+
+const CAPACITY: Amount = Amount {
+    millicpus: 4000,
+    memory: 8 << 30,
+};
+
+fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -> Row {
+    Row {
+        id,
+        measure,
+        value,
+        aux: known(aux),
+        limits: Limits {
+            cpus: Some(cpus),
+            ..Limits::default()
+        },
+        spread: None,
+        revision: None,
+        written: 0,
+    }
+}
+
+fn known(aux: &[(&str, &str)]) -> Aux {
+    aux.iter()
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect()
+}
+
+fn goal(desire: f64, bound: f64) -> Goal {
+    Goal {
+        measure: Measure::Rrt,
+        desire,
+        bound,
+    }
+}
+
+fn shelf<'a>(rows: &'a [Row], aux: &'a Aux) -> Shelf<'a> {
+    Shelf {
+        rows,
+        aux,
+        own: Limits::default(),
+        reserve: (0.01, 64 << 20),
+        capacity: CAPACITY,
+    }
+}
+
+/// The number of the row that is taken, and whether it reaches the desire; else the best one and the one that is too dear.
+fn taken(choice: &Choice<'_>) -> Result<Option<(i64, bool)>, (Option<i64>, Option<i64>)> {
+    match choice {
+        Choice::Silent => Ok(None),
+        Choice::Taken { row, desired, .. } => Ok(Some((row.id, *desired))),
+        Choice::Unmet { best, beyond, .. } => {
+            Err((best.map(|row| row.id), beyond.map(|row| row.id)))
+        }
+    }
+}
+
+#[test]
+fn the_cheapest_that_meets_the_goal_is_taken() {
+    let rows = [
+        row(1, Measure::Rrt, 0.050, 3.0, &[]),
+        row(2, Measure::Rrt, 0.100, 1.5, &[]),
+        row(3, Measure::Rrt, 0.200, 0.75, &[]),
+        row(4, Measure::Rrt, 0.200, 1.0, &[]),
+        row(5, Measure::Fps, 5.0, 0.5, &[]),
+        row(6, Measure::Fps, 20.0, 2.0, &[]),
+    ];
+    let none = Aux::new();
+    let shelf = shelf(&rows, &none);
+    for (desire, bound, most, expected) in [
+        (0.100, 0.300, 4.0, Ok(Some((2, true)))),
+        (0.150, 0.300, 4.0, Ok(Some((2, true)))),
+        (0.200, 0.300, 4.0, Ok(Some((3, true)))),
+        (0.060, 0.300, 4.0, Ok(Some((1, true)))),
+        // The desire is not reached: the best within the bound.
+        (0.020, 0.300, 4.0, Ok(Some((1, false)))),
+        (0.060, 0.300, 2.0, Ok(Some((2, false)))),
+        (0.060, 0.300, 1.0, Ok(Some((3, false)))),
+        // Not even the bound.
+        (0.020, 0.030, 4.0, Err((Some(1), None))),
+        (0.050, 0.060, 2.0, Err((Some(2), Some(1)))),
+        (0.050, 0.300, 0.1, Err((None, Some(3)))),
+    ] {
+        let choice = shelf.choose(&goal(desire, bound), |row| row.limits.cpus <= Some(most));
+        assert_eq!(taken(&choice), expected, "{desire} {bound} {most}");
+    }
+    let fps = |desire, bound| Goal {
+        measure: Measure::Fps,
+        desire,
+        bound,
+    };
+    for (desire, bound, expected) in [
+        (4.0, 2.0, Ok(Some((5, true)))),
+        (10.0, 2.0, Ok(Some((6, true)))),
+        (30.0, 10.0, Ok(Some((6, false)))),
+        (30.0, 25.0, Err((Some(6), None))),
+    ] {
+        let choice = shelf.choose(&fps(desire, bound), |_| true);
+        assert_eq!(taken(&choice), expected, "{desire} {bound}");
+    }
+    let age = Goal {
+        measure: Measure::Age,
+        desire: 1.0,
+        bound: 1.0,
+    };
+    assert_eq!(shelf.choose(&age, |_| true), Choice::Silent);
+    let next = |id: usize| {
+        let (better, weaker) = shelf.next_to(&rows[id - 1]);
+        (better.map(|row| row.id), weaker.map(|row| row.id))
+    };
+    assert_eq!(next(2), (Some(1), Some(3)));
+    assert_eq!((next(1), next(3)), ((None, Some(2)), (Some(2), None)));
+    assert_eq!((next(5), next(6)), ((Some(6), None), (None, Some(5))));
+}
+
+#[test]
+fn cheap_is_what_takes_a_small_share_of_the_machine() {
+    let with = |id, cpus, gib: u64| {
+        let mut row = row(id, Measure::Rrt, 0.1, cpus, &[]);
+        row.limits.memory = Some(Size(gib << 30));
+        row
+    };
+    let none = Aux::new();
+    for (rows, expected) in [
+        // A quarter of the cores against half of the memory.
+        ([with(1, 1.0, 1), with(2, 0.1, 4)], 1),
+        // As much of both: the smaller other share, then the smaller number.
+        ([with(1, 1.0, 2), with(2, 1.0, 1)], 2),
+        ([with(2, 1.0, 1), with(1, 1.0, 1)], 1),
+    ] {
+        let choice = shelf(&rows, &none).choose(&goal(0.1, 0.1), |_| true);
+        assert_eq!(taken(&choice), Ok(Some((expected, true))));
+    }
+    // Where a row names no memory, the service's own counts.
+    let rows = [row(1, Measure::Rrt, 0.1, 1.0, &[]), with(2, 1.1, 1)];
+    let own = Limits {
+        memory: Some(Size(4 << 30)),
+        ..Limits::default()
+    };
+    let shelf = Shelf {
+        own,
+        ..shelf(&rows, &none)
+    };
+    let choice = shelf.choose(&goal(0.1, 0.1), |_| true);
+    assert_eq!(taken(&choice), Ok(Some((2, true))));
+}
+
+#[test]
+fn auxiliary_parameters_say_which_rows_hold() {
+    let rows = [
+        row(1, Measure::Rrt, 0.1, 0.5, &[("width", "640")]),
+        row(2, Measure::Rrt, 0.1, 2.0, &[("width", "1920")]),
+        row(
+            3,
+            Measure::Rrt,
+            0.1,
+            3.0,
+            &[("width", "640"), ("model", "big")],
+        ),
+        row(4, Measure::Rrt, 0.05, 3.5, &[("model", "big")]),
+    ];
+    for (aux, desire, expected) in [
+        (
+            &[("width", "640"), ("model", "small")][..],
+            0.1,
+            Ok(Some((1, true))),
+        ),
+        (
+            &[("width", "320.5"), ("model", "small")],
+            0.1,
+            Ok(Some((1, true))),
+        ),
+        (
+            &[("width", "641"), ("model", "small")],
+            0.1,
+            Ok(Some((2, true))),
+        ),
+        // Nothing was measured for it.
+        (
+            &[("width", "1921"), ("model", "small")],
+            0.1,
+            Err((None, None)),
+        ),
+        (
+            &[("width", "wide"), ("model", "small")],
+            0.1,
+            Err((None, None)),
+        ),
+        (
+            &[("width", "wide"), ("model", "big")],
+            0.1,
+            Ok(Some((4, true))),
+        ),
+        (
+            &[("width", "640"), ("model", "big")],
+            0.05,
+            Ok(Some((4, true))),
+        ),
+        // What is not known may be anything that rows name.
+        (&[("model", "small")], 0.1, Ok(Some((2, true)))),
+        (&[("width", "640")], 0.1, Ok(Some((1, true)))),
+    ] {
+        let aux = known(aux);
+        let choice = shelf(&rows, &aux).choose(&goal(desire, 0.1), |_| true);
+        assert_eq!(taken(&choice), expected, "{aux:?} {desire}");
+    }
+    let nothing = Aux::new();
+    let choice = shelf(&rows[..2], &nothing).choose(&goal(0.1, 0.1), |_| true);
+    let Choice::Taken { assumed, .. } = choice else {
+        panic!("{choice:?}");
+    };
+    assert_eq!(assumed, known(&[("width", "1920")]), "it is said");
+}
+
+#[test]
+fn rows_that_cannot_be_are_refused_with_what_to_write() {
+    let good = row(0, Measure::Rrt, 0.1, 1.0, &[("width", "640")]);
+    assert_eq!(check(&good), Ok(()));
+    let with = |change: fn(&mut Row)| {
+        let mut row = good.clone();
+        change(&mut row);
+        check(&row).expect_err("refused")
+    };
+    for (refused, words) in [
+        (with(|row| row.value = 0.0), "rrt \"0\" is not a time"),
+        (with(|row| row.value = f64::NAN), "rrt \"NaN\""),
+        (with(|row| row.value = 1e9), "rrt \"1000000000\""),
+        (
+            with(|row| (row.measure, row.value) = (Measure::Fps, -1.0)),
+            "fps = \"-1\" is not a rate",
+        ),
+        (
+            with(|row| row.aux = known(&[("a b", "1")])),
+            "aux.a b names no auxiliary parameter",
+        ),
+        (
+            with(|row| row.aux = known(&[("a", "")])),
+            "aux.a has no value",
+        ),
+        (with(|row| row.limits.cpus = Some(0.0)), "cpus = 0 is not"),
+        (
+            with(|row| row.limits.memory = Some(Size(1))),
+            "memory = 1 is too little",
+        ),
+        (
+            with(|row| {
+                row.spread = Some(api::dictionary::Spread {
+                    p50: f64::NAN,
+                    p95: 1.0,
+                    requests: 1,
+                });
+            }),
+            "spread: p50 NaN",
+        ),
+    ] {
+        assert!(refused.starts_with(words), "{refused}");
+    }
+}
+
+fn measures() -> impl Strategy<Value = Measure> {
+    prop_oneof![Just(Measure::Rrt), Just(Measure::Fps)]
+}
+
+/// Few different values, so that they meet.
+fn value() -> impl Strategy<Value = f64> {
+    (1u32..12).prop_map(|n| f64::from(n) / 8.0)
+}
+
+fn rows() -> impl Strategy<Value = Vec<Row>> {
+    let width = proptest::option::of(1u32..5);
+    let one = (measures(), value(), 1u32..12, 1u64..6, width);
+    proptest::collection::vec(one, 0..12).prop_map(|rows| {
+        let rows = rows.into_iter().enumerate();
+        rows.map(|(index, (measure, value, cpus, gib, width))| {
+            let mut row = row(index as i64 + 1, measure, value, f64::from(cpus) / 4.0, &[]);
+            row.limits.memory = Some(Size(gib << 30));
+            if let Some(width) = width {
+                row.aux.insert("width".into(), width.to_string());
+            }
+            row
+        })
+        .collect()
+    })
+}
+
+fn goals() -> impl Strategy<Value = Goal> {
+    (measures(), value(), value()).prop_map(|(measure, one, other)| {
+        let in_order = measure.reaches(one, other);
+        let (desire, bound) = if in_order { (one, other) } else { (other, one) };
+        Goal {
+            measure,
+            desire,
+            bound,
+        }
+    })
+}
+
+fn within(most: f64) -> impl Fn(&Row) -> bool {
+    move |row| row.limits.cpus <= Some(most)
+}
+
+proptest! {
+    #[test]
+    fn what_is_taken_meets_the_goal_and_nothing_cheaper_does(
+        rows in rows(), goal in goals(), width in 1u32..6, most in value().prop_map(|n| n * 3.0),
+    ) {
+        let aux = known(&[("width", &width.to_string())]);
+        let shelf = shelf(&rows, &aux);
+        let open = |row: &&Row| {
+            let fits = row.aux.get("width").is_none_or(|has| has.parse::<u32>().unwrap() >= width);
+            row.measure == goal.measure && fits && within(most)(row)
+        };
+        let reaching = |than: f64| rows.iter().filter(open).filter(move |row| goal.measure.reaches(row.value, than));
+        match shelf.choose(&goal, within(most)) {
+            Choice::Silent => prop_assert!(rows.iter().all(|row| row.measure != goal.measure)),
+            Choice::Taken { row, desired, assumed } => {
+                prop_assert!(assumed.is_empty());
+                prop_assert!(open(&row) && goal.measure.reaches(row.value, goal.bound));
+                prop_assert_eq!(desired, reaching(goal.desire).next().is_some());
+                if desired {
+                    for other in reaching(goal.desire) {
+                        prop_assert!(less(shelf.cost(row), shelf.cost(other)).is_le());
+                    }
+                } else {
+                    for other in reaching(goal.bound) {
+                        prop_assert!(goal.measure.reaches(row.value, other.value));
+                    }
+                }
+            }
+            Choice::Unmet { .. } => prop_assert!(reaching(goal.bound).next().is_none()),
+        }
+    }
+
+    #[test]
+    fn the_order_of_rows_does_not_matter(rows in rows(), goal in goals(), most in value()) {
+        let none = Aux::new();
+        let turned: Vec<Row> = rows.iter().rev().cloned().collect();
+        let one = shelf(&rows, &none).choose(&goal, within(most * 3.0)).clone();
+        let other = shelf(&turned, &none);
+        prop_assert_eq!(taken(&one), taken(&other.choose(&goal, within(most * 3.0))));
+    }
+
+    #[test]
+    fn who_wishes_for_less_never_pays_more(rows in rows(), goal in goals(), less in value(), width in 1u32..6) {
+        let aux = known(&[("width", &width.to_string())]);
+        let shelf = shelf(&rows, &aux);
+        let relaxed = match goal.measure.reaches(less, goal.desire) {
+            true => return Ok(()),
+            false => Goal { desire: less, bound: if goal.measure.reaches(goal.bound, less) { less } else { goal.bound }, ..goal },
+        };
+        if let Choice::Taken { row, .. } = shelf.choose(&goal, |_| true) {
+            let Choice::Taken { row: other, .. } = shelf.choose(&relaxed, |_| true) else {
+                panic!("it could be met before");
+            };
+            prop_assert!(super::less(shelf.cost(other), shelf.cost(row)).is_le());
+        }
+    }
+
+    #[test]
+    fn who_does_not_say_pays_for_the_dearest_that_rows_know(rows in rows(), goal in goals()) {
+        let nothing = Aux::new();
+        let Choice::Taken { row, .. } = shelf(&rows, &nothing).choose(&goal, |_| true) else {
+            return Ok(());
+        };
+        for width in rows.iter().filter(|row| row.measure == goal.measure).filter_map(|row| row.aux.get("width")) {
+            let aux = known(&[("width", width)]);
+            let shelf = shelf(&rows, &aux);
+            let Choice::Taken { row: told, .. } = shelf.choose(&goal, |_| true) else {
+                panic!("it could be met for all");
+            };
+            prop_assert!(less(shelf.cost(told), shelf.cost(row)).is_le());
+        }
+    }
+}

@@ -1,0 +1,417 @@
+//! `sla`: a service's dictionary, from what robots state to resources.
+
+use std::collections::BTreeMap;
+
+use anyhow::bail;
+use api::dictionary::{Explained, NewRows, Row, Spread};
+use api::sla::{AUX, check_aux};
+use api::{Limits, Measure, Stated};
+
+use crate::client::{Client, escaped};
+use crate::limits::LimitFlags;
+use crate::output::{self, Format, Table};
+
+/// What an SLA costs: list, set, remove and explain the rows of a service's dictionary.
+#[derive(Debug, clap::Args)]
+pub struct Sla {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Verb {
+    List(List),
+    Set(Set),
+    Rm(Rm),
+    Explain(Explain),
+}
+
+/// List the rows of a service's dictionary.
+#[derive(Debug, clap::Args)]
+struct List {
+    /// The service.
+    service: String,
+}
+
+/// Write a row: with these limits, a servant reaches this value. One of the same value and auxiliary parameters is replaced.
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("value").required(true).args(["rrt", "fps", "age"])))]
+struct Set {
+    /// The service.
+    service: String,
+    /// Response time that is reached, such as 100ms.
+    #[arg(long, value_name = "TIME", value_parser = rrt)]
+    rrt: Option<f64>,
+    /// Frames per second that are reached.
+    #[arg(long, value_name = "RATE", value_parser = fps)]
+    fps: Option<f64>,
+    /// Age of an output that is reached, such as 500ms.
+    #[arg(long, value_name = "TIME", value_parser = age)]
+    age: Option<f64>,
+    /// Auxiliary parameter for which it holds: of a number up to this one; may be given several times.
+    #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
+    aux: Vec<(String, String)>,
+    #[command(flatten)]
+    limits: LimitFlags,
+    /// How it was measured: median, 95th percentile and number of requests, such as 80ms,95ms,200.
+    #[arg(long, value_name = "P50,P95,N")]
+    spread: Option<String>,
+}
+
+/// Remove rows by their numbers.
+#[derive(Debug, clap::Args)]
+struct Rm {
+    /// The service.
+    service: String,
+    /// Numbers of rows, as `sla list` shows them.
+    #[arg(required = true)]
+    rows: Vec<i64>,
+}
+
+/// Say which row a robot would get that states this, why, and what comes next.
+#[derive(Debug, clap::Args)]
+struct Explain {
+    /// The service.
+    service: String,
+    /// Response time that is wished for, such as 100ms.
+    #[arg(long, value_name = "TIME")]
+    rrt: Option<String>,
+    /// The longest that is acceptable.
+    #[arg(long, value_name = "TIME")]
+    max_rrt: Option<String>,
+    /// Frames per second that are wished for.
+    #[arg(long, value_name = "RATE")]
+    fps: Option<String>,
+    /// The least that is acceptable.
+    #[arg(long, value_name = "RATE")]
+    min_fps: Option<String>,
+    /// Age of an output that is wished for.
+    #[arg(long, value_name = "TIME")]
+    age: Option<String>,
+    /// The greatest that is acceptable.
+    #[arg(long, value_name = "TIME")]
+    max_age: Option<String>,
+    /// Class of the daemon's configuration.
+    #[arg(long, value_name = "NAME")]
+    class: Option<String>,
+    /// Cores outright.
+    #[arg(long, value_name = "N")]
+    cpus: Option<String>,
+    /// Memory outright, such as 512M.
+    #[arg(long, value_name = "SIZE")]
+    memory: Option<String>,
+    /// Auxiliary parameter; may be given several times.
+    #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
+    aux: Vec<(String, String)>,
+}
+
+fn rrt(text: &str) -> Result<f64, String> {
+    Measure::Rrt.read(text)
+}
+
+fn fps(text: &str) -> Result<f64, String> {
+    Measure::Fps.read(text)
+}
+
+fn age(text: &str) -> Result<f64, String> {
+    Measure::Age.read(text)
+}
+
+fn aux(text: &str) -> Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE")?;
+    check_aux(key, value)?;
+    Ok((key.to_owned(), value.to_owned()))
+}
+
+impl Sla {
+    /// Asks and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        match self.verb {
+            Verb::List(verb) => {
+                let rows: Vec<Row> = client.get(&path(&verb.service, "")).await?;
+                list(&verb.service, &rows, format)
+            }
+            Verb::Set(verb) => {
+                let new = NewRows {
+                    rows: vec![verb.row()?],
+                    replace: false,
+                };
+                let rows: Vec<Row> = client.put(&path(&verb.service, ""), &new).await?;
+                list(&verb.service, &rows, format)
+            }
+            Verb::Rm(verb) => {
+                let mut left = Vec::new();
+                for row in &verb.rows {
+                    let path = path(&verb.service, &format!("/{row}"));
+                    left = client.delete(&path).await?;
+                }
+                list(&verb.service, &left, format)
+            }
+            Verb::Explain(verb) => {
+                let stated = verb.stated()?;
+                let query: Vec<String> = stated
+                    .pairs()
+                    .iter()
+                    .map(|(key, value)| format!("{}={}", escaped(key), escaped(value)))
+                    .collect();
+                let path = path(&verb.service, &format!("/explain?{}", query.join("&")));
+                let explained: Explained = client.get(&path).await?;
+                match format {
+                    Format::Json => output::json(&explained),
+                    Format::Table => explain(&explained),
+                }
+            }
+        }
+    }
+}
+
+fn path(service: &str, rest: &str) -> String {
+    format!("/api/v1/services/{}/sla{rest}", escaped(service))
+}
+
+impl Set {
+    fn row(&self) -> anyhow::Result<Row> {
+        let given = [
+            (Measure::Rrt, self.rrt),
+            (Measure::Fps, self.fps),
+            (Measure::Age, self.age),
+        ];
+        let given = given
+            .into_iter()
+            .find_map(|(measure, value)| Some((measure, value?)));
+        let Some((measure, value)) = given else {
+            bail!("nothing is reached; name --rrt, --fps or --age");
+        };
+        let limits = Limits::from(self.limits);
+        if limits == Limits::default() {
+            bail!("nothing is needed; name a limit, such as --cpus 1.5 or --memory 512M");
+        }
+        let spread = self.spread.as_deref();
+        Ok(Row {
+            id: 0,
+            measure,
+            value,
+            aux: self.aux.iter().cloned().collect(),
+            limits,
+            spread: spread.map(|text| spread_of(measure, text)).transpose()?,
+            revision: None,
+            written: 0,
+        })
+    }
+}
+
+fn spread_of(measure: Measure, text: &str) -> anyhow::Result<Spread> {
+    let parts: Vec<&str> = text.split(',').map(str::trim).collect();
+    let [p50, p95, requests] = parts[..] else {
+        bail!("--spread {text:?} has not three parts; write P50,P95,N such as 80ms,95ms,200");
+    };
+    let read = |text| {
+        measure
+            .read(text)
+            .map_err(|reason| anyhow::anyhow!("--spread {reason}"))
+    };
+    let Ok(requests) = requests.parse() else {
+        bail!("--spread: {requests:?} is not a number of requests; write one such as 200");
+    };
+    Ok(Spread {
+        p50: read(p50)?,
+        p95: read(p95)?,
+        requests,
+    })
+}
+
+impl Explain {
+    fn stated(&self) -> anyhow::Result<Stated> {
+        let given = [
+            ("rrt", &self.rrt),
+            ("max_rrt", &self.max_rrt),
+            ("fps", &self.fps),
+            ("min_fps", &self.min_fps),
+            ("age", &self.age),
+            ("max_age", &self.max_age),
+            ("class", &self.class),
+            ("cpus", &self.cpus),
+            ("memory", &self.memory),
+        ];
+        let given = given
+            .into_iter()
+            .filter_map(|(key, value)| Some((key.to_owned(), value.clone()?)));
+        let aux = self.aux.iter();
+        let aux = aux.map(|(key, value)| (format!("{AUX}{key}"), value.clone()));
+        Ok(Stated::read(given.chain(aux))?)
+    }
+}
+
+fn in_words(aux: &BTreeMap<String, String>) -> String {
+    let pairs = aux.iter().map(|(key, value)| format!("{key}={value}"));
+    pairs.collect::<Vec<_>>().join(" ")
+}
+
+fn cells(row: &Row) -> [String; 6] {
+    let print = |value| row.measure.print(value);
+    let spread = row.spread.map(|spread| {
+        format!(
+            "p50 {}, p95 {} of {}",
+            print(spread.p50),
+            print(spread.p95),
+            spread.requests
+        )
+    });
+    [
+        row.id.to_string(),
+        format!("{} {}", row.measure.name(), print(row.value)),
+        in_words(&row.aux),
+        output::limits(&row.limits),
+        spread.unwrap_or_default(),
+        row.revision.map_or_else(String::new, |n| n.to_string()),
+    ]
+}
+
+const HEADINGS: [&str; 6] = ["ROW", "REACHES", "FOR", "WITH", "MEASURED", "REVISION"];
+
+fn list(service: &str, rows: &[Row], format: Format) -> anyhow::Result<()> {
+    if format == Format::Json {
+        return output::json(&rows);
+    }
+    if rows.is_empty() {
+        return output::line(&format!(
+            "{service} has no rows: every robot gets the service's own limits; add one with: cloudroidctl sla set {service} --rrt 100ms --cpus 1.5"
+        ));
+    }
+    let mut table = Table::new(&HEADINGS);
+    for row in rows {
+        table.row(cells(row));
+    }
+    table.print()
+}
+
+fn explain(explained: &Explained) -> anyhow::Result<()> {
+    let Explained {
+        service, stated, ..
+    } = explained;
+    match (&explained.limits, &explained.refused) {
+        (Some(limits), _) => output::line(&format!(
+            "a robot that states {stated} to {service} is promised {}",
+            output::limits(limits)
+        ))?,
+        (None, Some(refused)) => output::line(&format!(
+            "a robot that states {stated} to {service} is refused: {refused}"
+        ))?,
+        (None, None) => {}
+    }
+    if let Some(class) = &explained.class {
+        output::line(&format!("  class {class}, priority {}", explained.priority))?;
+    }
+    for why in &explained.why {
+        output::line(&format!("  {why}"))?;
+    }
+    for next in &explained.next {
+        output::line(&format!("next {next}"))?;
+    }
+    for goal in &explained.goals {
+        let print = |value| goal.measure.print(value);
+        output::line(&format!(
+            "\n{}: {} is wished for, {} acceptable",
+            goal.measure.name(),
+            print(goal.desire),
+            print(goal.bound)
+        ))?;
+        let mut table = Table::new(&["ROW", "REACHES", "FOR", "WITH", ""]);
+        for considered in &goal.rows {
+            let [id, reaches, aux, limits, ..] = cells(&considered.row);
+            table.row([id, reaches, aux, limits, considered.why.clone()]);
+        }
+        if !table.is_empty() {
+            table.print()?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use api::Size;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        sla: Sla,
+    }
+
+    fn parse(line: &str) -> Result<Verb, clap::Error> {
+        Line::try_parse_from(std::iter::once("sla").chain(line.split_whitespace()))
+            .map(|line| line.sla.verb)
+    }
+
+    #[test]
+    fn a_row_is_what_is_typed() {
+        let line = "set detect --rrt 100ms --aux width=640 --cpus 1.5 --memory 512M --spread 80ms,95ms,200";
+        let Verb::Set(set) = parse(line).expect("valid") else {
+            panic!("another verb");
+        };
+        let row = set.row().expect("a row");
+        assert_eq!((row.measure, row.value), (Measure::Rrt, 0.1));
+        assert_eq!(row.aux["width"], "640");
+        assert_eq!(row.limits.memory, Some(Size(512 << 20)));
+        let spread = row.spread.expect("it was measured");
+        assert_eq!(
+            (spread.p50, spread.p95, spread.requests),
+            (0.08, 0.095, 200)
+        );
+    }
+
+    #[test]
+    fn what_is_stated_is_what_is_typed() {
+        let line = "explain detect --rrt 100ms --max-rrt 0.3 --class urgent --aux width=640";
+        let Verb::Explain(explain) = parse(line).expect("valid") else {
+            panic!("another verb");
+        };
+        let stated = explain.stated().expect("it can be stated");
+        assert_eq!(
+            stated.to_string(),
+            "rrt=100ms max_rrt=300ms class=urgent aux.width=640"
+        );
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_refused_with_what_to_write() {
+        for (line, words) in [
+            ("set detect", "--rrt"),
+            ("set detect --rrt 1 --fps 1 --cpus 1", "cannot be used with"),
+            ("set detect --rrt soon --cpus 1", "is not a time"),
+            ("set detect --fps 0 --cpus 1", "is not a rate"),
+            ("set detect --rrt 1 --aux width --cpus 1", "KEY=VALUE"),
+            ("rm detect", "ROWS"),
+            ("rm detect one", "invalid"),
+        ] {
+            let refused = parse(line).expect_err(line).to_string();
+            assert!(refused.contains(words), "{line}: {refused}");
+        }
+        for (line, words) in [
+            ("set detect --rrt 1", "name a limit"),
+            ("set detect --rrt 1 --cpus 1 --spread 1,2", "P50,P95,N"),
+            (
+                "set detect --rrt 1 --cpus 1 --spread 1,x,3",
+                "is not a time",
+            ),
+            (
+                "set detect --rrt 1 --cpus 1 --spread 1,2,x",
+                "number of requests",
+            ),
+        ] {
+            let Verb::Set(set) = parse(line).expect(line) else {
+                panic!("another verb");
+            };
+            let refused = set.row().expect_err(line).to_string();
+            assert!(refused.contains(words), "{line}: {refused}");
+        }
+        let Verb::Explain(explain) = parse("explain detect --rrt 2 --max-rrt 1").expect("parsed")
+        else {
+            panic!("another verb");
+        };
+        let refused = explain.stated().expect_err("in disorder").to_string();
+        assert!(refused.contains("greater than max_rrt"), "{refused}");
+    }
+}

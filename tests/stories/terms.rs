@@ -1,0 +1,279 @@
+//! What robots state is what they get, as the kernel has it.
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::Signal;
+use ros::bus::{GlobalParameters, Graph, ParamValue};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::daemon::Daemon;
+use support::robot::Robot;
+use support::site::Site;
+use support::world::world;
+
+const MIB: u64 = 1 << 20;
+
+/// A daemon with classes, and the greeter with a dictionary.
+fn daemon(name: &str) -> anyhow::Result<Daemon> {
+    let daemon = world()
+        .own(name)
+        .config(
+            "[capacity]\ncpus = 4.0\n[class.default]\nmax_cpus = 1.5\n\
+             [class.urgent]\npriority = 10\nmax_cpus = 3.0\n",
+        )
+        .start()?;
+    let deployer = daemon.deployer();
+    let push = [
+        "--node",
+        "greeter",
+        "--param",
+        "word=hi",
+        "--cpus",
+        "0.5",
+        "--max-memory",
+        "512M",
+        "--rrt",
+        "100ms",
+        "--max-rrt",
+        "300ms",
+    ];
+    deployer.pushes("greeter_cpp", &push)?.succeeded()?;
+    for row in [
+        ["--rrt", "200ms", "--cpus", "0.25", "--memory", "128M"],
+        ["--rrt", "100ms", "--cpus", "0.75", "--memory", "192M"],
+        ["--rrt", "50ms", "--cpus", "2", "--memory", "256M"],
+    ] {
+        let verb = ["sla", "set", "greeter_cpp"];
+        deployer
+            .types(&[&verb[..], &row[..]].concat())?
+            .succeeded()?;
+    }
+    Ok(daemon)
+}
+
+/// Cores and MiB that are in force for a robot's servant.
+fn in_force(daemon: &Daemon, robot: &str) -> anyhow::Result<(Option<f64>, Option<u64>, Value)> {
+    let servant = daemon.servant_of("greeter_cpp", robot)?;
+    let enforced = &servant["enforced"];
+    let memory = enforced["memory"].as_u64().map(|bytes| bytes / MIB);
+    Ok((enforced["cpus"].as_f64(), memory, servant))
+}
+
+/// Why a handshake is refused.
+fn refusal(daemon: &Daemon, path: &str) -> anyhow::Result<(u16, Value)> {
+    match Robot::try_connect(&daemon.url(path)) {
+        Ok(_) => anyhow::bail!("{path} was let in"),
+        Err(refusal) => Ok((
+            refusal.status,
+            serde_json::from_str(&refusal.body).with_context(|| refusal.body.clone())?,
+        )),
+    }
+}
+
+pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
+    let daemon = daemon("terms")?;
+    let deployer = daemon.deployer();
+    let listed = deployer
+        .types(&["sla", "list", "greeter_cpp"])?
+        .succeeded()?;
+    for words in ["rrt 50ms", "2 cpus, 256M", "rrt 200ms"] {
+        ensure!(listed.stdout.contains(words), "{}", listed.stdout);
+    }
+    // Who states nothing gets what the push says; who states an SLA what its row says.
+    let mut plain = daemon.robot("greeter_cpp?robot=plain")?;
+    plain.calls("/rosapi/get_time", json!({}))?;
+    ensure!(in_force(&daemon, "plain")?.0 == Some(0.5));
+    let mut robot = daemon.robot("greeter_cpp?robot=rover&rrt=100ms&max_rrt=300ms")?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    let (cpus, memory, before) = in_force(&daemon, "rover")?;
+    ensure!(
+        (cpus, memory) == (Some(0.75), Some(192)),
+        "what the row says is in force: {before:#}"
+    );
+    ensure!(
+        before["terms"]["rows"][0]["id"] == 2 && before["terms"]["class"] == "default",
+        "it is shown: {before:#}"
+    );
+    daemon.awaits_event("what was stated", |event| {
+        event["kind"] == "terms"
+            && event["message"]
+                .as_str()
+                .is_some_and(|text| text.contains("rrt=100ms"))
+    })?;
+    // It connects again and wishes for more, in a class that may have it: the same nodes, with more.
+    let mut again = daemon.robot("greeter_cpp?robot=rover&rrt=50ms&class=urgent")?;
+    again.calls("/greeter/count", json!({"reset": false}))?;
+    let (cpus, memory, after) = in_force(&daemon, "rover")?;
+    ensure!((cpus, memory) == (Some(2.0), Some(256)), "{after:#}");
+    ensure!(
+        after["pids"] == before["pids"],
+        "resized in place: {after:#}"
+    );
+    ensure!(after["terms"]["priority"] == 10, "{after:#}");
+    robot.calls("/greeter/count", json!({"reset": false}))?;
+    for (verb, words) in [
+        (&["servants"][..], ["rrt=50ms", "row 3"]),
+        (
+            &["explain", "rover"],
+            ["rrt=50ms", "is the cheapest that reaches"],
+        ),
+    ] {
+        let said = deployer.types(verb)?.succeeded()?.stdout;
+        for words in words {
+            ensure!(
+                said.contains(words),
+                "{verb:?} does not tell {words}: {said}"
+            );
+        }
+    }
+    // More than there is, than is allowed, or than can be reached: each is told what to do, and it keeps what it has.
+    for (query, status, words) in [
+        (
+            "rrt=50ms",
+            403,
+            &[
+                "needs row 3",
+                "1.5, the max_cpus of class default",
+                "rrt=100ms",
+            ][..],
+        ),
+        (
+            "class=urgent&cpus=2.9&memory=600M",
+            403,
+            &[
+                "memory = 600M",
+                "512M, the --max-memory",
+                "memory=512M or less",
+            ],
+        ),
+        (
+            "rrt=1ms&class=urgent",
+            422,
+            &[
+                "does not reach rrt 1ms",
+                "row 3",
+                "state what fits: rrt=50ms",
+            ],
+        ),
+        (
+            "class=nope",
+            400,
+            &["class = \"nope\"", "state one that exists"],
+        ),
+        ("rrt=soon", 400, &["rrt = \"soon\" is not a time", "300ms"]),
+        ("rtt=100ms", 400, &["rtt is not a key; write rrt"]),
+    ] {
+        let (got, problem) = refusal(&daemon, &format!("greeter_cpp?robot=stranger&{query}"))?;
+        let said = format!("{} {}", problem["detail"], problem["next"]).replace("\\\"", "\"");
+        ensure!(got == status, "{query}: {got} {said}");
+        for words in words {
+            ensure!(
+                said.contains(words),
+                "{query}: {words:?} is missing: {said}"
+            );
+        }
+    }
+    // Who has a servant is told by a status message, and keeps it as it is.
+    for (query, words) in [
+        ("rrt=50ms", "the max_cpus of class default"),
+        ("rrt=1ms&class=urgent", "state what fits: rrt=50ms"),
+        ("class=nope", "not one of the configuration's classes"),
+    ] {
+        let mut rover = daemon.robot(&format!("greeter_cpp?robot=rover&{query}"))?;
+        rover.hears_status(words)?;
+        rover.hears_close()?;
+    }
+    let (cpus, memory, kept) = in_force(&daemon, "rover")?;
+    ensure!((cpus, memory) == (Some(2.0), Some(256)), "{kept:#}");
+    ensure!(
+        daemon.servants_of("greeter_cpp")?.len() == 2,
+        "strangers left nothing"
+    );
+    // There are four cores.
+    let mut greedy = daemon.robot("greeter_cpp?robot=plain&class=urgent&cpus=2.5")?;
+    greedy.hears_status("state what fits: cpus=")?;
+    greedy.hears_close()?;
+    // What a robot would get, without being one.
+    let line = [
+        "sla",
+        "explain",
+        "greeter_cpp",
+        "--rrt",
+        "150ms",
+        "--max-rrt",
+        "250ms",
+    ];
+    let said = deployer.types(&line)?.succeeded()?.stdout;
+    for words in [
+        "is promised 0.75 cpus, 192M",
+        "row 2 (rrt 100ms: cpus 0.75, memory 192M) is the cheapest that reaches rrt 150ms",
+        "next better: row 3",
+        "next cheaper: row 1",
+        "is acceptable, but does not reach 150ms",
+    ] {
+        ensure!(said.contains(words), "{words:?} is missing: {said}");
+    }
+    let gone = deployer
+        .types(&["sla", "rm", "greeter_cpp", "1", "2", "3"])?
+        .succeeded()?;
+    ensure!(gone.stdout.contains("has no rows"), "{}", gone.stdout);
+    deployer
+        .types(&["sla", "rm", "greeter_cpp", "7"])?
+        .failed_saying(&["no row \"7\"", "sla list greeter_cpp"])?;
+    Ok(())
+}
+
+pub fn a_stub_states_what_its_robot_says_before_it_is_admitted() -> Verdict {
+    let daemon = daemon("terms-stub")?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let serves = |graph: &Graph| graph.services.contains_key("/greeter/count");
+    let run = |state: &[(&str, ParamValue)]| -> anyhow::Result<Value> {
+        for (key, value) in state {
+            let name = format!("/greeter/cloudroid/{key}");
+            site.runtime.block_on(app.set(&name, value.clone()))?;
+        }
+        let overlay = site.installs(
+            &daemon,
+            "greeter_cpp",
+            "robot = \"linked\"\nlocal = \"none\"\n",
+        )?;
+        let mut stub = site.runs(&overlay, "greeter_cpp", "greeter", &[])?;
+        let there = site.until(&app, "the service", serves);
+        there.with_context(|| format!("the stub said:\n{}", stub.said()))?;
+        let (_, _, servant) = in_force(&daemon, "linked")?;
+        stub.signal(Signal::SIGINT)?;
+        stub.ends()?;
+        site.until(&app, "its end", |graph| !serves(graph))?;
+        Ok(servant)
+    };
+    let enforced = |servant: &Value| {
+        let memory = servant["enforced"]["memory"]
+            .as_u64()
+            .map(|bytes| bytes / MIB);
+        (servant["enforced"]["cpus"].as_f64(), memory)
+    };
+    // The robot says nothing: what the push says of its stubs.
+    let first = run(&[])?;
+    ensure!(enforced(&first) == (Some(0.75), Some(192)), "{first:#}");
+    ensure!(
+        first["terms"]["stated"]["/greeter"]["sla"] == json!({"rrt": "100ms", "max_rrt": "300ms"}),
+        "{first:#}"
+    );
+    // It says something else by its parameters, and is started again: the same servant, resized.
+    let times = [
+        ("desire", ParamValue::Double(0.05)),
+        ("max", ParamValue::Double(0.2)),
+        ("class", ParamValue::String("urgent".into())),
+    ];
+    let second = run(&times)?;
+    ensure!(second["id"] == first["id"], "{second:#}");
+    ensure!(enforced(&second) == (Some(2.0), Some(256)), "{second:#}");
+    // Resources outright come before.
+    let direct = [
+        ("cpus", ParamValue::Double(1.25)),
+        ("memory", ParamValue::String("300M".into())),
+    ];
+    let third = run(&direct)?;
+    ensure!(enforced(&third) == (Some(1.25), Some(300)), "{third:#}");
+    Ok(())
+}
