@@ -7,6 +7,7 @@ mod decide;
 mod herd;
 mod in_time;
 mod neighbours;
+mod shared;
 mod worker;
 
 use anyhow::{Context, Result};
@@ -16,11 +17,12 @@ use bench_report::Report;
 type Group = (&'static str, fn(&mut Report) -> Result<()>);
 
 /// All groups, in the order in which they are measured.
-const GROUPS: [Group; 4] = [
+const GROUPS: [Group; 5] = [
     ("decide", decide::measure),
     ("herd", herd::measure),
     ("neighbours", neighbours::measure),
     ("in_time", in_time::measure),
+    ("shared", shared::measure),
 ];
 
 fn main() -> Result<()> {

@@ -1,0 +1,155 @@
+//! Servants that robots share: calls a second of fifty robots, beside what one robot gets of a servant of its own, and beside
+//! a client in roscpp of the same node in the same container. Each call takes two milliseconds of waiting, as of a node
+//! whose work is elsewhere (a graphics card, a device), so that servants and not this machine's cores are what is shared.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use bench_report::{Report, Target};
+use serde_json::{Value, json};
+use support::daemon::{Daemon, Setup};
+use support::robot::Robot;
+
+const PACKAGE: &str = "sharer_cpp";
+const ROBOTS: usize = 50;
+const LASTS: Duration = Duration::from_secs(5);
+const WORK: f64 = 0.002;
+
+/// What is pushed: the name, and more arguments.
+const PUSHED: [(&str, &[&str]); 4] = [
+    ("own", &["--node", "sharer"]),
+    ("one", &["--node", "sharer", "--shared", "--max", "1"]),
+    (
+        "two",
+        &["--node", "sharer", "--shared", "--min", "2", "--max", "2"],
+    ),
+    (
+        "roscpp",
+        &[
+            "--node",
+            "sharer",
+            "--node",
+            "asker",
+            "--param",
+            "seconds=0.002",
+        ],
+    ),
+];
+
+pub fn measure(report: &mut Report) -> Result<()> {
+    let place = tempfile::Builder::new()
+        .prefix("cloudroid-bench-")
+        .tempdir()?;
+    let setup = Setup::new(&place.path().join("home"));
+    let daemon = setup.config("[capacity]\ncpus = 64\n").start()?;
+    for (name, arguments) in PUSHED {
+        let arguments = [&["--name", name, "--cpus", "0.5"], arguments].concat();
+        daemon.deployer().pushes(PACKAGE, &arguments)?.succeeded()?;
+    }
+    let roscpp = of_roscpp(&daemon)?;
+    let single = calls(&daemon, "own", 1)?;
+    report
+        .figure("one robot at a servant of its own", "calls/s", single)
+        .beside("roscpp in the same container", roscpp);
+    for (name, servants) in [("one", 1), ("two", 2)] {
+        let shared = calls(&daemon, name, ROBOTS)?;
+        let sum = single * f64::from(servants);
+        report
+            .figure(
+                format!("{ROBOTS} robots at {servants} shared"),
+                "calls/s",
+                shared,
+            )
+            .beside(format!("{servants} x one robot at its own"), sum)
+            .reach(Target::RatioAtLeast(0.9));
+        report
+            .figure(
+                format!("{ROBOTS} robots at {servants} shared"),
+                "calls/s",
+                shared,
+            )
+            .beside(
+                format!("{servants} x roscpp in the same container"),
+                roscpp * f64::from(servants),
+            );
+    }
+    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    daemon.ends()?;
+    Ok(())
+}
+
+/// Calls a second of so many robots, each with one call after the other.
+fn calls(daemon: &Daemon, service: &str, robots: usize) -> Result<f64> {
+    let mut ready = Vec::new();
+    for number in 0..robots {
+        let mut robot = daemon.robot(&format!("{service}?robot=r{number}"))?;
+        call(&mut robot)?;
+        ready.push(robot);
+    }
+    let wanted = if service == "two" { 2 } else { 1 };
+    daemon.awaits(
+        &format!("/api/v1/services/{service}"),
+        "its servants",
+        |found| {
+            let groups = found["groups"].as_array();
+            let servants = groups
+                .and_then(|all| all.first())
+                .map(|group| &group["servants"]);
+            let ready = |one: &&Value| one["ready"] == true;
+            let count = servants.map_or(1, |all| {
+                all.as_array()
+                    .map_or(0, |all| all.iter().filter(ready).count())
+            });
+            (count >= wanted).then_some(())
+        },
+    )?;
+    let (counted, over) = (
+        Arc::new(AtomicU64::new(0)),
+        Arc::new(AtomicBool::new(false)),
+    );
+    let began = Instant::now();
+    let working: Vec<_> = ready
+        .into_iter()
+        .map(|mut robot| {
+            let (counted, over) = (Arc::clone(&counted), Arc::clone(&over));
+            thread::spawn(move || -> Result<()> {
+                while !over.load(Ordering::Relaxed) {
+                    call(&mut robot)?;
+                    counted.fetch_add(1, Ordering::Relaxed);
+                }
+                Ok(())
+            })
+        })
+        .collect();
+    thread::sleep(LASTS);
+    let rate = counted.load(Ordering::Relaxed) as f64 / began.elapsed().as_secs_f64();
+    over.store(true, Ordering::Relaxed);
+    for robot in working {
+        robot
+            .join()
+            .map_err(|_| anyhow::anyhow!("a robot panicked"))??;
+    }
+    Ok(rate)
+}
+
+fn call(robot: &mut Robot) -> Result<()> {
+    let answer = robot.calls("/work", json!({ "who": "r", "seconds": WORK }))?;
+    ensure!(answer["result"] == true, "{answer}");
+    Ok(())
+}
+
+/// What the client in roscpp prints.
+fn of_roscpp(daemon: &Daemon) -> Result<f64> {
+    let _robot = daemon.robot("roscpp?robot=r")?;
+    let servant = daemon.servant_of("roscpp", "r")?;
+    let id = servant["id"].as_str().context("an id")?.to_owned();
+    support::until("its figure", || {
+        let said = daemon.deployer().types(&["logs", &id])?.said();
+        let figure = said.split("calls a second: ").nth(1);
+        let figure = figure.and_then(|rest| rest.split_whitespace().next()?.parse().ok());
+        Ok(figure.ok_or(said))
+    })
+}
