@@ -355,7 +355,7 @@ fn observe(inner: &Inner, shares: &Shares) -> Option<Failure> {
                         "servant {} of {} was lost with what it worked at for robots: {reason}",
                         handle.id, shares.revision.service
                     );
-                    if !one.retiring {
+                    if life.failure.is_some() {
                         inner
                             .journal
                             .warning("shared-servant-lost", &message, &handle.about());
