@@ -3,11 +3,13 @@
 mod curve;
 
 use std::fs;
+use std::io::{BufRead, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use api::calibration::{Point, Source};
-use api::dictionary::Row;
+use api::dictionary::{NewRows, Row};
+use api::sla::check_aux;
 use api::{Calibration, CalibrationEvent, CalibrationOptions, Size};
 use futures_util::StreamExt;
 use http_body_util::{BodyExt, Full};
@@ -18,7 +20,7 @@ use crate::output::{self, Format, Table};
 
 /// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
 ///
-/// A servant of its own is started, asks for room as any other, and is ended afterwards.
+/// A servant of its own is started, asks for room as any other, and is ended afterwards. Rows are written when you say yes.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "frames", "live"])))]
 pub struct Calibrate {
@@ -63,19 +65,19 @@ pub struct Calibrate {
     /// Where to draw the curve; SERVICE-calibration.svg by default.
     #[arg(long, value_name = "FILE")]
     curve: Option<PathBuf>,
+    /// Write the rows without asking.
+    #[arg(long)]
+    yes: bool,
 }
 
 fn auxiliary(text: &str) -> Result<(String, String), String> {
-    match text.split_once('=') {
-        Some((key, value)) if !key.is_empty() && !value.is_empty() => {
-            Ok((key.to_owned(), value.to_owned()))
-        }
-        _ => Err("write K=V".to_owned()),
-    }
+    let (key, value) = text.split_once('=').ok_or("write K=V")?;
+    check_aux(key, value)?;
+    Ok((key.to_owned(), value.to_owned()))
 }
 
 impl Calibrate {
-    /// Measures and shows.
+    /// Measures, shows, asks, writes.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let body = self.body()?;
         let curve = self
@@ -89,9 +91,26 @@ impl Calibrate {
         fs::write(&curve, curve::draw(&calibration))
             .with_context(|| format!("cannot write the curve {}", curve.display()))?;
         match format {
-            Format::Json => output::json_line(&calibration),
-            Format::Table => print(&calibration, &curve),
+            Format::Json => output::json_line(&calibration)?,
+            Format::Table => print(&calibration, &curve)?,
         }
+        if calibration.rows.is_empty() {
+            return Ok(());
+        }
+        let say = |words: &str| match format {
+            Format::Json => Ok(()),
+            Format::Table => output::line(words),
+        };
+        if !self.yes && !agrees(&self.service)? {
+            return say("nothing was written; --yes writes the rows without asking");
+        }
+        let rows = calibration.rows;
+        let count = rows.len();
+        write(client, &self.service, rows).await?;
+        say(&format!(
+            "{count} rows written; see them with: cloudroidctl sla list {}",
+            self.service
+        ))
     }
 
     /// What is sent: a recording, or pictures one behind the other.
@@ -249,6 +268,37 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     rows(&calibration.rows)
 }
 
+/// Writes rows into the dictionary of a service.
+async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result<()> {
+    let new = NewRows {
+        rows,
+        replace: false,
+    };
+    let path = format!("/api/v1/services/{}/sla", escaped(service));
+    // Whoever wants to see all rows lists them.
+    client.put::<Vec<Row>>(&path, &new).await.map(drop)
+}
+
+/// Whether whoever sits at the terminal says yes; nobody does where there is none.
+fn agrees(service: &str) -> anyhow::Result<bool> {
+    if !std::io::stdin().is_terminal() {
+        return Ok(false);
+    }
+    let mut out = std::io::stderr().lock();
+    write!(
+        out,
+        "write these rows to the dictionary of {service}? [y/N] "
+    )?;
+    out.flush()?;
+    let mut answer = String::new();
+    std::io::stdin().lock().read_line(&mut answer)?;
+    Ok(is_yes(&answer))
+}
+
+fn is_yes(answer: &str) -> bool {
+    matches!(answer.trim().to_ascii_lowercase().as_str(), "y" | "yes")
+}
+
 /// Proposed rows.
 fn rows(rows: &[Row]) -> anyhow::Result<()> {
     let mut table = Table::new(&["ROW", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
@@ -270,6 +320,19 @@ fn rows(rows: &[Row]) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_a_yes_is_a_yes() {
+        for (answer, yes) in [
+            ("y\n", true),
+            ("Yes\n", true),
+            ("\n", false),
+            ("", false),
+            ("yep", false),
+        ] {
+            assert_eq!(is_yes(answer), yes, "{answer:?}");
+        }
+    }
 
     #[test]
     fn pictures_come_in_the_order_of_their_names() {
