@@ -97,6 +97,42 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub dropped: u64,
+    /// Its nodes that failed and are not started again yet.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub down: Vec<NodeDown>,
+}
+
+/// A node that failed and is not started again yet.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct NodeDown {
+    /// Its name.
+    pub node: String,
+    /// How often in a row it failed.
+    pub failures: u32,
+    /// When it is started again.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
+    pub again: Millis,
+}
+
+/// A service that is not started for a robot before a time, since its servants have failed again and again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct BackOff {
+    /// The service.
+    pub service: String,
+    /// Its revision.
+    pub revision: u64,
+    /// The robot; `~`: those without a name, `~warm`: servants that are kept ready for robots.
+    pub robot: String,
+    /// How often in a row.
+    pub failures: u32,
+    /// What happened last, beginning with a verb.
+    pub reason: String,
+    /// When it may be started again.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
+    pub again: Millis,
 }
 
 /// What a robot stated, and what its servant is promised for it.

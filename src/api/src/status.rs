@@ -36,6 +36,9 @@ pub struct Status {
     /// Containers made ahead, for robots to come.
     #[serde(default, alias = "spares")]
     pub warm_pool: usize,
+    /// Those of them in which the nodes run.
+    #[serde(default)]
+    pub warm_nodes: usize,
     /// Connections of robots now.
     pub connections: usize,
     /// What the servants that live use together; the pressure is the whole machine's, none where the kernel does not

@@ -18,7 +18,9 @@
 //! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
 //! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
 //! | [`group`] | how many servants answer the robots that share a service | their requests, how long these take, bounds, the time |
-//! | [`warm_pool`] | which services have a container in the warm pool, which containers end | what is published, what was asked for last |
+//! | [`back_off`] | when a servant that failed may be started again | how often in a row, how long it was ready |
+//! | [`warm_pool`] | how many containers each service has ahead, in which the nodes run, which end | what is published, what was asked for last, the forecast, a budget |
+//! | [`forecast`] | how many robots are about to ask | when robots asked |
 //! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
 //!
 //! What is decided under the choreographer's lock, or the queue's, is recorded under the same lock.
@@ -26,12 +28,14 @@
 pub(crate) mod admission;
 pub(crate) mod adoption;
 mod amount;
+pub(crate) mod back_off;
 pub(crate) mod calibration;
 pub(crate) mod capacity;
 pub mod controller;
 pub(crate) mod demand;
 pub(crate) mod dictionary;
 pub(crate) mod fit;
+pub(crate) mod forecast;
 pub(crate) mod group;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;

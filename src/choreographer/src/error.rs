@@ -43,6 +43,23 @@ pub enum Error {
         /// Last lines of its log.
         log: Vec<String>,
     },
+    /// Its servants have failed again and again.
+    #[error(
+        "servants of {service} for robot {robot} have failed {failures} times in a row (the last one {reason}); the next is started in {} s at the earliest",
+        crate::lives::back_off::seconds(*again)
+    )]
+    BackOff {
+        /// The service.
+        service: String,
+        /// The robot.
+        robot: String,
+        /// How often.
+        failures: u32,
+        /// What happened last, beginning with a verb.
+        reason: String,
+        /// After this time it may ask again.
+        again: std::time::Duration,
+    },
     /// The daemon is ending.
     #[error("the daemon is ending")]
     Ending,

@@ -2,11 +2,13 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use api::{Limits, Millis, Phase, Stated, Terms};
 use parking_lot::Mutex;
 use reach::{Reach, Tenant};
 use tokio::sync::watch;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::Error;
@@ -83,11 +85,13 @@ pub struct Handle {
     asked: Mutex<Asked>,
     limits_turn: tokio::sync::Mutex<()>,
     promise: OnceLock<Promise>,
+    ready_since: OnceLock<Instant>,
     connections: watch::Sender<usize>,
     /// 0: not idle.
     idle_until: AtomicU64,
     /// Its nodes are started and ended by a robot's stubs.
     linked: AtomicBool,
+    down: Mutex<Vec<api::NodeDown>>,
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
@@ -119,9 +123,11 @@ impl Handle {
             asked: Mutex::new(asked),
             limits_turn: tokio::sync::Mutex::default(),
             promise: OnceLock::new(),
+            ready_since: OnceLock::new(),
             connections: watch::Sender::new(0),
             idle_until: AtomicU64::new(0),
             linked: AtomicBool::new(false),
+            down: Mutex::default(),
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
             container: OnceLock::new(),
@@ -236,6 +242,22 @@ impl Handle {
         Some(self.idle_until.load(Ordering::Relaxed)).filter(|until| *until > 0)
     }
 
+    /// Its nodes that failed and are not started again yet.
+    pub fn down(&self) -> Vec<api::NodeDown> {
+        self.down.lock().clone()
+    }
+
+    /// Of `node`: until when it is down, with its failures in a row; none: it is not any more.
+    pub(crate) fn set_down(&self, node: &str, until: Option<(u32, Duration)>) {
+        let mut down = self.down.lock();
+        down.retain(|one| one.node != node);
+        down.extend(until.map(|(failures, after)| api::NodeDown {
+            node: node.to_owned(),
+            failures,
+            again: store::now() + after.as_millis() as u64,
+        }));
+    }
+
     /// Asks for its end. The first reason stays.
     pub fn end(&self, reason: &str) {
         let _ = self.end_reason.set(reason.to_owned());
@@ -261,7 +283,15 @@ impl Handle {
             .await;
     }
 
+    /// How long it has been ready, if it ever was.
+    pub(crate) fn ready_for(&self) -> Option<Duration> {
+        self.ready_since.get().map(Instant::elapsed)
+    }
+
     pub(crate) fn set_phase(&self, phase: Phase) {
+        if phase == Phase::Ready {
+            let _ = self.ready_since.set(Instant::now());
+        }
         self.life.send_modify(|life| life.phase = phase);
     }
 

@@ -62,6 +62,7 @@ pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
+pub use lives::back_off::seconds;
 pub use handle::{Handle, Lease};
 pub use limits::engine_limits;
 pub use lives::calibration::Requests;
@@ -77,6 +78,7 @@ use decide::placement::{Placement, place};
 use decide::terms::explain;
 use handle::Anew;
 use lives::Inner;
+use lives::back_off::BackOffs;
 use lives::driver::{self, Beginning};
 use lives::warm_pool::{self, WarmPool};
 
@@ -118,6 +120,7 @@ impl Choreographer {
             servants: Mutex::default(),
             warm_pool: WarmPool::default(),
             groups: Default::default(),
+            back_offs: BackOffs::default(),
             incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
         };
@@ -145,8 +148,15 @@ impl Choreographer {
             }
             let terms = inner.terms(&request.statement(), &revision);
             let has = servants.given.get(&key).map(|handle| inner.facts(handle));
+            if has.as_ref().is_none_or(|has| has.ending) {
+                inner.check_back_off(&revision, &request.robot, request.anonymous)?;
+            }
+            // Nobody who waits for capacity is overtaken by one that takes what was promised ahead.
+            let default_names = request.stub.is_none() && inner.admission.is_calm();
             let (placement, warm) = match revision.plan.shared {
-                None => inner.warm_pool.place(has.as_ref(), &revision),
+                None => inner
+                    .warm_pool
+                    .place(has.as_ref(), &revision, default_names),
                 // A place in a group needs no container.
                 Some(_) => (
                     place(has.as_ref(), None, revision.number, &revision.image),
@@ -281,9 +291,14 @@ impl Choreographer {
         &self.inner.request_times
     }
 
-    /// Containers of the warm pool.
-    pub fn warm_pool(&self) -> usize {
+    /// Containers of the warm pool, and those of them in which the nodes run.
+    pub fn warm_pool(&self) -> (usize, usize) {
         self.inner.warm_pool.count()
+    }
+
+    /// Whose servants have failed again and again, and are not started again yet.
+    pub fn back_offs(&self) -> Vec<api::BackOff> {
+        self.inner.back_offs()
     }
 
     /// What may be held for clients and servants.
@@ -409,6 +424,7 @@ impl Choreographer {
             usage: usage(handle).await,
             pids: pids.unwrap_or_default(),
             dropped: reach.map_or(0, |reach| reach.dropped()),
+            down: handle.down(),
         }
     }
 

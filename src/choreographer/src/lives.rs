@@ -2,6 +2,7 @@
 //! keeps the warm pool ([`warm_pool`]), and one that looks at the machine and moves cores ([`controller`]). Servants of an earlier daemon are taken over here ([`adoption`]).
 
 mod adoption;
+pub(crate) mod back_off;
 pub(crate) mod calibration;
 pub(crate) mod capture;
 pub(crate) mod controller;
@@ -36,6 +37,7 @@ use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
+use back_off::BackOffs;
 use group::Groups;
 use recent::Recent;
 use waiting::Admission;
@@ -58,6 +60,7 @@ pub(crate) struct Inner {
     pub(crate) servants: Mutex<Servants>,
     pub(crate) warm_pool: WarmPool,
     pub(crate) groups: Groups,
+    pub(crate) back_offs: BackOffs,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,
@@ -141,13 +144,29 @@ impl Inner {
         }
     }
 
-    /// Ends idle servants, and has pushes give way, for those who wait for capacity.
-    pub(crate) fn make_room(&self) {
+    /// Ends servants that were made ahead, then idle ones, and has pushes give way, for those who wait for capacity.
+    pub(crate) fn make_room(self: &Arc<Self>) {
         let servants = self.servants.lock();
+        let warm = self.warm_pool.promised(self);
+        let warm = warm.iter().map(|(id, promised, ending)| Servant {
+            id,
+            revision: 0,
+            connections: 0,
+            promised: Some(*promised),
+            // Before any that a robot may come back to.
+            idle_until: Some(0),
+            ending: *ending,
+        });
         let all = servants.all.values().map(|handle| self.facts(handle));
         let (lacking, pushes) = self.admission.lacking();
-        let Room { ends, give_way } = capacity::make_room(lacking, all, &pushes);
-        servants.end(ends);
+        let Room { ends, give_way } = capacity::make_room(lacking, warm.chain(all), &pushes);
+        let (warm, used): (Vec<End<'_>>, Vec<End<'_>>) = ends
+            .into_iter()
+            .partition(|end| !servants.all.contains_key(end.id));
+        for end in warm {
+            self.warm_pool.end_for_room(self, end.id);
+        }
+        servants.end(used);
         self.admission.give_way(&give_way);
     }
 

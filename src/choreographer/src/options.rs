@@ -29,8 +29,12 @@ pub struct Options {
     pub grace: Duration,
     /// The same for connections that named no robot.
     pub anonymous_grace: Duration,
-    /// Most containers made ahead, without nodes.
+    /// Most services that have containers made ahead.
     pub warm_pool: usize,
+    /// Bytes that all those containers may take.
+    pub warm_memory: u64,
+    /// Most of them in which the nodes run.
+    pub warm_nodes: usize,
     /// Sessions of rosbridge before each servant.
     pub bridge: BridgeOptions,
     /// Memory held for clients and servants.

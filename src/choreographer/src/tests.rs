@@ -45,6 +45,8 @@ fn options() -> Options {
         grace: Duration::from_secs(60),
         anonymous_grace: Duration::ZERO,
         warm_pool: 8,
+        warm_memory: 1 << 30,
+        warm_nodes: 0,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions {
             daemon: memory,

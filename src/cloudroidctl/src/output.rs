@@ -127,6 +127,14 @@ pub fn age(then: Millis) -> String {
     span(now.saturating_sub(then))
 }
 
+/// How long until then, roughly.
+pub fn until(then: Millis) -> String {
+    let now = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |since| since.as_millis() as u64);
+    span(then.saturating_sub(now).next_multiple_of(1000))
+}
+
 fn span(millis: u64) -> String {
     let seconds = millis / 1000;
     match seconds {

@@ -1,6 +1,6 @@
 //! `servants`: who works for which robot.
 
-use api::{Pressure, Servant, Size};
+use api::{BackOff, Pressure, Servant, Size};
 
 use crate::client::Client;
 use crate::output::{self, Format, Table};
@@ -24,7 +24,9 @@ impl Servants {
         if format == Format::Json {
             return output::json(&servants);
         }
-        if servants.is_empty() {
+        let mut failing: Vec<BackOff> = client.get("/api/v1/back-offs").await?;
+        failing.retain(|one| self.service.as_ref().is_none_or(|it| *it == one.service));
+        if servants.is_empty() && failing.is_empty() {
             return output::line("no servants; one starts when a robot connects to a service");
         }
         let mut table = Table::new(&[
@@ -66,7 +68,21 @@ impl Servants {
                 output::terms(servant),
             ]);
         }
-        table.print()
+        if !servants.is_empty() {
+            table.print()?;
+        }
+        for one in failing {
+            output::line(&format!(
+                "{}:{} for {} has failed {} times in a row (the last one {}); next start in {}",
+                one.service,
+                one.revision,
+                one.robot,
+                one.failures,
+                one.reason,
+                output::until(one.again),
+            ))?;
+        }
+        Ok(())
     }
 }
 
@@ -84,8 +100,21 @@ fn pressure(of: Pressure) -> String {
 }
 
 fn state(servant: &Servant) -> String {
+    let down: Vec<String> = servant
+        .down
+        .iter()
+        .map(|down| {
+            format!(
+                "{} failed {} times in a row, next start in {}",
+                down.node,
+                down.failures,
+                output::until(down.again)
+            )
+        })
+        .collect();
     match &servant.reason {
         Some(reason) => format!("{}: {reason}", servant.phase),
+        None if !down.is_empty() => format!("{}: {}", servant.phase, down.join(", ")),
         None if servant.idle_until.is_some() => format!("{} (idle)", servant.phase),
         None => servant.phase.to_string(),
     }

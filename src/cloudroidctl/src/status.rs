@@ -65,8 +65,8 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         (
             "servants",
             format!(
-                "{} with {} connections; {} warm containers",
-                status.servants, status.connections, status.warm_pool
+                "{} with {} connections; {} warm containers, {} of them with nodes",
+                status.servants, status.connections, status.warm_pool, status.warm_nodes
             ),
         ),
         (

@@ -133,9 +133,14 @@ pub struct Servant {
     pub grace: Time,
     /// The same for connections that named no robot.
     pub anonymous_grace: Time,
-    /// Containers of the warm pool, made before a robot asks and without nodes: one for each of the services used last, at most.
+    /// Most services, those used last, that have containers made before a robot asks; how many each has is decided from the
+    /// robots that come.
     #[serde(alias = "spares")]
     pub warm_pool: usize,
+    /// Memory that all of those may take.
+    pub warm_memory: Size,
+    /// Most of them in which the nodes run, too.
+    pub warm_nodes: usize,
 }
 
 /// What JSON has no word for.
@@ -277,6 +282,8 @@ impl Default for Servant {
             grace: Time::seconds(60),
             anonymous_grace: Time::seconds(0),
             warm_pool: 8,
+            warm_memory: Size(1 << 30),
+            warm_nodes: 0,
         }
     }
 }

@@ -261,6 +261,11 @@ pub async fn servants(State(app): State<Arc<App>>) -> Json<Vec<api::Servant>> {
     Json(futures_util::future::join_all(described).await)
 }
 
+/// Whose servants have failed again and again, and are not started again yet.
+pub async fn back_offs(State(app): State<Arc<App>>) -> Json<Vec<api::BackOff>> {
+    Json(app.choreographer.back_offs())
+}
+
 /// One servant.
 pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<api::Servant> {
     let handle = app.choreographer.servant(&id)?;

@@ -170,7 +170,11 @@ impl Error {
             problem.log = log.to_vec();
         }
         let again = status == StatusCode::SERVICE_UNAVAILABLE;
-        problem.retry_after = again.then_some(RETRY_AFTER);
+        let after = match self.of_choreographer() {
+            Some(choreographer::Error::BackOff { again, .. }) => choreographer::seconds(*again),
+            _ => RETRY_AFTER,
+        };
+        problem.retry_after = again.then_some(after);
         problem
     }
 
@@ -316,6 +320,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
             Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
         },
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
+        C::BackOff { .. } => (S::SERVICE_UNAVAILABLE, "back-off", "servant fails again and again"),
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
@@ -348,6 +353,9 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
         C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
+        }
+        C::BackOff { service, .. } => {
+            format!("see why with: cloudroidctl events; push {service} again when its package is fixed: a new revision is started at once")
         }
         C::Catalogue(error) => return next_of_catalogue(error),
         C::Ending => NEXT_OF_ENDING.into(),

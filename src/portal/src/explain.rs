@@ -53,7 +53,7 @@ pub async fn robot(
             .await;
     Ok(Explanation {
         robot: name.to_owned(),
-        causes: causes(&servants, &events),
+        causes: causes(&servants, &events, &failing(choreographer, name)),
         servants,
         events,
     })
@@ -162,10 +162,29 @@ fn parts<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Vec<Part> {
     parts.into_iter().flatten().collect()
 }
 
+/// The robot's servants that are not started again yet, each with when they will be.
+fn failing(choreographer: &Choreographer, robot: &str) -> Vec<api::BackOff> {
+    let mut all = choreographer.back_offs();
+    all.retain(|one| one.robot == robot);
+    all
+}
+
 /// What follows from all that, the weightiest first.
-fn causes(servants: &[Served], events: &[Event]) -> Vec<Cause> {
+fn causes(servants: &[Served], events: &[Event], failing: &[api::BackOff]) -> Vec<Cause> {
     let mut causes = Vec::new();
     let mut say = |weight, what: String, next: String| causes.push(Cause { weight, what, next });
+    for one in failing {
+        let left = one.again.saturating_sub(store::now()).div_ceil(1000);
+        let what = format!(
+            "its servants of {} have failed {} times in a row (the last one {}); the next is started in {left} s at the earliest",
+            one.service, one.failures, one.reason
+        );
+        let next = format!(
+            "cloudroidctl events; push {} again when it is fixed",
+            one.service
+        );
+        say(Weight::Blocks, what, next);
+    }
     if servants.is_empty() {
         let last = events.last().map(|event| event.message.as_str());
         let what = match last {
@@ -207,6 +226,17 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
         say(
             weight,
             format!("{id} is {}: {reason}", servant.phase),
+            format!("cloudroidctl logs {id}"),
+        );
+    }
+    for down in &servant.down {
+        let left = down.again.saturating_sub(store::now()).div_ceil(1000);
+        say(
+            Weight::Blocks,
+            format!(
+                "{} of {id} failed {} times in a row and is started again in {left} s",
+                down.node, down.failures
+            ),
             format!("cloudroidctl logs {id}"),
         );
     }
@@ -480,6 +510,7 @@ mod tests {
                 usage: Some(api::Usage::default()),
                 pids: Vec::new(),
                 dropped: 0,
+                down: Vec::new(),
             },
             throttled: 0.0,
             cores: 0.0,
@@ -503,7 +534,7 @@ mod tests {
     }
 
     fn texts(served: Served) -> Vec<(Weight, String)> {
-        causes(&[served], &[])
+        causes(&[served], &[], &[])
             .into_iter()
             .map(|cause| (cause.weight, format!("{}; {}", cause.what, cause.next)))
             .collect()
@@ -617,7 +648,7 @@ mod tests {
             robot: Some("rover".into()),
             message: "the servant ran out of memory".into(),
         };
-        let causes = causes(&[], &[event]);
+        let causes = causes(&[], &[event], &[]);
         assert_eq!(causes[0].weight, Weight::Blocks);
         assert!(causes[0].what.ends_with("the servant ran out of memory"));
     }
@@ -639,7 +670,7 @@ mod tests {
             event("state-lost", "the cloud goes on without 3 of /scan"),
             event("local-hands-back", "the link is up again"),
         ];
-        let causes = causes(&[], &events);
+        let causes = causes(&[], &events, &[]);
         let lost: Vec<_> = causes
             .iter()
             .filter(|cause| cause.weight == Weight::Hint)

@@ -133,7 +133,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         out,
         "cloudroid_warm_pool",
         "Containers made ahead.",
-        [(String::new(), choreographer.warm_pool() as f64)],
+        [(String::new(), choreographer.warm_pool().0 as f64)],
     );
     let mut connections: BTreeMap<String, usize> = BTreeMap::new();
     for handle in &handles {

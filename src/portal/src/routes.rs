@@ -264,6 +264,13 @@ pub const ROUTES: &[Route] = &[
             .asks::<api_v1::Part>()
             .streams::<api::LogLine>()
     }),
+    at("GET", "/api/v1/back-offs", Token, || get(api_v1::back_offs)).described(|| {
+        operation(
+            "backOffs",
+            "Whose servants have failed again and again, and when each is started again at the earliest.",
+        )
+        .lists::<api::BackOff>()
+    }),
     at("GET", "/api/v1/robots/{name}/explain", Token, || {
         get(api_v1::explain)
     })

@@ -123,6 +123,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
     let servants = app.choreographer.servants();
     let usage = used(&servants).await;
     let (capacity, taken, waiting) = app.choreographer.admission().look();
+    let (warm_pool, warm_nodes) = app.choreographer.warm_pool();
     Ok(Status {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         pid: std::process::id(),
@@ -145,7 +146,8 @@ pub async fn status(app: &App) -> Result<Status, Error> {
         limits: app.choreographer.default_limits(),
         services: app.state.service_names()?.len(),
         servants: servants.len(),
-        warm_pool: app.choreographer.warm_pool(),
+        warm_pool,
+        warm_nodes,
         connections: servants.iter().map(|servant| servant.connections()).sum(),
         usage,
         warnings: app

@@ -305,6 +305,20 @@ impl Book {
         (verdict, admitted)
     }
 
+    /// Whether nobody waits, and the machine does not stall.
+    pub fn is_calm(&self) -> bool {
+        self.waiting.is_empty() && self.stalled.is_none()
+    }
+
+    /// Promises `amount` to what nobody waits for, if it is free and nobody waits for anything; whether it did.
+    pub fn take_spare(&mut self, amount: Amount) -> bool {
+        let spare = self.is_calm() && amount.fits(self.free());
+        if spare {
+            self.promise(amount);
+        }
+        spare
+    }
+
     /// Promises `amount` even where it is not free: to a servant that runs already.
     pub fn promise(&mut self, amount: Amount) {
         self.promised = self.promised.plus(amount);

@@ -5,6 +5,8 @@
 pub struct Found {
     /// The database knows it as a robot's servant.
     pub recorded: bool,
+    /// The database knows it as one that was ready for a robot that had not come.
+    pub nobodys: bool,
     /// The revision that it was started from is known.
     pub published: bool,
     /// No node was ever started in it.
@@ -25,6 +27,7 @@ pub enum Fate {
 /// What becomes of one.
 pub fn fate(found: Found) -> Fate {
     match found {
+        Found { nobodys: true, .. } => Fate::Unused,
         Found {
             recorded: true,
             published: true,
@@ -45,18 +48,21 @@ mod tests {
 
     #[test]
     fn what_was_left_is_kept_for_its_robot_or_ended() {
-        for (recorded, published, empty, expected) in [
-            (true, true, false, Fate::Kept),
+        for (recorded, nobodys, published, empty, expected) in [
+            (true, false, true, false, Fate::Kept),
             // Its stubs have started none yet.
-            (true, true, true, Fate::Kept),
-            (true, false, false, Fate::Unknown),
-            (true, false, true, Fate::Unknown),
-            (false, false, true, Fate::Unused),
-            (false, true, true, Fate::Unused),
-            (false, false, false, Fate::Unknown),
+            (true, false, true, true, Fate::Kept),
+            (true, false, false, false, Fate::Unknown),
+            (true, false, false, true, Fate::Unknown),
+            (false, false, false, true, Fate::Unused),
+            (false, false, true, true, Fate::Unused),
+            (false, false, false, false, Fate::Unknown),
+            (true, true, true, false, Fate::Unused),
+            (true, true, false, false, Fate::Unused),
         ] {
             let found = Found {
                 recorded,
+                nobodys,
                 published,
                 empty,
             };

@@ -88,6 +88,7 @@ mod tests {
                 revision,
                 image,
                 runs,
+                nodes: false,
             };
             let placement = place(None, Some(&warm), 2, "sha256:2");
             let expected = Placement::Start {

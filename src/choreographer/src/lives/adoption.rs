@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::driver::{self, Beginning};
+use super::warm_pool::NOBODY;
 use servant::engine::ContainerState;
 
 use crate::Error;
@@ -11,6 +12,11 @@ use crate::decide::adoption::{Fate, Found, fate};
 use crate::decide::demand::Asked;
 use crate::{Choreographer, Handle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
+
+/// It was kept ready for a robot that had not come.
+fn is_nobodys(record: &ServantRecord) -> bool {
+    record.robot == NOBODY
+}
 
 impl Choreographer {
     /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
@@ -37,6 +43,7 @@ impl Choreographer {
             };
             let fate = fate(Found {
                 recorded: record.is_some(),
+                nobodys: record.as_ref().is_some_and(is_nobodys),
                 published: revision.is_some(),
                 empty: servant.nodes().is_empty(),
             });
@@ -45,7 +52,10 @@ impl Choreographer {
                     self.adopt_one(record, revision, servant);
                     adopted += 1;
                 }
-                (Fate::Unused, _) => self.end_unknown(&servant).await,
+                (Fate::Unused, _) => {
+                    self.end_unknown(&servant).await;
+                    inner.state.remove_servant(servant.id());
+                }
                 (Fate::Unknown | Fate::Kept, _) => {
                     inner.journal.warning(
                         "servant-unknown",
@@ -70,6 +80,9 @@ impl Choreographer {
             .collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
+            if is_nobodys(&gone) {
+                continue;
+            }
             let why = match ends.remove(&gone.id).flatten() {
                 Some(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
                     format!(": {reason}")

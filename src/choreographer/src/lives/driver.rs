@@ -35,6 +35,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     let mut permit = None;
     let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
+    inner.note_end(&handle, &outcome);
     let outcome = match outcome {
         Ok(reason) => Ok(reason),
         Err(failure) => Err(with_log(failure, &handle).await),
@@ -114,8 +115,9 @@ async fn live(
     }
     let (container, reach, fresh) = match beginning {
         Beginning::Asked(warm) => {
+            let ahead = warm.as_mut().and_then(|warm| warm.permit.take());
             let permit = tokio::select! {
-                permit = admit(inner, handle) => permit?,
+                permit = admit(inner, handle, ahead) => permit?,
                 reason = handle.end_asked() => return Ok(reason),
                 reason = unneeded(inner, handle, true) => return Ok(reason),
             };
@@ -209,9 +211,20 @@ async fn run(
     Err(nodes.supervise().await)
 }
 
-async fn admit(inner: &Inner, handle: &Handle) -> Result<Permit, Failure> {
+/// `ahead` was promised to the servant before it had a robot: then that is what the robot is promised.
+async fn admit(
+    inner: &Arc<Inner>,
+    handle: &Handle,
+    ahead: Option<Permit>,
+) -> Result<Permit, Failure> {
     let deadline = inner.options.deadline;
-    let ask = Ask::robot(inner.promised(&handle.asked()), handle.priority());
+    let wanted = inner.promised(&handle.asked());
+    if let Some(permit) = ahead
+        && permit.promise().change(wanted).is_ok()
+    {
+        return Ok(permit);
+    }
+    let ask = Ask::robot(wanted, handle.priority());
     let make_room = || inner.make_room();
     let admission = &inner.admission;
     let admitted = admission.admit(ask, deadline, handle.stands(), make_room);

@@ -480,7 +480,7 @@ fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) ->
     if let Some(handle) = has {
         return Some(Lease::new(Arc::clone(handle)));
     }
-    let (placement, warm) = inner.warm_pool.place(None, revision);
+    let (placement, warm) = inner.warm_pool.place(None, revision, false);
     debug_assert!(matches!(placement, Placement::Start { ends: None, .. }));
     let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
     let handle = Arc::new(Handle::new(

@@ -61,7 +61,7 @@ pub(super) async fn interface_there(
 }
 
 /// Comes back when nobody needs the servant any more, with the reason. It is given to nobody from then on.
-pub(super) async fn unneeded(inner: &Inner, handle: &Arc<Handle>, fresh: bool) -> String {
+pub(super) async fn unneeded(inner: &Arc<Inner>, handle: &Arc<Handle>, fresh: bool) -> String {
     let times = &inner.options;
     let grace = match handle.anonymous {
         true => times.anonymous_grace,

@@ -188,6 +188,7 @@ impl<'a> Nodes<'a> {
                 event,
             } => {
                 self.report(&event);
+                self.handle.set_down(&node.name, Some((failures, after)));
                 self.failures.insert(node.name.clone(), failures);
                 self.pausing.push(Box::pin(async move {
                     tokio::time::sleep(after).await;
@@ -203,6 +204,7 @@ impl<'a> Nodes<'a> {
     }
 
     async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
+        self.handle.set_down(&node.name, None);
         if self.handle.is_linked() {
             // A stub took its place while it paused.
             return Ok(());

@@ -50,15 +50,18 @@ fn planned(handle: &Handle) -> Vec<NodeSpec> {
     handle.revision.plan.nodes.clone()
 }
 
-/// Starts the nodes in a container that was made without; none if it has ended meanwhile, and then nothing is left of it.
+/// Makes a warm container the robot's: gives it the robot's limits, and starts the nodes where it was made without. None if
+/// it has ended meanwhile, and then nothing is left of it.
 pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
     let warm = warm?;
-    let made = inner.of_push(&handle.revision).limits();
     let limits = handle.limits();
-    if let Err(error) = limits::fit(&*warm.container, &made, &limits).await {
+    if let Err(error) = limits::fit(&*warm.container, &warm.limits, &limits).await {
         tracing::debug!("a warm container cannot be given {limits:?}: {error}");
-        warm.end().await;
+        warm.end(inner).await;
         return None;
+    }
+    if warm.nodes {
+        return Some(warm);
     }
     // In their order and without waiting for one another. A program that cannot be executed is refused here, and
     // looked at where the ends of nodes are.
@@ -66,7 +69,7 @@ pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>)
     let started = join_all(nodes.map(|node| warm.container.start_node(node))).await;
     let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
     if started.iter().any(lost) {
-        warm.end().await;
+        warm.end(inner).await;
         return None;
     }
     Some(warm)

@@ -249,6 +249,20 @@ impl Admission {
         }
     }
 
+    /// Whether nobody waits, and the machine does not stall.
+    pub(crate) fn is_calm(&self) -> bool {
+        self.desk.lock().book.is_calm()
+    }
+
+    /// Takes `wanted` for something that nobody waits for, where it is free and nobody waits at all.
+    pub(crate) fn admit_now(&self, wanted: Amount) -> Option<Permit> {
+        let spare = self.desk.lock().book.take_spare(wanted);
+        spare.then(|| Permit {
+            promise: self.promise(wanted),
+            work: None,
+        })
+    }
+
     /// Takes what is asked for, waiting at most `deadline`, and tells by `stands` where it stands meanwhile. Calls `on_wait`
     /// when it is not to be had at once.
     pub(crate) async fn admit(

@@ -7,6 +7,8 @@ use servant::spec::NodeSpec;
 
 use super::*;
 
+mod ahead;
+
 /// A machine, and what outlives a daemon on it.
 pub(super) struct World {
     _home: tempfile::TempDir,
@@ -43,9 +45,9 @@ impl World {
     /// The same with other options.
     pub(super) fn daemon_with(&self, change: impl FnOnce(&mut Options)) -> Choreographer {
         let mut options = Options {
+            warm_pool: 0,
             reserve_cpus: 1.0,
             reserve_memory: 0,
-            warm_pool: 0,
             ..options()
         };
         change(&mut options);

@@ -226,7 +226,7 @@ async fn a_warm_container_gets_what_its_robot_states() {
     });
     let daemon = world.daemon_with(|options| options.warm_pool = 1);
     daemon.keep_warm_pool();
-    while daemon.warm_pool() == 0 {
+    while daemon.warm_pool().0 == 0 {
         tokio::task::yield_now().await;
     }
     let lease = ready(&daemon, stating("r1", &[("cpus", "1.5")])).await;

@@ -33,6 +33,8 @@ impl Config {
             grace: servant.grace.0,
             anonymous_grace: servant.anonymous_grace.0,
             warm_pool: servant.warm_pool,
+            warm_memory: servant.warm_memory.0,
+            warm_nodes: servant.warm_nodes,
             bridge: bridge_options(self),
             memory: MemoryOptions {
                 daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),

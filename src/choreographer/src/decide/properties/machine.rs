@@ -8,7 +8,7 @@ use crate::decide::admission::{Admitted, Ask, Book, OVERTAKEN, Ticket, Verdict};
 use crate::decide::capacity::{Push, Room};
 use crate::decide::lifetime::{Need, Stage, Tenancy, needed};
 use crate::decide::placement::{Placement, place};
-use crate::decide::warm_pool::{Wanted, Warm, deserving, stale};
+use crate::decide::warm_pool::{Missing, Size, Wanted, Warm, choose, deserving, missing, stale};
 use crate::decide::{Amount, End, Servant, capacity};
 
 const GRACE: Duration = Duration::from_secs(60);
@@ -74,9 +74,23 @@ struct Pooled {
     service: usize,
     revision: u64,
     runs: bool,
+    /// Its nodes run, for which it is promised so much.
+    promised: Option<Amount>,
 }
 
 impl Pooled {
+    /// As a servant that nobody needs.
+    fn idle(&self) -> Servant<'_> {
+        Servant {
+            id: &self.id,
+            revision: self.revision,
+            connections: 0,
+            promised: self.promised,
+            idle_until: Some(0),
+            ending: false,
+        }
+    }
+
     fn facts(&self) -> Warm<'_> {
         Warm {
             id: &self.id,
@@ -84,6 +98,7 @@ impl Pooled {
             revision: self.revision,
             image: "an image",
             runs: self.runs,
+            nodes: self.promised.is_some(),
         }
     }
 }
@@ -211,8 +226,9 @@ impl Machine {
             })
             .collect();
         let decide = || {
-            let servants = self.servants.iter().map(|it| it.facts(began));
-            capacity::make_room(lacking, servants, &pushes)
+            let used = self.servants.iter().map(|it| it.facts(began));
+            let all = self.pool.iter().map(Pooled::idle).chain(used);
+            capacity::make_room(lacking, all, &pushes)
         };
         let Room { ends, give_way } = decide();
         assert_eq!(ends, decide().ends, "the same facts, another decision");
@@ -220,11 +236,22 @@ impl Machine {
             let all = self.servants.iter();
             let free = all.filter(|it| it.ending || ids.iter().any(|end| end.id == it.id));
             let free = free.filter_map(|it| it.promised);
+            let pooled = self.pool.iter();
+            let pooled = pooled.filter(|it| ids.iter().any(|end| end.id == it.id));
+            let pooled = pooled.filter_map(|it| it.promised);
             let leave = self.pushes.iter();
             let leave = leave.filter(|(ticket, it)| it.gives_way || pushes.contains(ticket));
             let leave = leave.filter_map(|(_, it)| it.promised);
-            free.chain(leave).fold(Amount::NONE, Amount::plus)
+            free.chain(pooled)
+                .chain(leave)
+                .fold(Amount::NONE, Amount::plus)
         };
+        let warm = |id: &str| self.pool.iter().any(|it| it.id == id);
+        let order: Vec<bool> = ends.iter().map(|end| warm(end.id)).collect();
+        assert!(
+            order.is_sorted_by(|one, other| one >= other),
+            "a robot's servant ends before what was made ahead"
+        );
         if let Some((_, others)) = ends.split_last() {
             assert_ne!(
                 lacking.all.minus(having(others, &[])),
@@ -248,6 +275,12 @@ impl Machine {
         }
         let ids: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         for id in ids {
+            if let Some(index) = self.pool.iter().position(|it| it.id == id) {
+                let warm = self.pool.remove(index);
+                let admitted = self.book.release(warm.promised.unwrap_or_default());
+                self.admitted(admitted);
+                continue;
+            }
             let servant = self.servant(&id);
             assert!(servant.connections == 0 && servant.stage == Stage::Ready);
             self.end(&id);
@@ -281,11 +314,13 @@ impl Machine {
             found.expect("what is given lives")
         });
         let facts = has.map(|it| it.facts(began));
-        let warm = self.pool.iter().find(|it| it.service == service);
-        let warm = warm.map(Pooled::facts);
+        let default_names = robot % 2 == 0 && self.book.is_calm();
+        let of = (name, current, "an image");
+        let warm = choose(self.pool.iter().map(Pooled::facts), of, default_names);
         let decide = || place(facts.as_ref(), warm.as_ref(), current, "an image");
         let placement = decide();
         assert_eq!(placement, decide(), "the same facts, another decision");
+        let chosen = warm.map(|warm| warm.id.to_owned());
         let (ends, warm) = match placement {
             Placement::Keep(id) => {
                 let id = id.to_owned();
@@ -302,10 +337,17 @@ impl Machine {
             self.end(&id);
         }
         let (ticket, fresh) = self.name();
-        let warm = warm.then(|| {
-            let index = self.pool.iter().position(|it| it.service == service);
+        let mut ahead = None;
+        let warm = chosen.filter(|_| warm).map(|id| {
+            let index = self.pool.iter().position(|it| it.id == id);
             let warm = self.pool.remove(index.expect("the pool has it"));
-            assert_eq!((warm.revision, warm.runs), (current, true));
+            let of = (warm.service, warm.revision, warm.runs);
+            assert_eq!(of, (service, current, true));
+            assert!(
+                robot % 2 == 0 || warm.promised.is_none(),
+                "it has other names"
+            );
+            ahead = warm.promised;
             assert!(
                 self.used.insert(warm.id.clone()),
                 "two robots have the same container"
@@ -313,7 +355,10 @@ impl Machine {
             warm.id
         });
         let wants = cores(SERVICES[service].1);
-        let (verdict, others) = self.book.ask(ticket, Ask::robot(wants, priority));
+        let (verdict, others) = match ahead {
+            Some(_) => (Verdict::Admitted, Vec::new()),
+            None => self.book.ask(ticket, Ask::robot(wants, priority)),
+        };
         let promised = match verdict {
             Verdict::Admitted => {
                 self.overtakes(self.line.len(), priority);
@@ -355,7 +400,6 @@ impl Machine {
     }
 
     fn tidy(&mut self) {
-        let before = self.book.clone();
         let published: Vec<String> = SERVICES.iter().map(|it| it.0.to_owned()).collect();
         let wanted = deserving(&published, &self.asked_for, POOL);
         let number = |name: &String| SERVICES.iter().position(|it| it.0 == name).expect("known");
@@ -367,28 +411,55 @@ impl Machine {
                 service: SERVICES[*service].0,
                 revision: revisions[*service],
                 image: "an image",
+                size: Size {
+                    makes: 1,
+                    keeps: 1 + *service,
+                    nodes: 1,
+                },
             })
             .collect();
-        let ends = stale(self.pool.iter().map(Pooled::facts), &facts);
+        let pool: Vec<Warm<'_>> = self.pool.iter().map(Pooled::facts).collect();
+        let ends = stale(&pool, &facts);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         for id in &ends {
             assert!(!self.used.contains(id), "{id} is a robot's");
         }
-        self.pool.retain(|it| !ends.contains(&it.id));
-        for service in wanted {
-            if !self.pool.iter().any(|it| it.service == service) {
-                let (_, id) = self.name();
-                let revision = revisions[service];
-                self.pool.push(Pooled {
-                    id,
-                    service,
-                    revision,
-                    runs: true,
-                });
+        for id in ends {
+            let index = self.pool.iter().position(|it| it.id == id);
+            let warm = self.pool.remove(index.expect("it is the pool's"));
+            let admitted = self.book.release(warm.promised.unwrap_or_default());
+            self.admitted(admitted);
+        }
+        for (service, wanted) in wanted.into_iter().zip(&facts) {
+            loop {
+                let pool: Vec<Warm<'_>> = self.pool.iter().map(Pooled::facts).collect();
+                match missing(&pool, wanted) {
+                    Missing::Nothing => break,
+                    Missing::Containers(_) => {
+                        let (_, id) = self.name();
+                        self.pool.push(Pooled {
+                            id,
+                            service,
+                            revision: revisions[service],
+                            runs: true,
+                            promised: None,
+                        });
+                    }
+                    Missing::Nodes(id) => {
+                        let (id, before) = (id.to_owned(), self.book.clone());
+                        let wants = cores(SERVICES[service].1);
+                        if !self.book.take_spare(wants) {
+                            assert_eq!(self.book, before, "refused, and yet promised");
+                            break;
+                        }
+                        assert_eq!(before.waiting(), 0, "those who wait were overtaken");
+                        let warm = self.pool.iter_mut().find(|it| it.id == id);
+                        warm.expect("it is the pool's").promised = Some(wants);
+                    }
+                }
             }
         }
-        assert!(self.pool.len() <= POOL);
-        assert_eq!(self.book, before, "the warm pool is promised nothing");
+        assert!(self.pool.iter().filter(|it| it.promised.is_some()).count() <= POOL);
     }
 
     pub(super) fn takes(&mut self, step: Step) {
@@ -537,7 +608,11 @@ impl Machine {
     pub(super) fn holds(&self) {
         let servants = self.servants.iter().filter_map(|it| it.promised);
         let pushes = self.pushes.values().filter_map(|push| push.promised);
-        let promised = servants.chain(pushes).fold(Amount::NONE, Amount::plus);
+        let pooled = self.pool.iter().filter_map(|it| it.promised);
+        let promised = servants
+            .chain(pushes)
+            .chain(pooled)
+            .fold(Amount::NONE, Amount::plus);
         assert_eq!(self.book.promised(), promised);
         assert!(
             promised.fits(self.book.capacity()),
@@ -597,7 +672,11 @@ impl Machine {
             }
             self.holds();
         }
-        assert_eq!(self.book.promised(), Amount::NONE);
+        let pooled = self.pool.iter().filter_map(|it| it.promised);
+        assert_eq!(
+            self.book.promised(),
+            pooled.fold(Amount::NONE, Amount::plus)
+        );
         assert_eq!(self.book.waiting(), 0, "somebody waits for ever");
     }
 }

@@ -7,10 +7,10 @@ use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Top
 use api::push::Layer;
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
-    CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor,
-    Event, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, Phase, Pressure, Problem,
-    PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Size, Sla,
-    Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
+    BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
+    Doctor, Event, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, NodeDown, Phase,
+    Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail,
+    ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -73,6 +73,22 @@ fn servant() -> Servant {
         usage: Some(usage()),
         pids: vec![1],
         dropped: 0,
+        down: vec![NodeDown {
+            node: "/x".into(),
+            failures: 2,
+            again: 1,
+        }],
+    }
+}
+
+fn back_off() -> BackOff {
+    BackOff {
+        service: "x".into(),
+        revision: 1,
+        robot: "r1".into(),
+        failures: 2,
+        reason: "ended".into(),
+        again: 1,
     }
 }
 
@@ -333,6 +349,7 @@ fn status() -> Status {
         services: 1,
         servants: 1,
         warm_pool: 1,
+        warm_nodes: 1,
         connections: 1,
         usage: usage(),
         warnings: all("x"),
@@ -431,6 +448,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("CalibrationOptions", CalibrationOptions::default()),
         sample("Fit", fits),
         sample("Fit", bare),
+        sample("BackOff", back_off()),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
         sample("Explained", explained()),

@@ -1,0 +1,180 @@
+//! How many robots are about to ask for a service, and how many containers made ahead that takes.
+//!
+//! Arrivals are counted in intervals and forecast by linear exponential smoothing (C. C. Holt, *Forecasting seasonals and
+//! trends by exponentially weighted moving averages*, ONR memorandum 52, 1957; Int. J. Forecasting 20, 2004). A pool of
+//! containers, each replaced a lead time after it was taken, is a loss system where an arrival that finds none does without:
+//! its share is Erlang's B of the pool's size and of the arrivals in a lead time (W. Karush, *A queuing model for an inventory
+//! problem*, Operations Research 5, 1957).
+
+use std::time::{Duration, Instant};
+
+/// Arrivals are counted in intervals of this length.
+pub const INTERVAL: Duration = Duration::from_secs(10);
+/// Weight of the last interval in the level.
+const LEVEL: f64 = 0.5;
+/// Weight of the last change of the level in the trend.
+const TREND: f64 = 0.1;
+/// After so many intervals without an arrival nothing is expected any more.
+const FORGOTTEN: u32 = 30;
+/// Most containers that are asked for, whatever the arrivals.
+const MOST: usize = 64;
+
+/// The arrivals of one service's robots.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Arrivals {
+    /// When the interval began that is being counted.
+    begun: Instant,
+    count: u32,
+    /// Arrivals in an interval, and how much more they become with each; none before the first interval is over.
+    smoothed: Option<(f64, f64)>,
+}
+
+impl Arrivals {
+    /// None so far.
+    pub fn new(now: Instant) -> Arrivals {
+        Arrivals {
+            begun: now,
+            count: 0,
+            smoothed: None,
+        }
+    }
+
+    /// A robot came.
+    pub fn arrived(&mut self, now: Instant) {
+        *self = self.at(now);
+        self.count = self.count.saturating_add(1);
+    }
+
+    /// Arrivals that are expected in a second. A burst counts before its interval is over.
+    pub fn expected(&self, now: Instant) -> f64 {
+        let of = self.at(now);
+        let forecast = of.smoothed.map_or(0.0, |(level, trend)| level + trend);
+        forecast.max(f64::from(of.count)) / INTERVAL.as_secs_f64()
+    }
+
+    /// With all intervals smoothed that are over.
+    fn at(&self, now: Instant) -> Arrivals {
+        let mut of = *self;
+        let over = now.saturating_duration_since(of.begun).as_secs() / INTERVAL.as_secs();
+        let over = u32::try_from(over).unwrap_or(u32::MAX);
+        of.begun += INTERVAL * over;
+        if over > FORGOTTEN {
+            return Arrivals::new(of.begun);
+        }
+        for _ in 0..over {
+            let count = f64::from(std::mem::take(&mut of.count));
+            of.smoothed = Some(match of.smoothed {
+                None => (count, 0.0),
+                Some((level, trend)) => {
+                    let next = (LEVEL * count + (1.0 - LEVEL) * (level + trend)).max(0.0);
+                    (next, TREND * (next - level) + (1.0 - TREND) * trend)
+                }
+            });
+        }
+        of
+    }
+}
+
+/// Erlang's B: the share of arrivals that find none of `containers`, where `offered` come in the time in which one is replaced.
+pub fn loss(containers: usize, offered: f64) -> f64 {
+    (1..=containers).fold(1.0, |loss, n| offered * loss / (n as f64 + offered * loss))
+}
+
+/// The fewest containers with which no more than `share` of the arrivals find none.
+pub fn containers(offered: f64, share: f64) -> usize {
+    (0..MOST)
+        .find(|n| loss(*n, offered) <= share)
+        .unwrap_or(MOST)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// What is expected after intervals with so many arrivals each.
+    fn after(counts: &[u32]) -> f64 {
+        let begun = Instant::now();
+        let mut arrivals = Arrivals::new(begun);
+        for (interval, count) in counts.iter().enumerate() {
+            for _ in 0..*count {
+                arrivals.arrived(begun + INTERVAL * interval as u32);
+            }
+        }
+        arrivals.expected(begun + INTERVAL * counts.len() as u32) * INTERVAL.as_secs_f64()
+    }
+
+    #[test]
+    fn what_comes_is_expected_from_what_came() {
+        for (counts, expected) in [
+            (&[] as &[u32], 0.0),
+            (&[4], 4.0),
+            (&[4, 4, 4], 4.0),
+            // Level 4, then 6, trend 0.2: Holt's formulas by hand.
+            (&[4, 8], 6.2),
+            (&[4, 0], 1.8),
+        ] {
+            let is = after(counts);
+            assert!((is - expected).abs() < 1e-9, "{counts:?}: {is}");
+        }
+        let begun = Instant::now();
+        let mut burst = Arrivals::new(begun);
+        (0..9).for_each(|_| burst.arrived(begun));
+        assert!((burst.expected(begun) - 0.9).abs() < 1e-9, "at once");
+        let later = begun + INTERVAL * (FORGOTTEN + 1);
+        assert_eq!(burst.expected(later), 0.0);
+    }
+
+    /// Figures of any table of Erlang's B.
+    #[test]
+    fn the_loss_is_erlangs() {
+        for (containers, offered, expected) in [
+            (0, 2.0, 1.0),
+            (1, 1.0, 0.5),
+            (2, 1.0, 0.2),
+            (5, 3.0, 0.1101),
+            (10, 5.0, 0.0184),
+        ] {
+            let is = loss(containers, offered);
+            assert!((is - expected).abs() < 5e-5, "{containers} {offered}: {is}");
+        }
+        assert_eq!(containers(0.0, 0.05), 1);
+        assert_eq!(containers(0.0, 1.0), 0);
+        assert_eq!(containers(1.0, 0.2), 2);
+        assert_eq!(containers(5.0, 0.02), 10);
+        assert_eq!(containers(1e9, 0.02), MOST);
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_expected_that_makes_no_sense(
+            counts in prop::collection::vec(0u32..50, 0..60),
+            quiet in 0u32..90,
+        ) {
+            let most = counts.iter().copied().max().unwrap_or(0);
+            let mut counts = counts;
+            let busy = after(&counts);
+            prop_assert!(busy >= 0.0 && busy.is_finite());
+            prop_assert!(busy <= f64::from(most) * 2.0, "a trend is no explosion: {busy}");
+            counts.extend(std::iter::repeat_n(0, quiet as usize));
+            if quiet > FORGOTTEN {
+                prop_assert_eq!(after(&counts), 0.0);
+            }
+        }
+
+        #[test]
+        fn more_containers_lose_less_and_more_robots_need_more(
+            offered in 0.0f64..40.0,
+            more in 0.0f64..10.0,
+            containers in 0usize..40,
+            share in 0.001f64..0.5,
+        ) {
+            prop_assert!(loss(containers + 1, offered) <= loss(containers, offered));
+            let need = super::containers(offered, share);
+            prop_assert!(super::containers(offered + more, share) >= need);
+            prop_assert!(need == MOST || loss(need, offered) <= share);
+            prop_assert!(need == 0 || loss(need - 1, offered) > share, "one too many");
+        }
+    }
+}

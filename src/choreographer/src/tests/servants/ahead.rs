@@ -1,0 +1,211 @@
+//! Servants that are made before their robots come, and servants that fail again and again.
+
+use super::*;
+
+const SECOND: Duration = Duration::from_secs(1);
+
+/// A daemon that keeps containers ahead, with the nodes running in so many of them.
+fn keeps(world: &World, nodes: usize) -> Choreographer {
+    let daemon = world.daemon_with(|options| {
+        options.warm_pool = 8;
+        options.warm_nodes = nodes;
+    });
+    daemon.keep_warm_pool();
+    daemon
+}
+
+/// Waits until the pool is so big and so many nodes run.
+async fn pool(daemon: &Choreographer, wanted: (usize, usize)) {
+    let there = async {
+        while daemon.warm_pool() != wanted {
+            tokio::time::sleep(SECOND / 10).await;
+        }
+    };
+    let there = tokio::time::timeout(SECOND * 600, there).await;
+    assert!(there.is_ok(), "{:?} is not {wanted:?}", daemon.warm_pool());
+}
+
+fn promised(daemon: &Choreographer) -> f64 {
+    daemon.admission().look().1.cpus()
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_gets_a_servant_whose_nodes_run_already() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = keeps(&world, 1);
+    pool(&daemon, (1, 1)).await;
+    assert_eq!(promised(&daemon), 1.0, "nodes that run are promised a core");
+    let ids = world.engine.servants();
+    assert!(daemon.servants().is_empty(), "it is nobody's");
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
+    lease.ready().await.expect("ready");
+    assert_eq!(ids, [lease.handle().id.clone()]);
+    let shown = daemon.describe(lease.handle()).await;
+    assert_eq!((&*shown.robot, shown.connections), ("r1", 1));
+    let ready = world.told("servant-ready");
+    assert!(ready[0].contains("for r1"), "{ready:?}");
+    // Another takes its place, and is promised the second core.
+    pool(&daemon, (1, 1)).await;
+    assert_eq!(promised(&daemon), 2.0);
+    daemon.end_warm_pool().await;
+    assert_eq!(promised(&daemon), 1.0);
+    assert_eq!(world.engine.servants(), ids);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robots_stubs_get_no_servant_whose_nodes_have_other_names() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = keeps(&world, 1);
+    pool(&daemon, (1, 1)).await;
+    let ids = world.engine.servants();
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1").by_stub("/greeter"))
+        .expect("a lease");
+    lease.ready().await.expect("ready");
+    assert!(!ids.contains(&lease.handle().id));
+    let servant = world.engine.servant(&lease.handle().id).expect("it runs");
+    assert!(servant::engine::Servant::nodes(&*servant).is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_is_kept_ready_ends_before_a_robot_waits() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    world.publish("map", "/greet", |record| {
+        record.plan.limits.cpus = Some(2.0);
+    });
+    let daemon = keeps(&world, 2);
+    // The second of them does not fit beside the first.
+    pool(&daemon, (2, 1)).await;
+    let lease = daemon
+        .ensure(ServantRequest::new("map", "r1"))
+        .expect("a lease");
+    lease.ready().await.expect("ready");
+    assert_eq!(promised(&daemon), 2.0);
+    assert_eq!(daemon.warm_pool().1, 0, "there is no capacity for it");
+}
+
+#[tokio::test(start_paused = true)]
+async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
+    let world = World::new();
+    world
+        .engine
+        .program("/fails", |process| fails(process, SECOND));
+    world.publish("greet", "/fails", |_| {});
+    let daemon = keeps(&world, 1);
+    tokio::time::sleep(SECOND * 600).await;
+    let told = world.told("warm-failed");
+    let words = "/greeter exited with status 1";
+    assert!(told.iter().all(|told| told.contains(words)), "{told:?}");
+    assert!((3..12).contains(&told.len()), "{told:?}");
+    let backs_off = async {
+        while daemon.back_offs().is_empty() {
+            tokio::time::sleep(SECOND / 2).await;
+        }
+        daemon.back_offs()
+    };
+    let back_offs = tokio::time::timeout(SECOND * 600, backs_off).await;
+    let back_offs = back_offs.expect("it fails again");
+    assert_eq!(
+        (&*back_offs[0].robot, &*back_offs[0].service),
+        ("~warm", "greet")
+    );
+    // A robot has its own luck.
+    daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
+}
+
+#[tokio::test]
+async fn what_a_killed_daemon_kept_ready_ends_without_a_word() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon_with(|options| {
+        options.warm_pool = 8;
+        options.warm_nodes = 1;
+    });
+    let died = tokio::task::spawn_blocking(move || {
+        let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+        runtime.block_on(async {
+            daemon.keep_warm_pool();
+            pool(&daemon, (1, 1)).await;
+        });
+        runtime.shutdown_background();
+    });
+    died.await.expect("no panic");
+    assert_eq!(world.engine.servants().len(), 1);
+    let next = world.daemon();
+    assert_eq!(next.adopt().await.expect("it starts"), 0);
+    assert!(world.engine.servants().is_empty());
+    let events = world.state.events(0, 100).expect("events");
+    assert!(events.is_empty(), "{events:?}");
+    assert!(world.state.servants().expect("servants").is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_servant_that_fails_again_and_again_is_started_after_pauses_that_grow() {
+    let world = World::new();
+    world.engine.program("/broken", |_| async { 3 });
+    world.publish("greet", "/broken", |_| {});
+    world.publish("other", "/greet", |_| {});
+    let daemon = world.daemon();
+    let mut pauses = Vec::new();
+    let mut starts = 0;
+    while pauses.len() < 4 {
+        match daemon.ensure(ServantRequest::new("greet", "r1")) {
+            Ok(lease) => {
+                let reason = failure(&lease).await;
+                assert!(reason.contains("status 3"), "{reason}");
+                starts += 1;
+            }
+            Err(Error::BackOff {
+                failures,
+                reason,
+                again,
+                ..
+            }) => {
+                assert_eq!(failures, starts);
+                assert!(reason.contains("status 3"), "{reason}");
+                pauses.push(seconds(again));
+                let shown = daemon.back_offs();
+                assert_eq!((&*shown[0].robot, shown[0].failures), ("r1", starts));
+                // Others are served meanwhile.
+                daemon
+                    .ensure(ServantRequest::new("greet", "r2"))
+                    .expect("a lease");
+                daemon
+                    .ensure(ServantRequest::new("other", "r1"))
+                    .expect("a lease");
+                tokio::time::sleep(again).await;
+            }
+            Err(error) => panic!("{error}"),
+        }
+    }
+    assert_eq!(pauses, [1, 2, 4, 8]);
+    let told = world.told("servant-back-off");
+    assert!(
+        told[0].contains("2 times in a row") && told[0].contains("in 1 s"),
+        "{told:?}"
+    );
+    assert!(daemon.back_offs().is_empty(), "its pause is over");
+    failure(
+        &daemon
+            .ensure(ServantRequest::new("greet", "r1"))
+            .expect("a lease"),
+    )
+    .await;
+    daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .err()
+        .expect("a pause");
+    // What is pushed anew is started at once.
+    world.publish("greet", "/greet", |_| {});
+    let lease = daemon
+        .ensure(ServantRequest::new("greet", "r1"))
+        .expect("a lease");
+    lease.ready().await.expect("ready");
+}
