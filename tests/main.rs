@@ -58,6 +58,8 @@ mod queue;
 mod readiness;
 #[path = "stories/refusals.rs"]
 mod refusals;
+#[path = "stories/rollouts.rs"]
+mod rollouts;
 #[path = "stories/shadowing.rs"]
 mod shadowing;
 #[path = "stories/sharing.rs"]
@@ -266,7 +268,13 @@ fn main() -> ExitCode {
             reserved_and_taken_names,
             a_full_disk_ends_a_push_and_nothing_else,
         ],
+        stories![rollouts:
+            a_canary_that_fails_is_taken_back_and_its_robot_goes_on,
+            a_canary_is_promoted_and_robots_keep_what_they_have_until_the_deadline,
+        ],
         stories![warm_pool:
+            a_robot_takes_a_servant_whose_nodes_run,
+            a_service_that_fails_again_and_again_says_when_it_is_tried,
             a_robot_takes_the_container_made_ahead_and_another_is_made,
             a_killed_daemons_warm_pool_end_without_a_word,
         ],

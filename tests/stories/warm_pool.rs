@@ -9,10 +9,13 @@ use nix::unistd::Pid;
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
+use support::robot::Robot;
 use support::world::world;
 
 pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Verdict {
-    let daemon = world().own("warm-pool").start()?;
+    // Enough for one container.
+    let setup = world().own("warm-pool");
+    let daemon = setup.config("[servant]\nwarm_memory = \"4M\"\n").start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
@@ -31,15 +34,7 @@ pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Verdict {
 
     let second = warm(&daemon, &BTreeSet::from([first.clone()]))?;
     // A warm container that dies is no reason to keep a robot waiting for it.
-    let runtime: Value = serde_json::from_slice(&fs::read(
-        daemon
-            .home
-            .join("servants")
-            .join(&second)
-            .join("runtime.json"),
-    )?)?;
-    let shim = runtime["shim"]["pid"].as_i64().context("the shim's pid")?;
-    kill(Pid::from_raw(shim as i32), Signal::SIGKILL)?;
+    kills(&daemon, &second)?;
     let mut two = daemon.robot("adder_py?robot=two")?;
     two.calls("/add_two", json!({"a": 2, "b": 2}))?;
     one.calls("/add_two", json!({"a": 3, "b": 3}))?;
@@ -53,8 +48,111 @@ pub fn a_robot_takes_the_container_made_ahead_and_another_is_made() -> Verdict {
     Ok(())
 }
 
+pub fn a_robot_takes_a_servant_whose_nodes_run() -> Verdict {
+    let setup = world()
+        .own("warm-nodes")
+        .config("[capacity]\ncpus = 2\n[servant]\nwarm_nodes = 1\nreserve_cpus = 1.0\n");
+    let daemon = setup.start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    nodes_run(&daemon)?;
+    let promised = daemon.api("/api/v1/status")?["capacity"]["cpus_reserved"].clone();
+    ensure!(promised == 1.0, "{promised} cores are promised to it");
+    let before = processes()?;
+    let mut one = daemon.robot("adder_py?robot=one")?;
+    let answer = one.calls("/add_two", json!({"a": 1, "b": 1}))?;
+    ensure!(answer["values"]["sum"] == 2, "{answer}");
+    let servant = daemon.servant_of("adder_py", "one")?;
+    let pids = servant["pids"].as_array().context("pids")?;
+    ensure!(
+        !pids.is_empty() && pids.iter().all(|pid| before.contains(&pid.to_string())),
+        "its node was started for it: {servant}"
+    );
+    let told = daemon.deployer().asks(&["events"])?.to_string();
+    ensure!(!told.contains("~warm"), "it is somebody's now: {told}");
+
+    // Another is ready beside it. It ends as soon as somebody needs its capacity.
+    nodes_run(&daemon)?;
+    let other = ["--name", "other", "--node", "adder.py"];
+    daemon.deployer().pushes("adder_py", &other)?.succeeded()?;
+    let mut two = daemon.robot("other?robot=two")?;
+    let answer = two.calls("/add_two", json!({"a": 2, "b": 2}))?;
+    ensure!(answer["values"]["sum"] == 4, "{answer}");
+    one.calls("/add_two", json!({"a": 3, "b": 3}))?;
+
+    // What is ready for nobody is nobody's after the daemon's death, too.
+    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    nodes_run(&daemon)?;
+    let left = directories(&daemon)?;
+    daemon.is_killed()?;
+    let daemon = setup.start()?;
+    nodes_run(&daemon)?;
+    let still: Vec<_> = directories(&daemon)?.intersection(&left).cloned().collect();
+    ensure!(
+        still.is_empty(),
+        "nobody knows in which state {still:?} are"
+    );
+    let told = daemon.deployer().asks(&["events"])?.to_string();
+    ensure!(
+        !told.contains("servant-lost") && !told.contains("servant-unknown"),
+        "{told}"
+    );
+    Ok(())
+}
+
+pub fn a_service_that_fails_again_and_again_says_when_it_is_tried() -> Verdict {
+    let daemon = world().own("back-off").start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    // Pauses grow until one is longer than it takes to ask again, however slow this machine is.
+    let refusal = support::until("a refusal", || {
+        let mut robot = match Robot::try_connect(&daemon.url("adder_py?robot=one")) {
+            Ok(robot) => robot,
+            Err(refusal) => return Ok(Ok(refusal)),
+        };
+        robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
+        kills(&daemon, &id_of(&daemon, "one")?)?;
+        robot.hears_close()?;
+        support::until("the servant's end", || {
+            let left = daemon.servants_of("adder_py")?;
+            Ok(left.is_empty().then_some(()).ok_or(format!("{left:?}")))
+        })?;
+        Ok(Err("it was started again at once".to_owned()))
+    })?;
+    ensure!(refusal.status == 503, "{refusal:?}");
+    let said = format!("{refusal:?}");
+    ensure!(
+        said.contains("times in a row") && said.contains("at the earliest"),
+        "{said}"
+    );
+    let listed = daemon.deployer().types(&["servants"])?.succeeded()?.said();
+    ensure!(listed.contains("next start in"), "{listed}");
+    let why = ["explain", "one"];
+    let explained = daemon.deployer().types(&why)?.succeeded()?.said();
+    ensure!(explained.contains("times in a row"), "{explained}");
+    daemon.awaits_event("the pause", |event| event["kind"] == "servant-back-off")?;
+    // Others are served, and so is the robot by another revision.
+    daemon
+        .robot("adder_py?robot=two")?
+        .calls("/add_two", json!({"a": 1, "b": 1}))?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    daemon
+        .robot("adder_py?robot=one")?
+        .calls("/add_two", json!({"a": 1, "b": 1}))?;
+    Ok(())
+}
+
 pub fn a_killed_daemons_warm_pool_end_without_a_word() -> Verdict {
-    let setup = world().own("warm-pool-killed");
+    let setup = world()
+        .own("warm-pool-killed")
+        .config("[servant]\nwarm_memory = \"4M\"\n");
     let daemon = setup.start()?;
     daemon
         .deployer()
@@ -82,11 +180,37 @@ fn warm(daemon: &Daemon, known: &BTreeSet<String>) -> anyhow::Result<String> {
     })
 }
 
+/// Waits for a warm container in which the nodes run.
+fn nodes_run(daemon: &Daemon) -> Verdict {
+    support::until("a warm container with nodes", || {
+        let status = daemon.api("/api/v1/status")?;
+        Ok((status["warm_nodes"] == 1)
+            .then_some(())
+            .ok_or_else(|| status.to_string()))
+    })
+}
+
+/// Ids of all processes of this machine.
+fn processes() -> anyhow::Result<BTreeSet<String>> {
+    let entries = fs::read_dir("/proc")?;
+    entries
+        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
+        .collect()
+}
+
 fn directories(daemon: &Daemon) -> anyhow::Result<BTreeSet<String>> {
     let entries = fs::read_dir(daemon.home.join("servants"))?;
     entries
         .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
         .collect()
+}
+
+/// Kills the parent of a servant's processes.
+fn kills(daemon: &Daemon, id: &str) -> Verdict {
+    let runtime = daemon.home.join("servants").join(id).join("runtime.json");
+    let runtime: Value = serde_json::from_slice(&fs::read(runtime)?)?;
+    let shim = runtime["shim"]["pid"].as_i64().context("the shim's pid")?;
+    Ok(kill(Pid::from_raw(shim as i32), Signal::SIGKILL)?)
 }
 
 fn id_of(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {

@@ -15,6 +15,7 @@ mod peers;
 mod robot;
 mod root;
 mod starts;
+mod upgrade;
 
 use std::path::Path;
 
@@ -80,14 +81,17 @@ fn measure() -> Result<()> {
     let image = Image::of(&daemon, "relay")?;
     let mut report = Report::new("servant");
     let without_warm_pool = serving("warm_pool = 0\n")?;
+    let warm_nodes = serving("warm_nodes = 1\n")?;
     starts::measure(
         &mut report,
         &daemon,
         &without_warm_pool,
+        &warm_nodes,
         &image,
         runtime.handle(),
     )?;
     drop(without_warm_pool);
+    drop(warm_nodes);
     crowd::measure(&mut report, &daemon, &image)?;
     report.finish()?;
     Ok(())

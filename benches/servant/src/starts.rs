@@ -14,6 +14,7 @@ use crate::image::Image;
 use crate::native::Native;
 use crate::peers::Peer;
 use crate::robot::Robot;
+use crate::upgrade;
 
 /// A robot connects; until rosapi tells it of its node. Then it leaves, and its servant ends.
 pub(crate) fn robot(daemon: &Daemon, image: &Image) -> Result<Duration> {
@@ -32,6 +33,17 @@ pub(crate) fn robot(daemon: &Daemon, image: &Image) -> Result<Duration> {
     Ok(took)
 }
 
+/// Waits until the nodes run in a container of the warm pool. They have registered long before the next turn.
+fn until_warm(daemon: &Daemon) -> Result<()> {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while daemon.get("/api/v1/status")?["warm_nodes"] == 0 {
+        ensure!(Instant::now() < deadline, "no nodes run ahead");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    std::thread::sleep(SETTLES);
+    Ok(())
+}
+
 /// Sorted and named.
 pub(crate) fn times(name: &str, mut list: Vec<Duration>) -> Times {
     list.sort_unstable();
@@ -46,6 +58,8 @@ pub(crate) fn median(times: &Times) -> f64 {
     times.median().as_secs_f64() * 1e3
 }
 
+/// For nodes that were started just now to register.
+const SETTLES: Duration = Duration::from_millis(500);
 /// Between two contestants, for what the one before left running in the kernel.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -81,6 +95,8 @@ impl<'a> Contestant<'a> {
 
 const ROBOT: &str = "robot";
 const COLD: &str = "robot, no container made ahead";
+const READY: &str = "robot, nodes running already";
+const UPGRADE: &str = "plain WebSocket upgrade";
 const NODE: &str = "node alone";
 const ENGINE: &str = "engine";
 const LIMITED: &str = "libcontainer alone, the same spec";
@@ -91,6 +107,7 @@ pub(crate) fn measure(
     report: &mut Report,
     daemon: &Daemon,
     without_warm_pool: &Daemon,
+    warm_nodes: &Daemon,
     image: &Image,
     runtime: &Handle,
 ) -> Result<()> {
@@ -99,10 +116,16 @@ pub(crate) fn measure(
     std::fs::create_dir_all(&place)?;
     let native = Native::prepare(&place, image, runtime)?;
     let ours = Ours::prepare(&place, runtime)?;
+    let plain = upgrade::server()?;
     let bundle = place.join("bundle");
     let mut contestants = vec![
         Contestant::ours(ROBOT, |_| robot(daemon, image)),
         Contestant::ours(COLD, |_| robot(without_warm_pool, image)),
+        Contestant::ours(READY, |_| {
+            until_warm(warm_nodes)?;
+            robot(warm_nodes, image)
+        }),
+        Contestant::ours(UPGRADE, |_| upgrade::time(&plain)),
         Contestant::ours(NODE, |_| native.time()),
         Contestant::ours(ENGINE, |spec| ours.time(spec.clone())),
         Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),
@@ -177,6 +200,27 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         )
         .note("the first robot of a service, and robots that come faster than containers are made");
     report
+        .figure(
+            "robot connects → node registered, bridged, in a container made ahead",
+            "ms",
+            median(robots),
+        )
+        .beside("node alone", node)
+        .reach(Target::RatioAtMost(1.2));
+    let ready = needed(READY)?;
+    report
+        .figure(
+            "robot connects → first answer, nodes running already",
+            "ms",
+            median(ready),
+        )
+        .beside(UPGRADE, median(needed(UPGRADE)?))
+        .reach(Target::RatioAtMost(10.0))
+        .note(format!(
+            "warm_nodes = 1; the answer names the node; best {:.2} ms",
+            ready.best().as_secs_f64() * 1e3
+        ));
+    report
         .figure("node alone: exec → registered", "ms", node)
         .note("in a chroot of the same layers, namespaces ready, the same Master");
     report
@@ -186,7 +230,7 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         .note("ours with limits read back, shim, Master and init");
     for other in all
         .iter()
-        .filter(|times| ![ROBOT, COLD, NODE, ENGINE].contains(&times.name.as_str()))
+        .filter(|times| ![ROBOT, COLD, READY, UPGRADE, NODE, ENGINE].contains(&times.name.as_str()))
     {
         if other.name != bare.name {
             report

@@ -71,6 +71,9 @@ pub struct PushOptions {
     /// Robots share its servants; none: each robot has a servant of its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shared: Option<Shared>,
+    /// On which terms it takes the place of the revision before; at once by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rollout: Option<crate::rollout::RolloutTerms>,
     /// What was pushed, in words, kept with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,

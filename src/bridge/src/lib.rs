@@ -55,5 +55,5 @@ mod waiting;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use metrics::{Counter, Metrics};
-pub use options::{BridgeOptions, SessionOptions};
+pub use options::{BridgeOptions, Called, SessionOptions};
 pub use waiting::Waiting;

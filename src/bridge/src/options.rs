@@ -1,5 +1,7 @@
 //! What an operator can set, and what each connection brings along.
 
+use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 use budget::Budget;
@@ -61,6 +63,34 @@ pub struct BridgeOptions {
     pub budget: Budget,
     /// A WebSocket message that was begun and is not complete after this time closes its connection (1008).
     pub unfinished: Duration,
+    /// Who hears of clients' calls of the servant's services.
+    pub called: Called,
+}
+
+/// Hears how long each call of a service of the servant took; none where it failed.
+#[derive(Clone, Default)]
+pub struct Called(Option<Arc<Listener>>);
+
+type Listener = dyn Fn(Option<Duration>) + Send + Sync;
+
+impl Called {
+    /// By this function, which must not block.
+    pub fn by(listener: impl Fn(Option<Duration>) + Send + Sync + 'static) -> Called {
+        Called(Some(Arc::new(listener)))
+    }
+
+    pub(crate) fn tell(&self, took: Option<Duration>) {
+        if let Some(listener) = &self.0 {
+            listener(took);
+        }
+    }
+}
+
+impl fmt::Debug for Called {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let heard = self.0.is_some();
+        out.debug_tuple("Called").field(&heard).finish()
+    }
 }
 
 impl Default for BridgeOptions {
@@ -94,6 +124,7 @@ impl Default for BridgeOptions {
             max_encoded: 64 << 20,
             budget: Budget::unlimited(),
             unfinished: Duration::from_secs(300),
+            called: Called::default(),
         }
     }
 }

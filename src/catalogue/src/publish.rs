@@ -34,12 +34,35 @@ impl Catalogue {
         record: RevisionRecord,
         inventory: Inventory,
     ) -> Result<u64, Error> {
+        self.publish_as(record, inventory, true).await
+    }
+
+    /// Writes the revision beside the one that new servants are started from. Gives its number.
+    pub async fn publish_beside(
+        &self,
+        record: RevisionRecord,
+        inventory: Inventory,
+    ) -> Result<u64, Error> {
+        self.publish_as(record, inventory, false).await
+    }
+
+    async fn publish_as(
+        &self,
+        record: RevisionRecord,
+        inventory: Inventory,
+        current: bool,
+    ) -> Result<u64, Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("publishing", move || {
-            let number = state.publish(&record, &inventory)?;
+            let number = match current {
+                true => state.publish(&record, &inventory)?,
+                false => state.publish_beside(&record, &inventory)?,
+            };
             // A crash before these is repaired at the next start.
             tag(&store, &record.service, number, &record.image)?;
-            tag_current(&store, &record.service, &record.image)?;
+            if let Some(current) = state.current(&record.service)? {
+                tag_current(&store, &record.service, &current.image)?;
+            }
             Ok(number)
         })
         .await

@@ -19,6 +19,7 @@
 //! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
 //! | [`group`] | how many servants answer the robots that share a service | their requests, how long these take, bounds, the time |
 //! | [`back_off`] | when a servant that failed may be started again | how often in a row, how long it was ready |
+//! | [`rollout`] | which robots a new revision serves first, when it is taken back or promoted | its terms, what was seen of both revisions |
 //! | [`warm_pool`] | how many containers each service has ahead, in which the nodes run, which end | what is published, what was asked for last, the forecast, a budget |
 //! | [`forecast`] | how many robots are about to ask | when robots asked |
 //! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
@@ -40,7 +41,9 @@ pub(crate) mod group;
 pub(crate) mod lifetime;
 pub(crate) mod nodes;
 pub(crate) mod placement;
+pub(crate) mod rollout;
 mod shares;
+mod sketch;
 pub(crate) mod stall;
 pub(crate) mod terms;
 pub(crate) mod warm_pool;

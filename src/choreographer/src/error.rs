@@ -60,6 +60,12 @@ pub enum Error {
         /// After this time it may ask again.
         again: std::time::Duration,
     },
+    /// The service was never on its way to another revision.
+    #[error("{0} is on its way to no other revision, nor was it")]
+    NoRollout(String),
+    /// A rollout cannot be begun or changed so.
+    #[error("{0}")]
+    Rollout(String),
     /// The daemon is ending.
     #[error("the daemon is ending")]
     Ending,

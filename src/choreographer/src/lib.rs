@@ -62,12 +62,13 @@ pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, with_last_words};
-pub use lives::back_off::seconds;
 pub use handle::{Handle, Lease};
 pub use limits::engine_limits;
+pub use lives::back_off::seconds;
 pub use lives::calibration::Requests;
 pub use lives::capture::Bounds;
 pub use lives::limits::Unchanged;
+pub use lives::rollouts::check_terms;
 pub use lives::waiting::{Admission, Permit, Standing};
 pub use memory::{Memory, MemoryOptions};
 pub use options::{Class, DEFAULT_CLASS, Options};
@@ -121,6 +122,7 @@ impl Choreographer {
             warm_pool: WarmPool::default(),
             groups: Default::default(),
             back_offs: BackOffs::default(),
+            rollouts: Arc::default(),
             incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
         };
@@ -142,7 +144,8 @@ impl Choreographer {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
             // followed by one of the revision before.
-            let revision = inner.catalogue.current(&request.service)?;
+            let revision =
+                inner.revision_for(&request.service, &request.robot, request.anonymous)?;
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }

@@ -14,6 +14,7 @@ pub(crate) mod limits;
 mod nodes;
 mod reaching;
 mod recent;
+pub(crate) mod rollouts;
 mod starting;
 pub(crate) mod waiting;
 pub(crate) mod warm_pool;
@@ -40,6 +41,7 @@ use crate::options::Options;
 use back_off::BackOffs;
 use group::Groups;
 use recent::Recent;
+use rollouts::Rollouts;
 use waiting::Admission;
 use warm_pool::WarmPool;
 
@@ -61,6 +63,7 @@ pub(crate) struct Inner {
     pub(crate) warm_pool: WarmPool,
     pub(crate) groups: Groups,
     pub(crate) back_offs: BackOffs,
+    pub(crate) rollouts: Arc<Rollouts>,
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,

@@ -15,6 +15,7 @@ mod output;
 mod push;
 mod rm;
 mod rollback;
+mod rollout;
 mod servants;
 mod services;
 mod set;
@@ -74,6 +75,7 @@ enum Verb {
     Stop(stop::Stop),
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
+    Rollout(rollout::Rollout),
     Stub(stub::Stub),
     Try(Box<trial::Try>),
     Calibrate(Box<calibrate::Calibrate>),
@@ -122,6 +124,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
+        Verb::Rollout(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,
         Verb::Calibrate(verb) => verb.run(&client, format).await,

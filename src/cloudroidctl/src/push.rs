@@ -15,6 +15,7 @@ use crate::client::{self, Client, escaped};
 use crate::limits::{CapFlags, LimitFlags};
 use crate::output::Format;
 use crate::push::shared::SharedFlags;
+use crate::rollout::TermFlags;
 use crate::services;
 use progress::Progress;
 
@@ -72,6 +73,8 @@ pub struct Push {
     stateful: Option<bool>,
     #[command(flatten)]
     shared: SharedFlags,
+    #[command(flatten)]
+    rollout: TermFlags,
     #[command(flatten)]
     limits: LimitFlags,
     #[command(flatten)]
@@ -208,6 +211,7 @@ impl Push {
             stateful: self.stateful == Some(true),
             stateless: self.stateful == Some(false),
             shared: self.shared.asked(),
+            rollout: self.rollout.terms(),
             source,
         })
     }

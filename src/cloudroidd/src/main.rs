@@ -201,6 +201,9 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         .repair()
         .await
         .context("cannot repair the image store")?;
+    app.choreographer
+        .keep_rollouts()
+        .context("cannot go on with the rollouts of an earlier daemon")?;
     let adopted = app
         .choreographer
         .adopt()

@@ -132,6 +132,35 @@ pub async fn rollback(
     Ok(Json(views::service(&app, &name)?))
 }
 
+/// How a service comes to its next revision.
+pub async fn rollout(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+) -> Answer<api::Rollout> {
+    Ok(Json(app.choreographer.rollout(&name)?))
+}
+
+/// Begins a rollout, promotes its canary, or takes it back.
+pub async fn order_rollout(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
+    body: Body,
+) -> Answer<api::Rollout> {
+    use api::rollout::RolloutOrder;
+    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+    let order: RolloutOrder = serde_json::from_slice(&body)
+        .map_err(|error| Error::BadRequest(format!("the order cannot be read: {error}")))?;
+    let choreographer = &app.choreographer;
+    Ok(Json(match order {
+        RolloutOrder::Start { revision, terms } => {
+            choreographer.begin_rollout(&name, revision, terms).await?
+        }
+        RolloutOrder::Promote => choreographer.promote_rollout(&name).await?,
+        RolloutOrder::Abort => choreographer.abort_rollout(&name)?,
+    }))
+}
+
 /// The largest recording for a trial or a calibration, where its sender may have so much: it is held in memory.
 const LARGEST_TRIAL: usize = 512 << 20;
 /// The longest of other bodies.

@@ -320,7 +320,13 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
             Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
         },
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
-        C::BackOff { .. } => (S::SERVICE_UNAVAILABLE, "back-off", "servant fails again and again"),
+        C::NoRollout(_) => (S::NOT_FOUND, "no-rollout", "no rollout"),
+        C::Rollout(_) => (S::CONFLICT, "rollout", "no such rollout"),
+        C::BackOff { .. } => (
+            S::SERVICE_UNAVAILABLE,
+            "back-off",
+            "servant fails again and again",
+        ),
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
@@ -354,6 +360,9 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
         }
+        C::NoRollout(service) => format!(
+            "push a revision with --canary or --deadline, or begin with one: cloudroidctl rollout {service} start REVISION --canary 10%"
+        ),
         C::BackOff { service, .. } => {
             format!("see why with: cloudroidctl events; push {service} again when its package is fixed: a new revision is started at once")
         }

@@ -155,6 +155,24 @@ pub const ROUTES: &[Route] = &[
             .takes::<api::Rollback>(Required::False)
             .answers::<api::ServiceDetail>()
     }),
+    at("GET", "/api/v1/services/{name}/rollout", Token, || {
+        get(api_v1::rollout)
+    })
+    .described(|| {
+        operation("rollout", "How a service comes to its next revision.")
+            .answers::<api::Rollout>()
+    }),
+    at("POST", "/api/v1/services/{name}/rollout", Token, || {
+        post(api_v1::order_rollout)
+    })
+    .described(|| {
+        operation(
+            "orderRollout",
+            "Begins a rollout, promotes its canary, or takes it back.",
+        )
+        .takes::<api::rollout::RolloutOrder>(Required::True)
+        .answers::<api::Rollout>()
+    }),
     at("POST", "/api/v1/services/{name}/trial", Token, || {
         post(api_v1::trial)
     })

@@ -242,7 +242,9 @@ impl Pusher {
             interface,
         };
         report.step("publishing").await;
-        let number = self.publish(record, built.inventory).await?;
+        let number = self
+            .publish(record, built.inventory, options.rollout)
+            .await?;
         let about = NewEvent {
             service: Some(&name),
             ..NewEvent::default()

@@ -1,5 +1,6 @@
 //! Publishing, rolling back and removing services: the catalogue does it, servants and warm containers follow.
 
+use api::rollout::RolloutTerms;
 use catalogue::RolledBack;
 use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
@@ -8,15 +9,34 @@ use super::Pusher;
 use crate::Error;
 
 impl Pusher {
-    /// Publishes the revision, and has a warm container made of it.
+    /// Publishes the revision on these terms, and has a warm container made of it.
     pub(super) async fn publish(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
+        terms: Option<RolloutTerms>,
     ) -> Result<u64, Error> {
-        let published = self.catalogue.publish(record, inventory).await;
+        let service = record.service.clone();
+        let before = self.catalogue.package(&service)?.is_some();
+        let terms = terms.filter(|_| before);
+        let beside = terms.is_some_and(|terms| terms.canary.is_some());
+        if beside {
+            self.choreographer.check_canary(&record)?;
+        }
+        let published = match beside {
+            true => self.catalogue.publish_beside(record, inventory).await,
+            false => self.catalogue.publish(record, inventory).await,
+        };
         self.choreographer.refill_warm_pool();
-        Ok(published?)
+        let number = published?;
+        match terms {
+            Some(terms) => {
+                let choreographer = &self.choreographer;
+                choreographer.begin_rollout(&service, number, terms).await?;
+            }
+            None => self.choreographer.revision_changed(&service, number)?,
+        }
+        Ok(number)
     }
 
     /// Makes an earlier revision the current one.
@@ -24,6 +44,7 @@ impl Pusher {
         let _turn = self.places.turn(name).await;
         let RolledBack { from, to } = self.catalogue.rollback(name, wanted).await?;
         self.choreographer.refill_warm_pool();
+        self.choreographer.revision_changed(name, to)?;
         let about = NewEvent {
             service: Some(name),
             ..NewEvent::default()

@@ -95,6 +95,9 @@ impl Pusher {
             .map_err(|error| Error::Options(error.to_string()))?;
         check_caps(options).map_err(Error::Options)?;
         check_sla(options).map_err(Error::Options)?;
+        if let Some(terms) = &options.rollout {
+            choreographer::check_terms(terms)?;
+        }
         self.choreographer.check_grants(&options.grants)?;
         shared::check_options(options)?;
         Ok(self.choreographer.check_limits(&options.limits)?)

@@ -12,6 +12,7 @@ mod events;
 mod journal;
 pub mod private;
 mod robots;
+mod rollouts;
 mod servants;
 mod services;
 
@@ -34,12 +35,13 @@ pub use servants::ServantRecord;
 pub use services::{Plan, RevisionLine, RevisionRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 5] = [
+const MIGRATIONS: [&str; 6] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
     include_str!("004-terms.sql"),
     include_str!("005-dictionary.sql"),
+    include_str!("006-rollouts.sql"),
 ];
 
 /// What can go wrong.

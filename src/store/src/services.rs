@@ -87,6 +87,24 @@ impl State {
     /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns. `inventory`:
     /// what its image holds.
     pub fn publish(&self, revision: &RevisionRecord, inventory: &Inventory) -> Result<u64, Error> {
+        self.publish_as(revision, inventory, true)
+    }
+
+    /// The same beside the current revision, if there is one.
+    pub fn publish_beside(
+        &self,
+        revision: &RevisionRecord,
+        inventory: &Inventory,
+    ) -> Result<u64, Error> {
+        self.publish_as(revision, inventory, false)
+    }
+
+    fn publish_as(
+        &self,
+        revision: &RevisionRecord,
+        inventory: &Inventory,
+        current: bool,
+    ) -> Result<u64, Error> {
         let flavour = to_json(&revision.flavour, &revision.service)?;
         let inventory = to_json(inventory, &revision.service)?;
         let plan = to_json(&revision.plan, &revision.service)?;
@@ -102,8 +120,8 @@ impl State {
             )?;
             transaction.execute(
                 "INSERT INTO services (name, package, current) VALUES (?1, ?2, ?3)
-                 ON CONFLICT (name) DO UPDATE SET current = ?3",
-                params![revision.service, revision.package, number],
+                 ON CONFLICT (name) DO UPDATE SET current = CASE WHEN ?4 THEN ?3 ELSE current END",
+                params![revision.service, revision.package, number, current],
             )?;
             transaction.execute(
                 "INSERT INTO revisions

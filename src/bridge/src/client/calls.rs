@@ -3,7 +3,7 @@
 use std::future::Future;
 use std::sync::Arc;
 use std::task::{Context, Waker};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use ros::bus::Digest;
@@ -154,12 +154,15 @@ impl Client {
             ),
             (Err(reason), ..) => return Err(reason.clone()),
         };
+        let asked = Instant::now();
         let response = self
             .shared
             .bus
             .call(&call.service, request, call.timeout)
-            .await
-            .map_err(|error| error.to_string())?;
+            .await;
+        let took = response.is_ok().then(|| asked.elapsed());
+        self.shared.options.called.tell(took);
+        let response = response.map_err(|error| error.to_string())?;
         self.response_frame(call, def.as_deref().ok(), &response)
     }
 

@@ -36,6 +36,9 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
     inner.note_end(&handle, &outcome);
+    if matches!(outcome, Err(Failure::Broken { .. })) {
+        inner.rollouts.note_servant(&handle, true);
+    }
     let outcome = match outcome {
         Ok(reason) => Ok(reason),
         Err(failure) => Err(with_log(failure, &handle).await),
@@ -181,6 +184,9 @@ async fn run(
         failure = nodes.supervise() => return Err(failure),
     }
     handle.set_phase(Phase::Ready);
+    if fresh {
+        inner.rollouts.note_servant(handle, false);
+    }
     inner.warm_pool.look();
     let took = store::now().saturating_sub(handle.created);
     let message = if fresh {

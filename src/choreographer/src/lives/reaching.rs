@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use api::Level;
+use bridge::{BridgeOptions, Called};
 use catalogue::{Catalogue, Known};
 use link::control::Request;
 use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
@@ -12,6 +13,7 @@ use store::{Journal, NewEvent, RevisionRecord};
 
 use super::Inner;
 use super::recent::Recent;
+use super::rollouts::Rollouts;
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
@@ -22,7 +24,10 @@ pub(crate) async fn open(
     let memory = &inner.memory;
     let options = ReachOptions {
         ros: revision.flavour.ros.bus(),
-        bridge: inner.options.bridge.clone(),
+        bridge: BridgeOptions {
+            called: called(inner, revision),
+            ..inner.options.bridge.clone()
+        },
         grace: inner.options.grace,
         budget: memory.servant(container.id()),
         unfinished: memory.unfinished,
@@ -34,12 +39,23 @@ pub(crate) async fn open(
         journal: inner.journal.clone(),
         request_times: Arc::clone(&inner.request_times),
         recent: Arc::clone(&inner.recent),
+        rollouts: Arc::clone(&inner.rollouts),
     };
     let recorded = Box::pin(recorded(inner, revision));
     let opener = &inner.opener;
     opener
         .open(container, recorded, options, Arc::new(reports))
         .await
+}
+
+/// Counts the calls of rosbridge's clients.
+fn called(inner: &Inner, revision: &RevisionRecord) -> Called {
+    let rollouts = Arc::clone(&inner.rollouts);
+    let (service, number) = (revision.service.clone(), revision.number);
+    Called::by(move |took| {
+        let millis = took.map(|took| took.as_secs_f64() * 1e3);
+        rollouts.note_request(&service, number, millis);
+    })
 }
 
 async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
@@ -77,6 +93,7 @@ struct Reports {
     journal: Journal,
     request_times: Arc<RequestTimes>,
     recent: Arc<Recent>,
+    rollouts: Arc<Rollouts>,
 }
 
 impl Observer for Reports {
@@ -98,7 +115,10 @@ impl Observer for Reports {
     }
 
     fn measured(&self, request: &Request) {
-        self.request_times.note(&self.revision.service, request);
+        let service = &self.revision.service;
+        self.request_times.note(service, request);
         self.recent.note(&self.id, request, Instant::now());
+        self.rollouts
+            .note_request(service, self.revision.number, request.total);
     }
 }

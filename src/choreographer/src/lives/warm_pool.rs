@@ -218,8 +218,9 @@ impl WarmPool {
     pub(crate) fn promised(&self, inner: &Inner) -> Vec<(String, Amount, bool)> {
         let kept = self.kept.lock();
         let pooled = kept.pool.iter();
-        let pooled = pooled
-            .filter_map(|warm| Some((warm.container.id().to_owned(), warm.promised(inner)?, false)));
+        let pooled = pooled.filter_map(|warm| {
+            Some((warm.container.id().to_owned(), warm.promised(inner)?, false))
+        });
         let ending = kept.ending.iter();
         let ending = ending.map(|(id, amount)| (id.clone(), *amount, true));
         pooled.chain(ending).collect()
@@ -290,6 +291,20 @@ fn wanted(inner: &Inner) -> Result<Vec<(Arc<RevisionRecord>, Demand)>, Error> {
                 .then(|| inner.promised(&revision.plan.limits).memory),
         };
         wanted.push((revision, demand));
+    }
+    for (service, number) in inner.rollouts.candidates() {
+        let of = |wanted: &(Arc<RevisionRecord>, Demand)| wanted.0.service == service;
+        let demand = wanted.iter().find(|it| of(it)).map(|it| it.1);
+        if let (Some(demand), Some(revision)) = (demand, inner.state.revision(&service, number)?) {
+            // Few robots get it: one is enough.
+            wanted.push((
+                revision,
+                Demand {
+                    rate: 0.0,
+                    ..demand
+                },
+            ));
+        }
     }
     Ok(wanted)
 }
@@ -398,7 +413,13 @@ async fn report_dead(inner: &Inner, warm: &Warm) {
     let message = format!("a servant of {service} that was kept ready for a robot failed: {how}");
     inner.journal.warning("warm-failed", &message, &about);
     let back_offs = &inner.back_offs;
-    back_offs.failed(service, NOBODY, &warm.revision, None, &format!("lost {how}"));
+    back_offs.failed(
+        service,
+        NOBODY,
+        &warm.revision,
+        None,
+        &format!("lost {how}"),
+    );
 }
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm, Error> {
@@ -458,7 +479,7 @@ async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
         anonymous: true,
         created: store::now(),
         limits: api::Limits::default(),
-        stated: Default::default(),
+        terms: None,
     };
     warm.permit = Some(permit);
     // A daemon that is killed now finds out by this that nobody misses it.
@@ -467,6 +488,10 @@ async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
     let nodes = revision.plan.nodes.iter().cloned();
     let started = join_all(nodes.map(|node| warm.container.start_node(node))).await;
     if recorded.is_err() || started.iter().any(Result::is_err) {
+        let (service, reason) = (&revision.service, "could not be started");
+        inner
+            .back_offs
+            .failed(service, NOBODY, &revision, None, reason);
         warm.end(inner).await;
         return None;
     }

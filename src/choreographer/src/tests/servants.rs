@@ -8,6 +8,7 @@ use servant::spec::NodeSpec;
 use super::*;
 
 mod ahead;
+mod rollouts;
 
 /// A machine, and what outlives a daemon on it.
 pub(super) struct World {
@@ -61,13 +62,8 @@ impl World {
         )
     }
 
-    /// Publishes a service of one node, `/greeter`, that runs `program` and publishes a topic.
-    pub(super) fn publish(
-        &self,
-        service: &str,
-        program: &str,
-        change: impl FnOnce(&mut RevisionRecord),
-    ) {
+    /// A revision of a service of one node, `/greeter`, that runs `program` and publishes a topic.
+    fn record(service: &str, program: &str) -> RevisionRecord {
         let mut record = revision(&format!("sha256:{service}"), 1.0);
         record.service = service.to_owned();
         record.plan.limits = api::Limits::default();
@@ -76,6 +72,17 @@ impl World {
             "name": "/greeting", "type": "std_msgs/String", "direction": "output", "nodes": ["/greeter"],
         });
         record.interface.topics = vec![serde_json::from_value(greeting).expect("a topic")];
+        record
+    }
+
+    /// Publishes a service of one node, `/greeter`, that runs `program` and publishes a topic.
+    pub(super) fn publish(
+        &self,
+        service: &str,
+        program: &str,
+        change: impl FnOnce(&mut RevisionRecord),
+    ) {
+        let mut record = World::record(service, program);
         change(&mut record);
         let published = self.state.publish(&record, &Default::default());
         published.expect("published");

@@ -5,6 +5,7 @@ use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use api::push::Layer;
+use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share};
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
@@ -78,6 +79,35 @@ fn servant() -> Servant {
             failures: 2,
             again: 1,
         }],
+    }
+}
+
+fn rollout_terms() -> RolloutTerms {
+    RolloutTerms {
+        canary: Some(Share::Percent(10.0)),
+        deadline: Some(1.5),
+        promote_after: Some(1.5),
+        ..RolloutTerms::default()
+    }
+}
+
+fn rollout() -> Rollout {
+    let arm = Arm {
+        p50: Some(1.5),
+        p95: Some(1.5),
+        ..Arm::default()
+    };
+    Rollout {
+        service: "x".into(),
+        stable: 1,
+        candidate: 2,
+        state: RolloutState::RolledBack,
+        reason: "it was worse".into(),
+        started: 1,
+        changed: 1,
+        terms: rollout_terms(),
+        of_stable: Arm::default(),
+        of_candidate: arm,
     }
 }
 
@@ -282,6 +312,7 @@ fn options() -> PushOptions {
         stateful: true,
         stateless: true,
         shared: Some(api::Shared::default()),
+        rollout: Some(rollout_terms()),
         source: "--apt x".into(),
     }
 }
@@ -464,6 +495,16 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("PushOptions", PushOptions::default()),
         sample("Rollback", Rollback { revision: Some(1) }),
         sample("Rollback", Rollback::default()),
+        sample("Rollout", rollout()),
+        sample("RolloutOrder", RolloutOrder::Promote),
+        sample("RolloutOrder", RolloutOrder::Abort),
+        sample(
+            "RolloutOrder",
+            RolloutOrder::Start {
+                revision: 1,
+                terms: rollout_terms(),
+            },
+        ),
         sample("Servant", servant()),
         sample("ServiceDetail", detail()),
         sample("Status", status()),

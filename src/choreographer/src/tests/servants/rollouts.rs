@@ -1,0 +1,227 @@
+//! Revisions that take each other's place, told with the engine in memory.
+
+use api::rollout::{RolloutState, RolloutTerms, Share};
+
+use super::*;
+
+const SECOND: Duration = Duration::from_secs(1);
+
+/// A world with a service whose revision 1 is the current one, and revision 2 published beside it.
+fn two() -> World {
+    let world = World::new();
+    // The catalogue sets tags, whether or not there is such an image.
+    let image = |number: u64| format!("sha256:{number:064}");
+    world.publish("greet", "/greet", |record| record.image = image(1));
+    let mut second = World::record("greet", "/greet");
+    second.image = image(2);
+    let published = world.state.publish_beside(&second, &Default::default());
+    assert_eq!(published.expect("published"), 2);
+    world
+}
+
+fn canary(share: Share) -> RolloutTerms {
+    RolloutTerms {
+        canary: Some(share),
+        samples: 5,
+        ..RolloutTerms::default()
+    }
+}
+
+/// A daemon that looks after rollouts.
+fn keeps(world: &World) -> Choreographer {
+    let daemon = world.daemon();
+    daemon.keep_rollouts().expect("they are read");
+    daemon
+}
+
+/// The robot's servant is of this revision.
+async fn gets(daemon: &Choreographer, robot: &str, revision: u64) -> Lease {
+    let lease = daemon.ensure(ServantRequest::new("greet", robot));
+    let lease = lease.expect("a lease");
+    lease.ready().await.expect("ready");
+    assert_eq!(lease.handle().revision.number, revision, "{robot}");
+    lease
+}
+
+async fn until(daemon: &Choreographer, state: RolloutState) {
+    let there = async {
+        while daemon.rollout("greet").expect("a rollout").state != state {
+            tokio::time::sleep(SECOND).await;
+        }
+    };
+    let there = tokio::time::timeout(SECOND * 60, there).await;
+    assert!(there.is_ok(), "{:?}", daemon.rollout("greet"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
+    let world = two();
+    let daemon = keeps(&world);
+    let first = daemon.begin_rollout("greet", 2, canary(Share::Robots(1)));
+    first.await.expect("it begins");
+    let (first, second) = (gets(&daemon, "r1", 2).await, gets(&daemon, "r2", 1).await);
+    let rollouts = &daemon.inner.rollouts;
+    for _ in 0..20 {
+        rollouts.note_request("greet", 1, Some(5.0));
+        rollouts.note_request("greet", 2, None);
+        rollouts.note_request("greet", 7, None);
+    }
+    first.handle().ended().await;
+    let reason = first.handle().life().reason().expect("a reason");
+    assert!(
+        reason.contains("100 % of its 20 requests failed"),
+        "{reason}"
+    );
+    drop(first);
+    let shown = daemon.rollout("greet").expect("a rollout");
+    assert_eq!(shown.state, RolloutState::RolledBack);
+    assert_eq!(
+        (shown.of_stable.requests, shown.of_candidate.requests),
+        (20, 20)
+    );
+    assert_eq!(shown.of_candidate.servants, 1);
+    gets(&daemon, "r1", 1).await;
+    assert_eq!(second.handle().life().phase, Phase::Ready, "others go on");
+    assert_eq!(world.told("rollout-rolled-back").len(), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    drop(gets(&daemon, "r1", 2).await);
+    // Written within a second.
+    tokio::time::sleep(SECOND * 2).await;
+    daemon.stop("the test goes on", |_| true).await;
+    let next = keeps(&world);
+    drop(gets(&next, "r2", 1).await);
+    drop(gets(&next, "r1", 2).await);
+    assert_eq!(
+        next.rollout("greet")
+            .expect("a rollout")
+            .of_candidate
+            .servants,
+        2
+    );
+    next.abort_rollout("greet").expect("it is one");
+    let refused = next
+        .abort_rollout("greet")
+        .expect_err("it is none any more");
+    assert!(
+        refused.to_string().contains("no canary: aborted"),
+        "{refused}"
+    );
+    next.stop("the test goes on", |_| true).await;
+    drop(gets(&next, "r1", 1).await);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
+    let world = two();
+    let daemon = keeps(&world);
+    let terms = RolloutTerms {
+        deadline: Some(0.0),
+        promote_after: Some(0.0),
+        ..canary(Share::Robots(1))
+    };
+    daemon
+        .begin_rollout("greet", 2, terms)
+        .await
+        .expect("it begins");
+    let old = gets(&daemon, "r1", 2).await;
+    until(&daemon, RolloutState::Promoted).await;
+    drop(gets(&daemon, "r2", 2).await);
+    assert_eq!(
+        old.handle().life().phase,
+        Phase::Ready,
+        "it is of that revision"
+    );
+    // A rollout without a canary: robots keep what they have until the deadline.
+    let terms = RolloutTerms {
+        deadline: Some(0.0),
+        ..RolloutTerms::default()
+    };
+    daemon
+        .begin_rollout("greet", 1, terms)
+        .await
+        .expect("it begins");
+    old.handle().ended().await;
+    let reason = old.handle().life().reason().expect("a reason");
+    assert!(
+        reason.contains("its deadline is over: revision 1"),
+        "{reason}"
+    );
+    drop(gets(&daemon, "r1", 1).await);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_makes_no_sense_or_would_break_robots_is_refused() {
+    let world = two();
+    world.publish("other", "/greet", |_| {});
+    let daemon = keeps(&world);
+    let mut third = World::record("greet", "/greet");
+    third.interface.topics.clear();
+    let published = world.state.publish_beside(&third, &Default::default());
+    assert_eq!(published.expect("published"), 3);
+    let wrong = |change: fn(&mut RolloutTerms)| {
+        let mut terms = canary(Share::Robots(1));
+        change(&mut terms);
+        terms
+    };
+    let share = canary(Share::Percent(10.0));
+    for (service, revision, terms, words) in [
+        ("greet", 9, share, "no revision 9"),
+        ("greet", 1, share, "is the current one already"),
+        (
+            "greet",
+            3,
+            share,
+            "robots of revision 1 would not find what they use",
+        ),
+        (
+            "greet",
+            2,
+            wrong(|terms| terms.bound = f64::NAN),
+            "numbers from 0 on",
+        ),
+        (
+            "greet",
+            2,
+            wrong(|terms| terms.deadline = Some(-1.0)),
+            "numbers from 0 on",
+        ),
+        ("greet", 2, wrong(|terms| terms.samples = 0), "at least 1"),
+        (
+            "greet",
+            2,
+            wrong(|terms| (terms.canary, terms.promote_after) = (None, Some(1.0))),
+            "is for a canary",
+        ),
+        ("gone", 2, share, "gone"),
+    ] {
+        let refused = daemon.begin_rollout(service, revision, terms).await;
+        let refused = refused.expect_err(words).to_string();
+        assert!(refused.contains(words), "{refused}");
+    }
+    let none = daemon.rollout("other").expect_err("it has none");
+    assert!(matches!(none, Error::NoRollout(_)), "{none}");
+    gets(&daemon, "r1", 1).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn another_revision_ends_a_rollout() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", 2, canary(Share::Percent(100.0)));
+    begun.await.expect("it begins");
+    let lease = gets(&daemon, "r1", 2).await;
+    world.publish("greet", "/greet", |_| {});
+    daemon.revision_changed("greet", 3).expect("it is told");
+    lease.handle().ended().await;
+    drop(lease);
+    gets(&daemon, "r1", 3).await;
+    let shown = daemon.rollout("greet").expect("a rollout");
+    assert_eq!(shown.state, RolloutState::Replaced, "{shown:?}");
+}
