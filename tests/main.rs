@@ -32,6 +32,8 @@ mod fallback;
 mod grants;
 #[path = "stories/house.rs"]
 mod house;
+#[path = "stories/hung.rs"]
+mod hung;
 #[path = "stories/images.rs"]
 mod images;
 #[path = "stories/isolation.rs"]
@@ -199,6 +201,7 @@ fn main() -> ExitCode {
         stories![memory:
             what_is_begun_and_never_ended_costs_its_owner,
         ],
+        stories![hung: a_node_that_answers_no_more_is_told_and_started_again],
         stories![mishaps:
             a_later_revision_is_gone_on_with_unless_its_interface_differs,
             another_version_of_the_protocol_is_named,

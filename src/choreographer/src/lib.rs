@@ -71,7 +71,7 @@ pub use lives::limits::Unchanged;
 pub use lives::rollouts::check_terms;
 pub use lives::waiting::{Admission, Permit, Standing};
 pub use memory::{Memory, MemoryOptions};
-pub use options::{Class, DEFAULT_CLASS, Options};
+pub use options::{Class, DEFAULT_CLASS, Hung, Options};
 pub use request::ServantRequest;
 
 use decide::admission::Ask;
@@ -81,6 +81,7 @@ use handle::Anew;
 use lives::Inner;
 use lives::back_off::BackOffs;
 use lives::driver::{self, Beginning};
+use lives::hung;
 use lives::warm_pool::{self, WarmPool};
 
 /// In a trial, for one answer: a message of a recording that is answered by nothing must not hold up the rest.
@@ -262,6 +263,11 @@ impl Choreographer {
     pub fn keep_warm_pool(&self) {
         tokio::spawn(warm_pool::keep(Arc::clone(&self.inner)));
         self.inner.warm_pool.look();
+    }
+
+    /// Looks from now on for nodes that hang; comes back at once.
+    pub fn watch_nodes(&self) {
+        tokio::spawn(hung::keep(Arc::clone(&self.inner)));
     }
 
     /// Has warm containers made for what is published now.

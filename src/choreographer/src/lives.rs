@@ -9,6 +9,7 @@ pub(crate) mod controller;
 pub(crate) mod driver;
 mod fit;
 pub(crate) mod group;
+pub(crate) mod hung;
 mod lifetime;
 pub(crate) mod limits;
 mod nodes;

@@ -6,6 +6,18 @@ use bridge::BridgeOptions;
 
 use crate::memory::MemoryOptions;
 
+/// What is done about nodes that are given inputs and answer none.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Hung {
+    /// Nothing.
+    Ignore,
+    /// It is told.
+    #[default]
+    Report,
+    /// It is told, and they are started again.
+    Restart,
+}
+
 /// What the operator decides of servants.
 #[derive(Debug, Clone)]
 pub struct Options {
@@ -35,6 +47,10 @@ pub struct Options {
     pub warm_memory: u64,
     /// Most of them in which the nodes run.
     pub warm_nodes: usize,
+    /// What is done about nodes that hang.
+    pub hung: Hung,
+    /// They hang that answer nothing for so many times T_max.
+    pub hung_after: f64,
     /// Sessions of rosbridge before each servant.
     pub bridge: BridgeOptions,
     /// Memory held for clients and servants.

@@ -47,6 +47,8 @@ fn options() -> Options {
         warm_pool: 8,
         warm_memory: 1 << 30,
         warm_nodes: 0,
+        hung: Hung::default(),
+        hung_after: 10.0,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions {
             daemon: memory,

@@ -141,6 +141,22 @@ pub struct Servant {
     pub warm_memory: Size,
     /// Most of them in which the nodes run, too.
     pub warm_nodes: usize,
+    /// What is done about nodes that are given inputs and answer none.
+    pub hung: Hung,
+    /// They hang that answer nothing for so many times the T_max that their robot stated.
+    pub hung_after: f64,
+}
+
+/// What is done about nodes that hang.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Hung {
+    /// Nothing.
+    Ignore,
+    /// It is told.
+    Report,
+    /// It is told, and they are started again.
+    Restart,
 }
 
 /// What JSON has no word for.
@@ -284,6 +300,8 @@ impl Default for Servant {
             warm_pool: 8,
             warm_memory: Size(1 << 30),
             warm_nodes: 0,
+            hung: Hung::Report,
+            hung_after: 10.0,
         }
     }
 }
@@ -496,6 +514,12 @@ impl Config {
             );
         }
         check_limits(&self.limits).context("[limits] of the configuration")?;
+        if !(self.servant.hung_after >= 1.0 && self.servant.hung_after <= 1e6) {
+            bail!(
+                "[servant] hung_after = {} in the configuration is no number of times; write one from 1 to 1000000, such as 10",
+                self.servant.hung_after
+            );
+        }
         for (name, class) in &self.class {
             class
                 .check(name)

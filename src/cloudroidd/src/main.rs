@@ -225,6 +225,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     );
     supervision::ready();
     app.catalogue.complete().await?;
+    app.choreographer.watch_nodes();
     app.choreographer.keep_warm_pool();
     app.choreographer.keep_watch();
     asked.cancelled().await;

@@ -111,6 +111,17 @@ pub struct ReachOptions {
     pub unfinished: Duration,
 }
 
+/// What went to nodes and came from them so far.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Flow {
+    /// The node of a link; nothing: all nodes that rosbridge clients use.
+    pub node: String,
+    /// Messages and calls that were given to them.
+    pub inputs: u64,
+    /// Messages and answers that came of them.
+    pub outputs: u64,
+}
+
 /// A connection behind its upgrade.
 pub type Stream = Box<dyn Io>;
 
@@ -134,6 +145,10 @@ pub trait Reach: Send + Sync + 'static {
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
     /// How its links are doing, by node.
     fn links(&self) -> Vec<LinkStatus>;
+    /// What flows, by who uses it.
+    fn flows(&self) -> Vec<Flow> {
+        Vec::new()
+    }
     /// What was counted of its rosbridge sessions.
     fn metrics(&self) -> &Metrics;
     /// Messages dropped because a client or the bridge was slow.

@@ -45,6 +45,7 @@ use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
 use link::{MAX_FRAME, MAX_RECORD};
 
+use crate::Flow;
 use attempts::Attempts;
 use duplicates::Machine;
 use node_link::NodeLink;
@@ -202,6 +203,12 @@ impl Hub {
     pub fn status(&self) -> Vec<LinkStatus> {
         let links: Vec<_> = self.links.lock().values().cloned().collect();
         links.iter().map(|link| link.status()).collect()
+    }
+
+    /// What went to the nodes of links and came from them.
+    pub fn flows(&self) -> Vec<Flow> {
+        let links = self.links.lock();
+        links.values().map(|link| link.flow()).collect()
     }
 
     /// Ends every connection with these words, and all links.

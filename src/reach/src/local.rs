@@ -18,7 +18,9 @@ use crate::links::{self, Hub, HubOptions, LinkStatus};
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
 use crate::trial::{self, Material, Pace, Replay};
-use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, Stream, Tenant, master};
+use crate::{
+    Error, Flow, Look, Observer, Opener, Reach, ReachOptions, Recorded, Stream, Tenant, master,
+};
 
 /// The name of our node in every servant's graph.
 const NODE: &str = "/cloudroid_bridge";
@@ -156,6 +158,18 @@ impl Reach for LocalReach {
 
     fn links(&self) -> Vec<LinkStatus> {
         self.hub.status()
+    }
+
+    fn flows(&self) -> Vec<Flow> {
+        let metrics = self.bridge.metrics();
+        let clients = Flow {
+            node: String::new(),
+            inputs: metrics.published.get() + metrics.calls.get(),
+            outputs: metrics.received.get() + metrics.answers.get(),
+        };
+        let mut flows = self.hub.flows();
+        flows.push(clients);
+        flows
     }
 
     fn metrics(&self) -> &Metrics {

@@ -4,7 +4,7 @@ use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{Class, Config, Controller, NonFinite, Push, machine_cores};
+use super::{Class, Config, Controller, Hung, NonFinite, Push, machine_cores};
 use crate::supervision::machine_memory;
 
 /// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
@@ -35,6 +35,12 @@ impl Config {
             warm_pool: servant.warm_pool,
             warm_memory: servant.warm_memory.0,
             warm_nodes: servant.warm_nodes,
+            hung: match servant.hung {
+                Hung::Ignore => choreographer::Hung::Ignore,
+                Hung::Report => choreographer::Hung::Report,
+                Hung::Restart => choreographer::Hung::Restart,
+            },
+            hung_after: servant.hung_after,
             bridge: bridge_options(self),
             memory: MemoryOptions {
                 daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),

@@ -23,6 +23,8 @@ const FATES: usize = 128;
 #[derive(Default)]
 pub(super) struct Given {
     recent: VecDeque<Input>,
+    /// Inputs while somebody listened to an output, and outputs.
+    flow: (u64, u64),
     /// Whether they were answered: the last ones of which that is known.
     fates: VecDeque<bool>,
     /// The `born` of the input that the node has answered last, by the same stamp, …
@@ -42,8 +44,9 @@ struct Input {
 }
 
 impl Given {
-    /// An input was given to the node.
-    pub(super) fn note(&mut self, channel: u32, mark: Mark, way: Answered) {
+    /// An input was given to the node; `heard`: somebody listens to what it puts out.
+    pub(super) fn note(&mut self, channel: u32, mark: Mark, way: Answered, heard: bool) {
+        self.flow.0 += u64::from(heard);
         if self.recent.len() == RECENT {
             self.recent.pop_front();
         }
@@ -58,6 +61,7 @@ impl Given {
     /// The input that an output of this mark answers, which was published at `born`: that of the same stamp, else
     /// the newest one, perhaps.
     pub(super) fn answered_by(&mut self, mark: Mark, born: i64) -> Option<Answered> {
+        self.flow.1 += 1;
         let same = |input: &Input| mark.is_some() && input.mark == mark;
         let Some(at) = self.recent.iter().rposition(same) else {
             return self.recent.back().map(|input| input.way);
@@ -89,6 +93,11 @@ impl Given {
         Some(way)
     }
 
+    /// Inputs while somebody listened to an output, and outputs.
+    pub(super) fn flow(&self) -> (u64, u64) {
+        self.flow
+    }
+
     /// Of how many of the last inputs it is known whether the node has answered them, and how many it has left out.
     pub(super) fn left_out(&self) -> (usize, usize) {
         let left_out = self.fates.iter().filter(|answered| !**answered).count();
@@ -117,15 +126,15 @@ mod tests {
     #[test]
     fn what_waits_for_the_node_is_not_computing() {
         let mut all = Given::default();
-        all.note(1, mark(1), way(100));
-        all.note(1, mark(2), way(101));
+        all.note(1, mark(1), way(100), true);
+        all.note(1, mark(2), way(101), true);
         let first = all.answered_by(mark(1), 150).unwrap();
         assert_eq!(first.given, 100);
         // A second output of the first input: the node was at it until then.
         assert_eq!(all.answered_by(mark(1), 160).unwrap().given, 100);
         let second = all.answered_by(mark(2), 210).unwrap();
         assert_eq!((second.born, second.given), (91, 160));
-        all.note(1, mark(3), way(500));
+        all.note(1, mark(3), way(500), true);
         assert_eq!(all.answered_by(mark(3), 550).unwrap().given, 500, "idle");
         assert_eq!(all.left_out(), (3, 0));
     }
@@ -134,8 +143,8 @@ mod tests {
     fn outputs_without_a_stamp_may_answer_the_newest() {
         let mut all = Given::default();
         assert!(all.answered_by(None, 5).is_none());
-        all.note(1, mark(1), way(100));
-        all.note(1, None, way(200));
+        all.note(1, mark(1), way(100), true);
+        all.note(1, None, way(200), true);
         assert_eq!(all.answered_by(None, 300).unwrap().given, 200);
         assert_eq!(all.answered_by(mark(9), 310).unwrap().given, 200);
         assert_eq!(all.left_out(), (0, 0));
@@ -145,9 +154,9 @@ mod tests {
     fn what_the_node_leaves_out_is_counted_once_and_by_topic() {
         let mut all = Given::default();
         for number in 1..=4 {
-            all.note(1, mark(number), way(i64::from(number) * 100));
-            all.note(2, mark(number), way(i64::from(number) * 100));
-            all.note(3, mark(100 + number), way(i64::from(number) * 100));
+            all.note(1, mark(number), way(i64::from(number) * 100), true);
+            all.note(2, mark(number), way(i64::from(number) * 100), true);
+            all.note(3, mark(100 + number), way(i64::from(number) * 100), true);
         }
         all.answered_by(mark(1), 150);
         all.answered_by(mark(4), 450);

@@ -16,6 +16,7 @@ use super::lent::RobotServices;
 use super::outputs::Outputs;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror};
+use crate::Flow;
 use link::clock::Sample;
 use link::control::{FromCloud, FromRobot, Hello, Request, Sla};
 use link::drops::{Drop, Drops, Reporter};
@@ -174,6 +175,15 @@ impl NodeLink {
             unfed: self.unfed(),
             unserved: self.unserved(),
             duplicates: self.duplicates(),
+        }
+    }
+
+    pub(super) fn flow(&self) -> Flow {
+        let (inputs, outputs) = self.outputs.flow();
+        Flow {
+            node: self.node.clone(),
+            inputs,
+            outputs,
         }
     }
 

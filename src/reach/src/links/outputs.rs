@@ -73,7 +73,19 @@ impl Outputs {
 
     /// An input was given to the node.
     pub(super) fn note(&self, channel: u32, mark: Mark, answered: Answered) {
-        self.given.lock().note(channel, mark, answered);
+        // What nobody listens to is not seen, whether or not it comes.
+        let heard = self.is_heard();
+        self.given.lock().note(channel, mark, answered, heard);
+    }
+
+    fn is_heard(&self) -> bool {
+        let channels = self.channels.lock();
+        channels.values().any(|channel| channel.reading.is_some())
+    }
+
+    /// How many inputs it was given while somebody listened, and how many outputs came.
+    pub(super) fn flow(&self) -> (u64, u64) {
+        self.given.lock().flow()
     }
 
     /// Of how many of the last inputs something is known, and how many of them the node has left out.

@@ -1,0 +1,49 @@
+//! Nodes that run and answer nobody.
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::json;
+use support::Verdict;
+use support::world::world;
+
+pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
+    let setup = world()
+        .own("hung")
+        .config("[servant]\nhung = \"restart\"\nhung_after = 2\n");
+    let daemon = setup.start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let mut robot = daemon.robot("adder_py?robot=one&max_rrt=500ms")?;
+    let sum = json!({"a": 1, "b": 1});
+    robot.calls("/add_two", sum.clone())?;
+    let servant = daemon.servant_of("adder_py", "one")?;
+    let pids = servant["pids"].as_array().context("pids")?;
+    ensure!(!pids.is_empty(), "it runs: {servant}");
+    for pid in pids {
+        let pid = pid.as_i64().context("a pid")?;
+        kill(Pid::from_raw(pid as i32), Signal::SIGSTOP)?;
+    }
+    for id in 0..5 {
+        robot.says(
+            json!({"op": "call_service", "id": id.to_string(), "service": "/add_two", "args": sum}),
+        )?;
+    }
+    let event = daemon.awaits_event("word of the node", |event| event["kind"] == "node-hung")?;
+    let message = event["message"].as_str().unwrap_or_default();
+    ensure!(
+        message.contains("/adder answered none of 5 inputs"),
+        "{message}"
+    );
+    daemon.awaits_event("its new start", |event| event["kind"] == "node-failed")?;
+    support::until("an answer", || {
+        let answer = robot.calls("/add_two", sum.clone())?;
+        Ok((answer["values"]["sum"] == 2)
+            .then_some(())
+            .ok_or_else(|| answer.to_string()))
+    })?;
+    ensure!(daemon.servant_of("adder_py", "one")?["id"] == servant["id"]);
+    Ok(())
+}
