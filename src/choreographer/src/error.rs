@@ -29,7 +29,7 @@ pub enum Error {
         /// What was stated.
         stated: String,
         /// Why not.
-        reason: Unchanged,
+        reason: Box<Unchanged>,
     },
     /// The servant could not be started, or ended.
     #[error("the servant of {service} for robot {robot} {reason}")]

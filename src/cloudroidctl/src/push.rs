@@ -302,7 +302,7 @@ mod tests {
             ("./pkg --stateful=false", (false, true)),
             ("./pkg --stateful=true", (true, false)),
         ] {
-            let options = parse(line).and_then(|push| Ok(push.options().expect("no file is read")));
+            let options = parse(line).map(|push| push.options().expect("no file is read"));
             let options = options.expect(line);
             assert_eq!((options.stateful, options.stateless), said, "{line}");
         }

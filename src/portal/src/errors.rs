@@ -314,7 +314,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::Full(Refused::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
         C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
         C::Terms(untenable) => kind_of_terms(untenable),
-        C::NotResized { reason, .. } => match reason {
+        C::NotResized { reason, .. } => match &**reason {
             Unchanged::Untenable(untenable) => kind_of_terms(untenable),
             Unchanged::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
             Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
@@ -344,7 +344,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
         C::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
         C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
         C::Terms(untenable) => next_of_terms(untenable),
-        C::NotResized { reason, .. } => match reason {
+        C::NotResized { reason, .. } => match &**reason {
             Unchanged::Untenable(untenable) => next_of_terms(untenable),
             Unchanged::Full(Refused::NoMore { free, .. }) => format!(
                 "state what fits: cpus={} memory={}; it keeps what it has until then",

@@ -68,7 +68,7 @@ pub enum Untenable {
         /// What was stated.
         asked: String,
         /// What bounds it.
-        cap: Cap,
+        cap: Box<Cap>,
     },
     /// The row that would do is more than it may have.
     #[error("{goal} needs {needs}, which is more {} than this robot may have: {cap}", cap.resource)]
@@ -78,7 +78,7 @@ pub enum Untenable {
         /// Limits, and the row that says so.
         needs: String,
         /// What bounds them.
-        cap: Cap,
+        cap: Box<Cap>,
         /// What would fit, as it would be stated.
         fits: Option<String>,
     },
@@ -248,7 +248,7 @@ fn unmet(
         Some((row, cap)) => Untenable::Beyond {
             goal,
             needs: named(row),
-            cap,
+            cap: Box::new(cap),
             fits,
         },
         None => Untenable::Unmet {

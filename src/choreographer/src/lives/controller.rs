@@ -121,7 +121,7 @@ impl Watch {
         inner
             .recent
             .keep(|id| handles.iter().any(|handle| handle.id == id));
-        let fresh = self.looks.is_multiple_of(LINKED);
+        let fresh = self.looks % LINKED == 0;
         self.looks += 1;
         let mut before = std::mem::take(&mut self.servants);
         let mut working = Vec::new();

@@ -275,7 +275,8 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
         let acts = step.is_some();
         match step {
             Some(Step::Start(reason)) => {
-                if !begin(&inner, &shares, &reason) {
+                let begun = begin(&inner, &shares, &reason);
+                if !begun {
                     break Some(Failure::broken("was not started: the daemon is ending"));
                 }
             }

@@ -98,7 +98,7 @@ impl Inner {
             servant: handle.id.clone(),
             service: handle.service().to_owned(),
             stated: stated.to_string(),
-            reason,
+            reason: Box::new(reason),
         };
         let terms = match self.terms(&all, &handle.revision) {
             Err(Error::Terms(untenable)) => return Err(refused(Unchanged::Untenable(untenable))),

@@ -77,7 +77,7 @@ async fn who_states_something_else_is_resized_in_place_or_told_what_would_fit() 
     };
     let free = Amount::new(2.0, 1 << 30);
     assert!(
-        matches!(reason, Unchanged::Full(Refused::NoMore { free: left, .. }) if *left == free),
+        matches!(&**reason, Unchanged::Full(Refused::NoMore { free: left, .. }) if *left == free),
         "{refused}"
     );
     assert!(refused.to_string().contains("cpus=2.5"), "{refused}");

@@ -49,7 +49,9 @@ fn shelf<'a>(rows: &'a [Row], aux: &'a Aux) -> Shelf<'a> {
 }
 
 /// The number of the row that is taken, and whether it reaches the desire; else the best one and the one that is too dear.
-fn taken(choice: &Choice<'_>) -> Result<Option<(i64, bool)>, (Option<i64>, Option<i64>)> {
+type Taken = Result<Option<(i64, bool)>, (Option<i64>, Option<i64>)>;
+
+fn taken(choice: &Choice<'_>) -> Taken {
     match choice {
         Choice::Silent => Ok(None),
         Choice::Taken { row, desired, .. } => Ok(Some((row.id, *desired))),

@@ -87,7 +87,7 @@ impl Bounds {
     /// Refuses resources that are stated outright and are more than that.
     pub(super) fn check(&self, stated: &Stated) -> Result<(), Untenable> {
         let capped = |asked: String, cap: &Cap| {
-            let cap = cap.clone();
+            let cap = Box::new(cap.clone());
             Err(Untenable::Capped { asked, cap })
         };
         match (stated.cpus, &self.cpus) {
