@@ -156,9 +156,14 @@ impl NodeLink {
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
         let (given, left_out) = self.outputs.left_out();
+        // Looked at one by one: what is borrowed within the expression below stays borrowed to its end, and `duplicates` looks at
+        // the same again. Two readers with a writer between them would wait for each other.
+        let up = *self.session.up().borrow();
+        let dropped = self.dropped.lock().clone();
+        let requests = self.requests.lock().iter().cloned().collect();
         LinkStatus {
             node: self.node.clone(),
-            up: *self.session.up().borrow(),
+            up,
             round_trip: self.session.round_trip().map(milliseconds),
             clock: self
                 .session
@@ -166,9 +171,9 @@ impl NodeLink {
                 .map(|sample| milliseconds(sample.offset)),
             throughput: self.session.throughput(),
             drops: self.drops_here(),
-            dropped: self.dropped.lock().clone(),
+            dropped,
             sla: self.sla.clone(),
-            requests: self.requests.lock().iter().cloned().collect(),
+            requests,
             unsent: self.unsent.lately(),
             given,
             left_out,
