@@ -240,10 +240,11 @@ impl WarmPool {
     }
 
     /// Whether time alone changes what is wanted.
-    fn is_restless(&self) -> bool {
+    fn is_restless(&self, inner: &Inner) -> bool {
         let kept = self.kept.lock();
         let now = Instant::now().into_std();
-        kept.pool.iter().any(|warm| warm.nodes)
+        // Nodes die, and the pauses of those that died come to an end.
+        inner.options.warm_nodes > 0
             || kept
                 .arrivals
                 .values()
@@ -263,7 +264,7 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
     loop {
         tokio::select! {
             () = inner.warm_pool.look.notified() => {}
-            () = tokio::time::sleep(INTERVAL), if inner.warm_pool.is_restless() => {}
+            () = tokio::time::sleep(INTERVAL), if inner.warm_pool.is_restless(&inner) => {}
         }
         if let Err(error) = tidy(&inner, true).await {
             tracing::warn!("no warm container could be made: {error}");
