@@ -7,13 +7,19 @@ use crate::engine::Pressure;
 
 /// Bytes of memory that the host has; none where `/proc/meminfo` cannot be read.
 pub fn memory() -> Option<u64> {
-    memory_of(&fs::read_to_string("/proc/meminfo").ok()?)
+    bytes_of("MemTotal:", &fs::read_to_string("/proc/meminfo").ok()?)
 }
 
-fn memory_of(meminfo: &str) -> Option<u64> {
-    let line = meminfo
-        .lines()
-        .find_map(|line| line.strip_prefix("MemTotal:"))?;
+/// Percent of the host's memory that programs could still be given (`MemAvailable`); none where `/proc/meminfo` cannot be
+/// read.
+pub fn memory_available() -> Option<f64> {
+    let meminfo = fs::read_to_string("/proc/meminfo").ok()?;
+    let total = bytes_of("MemTotal:", &meminfo).filter(|total| *total > 0)?;
+    Some(bytes_of("MemAvailable:", &meminfo)? as f64 / total as f64 * 100.0)
+}
+
+fn bytes_of(key: &str, meminfo: &str) -> Option<u64> {
+    let line = meminfo.lines().find_map(|line| line.strip_prefix(key))?;
     let kib: u64 = line.trim().strip_suffix("kB")?.trim_end().parse().ok()?;
     Some(kib * 1024)
 }
@@ -83,8 +89,8 @@ mod tests {
     #[test]
     fn the_kernels_texts_are_read() {
         let meminfo = "MemTotal:       16316412 kB\nMemFree:         1204 kB\n";
-        assert_eq!(memory_of(meminfo), Some(16_316_412 * 1024));
-        assert_eq!(memory_of("MemFree: 1204 kB\n"), None);
+        assert_eq!(bytes_of("MemTotal:", meminfo), Some(16_316_412 * 1024));
+        assert_eq!(bytes_of("MemTotal:", "MemFree: 1204 kB\n"), None);
         let pressure = "some avg10=1.53 avg60=0.87 avg300=0.20 total=1\nfull avg10=0.25 avg60=0.00 avg300=0.00 total=0\n";
         assert_eq!(avg10("some ", pressure), Some(1.53));
         assert_eq!(avg10("full ", pressure), Some(0.25));

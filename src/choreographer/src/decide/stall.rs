@@ -2,7 +2,8 @@
 //!
 //! Memory is never promised twice, but peaks are not promised, and the machine has other users. What the kernel counts of
 //! waiting says when that went wrong (pressure stall information, kernel documentation, accounting/psi): `full` of memory is
-//! the time in which nothing could run because all waited for memory.
+//! the time in which nothing could run because all waited for memory. Servants that wait at limits of their own count there,
+//! too, where nothing else runs; so it says something of the machine only while its memory is short.
 
 use std::time::{Duration, Instant};
 
@@ -10,6 +11,8 @@ use std::time::{Duration, Instant};
 const STALLS: f64 = 10.0;
 /// … and from so little on no longer.
 const FLOWS: f64 = 5.0;
+/// Percent of its memory that can still be given: with so much it is not the machine that stalls.
+const PLENTY: f64 = 25.0;
 /// Bytes a second read from swap: from so many on it swaps, …
 const SWAPS: f64 = (1 << 20) as f64;
 /// … and from so few on no longer.
@@ -22,6 +25,8 @@ const QUIET: Duration = Duration::from_secs(5);
 pub struct Reading {
     /// `full avg10` of memory, percent; none where the kernel does not tell.
     pub memory_full: Option<f64>,
+    /// `MemAvailable`, percent of all memory; none where the kernel does not tell.
+    pub available: Option<f64>,
     /// Bytes a second read from swap since the last reading.
     pub swapped_in: f64,
 }
@@ -41,7 +46,8 @@ impl Stall {
             None => (STALLS, SWAPS),
             Some(_) => (FLOWS, SETTLED),
         };
-        let why = if full >= stalls {
+        let short = reading.available.is_none_or(|percent| percent < PLENTY);
+        let why = if short && full >= stalls {
             format!(
                 "this machine stalls: in {full:.0} % of the last 10 s everything waited for memory"
             )
@@ -76,7 +82,20 @@ mod tests {
     fn reading(memory_full: f64, swapped_in: f64) -> Reading {
         Reading {
             memory_full: Some(memory_full),
+            available: Some(3.0),
             swapped_in,
+        }
+    }
+
+    #[test]
+    fn servants_that_wait_at_their_own_limits_are_not_the_machine() {
+        for (available, stalls) in [(Some(80.0), false), (Some(24.9), true), (None, true)] {
+            let of = Reading {
+                available,
+                ..reading(90.0, 0.0)
+            };
+            let why = Stall::default().judge(of, Instant::now());
+            assert_eq!(why.is_some(), stalls, "{available:?}: {why:?}");
         }
     }
 

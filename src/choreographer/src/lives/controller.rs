@@ -111,6 +111,7 @@ impl Watch {
         });
         Reading {
             memory_full: host::memory_stalled(),
+            available: host::memory_available(),
             swapped_in: rate.unwrap_or(0.0),
         }
     }
