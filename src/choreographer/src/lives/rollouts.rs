@@ -128,7 +128,9 @@ impl Inner {
                 }
                 Given::CandidateFromNow => {
                     rollout.robots.push(robot.to_owned());
-                    kept.counted.insert(service.to_owned());
+                    // At once: a daemon that is started after this one was killed would give it to another robot.
+                    let rollout = rollout.clone();
+                    self.write_rollout(service, &rollout)?;
                 }
             }
             kept.by_service[service].candidate
