@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use api::calibration::{Point, Source};
 use api::dictionary::{NewRows, Row};
-use api::sla::check_aux;
 use api::{Calibration, CalibrationEvent, CalibrationOptions, Size};
 use futures_util::StreamExt;
 use http_body_util::{BodyExt, Full};
@@ -17,6 +16,7 @@ use hyper::Method;
 
 use crate::client::{self, Client, escaped};
 use crate::output::{self, Format, Table};
+use crate::stated::aux;
 
 /// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
 ///
@@ -60,7 +60,7 @@ pub struct Calibrate {
     #[arg(long, value_name = "MS")]
     network: Option<f64>,
     /// Auxiliary parameter of the rows, such as width=640; may be given several times.
-    #[arg(long, value_name = "K=V", value_parser = auxiliary)]
+    #[arg(long, value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
     /// Where to draw the curve; SERVICE-calibration.svg by default.
     #[arg(long, value_name = "FILE")]
@@ -68,12 +68,6 @@ pub struct Calibrate {
     /// Write the rows without asking.
     #[arg(long)]
     yes: bool,
-}
-
-fn auxiliary(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("write K=V")?;
-    check_aux(key, value)?;
-    Ok((key.to_owned(), value.to_owned()))
 }
 
 impl Calibrate {

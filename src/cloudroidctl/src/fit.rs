@@ -4,64 +4,33 @@ use api::Size;
 
 use crate::client::{Client, escaped};
 use crate::output::{self, Format, Table};
+use crate::stated::{StatedFlags, query};
 
 /// Say whether one more robot would find room, what it would cost the others, and how many more would fit.
 #[derive(Debug, clap::Args)]
 pub struct Fit {
     /// The service.
     service: String,
-    /// Request response time that the robot wishes for, such as 100ms.
-    #[arg(long, value_name = "TIME")]
-    rrt: Option<String>,
-    /// The longest that it accepts.
-    #[arg(long, value_name = "TIME")]
-    max_rrt: Option<String>,
-    /// Frames per second that it wishes for.
-    #[arg(long, value_name = "RATE")]
-    fps: Option<String>,
-    /// Age of an output that it wishes for, such as 200ms.
-    #[arg(long, value_name = "TIME")]
-    age: Option<String>,
-    /// Its class.
-    #[arg(long, value_name = "NAME")]
-    class: Option<String>,
-    /// Cores that it asks for outright.
-    #[arg(long, value_name = "N")]
-    cpus: Option<f64>,
-    /// Memory that it asks for outright.
-    #[arg(long, value_name = "SIZE")]
-    memory: Option<Size>,
+    #[command(flatten)]
+    stated: StatedFlags,
 }
 
 impl Fit {
     /// Asks and prints.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let fit: api::Fit = client.get(&self.path()).await?;
+        let fit: api::Fit = client.get(&self.path()?).await?;
         match format {
             Format::Json => output::json(&fit),
             Format::Table => print(&self.service, &fit),
         }
     }
 
-    fn path(&self) -> String {
-        let stated = [
-            ("rrt", self.rrt.clone()),
-            ("max_rrt", self.max_rrt.clone()),
-            ("fps", self.fps.clone()),
-            ("age", self.age.clone()),
-            ("class", self.class.clone()),
-            ("cpus", self.cpus.map(|cpus| cpus.to_string())),
-            ("memory", self.memory.map(|memory| memory.to_string())),
-        ];
-        let stated: Vec<String> = stated
-            .into_iter()
-            .filter_map(|(key, value)| Some(format!("{key}={}", escaped(&value?))))
-            .collect();
-        let path = format!("/api/v1/services/{}/fit", escaped(&self.service));
-        match stated.is_empty() {
-            true => path,
-            false => format!("{path}?{}", stated.join("&")),
-        }
+    fn path(&self) -> anyhow::Result<String> {
+        let query = query(&self.stated.stated()?);
+        Ok(format!(
+            "/api/v1/services/{}/fit{query}",
+            escaped(&self.service)
+        ))
     }
 }
 
@@ -178,14 +147,25 @@ mod tests {
             fit: Fit,
         }
         let line = [
-            "fit", "a b", "--rrt", "100ms", "--memory", "1G", "--class", "x&y",
+            "fit",
+            "a b",
+            "--rrt",
+            "100ms",
+            "--memory",
+            "1G",
+            "--class",
+            "x-y",
+            "--aux",
+            "width=640",
         ];
-        let line = Line::parse_from(line);
-        assert_eq!(
-            line.fit.path(),
-            "/api/v1/services/a%20b/fit?rrt=100ms&class=x%26y&memory=1G"
-        );
-        let line = Line::parse_from(["fit", "a"]);
-        assert_eq!(line.fit.path(), "/api/v1/services/a/fit");
+        let path = |line: &[&str]| {
+            let path = Line::parse_from(line).fit.path();
+            path.map_err(|error| error.to_string())
+        };
+        let stated = "/api/v1/services/a%20b/fit?rrt=100ms&class=x-y&memory=1G&aux.width=640";
+        assert_eq!(path(&line).as_deref(), Ok(stated));
+        assert_eq!(path(&["fit", "a"]).as_deref(), Ok("/api/v1/services/a/fit"));
+        let wrong = path(&["fit", "a", "--rrt", "soon"]).expect_err("no time");
+        assert!(wrong.contains("rrt"), "{wrong}");
     }
 }

@@ -20,6 +20,7 @@ mod servants;
 mod services;
 mod set;
 mod sla;
+mod stated;
 mod status;
 mod stop;
 mod stub;

@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 
 use anyhow::bail;
 use api::dictionary::{Explained, NewRows, Row, Spread};
-use api::sla::{AUX, check_aux};
-use api::{Limits, Measure, Stated};
+use api::{Limits, Measure};
 
 use crate::client::{Client, escaped};
 use crate::limits::LimitFlags;
 use crate::output::{self, Format, Table};
+use crate::stated::{StatedFlags, aux, query};
 
 /// What an SLA costs: list, set, remove and explain the rows of a service's dictionary.
 #[derive(Debug, clap::Args)]
@@ -73,36 +73,8 @@ struct Rm {
 struct Explain {
     /// The service.
     service: String,
-    /// Response time that is wished for, such as 100ms.
-    #[arg(long, value_name = "TIME")]
-    rrt: Option<String>,
-    /// The longest that is acceptable.
-    #[arg(long, value_name = "TIME")]
-    max_rrt: Option<String>,
-    /// Frames per second that are wished for.
-    #[arg(long, value_name = "RATE")]
-    fps: Option<String>,
-    /// The least that is acceptable.
-    #[arg(long, value_name = "RATE")]
-    min_fps: Option<String>,
-    /// Age of an output that is wished for.
-    #[arg(long, value_name = "TIME")]
-    age: Option<String>,
-    /// The greatest that is acceptable.
-    #[arg(long, value_name = "TIME")]
-    max_age: Option<String>,
-    /// Class of the daemon's configuration.
-    #[arg(long, value_name = "NAME")]
-    class: Option<String>,
-    /// Cores outright.
-    #[arg(long, value_name = "N")]
-    cpus: Option<String>,
-    /// Memory outright, such as 512M.
-    #[arg(long, value_name = "SIZE")]
-    memory: Option<String>,
-    /// Auxiliary parameter; may be given several times.
-    #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
-    aux: Vec<(String, String)>,
+    #[command(flatten)]
+    stated: StatedFlags,
 }
 
 fn rrt(text: &str) -> Result<f64, String> {
@@ -115,12 +87,6 @@ fn fps(text: &str) -> Result<f64, String> {
 
 fn age(text: &str) -> Result<f64, String> {
     Measure::Age.read(text)
-}
-
-fn aux(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE")?;
-    check_aux(key, value)?;
-    Ok((key.to_owned(), value.to_owned()))
 }
 
 impl Sla {
@@ -148,13 +114,8 @@ impl Sla {
                 list(&verb.service, &left, format)
             }
             Verb::Explain(verb) => {
-                let stated = verb.stated()?;
-                let query: Vec<String> = stated
-                    .pairs()
-                    .iter()
-                    .map(|(key, value)| format!("{}={}", escaped(key), escaped(value)))
-                    .collect();
-                let path = path(&verb.service, &format!("/explain?{}", query.join("&")));
+                let query = query(&verb.stated.stated()?);
+                let path = path(&verb.service, &format!("/explain{query}"));
                 let explained: Explained = client.get(&path).await?;
                 match format {
                     Format::Json => output::json(&explained),
@@ -218,28 +179,6 @@ fn spread_of(measure: Measure, text: &str) -> anyhow::Result<Spread> {
         p95: read(p95)?,
         requests,
     })
-}
-
-impl Explain {
-    fn stated(&self) -> anyhow::Result<Stated> {
-        let given = [
-            ("rrt", &self.rrt),
-            ("max_rrt", &self.max_rrt),
-            ("fps", &self.fps),
-            ("min_fps", &self.min_fps),
-            ("age", &self.age),
-            ("max_age", &self.max_age),
-            ("class", &self.class),
-            ("cpus", &self.cpus),
-            ("memory", &self.memory),
-        ];
-        let given = given
-            .into_iter()
-            .filter_map(|(key, value)| Some((key.to_owned(), value.clone()?)));
-        let aux = self.aux.iter();
-        let aux = aux.map(|(key, value)| (format!("{AUX}{key}"), value.clone()));
-        Ok(Stated::read(given.chain(aux))?)
-    }
 }
 
 fn in_words(aux: &BTreeMap<String, String>) -> String {
@@ -368,7 +307,7 @@ mod tests {
         let Verb::Explain(explain) = parse(line).expect("valid") else {
             panic!("another verb");
         };
-        let stated = explain.stated().expect("it can be stated");
+        let stated = explain.stated.stated().expect("it can be stated");
         assert_eq!(
             stated.to_string(),
             "rrt=100ms max_rrt=300ms class=urgent aux.width=640"
@@ -411,7 +350,11 @@ mod tests {
         else {
             panic!("another verb");
         };
-        let refused = explain.stated().expect_err("in disorder").to_string();
+        let refused = explain
+            .stated
+            .stated()
+            .expect_err("in disorder")
+            .to_string();
         assert!(refused.contains("greater than max_rrt"), "{refused}");
     }
 }
