@@ -24,6 +24,8 @@ mod limits;
 mod machine;
 #[path = "stories/restarts.rs"]
 mod restarts;
+#[path = "stories/sla.rs"]
+mod sla;
 
 /// A story under its function's name.
 struct Story {
@@ -67,6 +69,7 @@ fn main() -> ExitCode {
             who_takes_too_much_memory_is_told_so,
             a_fork_bomb_ends_when_its_servant_does,
         ],
+        stories![sla: what_robots_state_becomes_what_the_kernel_enforces_and_is_kept],
         stories![confinement:
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
