@@ -152,10 +152,7 @@ impl Client {
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        let body = Full::new(Bytes::from(serde_json::to_vec(body)?))
-            .map_err(|never| match never {})
-            .boxed_unsync();
-        read(self.send(Method::PATCH, path, body).await?).await
+        read(self.send(Method::PATCH, path, json(body)?).await?).await
     }
 
     /// `DELETE path`.
@@ -169,10 +166,7 @@ impl Client {
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        let body = Full::new(Bytes::from(serde_json::to_vec(body)?))
-            .map_err(|never| match never {})
-            .boxed_unsync();
-        read(self.send(Method::PUT, path, body).await?).await
+        read(self.send(Method::PUT, path, json(body)?).await?).await
     }
 
     /// `POST path` with a JSON body.
@@ -181,10 +175,7 @@ impl Client {
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        let body = Full::new(serde_json::to_vec(body)?.into())
-            .map_err(|never| match never {})
-            .boxed_unsync();
-        read(self.send(Method::POST, path, body).await?).await
+        read(self.send(Method::POST, path, json(body)?).await?).await
     }
 
     /// `GET path` of JSON lines.
@@ -273,6 +264,13 @@ pub fn empty() -> Body {
     Full::default()
         .map_err(|never| match never {})
         .boxed_unsync()
+}
+
+/// A body as JSON.
+fn json(body: &impl Serialize) -> serde_json::Result<Body> {
+    Ok(Full::new(Bytes::from(serde_json::to_vec(body)?))
+        .map_err(|never| match never {})
+        .boxed_unsync())
 }
 
 async fn refusal(response: Response<Incoming>) -> anyhow::Error {
