@@ -71,48 +71,46 @@ mod tests {
         );
     }
 
-    /// KiB of the mappings that may be forgotten which are in this process's memory (proc(5), smaps).
-    fn mapped() -> u64 {
+    /// KiB of the mapping that begins at `start` which are in this process's memory (proc(5), smaps).
+    fn resident(start: usize) -> u64 {
         let maps = fs::read_to_string("/proc/self/smaps").expect("smaps");
-        let mut counts = false;
-        let mut sum = 0;
-        for line in maps.lines() {
-            match line.strip_prefix("Rss:") {
-                Some(rss) if counts => {
-                    let kib = rss.trim().trim_end_matches(" kB");
-                    sum += kib.parse::<u64>().expect("a number");
-                }
-                Some(_) => {}
-                None if line.contains('-')
-                    && !line.split(' ').next().unwrap_or("").ends_with(':') =>
-                {
-                    counts = unchanged_file(line).is_some();
-                }
-                None => {}
-            }
-        }
-        sum
+        let begins = format!("{start:x}-");
+        let mut lines = maps.lines().skip_while(|line| !line.starts_with(&begins));
+        let rss = lines
+            .find_map(|line| line.strip_prefix("Rss:"))
+            .expect("the mapping");
+        let kib = rss.trim().trim_end_matches(" kB");
+        kib.parse().expect("a number")
     }
 
+    /// A file of its own is mapped as a program's constants and code are: the pages of this program are touched by other tests at
+    /// any time.
     #[test]
-    fn code_that_was_forgotten_is_unmapped_and_still_runs() {
-        // Every page of the program is touched first: what is in memory otherwise is other tests' matter.
-        for (start, end) in fs::read_to_string("/proc/self/maps")
-            .expect("maps")
-            .lines()
-            .filter_map(unchanged_file)
-        {
-            for page in (start..end).step_by(4096) {
-                // SAFETY: a mapping that can be read, of this process, which unmaps none of them.
-                std::hint::black_box(unsafe { std::ptr::read_volatile(page as *const u8) });
-            }
+    fn what_was_forgotten_is_unmapped_and_reads_as_before() {
+        use std::os::fd::AsRawFd;
+
+        const PAGES: usize = 64;
+        let mut file = tempfile::NamedTempFile::new().expect("a file");
+        let bytes: Vec<u8> = (0..PAGES * 4096).map(|at| (at / 4096) as u8).collect();
+        std::io::Write::write_all(&mut file, &bytes).expect("written");
+        for access in [libc::PROT_READ, libc::PROT_READ | libc::PROT_EXEC] {
+            // SAFETY: a new mapping where the kernel chooses, of a file that nobody changes.
+            let at = unsafe {
+                let nowhere = std::ptr::null_mut();
+                let (private, file) = (libc::MAP_PRIVATE, file.as_file().as_raw_fd());
+                libc::mmap(nowhere, bytes.len(), access, private, file, 0)
+            };
+            assert_ne!(at, libc::MAP_FAILED, "{}", std::io::Error::last_os_error());
+            // SAFETY: mapped above, readable, and unmapped only below.
+            let read = || unsafe { std::slice::from_raw_parts(at as *const u8, bytes.len()) };
+            assert!(read() == bytes, "the file's bytes");
+            let before = resident(at as usize);
+            forget_files();
+            let after = resident(at as usize);
+            assert_eq!((before, after), (PAGES as u64 * 4, 0), "KiB");
+            assert!(read() == bytes, "the file's bytes, read again");
+            // SAFETY: mapped above; nothing borrows it any more.
+            assert_eq!(unsafe { libc::munmap(at, bytes.len()) }, 0);
         }
-        let before = mapped();
-        forget_files();
-        let after = mapped();
-        assert!(
-            before > 1000 && after < before / 2,
-            "{after} of {before} KiB are left"
-        );
     }
 }
