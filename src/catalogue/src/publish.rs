@@ -104,6 +104,24 @@ impl Catalogue {
         })
     }
 
+    /// Makes revision `to` the current one where `from` is it, or `to` itself; false where another one is, which stays.
+    pub async fn promote(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
+        let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
+        let service = service.to_owned();
+        blocking("promoting a revision", move || {
+            let target = state.revision(&service, to)?;
+            let Some(target) = target else {
+                return Ok(false);
+            };
+            if !state.replace_current(&service, from, to)? {
+                return Ok(false);
+            }
+            tag_current(&store, &service, &target.image)?;
+            Ok(true)
+        })
+        .await
+    }
+
     /// Takes a service out of the database: nobody is given a servant of it any more. Its images stay until
     /// [`untag`](Self::untag).
     pub fn withdraw(&self, service: &str) -> Result<Withdrawn, Error> {

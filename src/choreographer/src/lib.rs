@@ -141,12 +141,11 @@ impl Choreographer {
     pub fn ensure(&self, request: ServantRequest) -> Result<Lease, Error> {
         let inner = &self.inner;
         let key = (request.service.clone(), request.robot.clone());
-        let (handle, lease, warm) = {
+        let (handle, lease, warm, takes_canary) = {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
             // followed by one of the revision before.
-            let revision =
-                inner.revision_for(&request.service, &request.robot, request.anonymous)?;
+            let (revision, takes_canary) = inner.revision_for(&request)?;
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
@@ -181,12 +180,17 @@ impl Choreographer {
             let terms = match terms {
                 Ok(terms) => terms,
                 Err(error) => {
+                    drop(servants);
                     inner.give_back(warm);
                     inner.report_refused(&request, &error);
                     return Err(error);
                 }
             };
             servants.end(ends);
+            if takes_canary {
+                let rollouts = &inner.rollouts;
+                rollouts.takes_canary(&request.service, &request.robot);
+            }
             let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
             let handle = Arc::new(Handle::new(
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
@@ -202,8 +206,12 @@ impl Choreographer {
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
             let lease = Lease::new(Arc::clone(&handle));
-            (handle, lease, warm)
+            (handle, lease, warm, takes_canary)
         };
+        if takes_canary {
+            // At once: a daemon that is started after this one was killed would give its place to another robot.
+            inner.write_changed();
+        }
         let beginning = Beginning::Asked(warm);
         tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
         Ok(lease)

@@ -60,3 +60,9 @@ impl ServantRequest {
         some.into_iter().collect()
     }
 }
+
+/// Whether a servant of this name serves no robot, but a purpose of this daemon: its measurement (`~try-…`, `~calibrate-…`), or
+/// many robots (`~group-…`). Robots that name no name are given one without a dash.
+pub(crate) fn serves_no_robot(robot: &str, anonymous: bool) -> bool {
+    anonymous && robot.contains('-')
+}

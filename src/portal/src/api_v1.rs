@@ -154,10 +154,12 @@ pub async fn order_rollout(
     let choreographer = &app.choreographer;
     Ok(Json(match order {
         RolloutOrder::Start { revision, terms } => {
-            choreographer.begin_rollout(&name, revision, terms).await?
+            choreographer
+                .begin_rollout(&name, None, revision, terms)
+                .await?
         }
         RolloutOrder::Promote => choreographer.promote_rollout(&name).await?,
-        RolloutOrder::Abort => choreographer.abort_rollout(&name)?,
+        RolloutOrder::Abort => choreographer.abort_rollout(&name).await?,
     }))
 }
 

@@ -17,8 +17,11 @@ impl Pusher {
         terms: Option<RolloutTerms>,
     ) -> Result<u64, Error> {
         let service = record.service.clone();
-        let before = self.catalogue.package(&service)?.is_some();
-        let terms = terms.filter(|_| before);
+        let before = match self.catalogue.package(&service)? {
+            Some(_) => Some(self.catalogue.current(&service)?.number),
+            None => None,
+        };
+        let terms = terms.filter(|_| before.is_some());
         let beside = terms.is_some_and(|terms| terms.canary.is_some());
         if beside {
             self.choreographer.check_canary(&record)?;
@@ -32,9 +35,14 @@ impl Pusher {
         match terms {
             Some(terms) => {
                 let choreographer = &self.choreographer;
-                choreographer.begin_rollout(&service, number, terms).await?;
+                choreographer
+                    .begin_rollout(&service, before, number, terms)
+                    .await?;
             }
-            None => self.choreographer.revision_changed(&service, number)?,
+            None => {
+                let choreographer = &self.choreographer;
+                choreographer.revision_changed(&service, number).await?;
+            }
         }
         Ok(number)
     }
@@ -44,7 +52,7 @@ impl Pusher {
         let _turn = self.places.turn(name).await;
         let RolledBack { from, to } = self.catalogue.rollback(name, wanted).await?;
         self.choreographer.refill_warm_pool();
-        self.choreographer.revision_changed(name, to)?;
+        self.choreographer.revision_changed(name, to).await?;
         let about = NewEvent {
             service: Some(name),
             ..NewEvent::default()
@@ -62,6 +70,7 @@ impl Pusher {
             .choreographer
             .stop("its service was removed", |handle| handle.service() == name)
             .await;
+        self.choreographer.forget_rollout(name).await;
         self.choreographer.end_stale_warm().await?;
         self.catalogue.untag(withdrawn).await?;
         self.collect_garbage().await;

@@ -156,6 +156,18 @@ impl State {
         .map(|changed| changed == 1)
     }
 
+    /// Makes revision `to` the current one where `from` is it, or `to` itself; false where another one is.
+    pub fn replace_current(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
+        self.durably(|connection| {
+            connection.execute(
+                "UPDATE services SET current = ?3 WHERE name = ?1 AND current IN (?2, ?3)
+                 AND EXISTS (SELECT 1 FROM revisions WHERE service = ?1 AND number = ?3)",
+                params![service, from, to],
+            )
+        })
+        .map(|changed| changed == 1)
+    }
+
     /// Forgets a service and its revisions; false when there is none.
     pub fn remove_service(&self, name: &str) -> Result<bool, Error> {
         self.durably(|connection| {

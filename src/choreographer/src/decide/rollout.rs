@@ -90,6 +90,16 @@ pub struct Rollout {
     pub of_candidate: Seen,
 }
 
+impl Rollout {
+    /// The state after its candidate has become the current revision.
+    pub fn after_promotion(&self) -> RolloutState {
+        match self.terms.deadline {
+            Some(_) => RolloutState::Draining,
+            None => RolloutState::Promoted,
+        }
+    }
+}
+
 /// Which revision a robot is given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Given {

@@ -83,6 +83,7 @@ struct Kept {
 /// How long it takes until there is a container in the place of one that was taken.
 struct Lead {
     mean: Duration,
+    /// When those were taken that are still to be replaced.
     taken: VecDeque<Instant>,
 }
 
@@ -107,6 +108,11 @@ impl Lead {
         if let Some(taken) = self.taken.pop_front() {
             self.mean = self.mean.mul_f64(1.0 - LAST) + (now - taken).mul_f64(LAST);
         }
+    }
+
+    /// No container is missing: what was taken before is not to be replaced.
+    fn complete(&mut self) {
+        self.taken.clear();
     }
 }
 
@@ -346,7 +352,16 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
         let facts: Vec<Facts<'_>> = kept.pool.iter().map(Warm::facts).collect();
         let ends = stale(&facts, &wanted);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
-        ends.iter().filter_map(|id| kept.take(id)).collect()
+        // A service that is to have none any more.
+        kept.leads
+            .retain(|service, _| wanted.iter().any(|it| it.service == service));
+        let removed: Vec<Warm> = ends.iter().filter_map(|id| kept.take(id)).collect();
+        for warm in &removed {
+            let promised = warm.promised(inner).unwrap_or_default();
+            let id = warm.container.id().to_owned();
+            kept.ending.insert(id, promised);
+        }
+        removed
     };
     for warm in &removed {
         report_dead(inner, warm).await;
@@ -358,13 +373,19 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
     for ((revision, _), wanted) in revisions.iter().zip(&wanted) {
         loop {
             let lacks = {
-                let kept = pool.kept.lock();
+                let mut kept = pool.kept.lock();
                 let facts: Vec<Facts<'_>> = kept.pool.iter().map(Warm::facts).collect();
-                match missing(&facts, wanted) {
+                let lacks = match missing(&facts, wanted) {
                     Missing::Nothing => None,
                     Missing::Containers(_) => Some(None),
                     Missing::Nodes(id) => Some(Some(id.to_owned())),
+                };
+                if let (None | Some(Some(_)), Some(lead)) =
+                    (&lacks, kept.leads.get_mut(wanted.service))
+                {
+                    lead.complete();
                 }
+                lacks
             };
             let Some(nodes_of) = lacks.filter(|_| !inner.is_ending()) else {
                 break;
@@ -516,4 +537,28 @@ pub(crate) async fn end_all(inner: &Inner) {
     join_all(all.into_iter().map(|warm| warm.end(inner))).await;
     // One that is being made just now is ended by whoever makes it.
     let _turn = inner.warm_pool.turn.lock().await;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_to_be_replaced_makes_no_lead_longer() {
+        let (began, second) = (Instant::now(), Duration::from_secs(1));
+        let mut lead = Lead::default();
+        for _ in 0..5 {
+            lead.taken(began);
+        }
+        lead.replaced(began + second);
+        assert_eq!(lead.mean, second);
+        // One of five is enough for those who come now.
+        lead.complete();
+        let later = began + Duration::from_secs(3600);
+        lead.replaced(later);
+        assert_eq!(lead.mean, second, "nobody waits for it");
+        lead.taken(later);
+        lead.replaced(later + second);
+        assert_eq!(lead.mean, second);
+    }
 }

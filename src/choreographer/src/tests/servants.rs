@@ -12,7 +12,7 @@ mod rollouts;
 
 /// A machine, and what outlives a daemon on it.
 pub(super) struct World {
-    _home: tempfile::TempDir,
+    home: tempfile::TempDir,
     state: Arc<State>,
     catalogue: Arc<Catalogue>,
     pub(super) engine: MemoryEngine,
@@ -31,7 +31,7 @@ impl World {
             pending().await
         });
         World {
-            _home: home,
+            home,
             catalogue: Arc::new(Catalogue::new(Arc::clone(&state), Arc::new(store))),
             state,
             engine,

@@ -57,7 +57,7 @@ async fn until(daemon: &Choreographer, state: RolloutState) {
 async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
     let world = two();
     let daemon = keeps(&world);
-    let first = daemon.begin_rollout("greet", 2, canary(Share::Robots(1)));
+    let first = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     first.await.expect("it begins");
     let (first, second) = (gets(&daemon, "r1", 2).await, gets(&daemon, "r2", 1).await);
     let rollouts = &daemon.inner.rollouts;
@@ -89,7 +89,7 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
 async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
     let world = two();
     let daemon = keeps(&world);
-    let begun = daemon.begin_rollout("greet", 2, canary(Share::Robots(1)));
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
     drop(gets(&daemon, "r1", 2).await);
     // Written within a second.
@@ -105,9 +105,10 @@ async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
             .servants,
         2
     );
-    next.abort_rollout("greet").expect("it is one");
+    next.abort_rollout("greet").await.expect("it is one");
     let refused = next
         .abort_rollout("greet")
+        .await
         .expect_err("it is none any more");
     assert!(
         refused.to_string().contains("no canary: aborted"),
@@ -127,7 +128,7 @@ async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
         ..canary(Share::Robots(1))
     };
     daemon
-        .begin_rollout("greet", 2, terms)
+        .begin_rollout("greet", None, 2, terms)
         .await
         .expect("it begins");
     let old = gets(&daemon, "r1", 2).await;
@@ -144,7 +145,7 @@ async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
         ..RolloutTerms::default()
     };
     daemon
-        .begin_rollout("greet", 1, terms)
+        .begin_rollout("greet", None, 1, terms)
         .await
         .expect("it begins");
     old.handle().ended().await;
@@ -201,7 +202,7 @@ async fn what_makes_no_sense_or_would_break_robots_is_refused() {
         ),
         ("gone", 2, share, "gone"),
     ] {
-        let refused = daemon.begin_rollout(service, revision, terms).await;
+        let refused = daemon.begin_rollout(service, None, revision, terms).await;
         let refused = refused.expect_err(words).to_string();
         assert!(refused.contains(words), "{refused}");
     }
@@ -214,14 +215,125 @@ async fn what_makes_no_sense_or_would_break_robots_is_refused() {
 async fn another_revision_ends_a_rollout() {
     let world = two();
     let daemon = keeps(&world);
-    let begun = daemon.begin_rollout("greet", 2, canary(Share::Percent(100.0)));
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Percent(100.0)));
     begun.await.expect("it begins");
     let lease = gets(&daemon, "r1", 2).await;
     world.publish("greet", "/greet", |_| {});
-    daemon.revision_changed("greet", 3).expect("it is told");
+    let told = daemon.revision_changed("greet", 3).await;
+    told.expect("it is told");
     lease.handle().ended().await;
     drop(lease);
     gets(&daemon, "r1", 3).await;
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.state, RolloutState::Replaced, "{shown:?}");
+}
+
+/// Which revision is the current one.
+fn current(world: &World) -> u64 {
+    world.catalogue.current("greet").expect("published").number
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_refused_or_keeps_its_servant_takes_no_place_of_a_canary() {
+    let world = two();
+    let daemon = keeps(&world);
+    let kept = gets(&daemon, "r1", 1).await;
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    // It is connected, and comes once more.
+    drop(gets(&daemon, "r1", 1).await);
+    let unknown = api::Stated::read([("class", "captain")]).expect("valid");
+    let refused = ServantRequest::new("greet", "r2").stating(unknown);
+    let refused = daemon.ensure(refused).err().expect("no such class");
+    assert!(refused.to_string().contains("captain"), "{refused}");
+    drop(gets(&daemon, "r3", 2).await);
+    drop(kept);
+    daemon.stop("the test goes on", |_| true).await;
+    gets(&daemon, "r1", 1).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_servant_that_is_measured_is_of_the_current_revision_and_judges_none() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Percent(100.0)));
+    begun.await.expect("it begins");
+    let measured = daemon.measured("greet", "try").expect("a servant");
+    measured.lease.ready().await.expect("ready");
+    assert_eq!(measured.lease.handle().revision.number, 1);
+    let shown = daemon.rollout("greet").expect("a rollout");
+    assert_eq!(shown.of_stable.servants, 0, "{shown:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_canary_does_not_take_the_place_of_a_revision_that_was_published_meanwhile() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    let lease = gets(&daemon, "r1", 2).await;
+    // Published, and the choreographer is not told yet.
+    world.publish("greet", "/greet", |_| {});
+    let shown = daemon.promote_rollout("greet").await.expect("answered");
+    assert_eq!(shown.state, RolloutState::Replaced, "{shown:?}");
+    assert_eq!(current(&world), 3);
+    lease.handle().ended().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_cannot_be_written_is_not_done() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    let lease = gets(&daemon, "r1", 2).await;
+    let database = rusqlite::Connection::open(world.home.path().join("cloudroid.db"));
+    let database = database.expect("the database");
+    let rename = |from: &str, to: &str| {
+        let renamed = database.execute(&format!("ALTER TABLE {from} RENAME TO {to}"), []);
+        renamed.expect("renamed");
+    };
+    rename("rollouts", "gone");
+    daemon.abort_rollout("greet").await.expect_err("no table");
+    let shown = daemon.rollout("greet").expect("a rollout");
+    assert_eq!(shown.state, RolloutState::Canary, "it goes on");
+    assert_eq!(lease.handle().life().phase, Phase::Ready);
+    rename("gone", "rollouts");
+    daemon.abort_rollout("greet").await.expect("it is written");
+    lease.handle().ended().await;
+    let next = keeps(&world);
+    let shown = next.rollout("greet").expect("a rollout");
+    assert_eq!(shown.state, RolloutState::Aborted);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_service_that_is_removed_has_no_rollout() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    world.catalogue.withdraw("greet").expect("removed");
+    daemon.forget_rollout("greet").await;
+    world.publish("greet", "/greet", |_| {});
+    let none = daemon.rollout("greet").expect_err("it is another service");
+    assert!(matches!(none, Error::NoRollout(_)), "{none}");
+    daemon.inner.write_changed();
+    assert!(world.state.rollouts().expect("read").is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_revision_with_a_deadline_alone_follows_the_one_before() {
+    let world = two();
+    let daemon = keeps(&world);
+    world.publish("greet", "/greet", |record| {
+        record.image = format!("sha256:{:064}", 1);
+    });
+    let terms = RolloutTerms {
+        deadline: Some(60.0),
+        ..RolloutTerms::default()
+    };
+    let shown = daemon.begin_rollout("greet", Some(1), 3, terms).await;
+    let shown = shown.expect("it begins");
+    assert_eq!((shown.stable, shown.candidate), (1, 3));
+    assert_eq!(shown.state, RolloutState::Draining);
 }
