@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ros::bus::Bus;
 use ros::schema::Registry;
+use ros::sizes::Seen;
 use rosbridge::{Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
@@ -115,6 +116,11 @@ impl Bridge {
     /// How many sessions there are, now and later.
     pub fn sessions(&self) -> watch::Receiver<SessionCount> {
         self.shared.sessions.subscribe()
+    }
+
+    /// How large the messages and requests of each topic and service are that clients send to nodes.
+    pub fn inputs(&self) -> Vec<(String, Seen)> {
+        self.shared.inputs.seen()
     }
 
     /// What was counted so far.

@@ -7,6 +7,7 @@ use std::sync::{Arc, Weak};
 use parking_lot::Mutex;
 use ros::bus::{Bus, PeerId};
 use ros::schema::{MessageType, Registry};
+use ros::sizes::Inputs;
 use tokio::sync::watch;
 
 use crate::bridge::SessionCount;
@@ -29,6 +30,8 @@ pub(crate) struct Shared {
     pub(crate) registrations: Registrations,
     pub(crate) presence: Presence,
     pub(crate) republisher: Republisher,
+    /// How large what clients send to nodes is.
+    pub(crate) inputs: Inputs,
     fanouts: Mutex<HashMap<String, Weak<Fanout>>>,
     /// What clients publish on, by topic.
     topic_publishers: Mutex<HashMap<String, Vec<Weak<TopicPublisher>>>>,
@@ -62,6 +65,7 @@ impl Shared {
             registrations: Registrations::default(),
             presence: Presence::default(),
             republisher: Republisher::default(),
+            inputs: Inputs::default(),
             fanouts: Mutex::default(),
             topic_publishers: Mutex::default(),
             clients: Mutex::default(),

@@ -9,6 +9,7 @@ use parking_lot::Mutex;
 use ros::bus::{Matched, Message, PeerId, Publisher, Qos, WireType};
 use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
+use ros::sizes::Sizes;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
@@ -26,6 +27,7 @@ pub(crate) struct TopicPublisher {
     pub(crate) message_type: Arc<MessageType>,
     pub(crate) latch: bool,
     wire_type: Arc<WireType>,
+    sizes: Arc<Sizes>,
     /// Tells this topic_publisher's latched message from others'.
     pub(crate) id: PeerId,
     shared: Arc<Shared>,
@@ -76,6 +78,7 @@ impl TopicPublisher {
         let wire_type = WireType::of(&message_type);
         let topic_publisher = Arc::new(TopicPublisher {
             topic: topic.to_owned(),
+            sizes: shared.inputs.of(topic, Some(&message_type)),
             message_type,
             latch,
             wire_type: Arc::new(wire_type.clone()),
@@ -94,6 +97,7 @@ impl TopicPublisher {
 
     pub(crate) fn publish(self: &Arc<Self>, bytes: Bytes) {
         self.shared.metrics.published.add(1);
+        self.sizes.note(&bytes);
         if self.latch {
             *self.last.lock() = Some(bytes.clone());
         }

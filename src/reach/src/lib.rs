@@ -39,6 +39,7 @@ use package::inventory::Inventory;
 use ros::bus::{Bus, BusError, Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use ros::schema::Registry;
+use ros::sizes::Seen;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -147,6 +148,10 @@ pub trait Reach: Send + Sync + 'static {
     fn links(&self) -> Vec<LinkStatus>;
     /// What flows, by who uses it.
     fn flows(&self) -> Vec<Flow> {
+        Vec::new()
+    }
+    /// How large the messages and requests are that its robot sends to nodes, by topic or service.
+    fn inputs(&self) -> Vec<(String, Seen)> {
         Vec::new()
     }
     /// What was counted of its rosbridge sessions.

@@ -33,6 +33,7 @@ use budget::Budget;
 use parking_lot::Mutex;
 use ros::bus::{Bus, ParamValue};
 use ros::schema::Registry;
+use ros::sizes::{Inputs, Seen};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::time::timeout;
@@ -134,6 +135,8 @@ pub struct Hub {
     attempts: Attempts,
     /// Machines that were told of each other.
     duplicates: Mutex<BTreeSet<(String, String)>>,
+    /// How large what robots send to nodes is.
+    inputs: Inputs,
     closed: watch::Sender<Option<String>>,
 }
 
@@ -195,6 +198,7 @@ impl Hub {
             skew: Skew::default(),
             attempts: Attempts::default(),
             duplicates: Mutex::default(),
+            inputs: Inputs::default(),
             closed: watch::Sender::new(None),
         })
     }
@@ -209,6 +213,11 @@ impl Hub {
     pub fn flows(&self) -> Vec<Flow> {
         let links = self.links.lock();
         links.values().map(|link| link.flow()).collect()
+    }
+
+    /// How large the messages and requests of each topic and service are that robots send to nodes.
+    pub fn inputs(&self) -> Vec<(String, Seen)> {
+        self.inputs.seen()
     }
 
     /// Ends every connection with these words, and all links.

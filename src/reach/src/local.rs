@@ -9,6 +9,7 @@ use link::session::Lost;
 use package::interface::Interface;
 use ros::JoinOptions;
 use ros::bus::{Bus, Graph, RosVersion};
+use ros::sizes::Seen;
 use servant::engine::Servant;
 use servant::local::{LocalEngine, LocalServant};
 use tokio::sync::watch;
@@ -170,6 +171,12 @@ impl Reach for LocalReach {
         let mut flows = self.hub.flows();
         flows.push(clients);
         flows
+    }
+
+    fn inputs(&self) -> Vec<(String, Seen)> {
+        let mut inputs = self.hub.inputs();
+        inputs.extend(self.bridge.inputs());
+        inputs
     }
 
     fn metrics(&self) -> &Metrics {

@@ -13,6 +13,7 @@ pub mod net;
 pub mod ring;
 pub mod ros1;
 pub mod schema;
+pub mod sizes;
 pub mod turns;
 
 pub use connect::{JoinOptions, connect};

@@ -154,6 +154,8 @@ impl Client {
             ),
             (Err(reason), ..) => return Err(reason.clone()),
         };
+        let of = def.as_ref().ok().map(|def| &*def.request);
+        self.shared.inputs.of(&call.service, of).note(&request);
         let asked = Instant::now();
         let response = self
             .shared

@@ -8,6 +8,7 @@ use parking_lot::Mutex;
 use ros::bus::{Publisher, Qos, WireType, reaches};
 use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
+use ros::sizes::Sizes;
 
 use super::Hub;
 use link::clock::now;
@@ -44,6 +45,7 @@ pub(super) struct Inputs {
 struct Channel {
     topic: String,
     stamps: Stamps,
+    sizes: Arc<Sizes>,
     state: State,
 }
 
@@ -55,10 +57,16 @@ enum State {
 
 impl Inputs {
     /// Messages of this channel may come before it is open.
-    pub(super) fn expect(&self, input: &Input) {
+    pub(super) fn expect(&self, hub: &Hub, input: &Input) {
+        let of = MessageType::from_full_text(&input.type_name, &input.definition);
+        let of = of.inspect_err(|error| {
+            tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
+        });
+        let of = of.ok();
         let fresh = Channel {
             topic: input.topic.clone(),
-            stamps: stamps(input),
+            stamps: stamps(input, of.as_deref()),
+            sizes: hub.inputs.of(&input.topic, of.as_deref()),
             state: State::Waiting(Ring::new(WAITING)),
         };
         self.channels.lock().insert(input.channel, fresh);
@@ -76,6 +84,7 @@ impl Inputs {
         let message = data.message;
         // By the robot's stamp: outputs are looked at when theirs are the robot's again.
         let mark = mark(&message);
+        channel.sizes.note(&message);
         let message = skew.apply(Direction::In, &channel.stamps, message);
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
@@ -145,15 +154,9 @@ impl Inputs {
 }
 
 /// Where the stamps of an input stand. `/clock` tells simulated time.
-fn stamps(input: &Input) -> Stamps {
-    if input.topic == "/clock" {
-        return Stamps::default();
-    }
-    match MessageType::from_full_text(&input.type_name, &input.definition) {
-        Ok(message) => Stamps::of(&message),
-        Err(error) => {
-            tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
-            Stamps::default()
-        }
+fn stamps(input: &Input, of: Option<&MessageType>) -> Stamps {
+    match of {
+        Some(of) if input.topic != "/clock" => Stamps::of(of),
+        _ => Stamps::default(),
     }
 }

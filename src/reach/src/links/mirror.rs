@@ -144,6 +144,7 @@ impl Sent {
                 let stamps = stamps.filter(|known| entry.1.digest == *known.md5);
                 let service = Service {
                     name: name.to_owned(),
+                    sizes: hub.inputs.of(name, stamps.as_ref().map(|of| &*of.request)),
                     request: stamps
                         .as_ref()
                         .map(|of| Stamps::of(&of.request))

@@ -24,6 +24,7 @@ use link::record::Record;
 use link::session::{CloudSession, Handler, SessionOptions};
 use link::skew::Direction;
 use ros::codec::Stamps;
+use ros::sizes::Sizes;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;
@@ -66,6 +67,7 @@ pub(super) struct NodeLink {
 /// What the node serves.
 pub(super) struct Service {
     pub(super) name: String,
+    pub(super) sizes: Arc<Sizes>,
     pub(super) request: Stamps,
     pub(super) response: Stamps,
 }
@@ -253,6 +255,7 @@ impl NodeLink {
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
         tokio::spawn(async move {
             let patience = hub.options.call_timeout;
+            service.sizes.note(&request);
             let request = hub.skew.apply(Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;
             let called =
@@ -313,7 +316,9 @@ impl NodeLink {
                 // Data may follow in the same breath.
                 let hold = match &order {
                     FromRobot::Open(input) => {
-                        self.inputs.expect(input);
+                        if let Some(hub) = self.hub.upgrade() {
+                            self.inputs.expect(&hub, input);
+                        }
                         None
                     }
                     FromRobot::Listeners { channel, count } => {

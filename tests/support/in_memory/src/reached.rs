@@ -14,6 +14,7 @@ use reach::{
     Tenant,
 };
 use ros::bus::{Bus, Graph, RosVersion};
+use ros::sizes::Seen;
 use servant::engine::Servant;
 use tokio::sync::watch;
 
@@ -100,6 +101,10 @@ impl Reach for MemoryReach {
 
     fn links(&self) -> Vec<LinkStatus> {
         Vec::new()
+    }
+
+    fn inputs(&self) -> Vec<(String, Seen)> {
+        self.servant.inputs.seen()
     }
 
     fn metrics(&self) -> &Metrics {

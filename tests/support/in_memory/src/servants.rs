@@ -7,6 +7,7 @@ use std::time::{Duration, SystemTime};
 use async_trait::async_trait;
 use parking_lot::Mutex;
 use ros::bus::Graph;
+use ros::sizes::Inputs;
 use servant::Error;
 use servant::engine::{
     ContainerState, Enforced, LogLine, LogStart, NodeEvent, NodeExit, Servant, Usage,
@@ -34,6 +35,8 @@ pub struct MemoryServant {
     /// Tasks of nodes.
     tasks: watch::Sender<usize>,
     pub(crate) graph: watch::Sender<Arc<Graph>>,
+    /// How large what its robot sends is.
+    pub inputs: Inputs,
     /// Where services of its nodes are called.
     pub(crate) system: Arc<MemorySystem>,
 }
@@ -88,6 +91,7 @@ impl MemoryServant {
             oom_kills: Mutex::default(),
             tasks: watch::Sender::default(),
             graph: watch::Sender::default(),
+            inputs: Inputs::default(),
             system: Arc::default(),
         })
     }
