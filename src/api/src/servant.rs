@@ -142,6 +142,10 @@ pub struct BackOff {
 pub struct Terms {
     /// What was stated: by the node that a stub stands for, or by `` (nothing), a rosbridge client.
     pub stated: BTreeMap<String, Stated>,
+    /// Auxiliary parameters of the dictionary that were measured, of what its clients sent. What they state comes before.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub measured: BTreeMap<String, String>,
     /// The class of the configuration that it is in.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub class: Option<String>,

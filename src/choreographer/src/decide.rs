@@ -6,6 +6,8 @@
 //! |---|---|---|
 //! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
 //! | [`dictionary`] | which row of a service's dictionary a goal of an SLA takes | rows, auxiliary parameters, caps |
+//! | [`measured`] | auxiliary parameters of a robot that does not state them | how large what it sends is, the keys of rows |
+//! | [`told`] | which refusals are told of | when which robots were refused |
 //! | [`terms`] | which limits a robot's servant is promised | what the robot states, classes, the service, caps |
 //! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
 //! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue and its priorities |
@@ -41,6 +43,7 @@ pub(crate) mod forecast;
 pub(crate) mod group;
 pub(crate) mod hung;
 pub(crate) mod lifetime;
+pub(crate) mod measured;
 pub(crate) mod nodes;
 pub(crate) mod placement;
 pub(crate) mod rollout;
@@ -48,6 +51,7 @@ mod shares;
 mod sketch;
 pub(crate) mod stall;
 pub(crate) mod terms;
+pub(crate) mod told;
 pub(crate) mod warm_pool;
 
 #[cfg(test)]

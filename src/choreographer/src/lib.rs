@@ -75,6 +75,7 @@ pub use options::{Class, DEFAULT_CLASS, Hung, Options};
 pub use request::ServantRequest;
 
 use decide::admission::Ask;
+use decide::dictionary::Aux;
 use decide::placement::{Placement, place};
 use decide::terms::explain;
 use handle::Anew;
@@ -126,6 +127,7 @@ impl Choreographer {
             rollouts: Arc::default(),
             incomplete: Mutex::default(),
             ending: AtomicBool::new(false),
+            refusals: Mutex::default(),
         };
         Choreographer {
             inner: Arc::new(inner),
@@ -293,9 +295,11 @@ impl Choreographer {
         warm_pool::end_all(&self.inner).await;
     }
 
-    /// Looks after the machine from now on, and moves cores where that is wanted; comes back at once.
+    /// Looks after the machine from now on, moves cores where that is wanted, and resizes servants by how large what their
+    /// robots send is; comes back at once.
     pub fn keep_watch(&self) {
         tokio::spawn(lives::controller::watch(Arc::clone(&self.inner)));
+        tokio::spawn(lives::measuring::watch(Arc::clone(&self.inner)));
     }
 
     /// So often cores were moved.
@@ -403,7 +407,7 @@ impl Choreographer {
     ) -> Result<api::dictionary::Explained, Error> {
         let inner = &self.inner;
         let revision = inner.catalogue.current(service)?;
-        inner.offering(&revision, |offer| explain(stated, offer))
+        inner.offering(&revision, |_| Aux::new(), |offer| explain(stated, offer))
     }
 
     /// Refuses limits that would never be admitted.

@@ -12,6 +12,7 @@ pub(crate) mod group;
 pub(crate) mod hung;
 mod lifetime;
 pub(crate) mod limits;
+pub(crate) mod measuring;
 mod nodes;
 mod reaching;
 mod recent;
@@ -24,6 +25,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+use api::dictionary::Row;
 use catalogue::Catalogue;
 use parking_lot::Mutex;
 use reach::{Opener, RequestTimes};
@@ -35,6 +37,7 @@ use crate::decide::capacity::Room;
 use crate::decide::demand::{self, Asked};
 use crate::decide::dictionary::Aux;
 use crate::decide::terms::{Offer, terms};
+use crate::decide::told::Told;
 use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
@@ -68,6 +71,8 @@ pub(crate) struct Inner {
     /// Images whose nodes did not show all of their interface although they had all the time of a start.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,
+    /// Of which refusals was told.
+    pub(crate) refusals: Mutex<Told>,
 }
 
 #[derive(Default)]
@@ -106,13 +111,15 @@ impl Inner {
         stated: &BTreeMap<String, api::Stated>,
         revision: &RevisionRecord,
     ) -> Result<api::Terms, Error> {
-        self.offering(revision, |offer| Ok(terms(stated, offer)?))?
+        self.offering(revision, |_| Aux::new(), |offer| Ok(terms(stated, offer)?))?
     }
 
-    /// What terms for a servant of this revision are made from.
+    /// What terms for a servant of this revision are made from; `measured` says, of the dictionary's rows, which auxiliary
+    /// parameters of its robot were measured.
     pub(crate) fn offering<T>(
         &self,
         revision: &RevisionRecord,
+        measured: impl FnOnce(&[Row]) -> Aux,
         work: impl FnOnce(&Offer<'_>) -> T,
     ) -> Result<T, Error> {
         let options = &self.options;
@@ -123,7 +130,7 @@ impl Inner {
             caps: revision.plan.caps,
             classes: &options.classes,
             rows: &rows,
-            measured: &Aux::new(),
+            measured: &measured(&rows),
             reserve: (options.reserve_cpus, options.reserve_memory),
             capacity: self.admission.look().0,
         }))

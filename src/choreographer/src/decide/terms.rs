@@ -106,6 +106,8 @@ struct Reading<'a> {
     /// Limits where neither resources nor rows say anything.
     own: Limits,
     aux: Aux,
+    /// Those of them that it did not state.
+    measured: Aux,
     sla: Sla,
     /// A goal that cannot be met is refused.
     strict: bool,
@@ -122,7 +124,9 @@ impl<'a> Reading<'a> {
             .unwrap_or_default();
         let class = class(together.class.as_deref(), offer.classes)?;
         let by_class = class.map_or(Limits::default(), |(_, class)| class.limits);
-        let mut aux = offer.measured.clone();
+        let mut measured = offer.measured.clone();
+        measured.retain(|key, _| !together.aux.contains_key(key));
+        let mut aux = measured.clone();
         aux.extend(together.aux.clone());
         let direct = together.cpus.is_some() || together.memory.is_some();
         let (sla, stated_sla) = match class {
@@ -136,6 +140,7 @@ impl<'a> Reading<'a> {
             together,
             class,
             aux,
+            measured,
             sla,
         })
     }
@@ -205,8 +210,13 @@ pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Ter
         why.push(reason);
         rows.push(row.clone());
     }
+    if !rows.is_empty() && !reading.measured.is_empty() {
+        let measured = pairs_of(&reading.measured);
+        why.push(format!("its messages were measured: {measured}"));
+    }
     Ok(Terms {
         stated: stated.clone(),
+        measured: offer.measured.clone(),
         class: reading.class.map(|(name, _)| name.to_owned()),
         priority: reading.class.map_or(0, |(_, class)| class.priority),
         rows,
@@ -280,14 +290,16 @@ pub(crate) fn named(row: &Row) -> String {
 
 /// What was assumed of auxiliary parameters, behind what it is about.
 fn for_what(assumed: &Aux) -> String {
-    let pairs = assumed.iter();
-    let pairs: Vec<String> = pairs
-        .map(|(key, value)| format!("aux.{key}={value}"))
-        .collect();
-    match pairs.is_empty() {
+    match assumed.is_empty() {
         true => String::new(),
-        false => format!(" with {}", pairs.join(" ")),
+        false => format!(" with {}", pairs_of(assumed)),
     }
+}
+
+/// Auxiliary parameters as they would be stated.
+pub(crate) fn pairs_of(aux: &Aux) -> String {
+    let pairs = aux.iter().map(|(key, value)| format!("aux.{key}={value}"));
+    pairs.collect::<Vec<_>>().join(" ")
 }
 
 /// The class that a robot is in: the one that it names, else the default one where there is one.

@@ -1,17 +1,20 @@
 //! Changes the limits of a servant while it works: because the operator says so, or because its robot states something else
 //! than before.
 
-use api::{Limits, Size, Stated};
+use api::{Limits, Size, Stated, Terms};
 use servant::engine::Servant;
 
 use super::Inner;
 use crate::decide::admission::Refused;
 use crate::decide::demand::{Asked, with_weight};
-use crate::decide::terms::{Untenable, in_words};
+use crate::decide::measured::{Input, grown, measured};
+use crate::decide::terms::{Untenable, in_words, pairs_of, terms};
+use crate::decide::told::left_out;
 use crate::handle::Handle;
 use crate::limits::limits_of;
 use crate::{Choreographer, Error, ServantRequest, engine_limits};
 use store::NewEvent;
+use tokio::time::Instant;
 
 /// Why a servant is not resized.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -58,16 +61,37 @@ impl Choreographer {
 impl Inner {
     /// Tells of a robot that is refused for what it states.
     pub(crate) fn report_refused(&self, request: &ServantRequest, error: &Error) {
-        let message = format!(
-            "robot {} states {} to {} and is refused: {error}",
-            request.robot, request.stated, request.service
-        );
+        let (service, robot) = (&request.service, &request.robot);
         let about = NewEvent {
-            service: Some(&request.service),
+            service: Some(service),
             servant: None,
-            robot: Some(&request.robot),
+            robot: Some(robot),
         };
-        self.journal.warning("terms-refused", &message, &about);
+        self.report_terms_refused(service, robot, &about, || {
+            let stated = &request.stated;
+            format!("robot {robot} states {stated} to {service} and is refused: {error}")
+        });
+    }
+
+    /// Tells of a servant that keeps what it has, although its robot states or sends something else.
+    pub(crate) fn report_not_resized(&self, handle: &Handle, error: &Error) {
+        let (service, robot) = (handle.service(), &handle.robot);
+        self.report_terms_refused(service, robot, &handle.about(), || error.to_string());
+    }
+
+    fn report_terms_refused(
+        &self,
+        service: &str,
+        robot: &str,
+        about: &NewEvent<'_>,
+        message: impl FnOnce() -> String,
+    ) {
+        let now = Instant::now().into_std();
+        let told = self.refusals.lock().tell(service, robot, now);
+        if let Some(before) = told {
+            let message = message() + &left_out(before);
+            self.journal.warning("terms-refused", &message, about);
+        }
     }
 
     /// Gives a servant that runs what its robot states now, by one of its clients. Where that cannot be, it keeps what it
@@ -80,8 +104,7 @@ impl Inner {
     ) -> Result<(), Error> {
         let agreed = self.agreed(handle, who, stated).await;
         if let Err(error @ Error::NotResized { .. }) = &agreed {
-            let (journal, message) = (&self.journal, error.to_string());
-            journal.warning("terms-refused", &message, &handle.about());
+            self.report_not_resized(handle, error);
         }
         agreed
     }
@@ -94,16 +117,72 @@ impl Inner {
             // Another connection of the same client was faster.
             return Ok(());
         }
+        let measured = before.terms.measured.clone();
+        let terms = self.offering(&handle.revision, |_| measured, |offer| terms(&all, offer))?;
+        let why = stated.to_string();
+        let changed = self.renew(handle, before, terms, &why).await?;
+        if !handle.is_place() {
+            let states = handle.terms().stated_in_words();
+            self.report_changed(handle, changed, &format!("its robot states {states}"));
+        }
+        Ok(())
+    }
+
+    /// Gives a servant that runs what the dictionary says of messages as large as those that its robot sends. Where that
+    /// cannot be, it keeps what it has.
+    pub(crate) async fn measured(&self, handle: &Handle, inputs: &[Input]) -> Result<(), Error> {
+        let _turn = handle.limits_turn().await;
+        let before = handle.all_asked();
+        let known = &before.terms.measured;
+        let anew = self.offering(
+            &handle.revision,
+            |rows| grown(known, measured(inputs, rows)),
+            |offer| {
+                let terms = || terms(&before.terms.stated, offer);
+                (offer.measured != known).then(|| (pairs_of(offer.measured), terms()))
+            },
+        )?;
+        let Some((sends, terms)) = anew else {
+            return Ok(());
+        };
+        let why = format!("messages of {sends}");
+        let changed = self.renew(handle, before.clone(), terms, &why).await?;
+        if changed.is_some() {
+            self.report_changed(handle, changed, &format!("its robot sends {why}"));
+        }
+        Ok(())
+    }
+
+    fn report_changed(&self, handle: &Handle, from: Option<Limits>, why: &str) {
+        let id = &handle.id;
+        let message = match from {
+            Some(earlier) => format!(
+                "servant {id}: {why}; limits changed from {} to {}",
+                in_words(&earlier),
+                in_words(&handle.limits()),
+            ),
+            None => format!("servant {id}: {why}; its limits stay"),
+        };
+        self.journal
+            .info("terms-changed", &message, &handle.about());
+    }
+
+    /// Gives a servant these terms, for what `why` says; the limits that it had, where they change. Only in its
+    /// [`Handle::limits_turn`].
+    async fn renew(
+        &self,
+        handle: &Handle,
+        before: Asked,
+        terms: Result<Terms, Untenable>,
+        why: &str,
+    ) -> Result<Option<Limits>, Error> {
         let refused = |reason| Error::NotResized {
             servant: handle.id.clone(),
             service: handle.service().to_owned(),
-            stated: stated.to_string(),
+            stated: why.to_owned(),
             reason: Box::new(reason),
         };
-        let terms = match self.terms(&all, &handle.revision) {
-            Err(Error::Terms(untenable)) => return Err(refused(Unchanged::Untenable(untenable))),
-            terms => terms?,
-        };
+        let terms = terms.map_err(|untenable| refused(Unchanged::Untenable(untenable)))?;
         let after = Asked {
             terms,
             ..before.clone()
@@ -111,7 +190,7 @@ impl Inner {
         if handle.is_place() {
             // It has no container; what it wishes of its SLA, the group heeds.
             handle.set_asked(after);
-            return Ok(());
+            return Ok(None);
         }
         let (earlier, told) = (before.limits(), after.terms.clone());
         let change = changed(&earlier, &after.limits());
@@ -125,28 +204,16 @@ impl Inner {
         }
         let resized = change != Limits::default();
         if resized {
-            self.resize(handle, change, after)
-                .await
-                .map_err(|error| match error {
-                    Error::Full(full) => refused(Unchanged::Full(full)),
-                    error => error,
-                })?;
+            let resized = self.resize(handle, change, after).await;
+            resized.map_err(|error| match error {
+                Error::Full(full) => refused(Unchanged::Full(full)),
+                error => error,
+            })?;
         } else {
             handle.set_asked(after);
         }
         self.state.set_servant_terms(&handle.id, &told)?;
-        let (stated, id) = (told.stated_in_words(), &handle.id);
-        let message = match resized {
-            true => format!(
-                "servant {id}: its robot states {stated}; limits changed from {} to {}",
-                in_words(&earlier),
-                in_words(&handle.limits()),
-            ),
-            false => format!("servant {id}: its robot states {stated}; its limits stay"),
-        };
-        self.journal
-            .info("terms-changed", &message, &handle.about());
-        Ok(())
+        Ok(resized.then_some(earlier))
     }
 
     /// Gives a servant the limits of `change`, and promises `after` to it; all or nothing. Only in its

@@ -235,12 +235,8 @@ async fn a_warm_container_gets_what_its_robot_states() {
     assert_eq!(first.id, lease.handle().id, "the warm one was used");
 }
 
-#[tokio::test(start_paused = true)]
-async fn an_sla_is_given_what_the_services_dictionary_says() {
-    let world = World::new();
-    world.publish("greet", "/greet", |_| {});
-    let daemon = world.daemon_with(|options| options.reserve_cpus = 0.25);
-    let row = |millis: u64, cpus| api::dictionary::Row {
+fn row(millis: u64, cpus: f64) -> api::dictionary::Row {
+    api::dictionary::Row {
         id: 0,
         measure: api::Measure::Rrt,
         value: millis as f64 / 1000.0,
@@ -252,7 +248,14 @@ async fn an_sla_is_given_what_the_services_dictionary_says() {
         spread: None,
         revision: None,
         written: 0,
-    };
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_sla_is_given_what_the_services_dictionary_says() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon_with(|options| options.reserve_cpus = 0.25);
     let rows = api::dictionary::NewRows {
         rows: vec![row(50, 1.5), row(100, 0.5)],
         replace: false,
@@ -285,4 +288,137 @@ async fn an_sla_is_given_what_the_services_dictionary_says() {
     let refused = impossible.ready().await.err().expect("no row reaches it");
     assert!(refused.to_string().contains("row 1"), "{refused}");
     assert_eq!(enforced(&daemon, &again).await.0, Some(1.5), "as it was");
+}
+
+/// A robot that says of its pictures only that it wants them looked at in a tenth of a second, where small ones cost half a core
+/// and large ones one and a half.
+async fn looks(world: &World, daemon: &Choreographer) -> (Lease, Arc<ros::sizes::Sizes>) {
+    let of_width = |cpus, width: &str| api::dictionary::Row {
+        aux: [("width".to_owned(), width.to_owned())].into(),
+        ..row(100, cpus)
+    };
+    let rows = api::dictionary::NewRows {
+        rows: vec![of_width(0.5, "320"), of_width(1.5, "1280")],
+        replace: false,
+    };
+    let state = &daemon.inner.state;
+    state.write_dictionary("greet", 1, &rows).expect("written");
+    daemon.keep_watch();
+    let lease = ready(daemon, stating("r1", &[("rrt", "100ms")])).await;
+    assert_eq!(enforced(daemon, &lease).await.0, Some(1.5), "the dearest");
+    let registry = ros::schema::Registry::new();
+    registry
+        .insert("a/Picture", "uint32 height\nuint32 width")
+        .expect("valid");
+    let picture = registry.message("a/Picture").expect("known");
+    let servant = world.engine.servant(&lease.handle().id).expect("it runs");
+    let sizes = servant.inputs.of("/camera", Some(&picture));
+    (lease, sizes)
+}
+
+fn picture(width: u32) -> Vec<u8> {
+    [width / 2, width].map(u32::to_le_bytes).concat()
+}
+
+/// Waits until one more event of this kind is told.
+async fn next_told(world: &World, kind: &str, before: usize) -> String {
+    let mut told = world.told(kind);
+    while told.len() <= before {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        told = world.told(kind);
+    }
+    // The newest first or last: all are looked through by their number.
+    told.retain(|message| message.contains("aux.width"));
+    told.into_iter().next_back().expect("of a width")
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_the_session_measures_resizes_the_servant_in_place() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let (lease, sizes) = looks(&world, &daemon).await;
+    for _ in 0..10 {
+        sizes.note(&picture(320));
+    }
+    let told = next_told(&world, "terms-changed", 0).await;
+    assert!(told.contains("sends messages of aux.width=320"), "{told}");
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(0.5));
+    assert_eq!(daemon.admission().look().1.cpus(), 0.5);
+    let terms = daemon.describe(lease.handle()).await.terms.expect("terms");
+    assert_eq!(terms.measured["width"], "320");
+    assert!(terms.why.iter().any(|why| why.contains("aux.width=320")));
+    // It sends larger ones from now on, and smaller ones again.
+    sizes.note(&picture(640));
+    next_told(&world, "terms-changed", 1).await;
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
+    sizes.note(&picture(320));
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5), "it stays");
+    // What it states itself comes before.
+    let again = stating("r1", &[("rrt", "100ms"), ("aux.width", "320")]);
+    ready(&daemon, again).await;
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(0.5));
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_measured_and_cannot_be_had_is_told_once_and_given_when_it_can() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    world.publish("other", "/greet", |_| {});
+    let daemon = world.daemon();
+    let (lease, sizes) = looks(&world, &daemon).await;
+    for _ in 0..10 {
+        sizes.note(&picture(320));
+    }
+    next_told(&world, "terms-changed", 0).await;
+    let other = api::Stated::read([("cpus", "1")]).expect("valid");
+    let other = ready(&daemon, ServantRequest::new("other", "r2").stating(other)).await;
+    sizes.note(&picture(640));
+    let told = next_told(&world, "terms-refused", 0).await;
+    assert!(
+        told.contains("messages of aux.width=640") && told.contains("1 cores and"),
+        "{told}"
+    );
+    tokio::time::sleep(Duration::from_secs(300)).await;
+    assert_eq!(world.told("terms-refused").len(), 1);
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(0.5), "as it was");
+    let id = other.handle().id.clone();
+    daemon
+        .stop("it is in the way", |handle| handle.id == id)
+        .await;
+    next_told(&world, "terms-changed", 1).await;
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
+    // Larger than in any row: what it has stays.
+    sizes.note(&picture(2000));
+    let told = next_told(&world, "terms-refused", 1).await;
+    assert!(told.contains("aux.width=2000"), "{told}");
+    assert_eq!(enforced(&daemon, &lease).await.0, Some(1.5));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_refused_again_and_again_does_not_fill_the_journal() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| {
+        record.plan.caps.cpus = Some(0.5);
+    });
+    let daemon = world.daemon();
+    for _ in 0..100 {
+        let refused = daemon.ensure(stating("r1", &[("cpus", "1.5")]));
+        refused.err().expect("more than it may have");
+    }
+    assert_eq!(world.told("terms-refused").len(), 1);
+    for number in 0..100 {
+        let refused = daemon.ensure(stating(&format!("r{number}"), &[("cpus", "1.5")]));
+        refused.err().expect("more than it may have");
+    }
+    assert!(world.told("terms-refused").len() <= 20);
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    let refused = daemon.ensure(stating("r1", &[("cpus", "1.5")]));
+    refused.err().expect("more than it may have");
+    let told = world.told("terms-refused");
+    let more = told
+        .iter()
+        .filter(|told| told.contains("180 more refusals"));
+    assert_eq!(more.count(), 1, "{told:?}");
 }

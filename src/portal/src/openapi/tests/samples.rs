@@ -139,6 +139,7 @@ fn terms() -> Terms {
     };
     Terms {
         stated: [("/n".to_owned(), stated)].into(),
+        measured: [("width".to_owned(), "640".to_owned())].into(),
         class: some("default"),
         priority: 1,
         rows: vec![row()],

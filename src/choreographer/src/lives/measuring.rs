@@ -1,0 +1,107 @@
+//! Looks once a second at how large what robots send is, and gives their servants what that costs by the dictionary.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use api::Phase;
+use ros::sizes::Seen;
+use tokio::time::{Instant, MissedTickBehavior, interval};
+
+use super::Inner;
+use crate::Error;
+use crate::decide::measured::Input;
+use crate::handle::Handle;
+
+/// Between two looks.
+const LOOK: Duration = Duration::from_secs(1);
+/// Where a servant could not be given what its robot's messages cost, it is tried again.
+const AGAIN: Duration = Duration::from_secs(10);
+
+/// What is remembered of a servant.
+#[derive(Default)]
+struct Watched {
+    /// When the first message of each input was seen.
+    first: HashMap<String, Instant>,
+    /// As its terms were made of it.
+    known: Vec<Input>,
+    refused: Option<(Instant, String)>,
+}
+
+/// Looks, for ever.
+pub(crate) async fn watch(inner: Arc<Inner>) {
+    let mut watched: HashMap<String, Watched> = HashMap::new();
+    let mut looks = interval(LOOK);
+    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        looks.tick().await;
+        if inner.is_ending() {
+            return;
+        }
+        let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
+        watched.retain(|id, _| handles.iter().any(|handle| handle.id == *id));
+        for handle in handles {
+            if handle.life().phase != Phase::Ready || handle.is_ending() || handle.is_place() {
+                continue;
+            }
+            // Of what nobody wishes for there is nothing to look up.
+            let terms = handle.terms();
+            if terms.stated.is_empty() && terms.class.is_none() {
+                continue;
+            }
+            if let Some(reach) = handle.reach() {
+                let watched = watched.entry(handle.id.clone()).or_default();
+                look(&inner, &handle, watched, reach.inputs()).await;
+            }
+        }
+    }
+}
+
+async fn look(inner: &Inner, handle: &Handle, watched: &mut Watched, seen: Vec<(String, Seen)>) {
+    let now = Instant::now();
+    let inputs = watched.inputs(seen, now);
+    let again = watched.refused.as_ref();
+    let again = again.is_some_and(|(then, _)| now.saturating_duration_since(*then) >= AGAIN);
+    if watched.known == inputs && !again {
+        return;
+    }
+    let outcome = inner.measured(handle, &inputs).await;
+    watched.known = inputs;
+    let before = watched.refused.take();
+    match outcome {
+        Ok(()) => {}
+        Err(error @ Error::NotResized { .. }) => {
+            let why = error.to_string();
+            if before.is_none_or(|(_, told)| told != why) {
+                inner.report_not_resized(handle, &error);
+            }
+            watched.refused = Some((now, why));
+        }
+        // One that ends just now is told of elsewhere.
+        Err(error) => tracing::debug!("servant {} stays as it is: {error}", handle.id),
+    }
+}
+
+impl Watched {
+    /// What was seen, without what changes with each message and says nothing new.
+    fn inputs(&mut self, seen: Vec<(String, Seen)>, now: Instant) -> Vec<Input> {
+        use crate::decide::measured::{ENOUGH, PATIENCE};
+        let seen = seen.into_iter().filter(|(_, seen)| seen.count > 0);
+        seen.map(|(name, seen)| {
+            let first = *self.first.entry(name.clone()).or_insert(now);
+            let known = now.saturating_duration_since(first).min(PATIENCE);
+            Input {
+                known: match known < PATIENCE {
+                    true => Duration::ZERO,
+                    false => known,
+                },
+                seen: Seen {
+                    count: seen.count.min(ENOUGH),
+                    ..seen
+                },
+                name,
+            }
+        })
+        .collect()
+    }
+}
