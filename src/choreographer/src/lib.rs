@@ -431,7 +431,13 @@ impl Choreographer {
             revision: handle.revision.number,
             robot: handle.robot.clone(),
             phase: life.phase,
-            reason: life.reason(),
+            reason: life.reason().or_else(|| {
+                handle
+                    .watch_standing()
+                    .borrow()
+                    .as_ref()
+                    .map(ToString::to_string)
+            }),
             created: handle.created,
             connections: handle.connections(),
             idle_until: handle.idle_until(),

@@ -78,15 +78,20 @@ impl Calibrate {
             .curve
             .clone()
             .unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
+        check_place(&curve)?;
         let calibration = tokio::select! {
             measured = self.measure(client, format, body) => measured?,
             _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
         };
-        fs::write(&curve, curve::draw(&calibration))
-            .with_context(|| format!("cannot write the curve {}", curve.display()))?;
+        // What was measured is shown all the same.
+        let drawn = fs::write(&curve, curve::draw(&calibration))
+            .with_context(|| format!("cannot write the curve {}", curve.display()));
         match format {
             Format::Json => output::json_line(&calibration)?,
             Format::Table => print(&calibration, &curve)?,
+        }
+        if let Err(error) = drawn {
+            eprintln!("warning: {error:#}");
         }
         if calibration.rows.is_empty() {
             return Ok(());
@@ -273,6 +278,25 @@ async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result
     client.put::<Vec<Row>>(&path, &new).await.map(drop)
 }
 
+/// Refuses a place for the curve that cannot be written to, before minutes of measuring.
+fn check_place(curve: &Path) -> anyhow::Result<()> {
+    let new = !curve.exists();
+    fs::OpenOptions::new()
+        .append(true)
+        .create(true)
+        .open(curve)
+        .with_context(|| {
+            format!(
+                "the curve cannot be written to {}; name another place with --curve",
+                curve.display()
+            )
+        })?;
+    if new {
+        let _ = fs::remove_file(curve);
+    }
+    Ok(())
+}
+
 /// Whether whoever sits at the terminal says yes; nobody does where there is none.
 fn agrees(service: &str) -> anyhow::Result<bool> {
     if !std::io::stdin().is_terminal() {
@@ -314,6 +338,19 @@ fn rows(rows: &[Row]) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_curve_that_cannot_be_written_is_told_before_measuring() {
+        let place = tempfile::tempdir().expect("a directory");
+        let told = check_place(&place.path().join("gone/curve.svg")).expect_err("no directory");
+        assert!(format!("{told:#}").contains("--curve"), "{told:#}");
+        let fine = place.path().join("curve.svg");
+        check_place(&fine).expect("it can be written");
+        assert!(!fine.exists(), "nothing is left");
+        fs::write(&fine, "an earlier one").expect("written");
+        check_place(&fine).expect("it can be written");
+        assert_eq!(fs::read_to_string(&fine).expect("read"), "an earlier one");
+    }
 
     #[test]
     fn only_a_yes_is_a_yes() {

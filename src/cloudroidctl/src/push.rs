@@ -13,9 +13,9 @@ use hyper::Method;
 
 use crate::client::{self, Client, escaped};
 use crate::limits::{CapFlags, LimitFlags};
-use crate::output::Format;
+use crate::output::{self, Format};
 use crate::push::shared::SharedFlags;
-use crate::rollout::TermFlags;
+use crate::rollout::{self, TermFlags};
 use crate::services;
 use progress::Progress;
 
@@ -137,11 +137,22 @@ fn mapping(text: &str) -> Result<(String, String), String> {
 impl Push {
     /// Sends the package, shows what is done with it, and ends with the service's address and interface.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let rolls_out = self.rollout.terms().is_some();
         let service = self.publish(client, format).await?;
-        match format {
-            Format::Table => services::show(&service),
-            Format::Json => Ok(()),
+        if format == Format::Json {
+            return Ok(());
         }
+        services::show(&service)?;
+        // The first revision of a service has nothing to take the place of.
+        if rolls_out && service.revisions.len() > 1 {
+            let path = format!(
+                "/api/v1/services/{}/rollout",
+                escaped(&service.summary.name)
+            );
+            output::line("")?;
+            rollout::show(&client.get(&path).await?)?;
+        }
+        Ok(())
     }
 
     /// The same under a name that nobody else has, without the service's address and interface.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use api::rollout::{Arm, Rollout as Shown, RolloutOrder, RolloutTerms, Share};
+use api::rollout::{Arm, Rollout as Shown, RolloutOrder, RolloutState, RolloutTerms, Share};
 
 use crate::client::{Client, escaped};
 use crate::output::{self, Format, Table};
@@ -113,7 +113,44 @@ impl Rollout {
     }
 }
 
-fn show(rollout: &Shown) -> anyhow::Result<()> {
+/// What is to come, and what it waits for.
+fn next_in_words(rollout: &Shown) -> Vec<String> {
+    let terms = &rollout.terms;
+    let time = |seconds: f64| format!("{seconds} s");
+    let mut words = Vec::new();
+    if rollout.state == RolloutState::Canary {
+        words.push(format!(
+            "it is taken back when it is worse by more than {}, from {} requests of each revision on",
+            terms.bound, terms.samples
+        ));
+        let of = &rollout.of_candidate;
+        words.push(match terms.promote_after {
+            Some(after) if of.servants <= of.servants_failed => format!(
+                "it becomes the current revision {} after it has begun, once a servant of it serves a robot; none does yet",
+                time(after)
+            ),
+            Some(after) => format!(
+                "it becomes the current revision {} after it has begun, unless it is worse",
+                time(after)
+            ),
+            None => format!(
+                "it becomes the current revision when you say: cloudroidctl rollout {} promote",
+                rollout.service
+            ),
+        });
+    }
+    match (rollout.state, terms.deadline) {
+        (RolloutState::Canary | RolloutState::Draining, Some(deadline)) => words.push(format!(
+            "servants of other revisions end {} after it has become the current one",
+            time(deadline)
+        )),
+        _ => {}
+    }
+    words
+}
+
+/// Also what a push of a canary ends with.
+pub fn show(rollout: &Shown) -> anyhow::Result<()> {
     output::line(&format!(
         "{}, revision {} after {}: {}, {} ago: {}",
         rollout.service,
@@ -123,8 +160,12 @@ fn show(rollout: &Shown) -> anyhow::Result<()> {
         output::age(rollout.changed),
         rollout.reason
     ))?;
+    for words in next_in_words(rollout) {
+        output::line(&format!("  {words}"))?;
+    }
     let seen = [&rollout.of_stable, &rollout.of_candidate];
-    if seen.iter().all(|arm| **arm == Arm::default()) {
+    let is_canary = rollout.state == RolloutState::Canary;
+    if !is_canary && seen.iter().all(|arm| **arm == Arm::default()) {
         return Ok(());
     }
     let mut table = Table::new(&["REVISION", "SERVANTS", "REQUESTS", "MEDIAN", "95 %"]);

@@ -9,7 +9,7 @@ use api::{Limits, Measure};
 use crate::client::{Client, escaped};
 use crate::limits::LimitFlags;
 use crate::output::{self, Format, Table};
-use crate::stated::{StatedFlags, aux, query};
+use crate::stated::{StatedFlags, aux, once, query};
 
 /// What an SLA costs: list, set, remove and explain the rows of a service's dictionary.
 #[derive(Debug, clap::Args)]
@@ -40,13 +40,13 @@ struct Set {
     /// The service.
     service: String,
     /// Response time that is reached, such as 100ms.
-    #[arg(long, value_name = "TIME", value_parser = rrt)]
+    #[arg(long, value_name = "TIME", value_parser = rrt, allow_hyphen_values = true)]
     rrt: Option<f64>,
     /// Frames per second that are reached.
-    #[arg(long, value_name = "RATE", value_parser = fps)]
+    #[arg(long, value_name = "RATE", value_parser = fps, allow_hyphen_values = true)]
     fps: Option<f64>,
     /// Age of an output that is reached, such as 500ms.
-    #[arg(long, value_name = "TIME", value_parser = age)]
+    #[arg(long, value_name = "TIME", value_parser = age, allow_hyphen_values = true)]
     age: Option<f64>,
     /// Auxiliary parameter for which it holds: of a number up to this one; may be given several times.
     #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
@@ -106,7 +106,15 @@ impl Sla {
                 list(&verb.service, &rows, format)
             }
             Verb::Rm(verb) => {
-                let mut left = Vec::new();
+                let mut left: Vec<Row> = client.get(&path(&verb.service, "")).await?;
+                let gone = |row: &&i64| !left.iter().any(|one| one.id == **row);
+                if let Some(row) = verb.rows.iter().find(gone) {
+                    bail!(
+                        "{} has no row {row}; nothing was removed; see its rows with: cloudroidctl sla list {}",
+                        verb.service,
+                        verb.service
+                    );
+                }
                 for row in &verb.rows {
                     let path = path(&verb.service, &format!("/{row}"));
                     left = client.delete(&path).await?;
@@ -152,7 +160,7 @@ impl Set {
             id: 0,
             measure,
             value,
-            aux: self.aux.iter().cloned().collect(),
+            aux: once(&self.aux)?,
             limits,
             spread: spread.map(|text| spread_of(measure, text)).transpose()?,
             revision: None,

@@ -271,6 +271,11 @@ pub fn check(row: &Row) -> Result<(), String> {
                 "spread: p50 {p50} and p95 {p95} are no times or rates"
             ));
         }
+        if row.measure != Measure::Fps && p95 < p50 {
+            return Err(format!(
+                "spread: the 95th percentile, {p95}, is less than the median, {p50}; write the median first"
+            ));
+        }
     }
     Ok(())
 }

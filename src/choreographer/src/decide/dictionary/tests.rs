@@ -258,6 +258,16 @@ fn rows_that_cannot_be_are_refused_with_what_to_write() {
             }),
             "spread: p50 NaN",
         ),
+        (
+            with(|row| {
+                row.spread = Some(api::dictionary::Spread {
+                    p50: 0.2,
+                    p95: 0.1,
+                    requests: 1,
+                });
+            }),
+            "spread: the 95th percentile, 0.1, is less than the median, 0.2",
+        ),
     ] {
         assert!(refused.starts_with(words), "{refused}");
     }
