@@ -39,8 +39,9 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
         }
     });
     race.add("one pass", || {
-        let sum =
-            |sum: u64, one: &Facts<'_>| sum + one.quota + one.weight + one.used + one.promised;
+        let sum = |sum: u64, one: &Facts<'_>| {
+            sum + one.quota + one.weight + one.used.unwrap_or(0) + one.promised
+        };
         black_box(black_box(&pass).iter().fold(0, sum));
     });
     let times = race.run();
@@ -75,7 +76,7 @@ fn servant(id: &str, number: u64) -> Facts<'_> {
         weighed: false,
         quota: limit,
         weight: promised.max(100),
-        used: number * 37 % 400,
+        used: Some(number * 37 % 400),
         throttled: (number % 5) as f64 / 10.0,
         waited: 0.0,
         goal: (number % 3 == 1).then_some(Goal {

@@ -38,7 +38,9 @@ pub use limits::{Caps, Limits, Pressure, Usage};
 pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
 pub use rollout::Rollout;
-pub use servant::{BackOff, LogLine, NodeDown, Phase, Servant, Stopped, Stream, Terms};
+pub use servant::{
+    BackOff, LogLine, NodeDown, Phase, ResponseTimes, Servant, Stopped, Stream, Terms,
+};
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use size::Size;
 pub use sla::{Measure, Sla, Span, Stated};

@@ -89,6 +89,9 @@ pub struct Servant {
     /// Usage now; none while it is not running.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Usage>,
+    /// How long its robot's requests took lately; none where none was answered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub response: Option<ResponseTimes>,
     /// Host process ids of its nodes and their children.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
@@ -101,6 +104,20 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub down: Vec<NodeDown>,
+}
+
+/// How long requests took that were answered within the last ten seconds: calls of services, goals, and messages on topics where
+/// the service has one input that its output answers. Measured by the robot's stubs, and of a robot that speaks rosbridge
+/// between the bridge and the servant.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct ResponseTimes {
+    /// So many requests; at most the last 256.
+    pub requests: usize,
+    /// What half of them did not exceed, milliseconds.
+    pub p50_ms: f64,
+    /// What 19 of 20 of them did not exceed, milliseconds.
+    pub p95_ms: f64,
 }
 
 /// A node that failed and is not started again yet.

@@ -2,6 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
+use std::time::Instant;
 
 use parking_lot::Mutex;
 use ros::bus::{Bus, Message, PeerId, Qos, Subscription, WireType};
@@ -10,7 +11,8 @@ use tokio::task::AbortHandle;
 
 use crate::Metrics;
 use crate::sample::{Sample, TopicTypes};
-use crate::shared::Shared;
+use crate::shared::{Heard, Shared};
+use crate::topic_requests::TopicRequests;
 
 /// Who listens to a topic: a client's queue, a goal waiting for its result.
 pub(crate) trait Listener: Send + Sync {
@@ -25,8 +27,12 @@ pub(crate) struct Fanout {
     pub(crate) topic: String,
     shared: Weak<Shared>,
     types: Arc<TopicTypes>,
+    /// What its messages answer, if anything.
+    answers: Option<Arc<TopicRequests>>,
     state: Mutex<State>,
     pump: OnceLock<AbortHandle>,
+    /// None of a topic of the bridge itself.
+    _heard: Option<Heard>,
 }
 
 #[derive(Default)]
@@ -78,8 +84,10 @@ impl Fanout {
             topic: topic.to_owned(),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
+            answers: shared.answers_on(topic),
             state: Mutex::default(),
             pump: OnceLock::new(),
+            _heard: Some(shared.hear_nodes()),
         });
         // Any digest: a publisher with another definition is read by its own, or its listeners are told of it; a
         // connection refused for it would only be silence.
@@ -103,8 +111,10 @@ impl Fanout {
             topic: topic.to_owned(),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
+            answers: None,
             state: Mutex::default(),
             pump: OnceLock::new(),
+            _heard: None,
         })
     }
 
@@ -200,6 +210,18 @@ impl Fanout {
             .retain(|sample| sample.publisher != *publisher);
     }
 
+    /// Tells how long a request took that this message answers. A latched message tells a state, and answers nothing.
+    fn answers(&self, message: &Message) {
+        let Some(requests) = self.answers.as_ref().filter(|_| !message.latching) else {
+            return;
+        };
+        let of = self.types.find(&message.wire_type).ok();
+        let took = of.and_then(|of| requests.answered(&of, &message.bytes, Instant::now()));
+        if let (Some(took), Some(shared)) = (took, self.shared.upgrade()) {
+            shared.options.called.tell(Some(took));
+        }
+    }
+
     fn fail(&self, reason: String) {
         let listeners = {
             let mut state = self.state.lock();
@@ -254,6 +276,9 @@ async fn pump(
         metrics.received.add(1);
         // From an action of another client.
         let local = message.publisher.node() == own;
+        if !local {
+            fanout.answers(&message);
+        }
         fanout.deliver(message, local);
         let now_dropped = subscription.dropped.get();
         if now_dropped > dropped {

@@ -50,6 +50,7 @@ mod shared;
 mod tf;
 mod topic_publisher;
 mod topic_queue;
+mod topic_requests;
 mod topics;
 mod waiting;
 

@@ -53,6 +53,8 @@ metrics! {
     bytes_out => "cloudroid_bridge_bytes_out_total",
     /// Messages that clients published.
     published => "cloudroid_bridge_published_total",
+    /// Messages that clients published while one of them listened to a topic of the nodes.
+    asked => "cloudroid_bridge_asked_total",
     /// Messages from ROS taken up for clients.
     received => "cloudroid_bridge_received_total",
     /// Messages that were encoded; fewer than sent where subscribers share an encoding.

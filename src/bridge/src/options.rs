@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use budget::Budget;
 use bytes::Bytes;
+use qos::Pair;
 use ros::codec::NonFinite;
 use rosbridge::{FragmentLimits, Level};
 
@@ -63,11 +64,13 @@ pub struct BridgeOptions {
     pub budget: Budget,
     /// A WebSocket message that was begun and is not complete after this time closes its connection (1008).
     pub unfinished: Duration,
-    /// Who hears of clients' calls of the servant's services.
+    /// Who hears of clients' requests to the servant: calls of its services, goals, and messages of the input of `pair`.
     pub called: Called,
+    /// Topics on which clients ask and the servant answers, where there is one such pair.
+    pub pair: Option<Pair>,
 }
 
-/// Hears how long each call of a service of the servant took; none where it failed.
+/// Hears how long each request of a client to the servant took, from the bridge to the servant and back; none where it failed.
 #[derive(Clone, Default)]
 pub struct Called(Option<Arc<Listener>>);
 
@@ -79,7 +82,8 @@ impl Called {
         Called(Some(Arc::new(listener)))
     }
 
-    pub(crate) fn tell(&self, took: Option<Duration>) {
+    /// Tells of one request.
+    pub fn tell(&self, took: Option<Duration>) {
         if let Some(listener) = &self.0 {
             listener(took);
         }
@@ -125,6 +129,7 @@ impl Default for BridgeOptions {
             budget: Budget::unlimited(),
             unfinished: Duration::from_secs(300),
             called: Called::default(),
+            pair: None,
         }
     }
 }

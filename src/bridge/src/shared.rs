@@ -1,7 +1,7 @@
 //! What a bridge's sessions, topics and services have in common.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
@@ -18,6 +18,7 @@ use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
 use crate::tf::{self, Republisher};
 use crate::topic_publisher::TopicPublisher;
+use crate::topic_requests::TopicRequests;
 use crate::{BridgeOptions, Metrics, SessionOptions};
 
 /// What the bridge's parts need of it.
@@ -32,12 +33,25 @@ pub(crate) struct Shared {
     pub(crate) republisher: Republisher,
     /// How large what clients send to nodes is.
     pub(crate) inputs: Inputs,
+    /// Requests that are made by topic.
+    requests: Option<Arc<TopicRequests>>,
     fanouts: Mutex<HashMap<String, Weak<Fanout>>>,
+    /// Topics of nodes that somebody listens to.
+    heard: Arc<AtomicUsize>,
     /// What clients publish on, by topic.
     topic_publishers: Mutex<HashMap<String, Vec<Weak<TopicPublisher>>>>,
     clients: Mutex<Clients>,
     pub(crate) sessions: watch::Sender<SessionCount>,
     numbers: AtomicU64,
+}
+
+/// Counts a topic of the nodes that is listened to.
+pub(crate) struct Heard(Arc<AtomicUsize>);
+
+impl Drop for Heard {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 #[derive(Default)]
@@ -56,6 +70,7 @@ impl Shared {
     ) -> Arc<Self> {
         presence::define(&registry);
         tf::define(&registry);
+        let requests = options.pair.as_ref().map(TopicRequests::of);
         Arc::new(Self {
             bus,
             registry,
@@ -66,7 +81,9 @@ impl Shared {
             presence: Presence::default(),
             republisher: Republisher::default(),
             inputs: Inputs::default(),
+            requests: requests.map(Arc::new),
             fanouts: Mutex::default(),
+            heard: Arc::default(),
             topic_publishers: Mutex::default(),
             clients: Mutex::default(),
             sessions: watch::Sender::default(),
@@ -163,6 +180,17 @@ impl Shared {
         self.registry.message(name).ok().filter(|_| !taken)
     }
 
+    /// Whether a client listens to a topic of the nodes.
+    pub(crate) fn hears_nodes(&self) -> bool {
+        self.heard.load(Ordering::Relaxed) > 0
+    }
+
+    /// One more topic of the nodes is listened to, until what is given is dropped.
+    pub(crate) fn hear_nodes(&self) -> Heard {
+        self.heard.fetch_add(1, Ordering::Relaxed);
+        Heard(Arc::clone(&self.heard))
+    }
+
     /// Tells who listens that somebody has come or gone.
     pub(crate) fn report_presence(&self) {
         for topic in presence::TOPICS {
@@ -250,6 +278,18 @@ impl Shared {
         {
             fanouts.remove(&fanout.topic);
         }
+    }
+
+    /// The requests that messages on this topic are, if any.
+    pub(crate) fn requests_on(&self, input: &str) -> Option<Arc<TopicRequests>> {
+        let requests = self.requests.as_ref();
+        requests.filter(|it| it.is_input(input)).cloned()
+    }
+
+    /// The requests that messages on this topic answer, if any.
+    pub(crate) fn answers_on(&self, output: &str) -> Option<Arc<TopicRequests>> {
+        let requests = self.requests.as_ref();
+        requests.filter(|it| it.is_output(output)).cloned()
     }
 
     /// A number that nothing else of this bridge has.

@@ -14,6 +14,7 @@ use tokio::sync::watch;
 use tokio::time::timeout_at;
 
 use crate::shared::Shared;
+use crate::topic_requests::TopicRequests;
 
 /// Kept while the topic is being advertised.
 const WARM: Bounds = Bounds {
@@ -30,6 +31,8 @@ pub(crate) struct TopicPublisher {
     sizes: Arc<Sizes>,
     /// Tells this topic_publisher's latched message from others'.
     pub(crate) id: PeerId,
+    /// What its messages are where they are requests.
+    requests: Option<Arc<TopicRequests>>,
     shared: Arc<Shared>,
     /// The last message, where it latches.
     last: Mutex<Option<Bytes>>,
@@ -83,6 +86,7 @@ impl TopicPublisher {
             latch,
             wire_type: Arc::new(wire_type.clone()),
             id: PeerId::new(format!("client#{}", shared.next_number()), 0),
+            requests: shared.requests_on(topic),
             shared: shared.clone(),
             last: Mutex::default(),
             given_up: Mutex::default(),
@@ -98,6 +102,9 @@ impl TopicPublisher {
     pub(crate) fn publish(self: &Arc<Self>, bytes: Bytes) {
         self.shared.metrics.published.add(1);
         self.sizes.note(&bytes);
+        if self.shared.hears_nodes() {
+            self.shared.metrics.asked.add(1);
+        }
         if self.latch {
             *self.last.lock() = Some(bytes.clone());
         }
@@ -118,7 +125,13 @@ impl TopicPublisher {
             tokio::spawn(settle(self.clone(), subscribers, deadline));
         }
         match &mut *state {
-            State::Live { publisher, .. } => publisher.publish(bytes),
+            State::Live { publisher, .. } => {
+                // Not of what waits for connections: that is no time of the servant.
+                if let Some(requests) = &self.requests {
+                    requests.asked(&self.message_type, &bytes, Instant::now());
+                }
+                publisher.publish(bytes);
+            }
             State::Failed => {}
             State::Warming { waiting, .. } => self.shared.metrics.lost(waiting.push(bytes)),
         }

@@ -22,6 +22,7 @@
 //! | [`group`] | how many servants answer the robots that share a service | their requests, how long these take, bounds, the time |
 //! | [`back_off`] | when a servant that failed may be started again | how often in a row, how long it was ready |
 //! | [`rollout`] | which robots a new revision serves first, when it is taken back or promoted | its terms, what was seen of both revisions |
+//! | [`requests`] | on which topics robots ask and are answered | the interface |
 //! | [`hung`] | whether nodes hang | what went to them and came from them, T_max |
 //! | [`warm_pool`] | how many containers each service has ahead, in which the nodes run, which end | what is published, what was asked for last, the forecast, a budget |
 //! | [`forecast`] | how many robots are about to ask | when robots asked |
@@ -46,6 +47,7 @@ pub(crate) mod lifetime;
 pub(crate) mod measured;
 pub(crate) mod nodes;
 pub(crate) mod placement;
+pub(crate) mod requests;
 pub(crate) mod rollout;
 mod shares;
 mod sketch;

@@ -1,5 +1,6 @@
 //! A servant as everybody but its driver sees it.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -92,6 +93,8 @@ pub struct Handle {
     /// Its nodes are started and ended by a robot's stubs.
     linked: AtomicBool,
     down: Mutex<Vec<api::NodeDown>>,
+    /// How often its nodes were started, as far as that was seen.
+    starts: Mutex<HashMap<String, u64>>,
     end: CancellationToken,
     end_reason: OnceLock<String>,
     container: OnceLock<Arc<dyn servant::engine::Servant>>,
@@ -128,6 +131,7 @@ impl Handle {
             idle_until: AtomicU64::new(0),
             linked: AtomicBool::new(false),
             down: Mutex::default(),
+            starts: Mutex::default(),
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
             container: OnceLock::new(),
@@ -256,6 +260,19 @@ impl Handle {
             failures,
             again: store::now() + after.as_millis() as u64,
         }));
+    }
+
+    /// How often the node was started, as far as that was seen; without a name: all of them.
+    pub(crate) fn starts(&self, node: &str) -> u64 {
+        let starts = self.starts.lock();
+        match node {
+            "" => starts.values().sum(),
+            node => starts.get(node).copied().unwrap_or_default(),
+        }
+    }
+
+    pub(crate) fn note_start(&self, node: &str) {
+        *self.starts.lock().entry(node.to_owned()).or_default() += 1;
     }
 
     /// Asks for its end. The first reason stays.

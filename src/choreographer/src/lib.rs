@@ -55,6 +55,7 @@ use reach::{Material, Opener, Pace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 pub use decide::Amount;
 pub use decide::admission::{Place, Refused};
@@ -417,6 +418,7 @@ impl Choreographer {
 
     /// A servant as the API shows it.
     pub async fn describe(&self, handle: &Handle) -> api::Servant {
+        let inner = &self.inner;
         let life = handle.life();
         let reach = handle.reach();
         let running = runs(life.phase);
@@ -424,7 +426,7 @@ impl Choreographer {
         let enforced = container.as_ref().map(|container| container.enforced());
         let pids = container
             .as_ref()
-            .map(|container| self.inner.opener.processes(container.id()));
+            .map(|container| inner.opener.processes(container.id()));
         api::Servant {
             id: handle.id.clone(),
             service: handle.service().to_owned(),
@@ -449,6 +451,7 @@ impl Choreographer {
                 .map_or(0, |enforced| enforced.cgroup_version),
             enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
             usage: usage(handle).await,
+            response: inner.recent.shown(&handle.id, Instant::now().into_std()),
             pids: pids.unwrap_or_default(),
             dropped: reach.map_or(0, |reach| reach.dropped()),
             down: handle.down(),

@@ -14,7 +14,7 @@ mod lifetime;
 pub(crate) mod limits;
 pub(crate) mod measuring;
 mod nodes;
-mod reaching;
+pub(crate) mod reaching;
 mod recent;
 pub(crate) mod rollouts;
 mod starting;

@@ -1,6 +1,6 @@
 //! `servants`: who works for which robot.
 
-use api::{BackOff, Pressure, Servant, Size};
+use api::{BackOff, Pressure, ResponseTimes, Servant, Size};
 
 use crate::client::Client;
 use crate::output::{self, Format, Table};
@@ -40,6 +40,7 @@ impl Servants {
             "CPU",
             "THROTTLED",
             "PRESSURE",
+            "RESPONSE",
             "LIMITS",
             "STATED",
         ]);
@@ -64,6 +65,7 @@ impl Servants {
                 usage
                     .map(|usage| usage.pressure.map_or("unknown".to_owned(), pressure))
                     .unwrap_or_default(),
+                servant.response.map(response).unwrap_or_default(),
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
                 output::terms(servant),
             ]);
@@ -84,6 +86,11 @@ impl Servants {
         }
         Ok(())
     }
+}
+
+/// What half of the requests of the last seconds did not exceed, and what 19 of 20 did not.
+fn response(times: ResponseTimes) -> String {
+    format!("{:.0}, {:.0} ms", times.p50_ms, times.p95_ms)
 }
 
 /// What some of it waits for, if for anything.

@@ -508,6 +508,7 @@ mod tests {
                 enforced: None,
                 cgroup_version: 2,
                 usage: Some(api::Usage::default()),
+                response: None,
                 pids: Vec::new(),
                 dropped: 0,
                 down: Vec::new(),

@@ -117,7 +117,7 @@ pub struct ReachOptions {
 pub struct Flow {
     /// The node of a link; nothing: all nodes that rosbridge clients use.
     pub node: String,
-    /// Messages and calls that were given to them.
+    /// Messages, given while somebody listened, and calls.
     pub inputs: u64,
     /// Messages and answers that came of them.
     pub outputs: u64,

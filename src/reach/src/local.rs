@@ -165,7 +165,8 @@ impl Reach for LocalReach {
         let metrics = self.bridge.metrics();
         let clients = Flow {
             node: String::new(),
-            inputs: metrics.published.get() + metrics.calls.get(),
+            // What nobody listens to the answers of need not be answered.
+            inputs: metrics.asked.get() + metrics.calls.get(),
             outputs: metrics.received.get() + metrics.answers.get(),
         };
         let mut flows = self.hub.flows();

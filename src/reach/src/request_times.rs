@@ -1,4 +1,4 @@
-//! How long requests of robots take, and in which phase: histograms by service, for `/metrics`. Robots tell each request
+//! How long requests of robots take, and in which phase: histograms by service, for `/metrics`. Each request is told
 //! once; a row for each of them would grow without end, one for each service does not.
 
 use std::collections::BTreeMap;
@@ -70,7 +70,7 @@ impl RequestTimes {
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "# HELP cloudroid_request_seconds Time from asked to answered by the cloud, as robots with an SLA tell it.\n\
+            "# HELP cloudroid_request_seconds Time from asked to answered by the cloud: as stubs with an SLA tell it, and between the bridge and the servant of robots that speak rosbridge.\n\
              # TYPE cloudroid_request_seconds histogram"
         );
         for (name, service) in &*services {

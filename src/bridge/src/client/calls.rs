@@ -110,14 +110,11 @@ impl Client {
 
     async fn answer(&self, call: &Call) -> Result<Frame, String> {
         self.serves_itself(&call.service).await;
-        let served = self
-            .shared
-            .bus
-            .graph()
-            .borrow()
-            .services
-            .contains_key(&call.service);
-        if !served && let Some(answer) = self.answer_ourselves(call).await {
+        let bus = &self.shared.bus;
+        let server = bus.graph().borrow().services.get(&call.service).cloned();
+        if server.is_none()
+            && let Some(answer) = self.answer_ourselves(call).await
+        {
             return answer;
         }
         let service_type = self
@@ -162,8 +159,11 @@ impl Client {
             .bus
             .call(&call.service, request, call.timeout)
             .await;
-        let took = response.is_ok().then(|| asked.elapsed());
-        self.shared.options.called.tell(took);
+        // What the robot's own clients serve says nothing of the servant.
+        if server.is_none_or(|server| server != bus.node()) {
+            let took = response.is_ok().then(|| asked.elapsed());
+            self.shared.options.called.tell(took);
+        }
         let response = response.map_err(|error| error.to_string())?;
         self.response_frame(call, def.as_deref().ok(), &response)
     }

@@ -10,6 +10,8 @@ mod manners;
 mod memory;
 #[path = "publishing.rs"]
 mod publishing;
+#[path = "requests.rs"]
+mod requests;
 #[path = "resuming.rs"]
 mod resuming;
 #[path = "rosapi.rs"]

@@ -14,6 +14,8 @@ mod memory;
 mod parameters;
 #[path = "publishing.rs"]
 mod publishing;
+#[path = "requests.rs"]
+mod requests;
 #[path = "resuming.rs"]
 mod resuming;
 #[path = "rosapi.rs"]

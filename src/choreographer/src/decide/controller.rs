@@ -106,8 +106,8 @@ pub struct Facts<'a> {
     pub quota: u64,
     /// `cpu.weight` as it is.
     pub weight: u64,
-    /// Cores used since the last look.
-    pub used: u64,
+    /// Cores used since the last look, where that is known.
+    pub used: Option<u64>,
     /// Part of the time since the last look in which it wanted to run and had used up its `cpu.max`.
     pub throttled: f64,
     /// Part of the last ten seconds in which something in it waited for a core.
@@ -163,14 +163,19 @@ impl Facts<'_> {
         }
     }
 
-    /// What it needs, as far as can be seen from what it uses.
+    /// What it needs, as far as can be seen from what it uses; all that it has, where that is not known.
     fn needs(&self) -> u64 {
-        self.used + self.used / HEADROOM + LEAST
+        match self.used {
+            Some(used) => used + used / HEADROOM + LEAST,
+            None => self.quota,
+        }
     }
 
     /// More cores would be used.
     fn is_held_up(&self) -> bool {
-        self.throttled >= HINDERED || self.waited >= HINDERED || self.needs() >= self.quota
+        self.throttled >= HINDERED
+            || self.waited >= HINDERED
+            || (self.used.is_some() && self.needs() >= self.quota)
     }
 
     /// It would not be near with so little: it uses no more, or its requests, computed so much longer, are still in time.
@@ -259,15 +264,12 @@ fn quotas(
     let needed = content.fold(0u64, |sum, (one, _)| {
         sum.saturating_add(one.needs().min(one.quota))
     });
-    let for_near = share(
-        cores.saturating_sub(needed),
-        all(),
-        Role::Near,
-        |one| match one.is_near() && one.is_held_up() {
-            true => wish(one),
-            false => one.needs().min(one.quota).max(one.promised),
-        },
-    );
+    let beyond = cores.saturating_sub(needed);
+    let near = |one: &Facts<'_>| match one.is_near() && one.is_held_up() {
+        true => wish(one),
+        false => one.needs().min(one.quota).max(one.promised),
+    };
+    let for_near = share(beyond, all(), Role::Near, near);
     let given = all()
         .zip(&for_near)
         .filter(|((_, role), _)| **role == Role::Near);
@@ -276,10 +278,16 @@ fn quotas(
     let for_rest = share(left, all(), Role::Rest, |one| one.needs().min(one.limit));
     all()
         .zip(for_near.into_iter().zip(for_rest))
-        .map(|((one, role), (near, rest))| match role {
-            // What it has it keeps while it is near: what others need more is theirs by weight.
-            Role::Near => near.max(one.quota.min(one.ceiling)).max(one.promised),
+        .map(|((one, role), (_, rest))| match role {
+            // What it has it keeps while it is near: what others need more is theirs by weight. So it is between those that
+            // are near: each is bounded by what the others do not need, and none by its share of that, since one that is
+            // throttled waits for the rest of a period although cores are idle.
+            Role::Near => near(one)
+                .min(beyond)
+                .max(one.quota.min(one.ceiling))
+                .max(one.promised),
             Role::Content => back(one, now),
+            Role::Rest if one.used.is_none() => one.quota.max(one.promised),
             // At most halved at once.
             Role::Rest => rest
                 .max(one.quota / 2)

@@ -14,6 +14,8 @@ pub struct Flow {
     pub inputs: u64,
     /// Messages and answers that they gave.
     pub outputs: u64,
+    /// How often one of them was started.
+    pub starts: u64,
 }
 
 /// What was seen of a flow so far.
@@ -21,6 +23,8 @@ pub struct Flow {
 pub struct Watched {
     /// As it was when there was an output last.
     answered: Flow,
+    /// Outputs before one of them was started last, as far as that was seen.
+    outputs_before: u64,
     /// When the first input was seen that came after it.
     since: Option<Instant>,
     /// It was told that they hang, and there was no output since.
@@ -37,7 +41,8 @@ pub struct Hung {
 }
 
 /// Looks at a flow again: what is to be remembered, and whether it is to be told that the nodes hang, which it is once until
-/// there is an output again. Nodes that never had an output may have none.
+/// there is an output again. Nodes that never had an output may have none; nor do those that were started again and still load
+/// what they need.
 pub fn look(
     before: Option<Watched>,
     flow: Flow,
@@ -46,17 +51,25 @@ pub fn look(
 ) -> (Watched, Option<Hung>) {
     let fresh = Watched {
         answered: flow,
+        outputs_before: match before {
+            Some(before) if before.answered.starts != flow.starts => flow.outputs,
+            // Those of other nodes, or of a bridge that was opened anew.
+            Some(before) if before.outputs_before <= flow.outputs => before.outputs_before,
+            _ => 0,
+        },
         since: None,
         told: false,
     };
     let same = |before: &Watched| {
-        before.answered.outputs == flow.outputs && before.answered.inputs <= flow.inputs
+        before.answered.outputs == flow.outputs
+            && before.answered.inputs <= flow.inputs
+            && before.answered.starts == flow.starts
     };
     let Some(mut watched) = before.filter(same) else {
         return (fresh, None);
     };
     let inputs = flow.inputs - watched.answered.inputs;
-    if inputs == 0 || flow.outputs == 0 {
+    if inputs == 0 || flow.outputs == watched.outputs_before {
         return (watched, None);
     }
     let since = now - *watched.since.get_or_insert(now);
@@ -82,6 +95,7 @@ mod tests {
             let flow = Flow {
                 inputs: *inputs,
                 outputs: *outputs,
+                starts: 0,
             };
             let now = begun + Duration::from_secs(second as u64);
             let (next, hung) = look(watched, flow, PATIENCE, now);
@@ -111,11 +125,43 @@ mod tests {
             assert_eq!(told(flows), expected, "{flows:?}");
         }
         let begun = Instant::now();
-        let flow = |inputs| Flow { inputs, outputs: 1 };
+        let flow = |inputs| Flow {
+            inputs,
+            outputs: 1,
+            starts: 0,
+        };
         let (watched, _) = look(None, flow(1), Duration::ZERO, begun);
         let (watched, _) = look(Some(watched), flow(9), Duration::ZERO, begun);
         let (_, hung) = look(Some(watched), flow(9), Duration::ZERO, begun + LEAST / 2);
         assert_eq!(hung, None, "not for so short a time");
+    }
+
+    #[test]
+    fn a_node_that_was_started_again_may_take_its_time() {
+        let begun = Instant::now();
+        let mut watched = None;
+        let mut hangs = |second: u32, inputs, outputs, starts| {
+            let flow = Flow {
+                inputs,
+                outputs,
+                starts,
+            };
+            let now = begun + Duration::from_secs(second.into());
+            let (next, hung) = look(watched, flow, PATIENCE, now);
+            watched = Some(next);
+            hung.is_some()
+        };
+        assert!(!hangs(0, 9, 9, 1));
+        assert!(!hangs(1, 19, 9, 1));
+        // It has crashed, and loads its model while inputs go on.
+        for second in 2..60 {
+            assert!(!hangs(second, u64::from(second) * 10, 9, 2), "{second}");
+        }
+        assert!(!hangs(60, 600, 10, 2), "it answers");
+        for second in 61..64 {
+            assert!(!hangs(second, u64::from(second) * 10, 10, 2), "{second}");
+        }
+        assert!(hangs(64, 640, 10, 2), "now it hangs");
     }
 
     proptest! {

@@ -14,6 +14,7 @@ use store::NewEvent;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::Inner;
+use super::limits::PLAIN_WEIGHT;
 use crate::decide::controller::{Facts, Goal, History, Outcome, control};
 use crate::decide::stall::{Reading, Stall};
 use crate::engine_limits;
@@ -53,7 +54,7 @@ struct Looked {
     asked: Limits,
     /// As they are in force.
     enforced: servant::spec::Limits,
-    used: u64,
+    used: Option<u64>,
     throttled: f64,
     waited: f64,
     goal: Option<Goal>,
@@ -158,13 +159,13 @@ impl Watch {
                 rates.and_then(|(usage, (then, before))| rates_of(before, usage, now - *then));
             let pressure = usage.as_ref().and_then(|usage| usage.pressure);
             seen.usage = usage.map(|usage| (now, usage));
-            let (used, throttled) = rates.unwrap_or_default();
+            let (used, throttled) = rates.unzip();
             all.push(Looked {
                 limits: handle.limits(),
                 asked: handle.asked(),
                 enforced: container.enforced().limits,
                 used,
-                throttled,
+                throttled: throttled.unwrap_or_default(),
                 waited: pressure.map_or(0.0, |pressure| pressure.cpu / 100.0),
                 goal,
                 history: seen.history,
@@ -223,7 +224,7 @@ impl Looked {
             id: &self.handle.id,
             promised,
             limit,
-            plain: self.limits.cpu_weight.unwrap_or(100),
+            plain: self.limits.cpu_weight.unwrap_or(PLAIN_WEIGHT),
             // Who was promised nothing has what the operator allows those.
             ceiling: match promised {
                 0 => limit,
@@ -231,7 +232,7 @@ impl Looked {
             },
             weighed: self.asked.cpu_weight.is_some(),
             quota: self.enforced.cpus.map_or(limit, millicpus),
-            weight: self.enforced.cpu_weight.unwrap_or(100),
+            weight: self.enforced.cpu_weight.unwrap_or(PLAIN_WEIGHT),
             used: self.used,
             throttled: self.throttled,
             waited: self.waited,

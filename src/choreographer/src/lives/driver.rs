@@ -14,7 +14,7 @@ use super::lifetime::{interface_there, unneeded};
 use super::nodes::Nodes;
 use super::waiting::Permit;
 use super::warm_pool::{self, Warm};
-use super::{Inner, group, starting};
+use super::{Inner, group, limits, starting};
 use crate::decide::admission::Ask;
 use crate::handle::{Failure, Handle};
 use crate::with_last_words;
@@ -147,6 +147,9 @@ async fn live(
     };
     handle.set_container(Arc::clone(&container));
     handle.set_phase(Phase::Created);
+    if !fresh {
+        limits::take_back(inner, handle, &*container).await;
+    }
     starting::report_unmet(inner, handle, &container);
     let mut nodes = Nodes::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, reach, &mut nodes, fresh));

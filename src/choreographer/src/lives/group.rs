@@ -23,6 +23,7 @@ use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
 use super::driver::{self, Beginning};
+use super::reaching::Measures;
 use super::{Inner, Servants};
 use crate::decide::group::{Facts, Since, Step, look};
 use crate::decide::placement::Placement;
@@ -232,6 +233,7 @@ async fn seated(inner: &Inner, handle: &Handle, shares: &Shares) -> Failure {
     };
     let options = BridgeOptions {
         budget: inner.memory.servant(&handle.id),
+        called: Measures::of(inner, &handle.revision, &handle.id).called(),
         ..inner.options.bridge.clone()
     };
     handle.set_reach(Arc::new(Seat::new(&shares.group, registry, options)));

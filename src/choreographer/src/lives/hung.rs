@@ -45,6 +45,7 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                 let seen = Flow {
                     inputs: flow.inputs,
                     outputs: flow.outputs,
+                    starts: handle.starts(&key.1),
                 };
                 let before = watched.remove(&key);
                 let (after, hung) = look(before, seen, patience, Instant::now().into_std());

@@ -1,6 +1,8 @@
 //! Changes the limits of a servant while it works: because the operator says so, or because its robot states something else
 //! than before.
 
+use std::time::Duration;
+
 use api::{Limits, Size, Stated, Terms};
 use servant::engine::Servant;
 
@@ -14,7 +16,12 @@ use crate::handle::Handle;
 use crate::limits::limits_of;
 use crate::{Choreographer, Error, ServantRequest, engine_limits};
 use store::NewEvent;
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
+
+/// For one servant to take other limits.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// `cpu.weight` where nobody has asked for one.
+pub(super) const PLAIN_WEIGHT: u64 = 100;
 
 /// Why a servant is not resized.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -251,6 +258,55 @@ pub(super) async fn fit(
         container.set_limits(engine_limits(&change)).await?;
     }
     Ok(())
+}
+
+/// Gives a servant that was adopted what it was promised, where an earlier daemon's controller has moved its cores and this one
+/// moves none.
+pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Servant) {
+    let (has, wanted) = (container.enforced().limits, handle.limits());
+    // What this host cannot limit was not moved.
+    if inner.options.controller || has.cpus.is_none() {
+        return;
+    }
+    let _turn = handle.limits_turn().await;
+    let before = Limits {
+        cpus: has.cpus,
+        cpu_weight: has.cpu_weight,
+        ..Limits::default()
+    };
+    let change = changed(
+        &before,
+        &Limits {
+            cpus: wanted.cpus,
+            cpu_weight: wanted.cpu_weight.or(has.cpu_weight.and(Some(PLAIN_WEIGHT))),
+            ..Limits::default()
+        },
+    );
+    if change == Limits::default() {
+        return;
+    }
+    let (id, about) = (&handle.id, handle.about());
+    match timeout(PATIENCE, container.set_limits(engine_limits(&change))).await {
+        Ok(Ok(_)) => {
+            let message = format!(
+                "servant {id} of {} for {}: back from {} to {}: no controller moves cores any more",
+                handle.service(),
+                handle.robot,
+                in_words(&before),
+                in_words(&change),
+            );
+            inner.journal.info("cores-moved", &message, &about);
+        }
+        Ok(Err(error)) => {
+            let message = format!("servant {id} keeps cores that a controller has moved: {error}");
+            inner.journal.warning("limits-unmet", &message, &about);
+        }
+        Err(_) => {
+            let message =
+                format!("servant {id} keeps cores that a controller has moved: it does not answer");
+            inner.journal.warning("limits-unmet", &message, &about);
+        }
+    }
 }
 
 /// Those of `after` that are not so before: some, such as a cpuset on cgroup v1, cannot be set again.

@@ -140,7 +140,7 @@ impl<'a> Nodes<'a> {
                     message,
                 });
             }
-            NodeEvent::Started { .. } => return,
+            NodeEvent::Started { node } => return self.handle.note_start(&node),
         };
         let respawns = self.handle.revision.plan.nodes.iter();
         if respawns

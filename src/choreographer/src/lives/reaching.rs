@@ -1,7 +1,6 @@
 //! Reaching what runs in a container: what is recorded of its revision, and what it tells of itself.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use api::Level;
 use bridge::{BridgeOptions, Called};
@@ -10,10 +9,12 @@ use link::control::Request;
 use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
 use servant::engine::Servant;
 use store::{Journal, NewEvent, RevisionRecord};
+use tokio::time::Instant;
 
 use super::Inner;
 use super::recent::Recent;
 use super::rollouts::Rollouts;
+use crate::decide::requests::asked_by_topic;
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
@@ -22,10 +23,12 @@ pub(crate) async fn open(
     container: &Arc<dyn Servant>,
 ) -> Result<Arc<dyn Reach>, reach::Error> {
     let memory = &inner.memory;
+    let measures = Measures::of(inner, revision, container.id());
     let options = ReachOptions {
         ros: revision.flavour.ros.bus(),
         bridge: BridgeOptions {
-            called: called(inner, revision),
+            called: measures.called(),
+            pair: asked_by_topic(&revision.interface),
             ..inner.options.bridge.clone()
         },
         grace: inner.options.grace,
@@ -37,9 +40,7 @@ pub(crate) async fn open(
         revision: Arc::clone(revision),
         catalogue: Arc::clone(&inner.catalogue),
         journal: inner.journal.clone(),
-        request_times: Arc::clone(&inner.request_times),
-        recent: Arc::clone(&inner.recent),
-        rollouts: Arc::clone(&inner.rollouts),
+        measures,
     };
     let recorded = Box::pin(recorded(inner, revision));
     let opener = &inner.opener;
@@ -48,14 +49,51 @@ pub(crate) async fn open(
         .await
 }
 
-/// Counts the calls of rosbridge's clients.
-fn called(inner: &Inner, revision: &RevisionRecord) -> Called {
-    let rollouts = Arc::clone(&inner.rollouts);
-    let (service, number) = (revision.service.clone(), revision.number);
-    Called::by(move |took| {
-        let millis = took.map(|took| took.as_secs_f64() * 1e3);
-        rollouts.note_request(&service, number, millis);
-    })
+/// Where the times of requests to one servant are noted: for the controller, rollouts, and whoever looks.
+pub(crate) struct Measures {
+    servant: String,
+    revision: Arc<RevisionRecord>,
+    request_times: Arc<RequestTimes>,
+    recent: Arc<Recent>,
+    rollouts: Arc<Rollouts>,
+}
+
+impl Measures {
+    pub(crate) fn of(inner: &Inner, revision: &Arc<RevisionRecord>, servant: &str) -> Arc<Self> {
+        Arc::new(Measures {
+            servant: servant.to_owned(),
+            revision: Arc::clone(revision),
+            request_times: Arc::clone(&inner.request_times),
+            recent: Arc::clone(&inner.recent),
+            rollouts: Arc::clone(&inner.rollouts),
+        })
+    }
+
+    /// A request took so many milliseconds, of which so many in the cloud.
+    fn note(&self, request: &Request, cloud: f64) {
+        let service = &self.revision.service;
+        self.request_times.note(service, request);
+        if let Some(total) = request.total {
+            let now = Instant::now().into_std();
+            self.recent.note(&self.servant, total, cloud, now);
+        }
+        let rollouts = &self.rollouts;
+        rollouts.note_request(service, self.revision.number, request.total);
+    }
+
+    /// Hears of the requests of rosbridge's clients. The time between them and the bridge is not known: what is measured is a
+    /// little less than what robots see, and all of it is the cloud's.
+    pub(crate) fn called(self: &Arc<Self>) -> Called {
+        let measures = Arc::clone(self);
+        Called::by(move |took| {
+            let total = took.map(|took| took.as_secs_f64() * 1e3);
+            let request = Request {
+                total,
+                ..Request::default()
+            };
+            measures.note(&request, total.unwrap_or_default());
+        })
+    }
 }
 
 async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
@@ -91,9 +129,7 @@ struct Reports {
     revision: Arc<RevisionRecord>,
     catalogue: Arc<Catalogue>,
     journal: Journal,
-    request_times: Arc<RequestTimes>,
-    recent: Arc<Recent>,
-    rollouts: Arc<Rollouts>,
+    measures: Arc<Measures>,
 }
 
 impl Observer for Reports {
@@ -115,10 +151,6 @@ impl Observer for Reports {
     }
 
     fn measured(&self, request: &Request) {
-        let service = &self.revision.service;
-        self.request_times.note(service, request);
-        self.recent.note(&self.id, request, Instant::now());
-        self.rollouts
-            .note_request(service, self.revision.number, request.total);
+        self.measures.note(request, request.queue + request.compute);
     }
 }

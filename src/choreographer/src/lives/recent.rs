@@ -1,9 +1,10 @@
-//! What requests of each servant took lately, as its robot tells it: for decisions, where `RequestTimes` keeps histograms for people.
+//! What requests of each servant took lately: for decisions, and to be shown beside the servant. (`RequestTimes` keeps histograms
+//! of a service.)
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use link::control::Request;
+use api::ResponseTimes;
 use parking_lot::Mutex;
 
 use crate::decide::controller::Measured;
@@ -29,14 +30,13 @@ struct Took {
 }
 
 impl Recent {
-    /// A request of this servant was answered.
-    pub(crate) fn note(&self, servant: &str, request: &Request, now: Instant) {
-        let sane = |milliseconds: f64| milliseconds.is_finite() && milliseconds >= 0.0;
-        let Some(total) = request.total.filter(|total| sane(*total)) else {
-            return;
-        };
+    /// A request of this servant was answered after so many milliseconds, of which it was so many in the cloud.
+    pub(crate) fn note(&self, servant: &str, total: f64, cloud: f64, now: Instant) {
         // Robots are not to be trusted.
-        let cloud = request.queue + request.compute;
+        let sane = |milliseconds: f64| milliseconds.is_finite() && milliseconds >= 0.0;
+        if !sane(total) {
+            return;
+        }
         let cloud = if sane(cloud) { cloud.min(total) } else { 0.0 };
         let mut all = self.by_servant.lock();
         let took = match all.get_mut(servant) {
@@ -55,27 +55,45 @@ impl Recent {
 
     /// What 19 of 20 requests of this servant did not exceed lately; none where too few are known.
     pub(crate) fn of(&self, servant: &str, now: Instant) -> Option<Measured> {
+        let (total, cloud) = self.times(servant, now)?;
+        (total.len() >= LEAST).then(|| Measured {
+            total: rank(&total, 19, 20),
+            cloud: rank(&cloud, 19, 20),
+        })
+    }
+
+    /// The same to be shown; none where nothing is known.
+    pub(crate) fn shown(&self, servant: &str, now: Instant) -> Option<ResponseTimes> {
+        let (total, _) = self.times(servant, now)?;
+        (!total.is_empty()).then(|| ResponseTimes {
+            requests: total.len(),
+            p50_ms: rank(&total, 1, 2),
+            p95_ms: rank(&total, 19, 20),
+        })
+    }
+
+    /// What requests took lately, and of that in the cloud; each in ascending order.
+    fn times(&self, servant: &str, now: Instant) -> Option<(Vec<f64>, Vec<f64>)> {
         let mut all = self.by_servant.lock();
         let took = all.get_mut(servant)?;
         took.retain(|one| now.saturating_duration_since(one.known) < LATELY);
-        if took.len() < LEAST {
-            return None;
-        }
-        let most = |of: fn(&Took) -> f64| {
+        let sorted = |of: fn(&Took) -> f64| {
             let mut times: Vec<f64> = took.iter().map(of).collect();
             times.sort_unstable_by(f64::total_cmp);
-            times[(times.len() * 19).div_ceil(20) - 1]
+            times
         };
-        Some(Measured {
-            total: most(|one| one.total),
-            cloud: most(|one| one.cloud),
-        })
+        Some((sorted(|one| one.total), sorted(|one| one.cloud)))
     }
 
     /// Forgets servants that are gone.
     pub(crate) fn keep(&self, lives: impl Fn(&str) -> bool) {
         self.by_servant.lock().retain(|id, _| lives(id));
     }
+}
+
+/// The one that `part` of `of` do not exceed (nearest rank), of at least one in ascending order.
+fn rank(times: &[f64], part: usize, of: usize) -> f64 {
+    times[(times.len() * part).div_ceil(of) - 1]
 }
 
 #[cfg(test)]
@@ -86,34 +104,40 @@ mod tests {
     fn what_was_lately_counts_and_nonsense_does_not() {
         let began = Instant::now();
         let recent = Recent::default();
-        let request = |total: f64, compute: f64| Request {
-            total: Some(total),
-            compute,
-            ..Request::default()
-        };
         for total in [9000.0, 9000.0, 9000.0] {
-            recent.note("a", &request(total, 1.0), began);
+            recent.note("a", total, 1.0, began);
         }
         let now = began + LATELY;
         for total in 1..=20 {
-            recent.note("a", &request(f64::from(total), f64::from(total) / 2.0), now);
+            recent.note("a", f64::from(total), f64::from(total) / 2.0, now);
         }
-        recent.note("a", &request(f64::NAN, 1.0), now);
-        recent.note("a", &request(-1.0, 1.0), now);
-        recent.note("a", &Request::default(), now);
+        for nonsense in [f64::NAN, f64::INFINITY, -1.0] {
+            recent.note("a", nonsense, 1.0, now);
+        }
         let measured = Measured {
             total: 19.0,
             cloud: 9.5,
         };
         assert_eq!(recent.of("a", now), Some(measured));
+        let shown = ResponseTimes {
+            requests: 20,
+            p50_ms: 10.0,
+            p95_ms: 19.0,
+        };
+        assert_eq!(recent.shown("a", now), Some(shown));
         // It cannot have been longer in the cloud than it took.
         for _ in 0..LEAST {
-            recent.note("b", &request(5.0, f64::INFINITY), now);
-            recent.note("c", &request(5.0, 70.0), now);
+            recent.note("b", 5.0, f64::INFINITY, now);
+            recent.note("c", 5.0, 70.0, now);
         }
         assert_eq!(recent.of("b", now).map(|it| it.cloud), Some(0.0));
         assert_eq!(recent.of("c", now).map(|it| it.cloud), Some(5.0));
+        // One is enough to be shown, and too few to decide upon.
+        recent.note("d", 5.0, 5.0, now);
+        assert_eq!(recent.of("d", now), None);
+        assert_eq!(recent.shown("d", now).map(|it| it.requests), Some(1));
         assert_eq!(recent.of("a", now + LATELY), None);
+        assert_eq!(recent.shown("a", now + LATELY), None);
         recent.keep(|id| id == "c");
         assert_eq!(
             (recent.of("b", now), recent.of("c", now).is_some()),
@@ -125,12 +149,8 @@ mod tests {
     fn robots_cannot_make_it_grow() {
         let recent = Recent::default();
         let now = Instant::now();
-        let request = Request {
-            total: Some(1.0),
-            ..Request::default()
-        };
         for _ in 0..10 * MOST {
-            recent.note("a", &request, now);
+            recent.note("a", 1.0, 1.0, now);
         }
         assert_eq!(recent.by_servant.lock()["a"].len(), MOST);
     }

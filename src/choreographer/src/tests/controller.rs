@@ -1,9 +1,8 @@
 //! Cores that are moved while servants work, and a machine that stalls, told with the engine in memory.
 
-use link::control::Request;
-
 use super::servants::World;
 use super::*;
+use crate::lives::reaching::Measures;
 
 /// A servant that is ready, of a robot that states this.
 async fn ready(daemon: &Choreographer, robot: &str, query: &[(&str, &str)]) -> Lease {
@@ -19,17 +18,13 @@ fn cpus(lease: &Lease) -> Option<f64> {
     container.enforced().limits.cpus
 }
 
-/// Its robot's requests take so long, all of it in the cloud.
+/// Requests of its rosbridge clients take so long.
 fn takes(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
-    let request = Request {
-        total: Some(milliseconds),
-        compute: milliseconds,
-        ..Request::default()
-    };
-    let now = tokio::time::Instant::now().into_std();
+    let handle = lease.handle();
+    let measures = Measures::of(&daemon.inner, &handle.revision, &handle.id);
     for _ in 0..3 {
-        let recent = &daemon.inner.recent;
-        recent.note(&lease.handle().id, &request, now);
+        let took = Duration::from_secs_f64(milliseconds / 1e3);
+        measures.called().tell(Some(took));
     }
 }
 
@@ -89,6 +84,60 @@ async fn without_a_controller_limits_stay_as_they_were_asked_for() {
         tokio::time::sleep(Duration::from_secs(1)).await;
     }
     assert_eq!((cpus(&near), daemon.moves()), (Some(0.02), 0));
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = |controller| {
+        world.daemon_with(|options| {
+            options.limits.cpus = Some(2.0);
+            options.controller = controller;
+        })
+    };
+    let first = daemon(true);
+    let moved = ready(&first, "moved", &[("cpus", "0.25")]).await;
+    let left = ready(&first, "left", &[("cpus", "0.5")]).await;
+    let plain = ready(&first, "plain", &[]).await;
+    let limits = |lease: &Lease| {
+        let container = world.engine.servant(&lease.handle().id).expect("it runs");
+        let limits = servant::engine::Servant::enforced(&*container).limits;
+        (limits.cpus, limits.cpu_weight)
+    };
+    let mut before = [&moved, &left, &plain].map(limits);
+    assert_eq!(before[0], (Some(0.25), Some(250)));
+    for (lease, cpus, cpu_weight) in [(&moved, 1.5, 1500), (&plain, 0.05, 1)] {
+        let container = lease.handle().container().expect("it runs");
+        let moves = servant::spec::Limits {
+            cpus: Some(cpus),
+            cpu_weight: Some(cpu_weight),
+            ..Default::default()
+        };
+        container.set_limits(moves).await.expect("it takes them");
+    }
+    // One that moves cores itself goes on from what is.
+    let next = daemon(true);
+    assert_eq!(next.adopt().await.expect("adopted"), 3);
+    let there = async |daemon: &Choreographer| {
+        for servant in daemon.servants() {
+            let mut life = servant.watch();
+            let ready = life.wait_for(|life| life.phase == Phase::Ready).await;
+            ready.expect("it lives");
+        }
+    };
+    there(&next).await;
+    assert_eq!(limits(&moved), (Some(1.5), Some(1500)));
+    let last = daemon(false);
+    assert_eq!(last.adopt().await.expect("adopted"), 3);
+    there(&last).await;
+    // What the kernel gives whom nobody gave a weight.
+    before[2].1 = Some(100);
+    assert_eq!([&moved, &left, &plain].map(limits), before);
+    let told = world.told("cores-moved");
+    assert_eq!(told.len(), 2, "{told:?}");
+    let words = "back from cpus 1.5, cpu-weight 1500 to cpus 0.25, cpu-weight 250";
+    assert!(told.iter().any(|it| it.contains(words)), "{told:?}");
 }
 
 #[tokio::test(start_paused = true)]

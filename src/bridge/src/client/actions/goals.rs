@@ -1,6 +1,7 @@
 //! A client as an action client: the goals it has sent.
 
-use std::sync::{Arc, Weak};
+use std::sync::{Arc, OnceLock, Weak};
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use ros::bus::{GoalEnd, GoalEvents, Outcome};
@@ -30,6 +31,8 @@ pub(super) struct Goal {
     pub(super) fragment_size: Option<usize>,
     /// Its definition and the count of goals under way; none where it is refused.
     pub(super) begun: Option<(Arc<ActionDef>, UnderWay)>,
+    /// When it went to the servant.
+    pub(super) sent: OnceLock<Instant>,
 }
 
 impl GoalEvents for Goal {
@@ -52,6 +55,7 @@ impl GoalEvents for Goal {
     }
 
     fn ended(&self, end: Result<GoalEnd, String>) {
+        self.tell(&end);
         let (status, end) = match end {
             Err(reason) => return self.fail(&reason),
             Ok(end) => match end.outcome {
@@ -70,6 +74,20 @@ impl GoalEvents for Goal {
 }
 
 impl Goal {
+    /// Tells how long it took; nothing where its client has cancelled it, which says nothing of the server.
+    fn tell(&self, end: &Result<GoalEnd, String>) {
+        let outcome = end.as_ref().ok().map(|end| end.outcome);
+        let (Some(client), Some(sent)) = (self.client.upgrade(), self.sent.get()) else {
+            return;
+        };
+        let took: Option<Duration> = match outcome {
+            Some(Outcome::Canceled) => return,
+            Some(Outcome::Succeeded) => Some(sent.elapsed()),
+            _ => None,
+        };
+        client.shared.options.called.tell(took);
+    }
+
     fn reply(&self) -> Reply {
         Reply {
             id: self.id.clone(),

@@ -1,6 +1,7 @@
 //! `send_action_goal`, `cancel_action_goal` from the client.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
+use std::time::Instant;
 
 use bytes::Bytes;
 use ros::bus::BusError;
@@ -48,6 +49,7 @@ impl Client {
             compression,
             fragment_size: op.fragment_size,
             begun: None,
+            sent: OnceLock::new(),
         };
         let prepared = self.begin(op.args).and_then(|guard| {
             let prepared = self.prepare_goal(&op, reply, compression)?;
@@ -170,6 +172,16 @@ async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
             return goal.fail(&text);
         }
         Err(error) => return goal.fail(&error.to_string()),
+    }
+    // What the robot's own clients serve says nothing of the servant.
+    let own = goal.client.upgrade().is_some_and(|client| {
+        let bus = &client.shared.bus;
+        let graph = bus.graph().borrow().clone();
+        let nodes = graph.actions.get(&name);
+        nodes.is_some_and(|nodes| nodes.servers.iter().any(|node| node == bus.node()))
+    });
+    if !own {
+        let _ = goal.sent.set(Instant::now());
     }
     action.bus.send(&goal_id, body, goal);
     // Cancelled while it was being sent.

@@ -22,7 +22,7 @@ fn servant(id: &str, promised: u64, used: u64) -> Facts<'_> {
         weighed: false,
         quota: limit,
         weight: plain,
-        used,
+        used: Some(used),
         throttled: 0.0,
         waited: 0.0,
         goal: None,
@@ -174,6 +174,60 @@ fn one_that_cannot_use_more_takes_no_more_from_others() {
 }
 
 #[test]
+fn those_that_are_near_are_not_throttled_for_each_other() {
+    let began = Instant::now();
+    let eager = |id| {
+        takes(
+            290.0,
+            Facts {
+                throttled: 0.5,
+                ..servant(id, 500, 490)
+            },
+        )
+    };
+    let patient = |id| takes(50.0, servant(id, 500, 60));
+    let all = ["a", "b", "c", "d"].map(eager).into_iter();
+    let all = all.chain(["e", "f", "g", "h"].map(patient)).collect();
+    let all = looks(all, began, 0..30);
+    let (eager, patient) = all.split_at(4);
+    for one in eager {
+        // What the patient ones need, who use 60 each, is left.
+        let beyond = CORES - 4 * (60 + 60 / HEADROOM + LEAST);
+        assert!(
+            one.quota <= beyond && one.quota * 10 > beyond * 9,
+            "{one:?}"
+        );
+        assert_eq!(one.weight, 500, "what is promised to others stays theirs");
+    }
+    for one in patient {
+        assert_eq!((one.quota, one.weight), (500, 500));
+    }
+}
+
+#[test]
+fn of_one_whose_use_is_not_known_nothing_is_taken() {
+    let near = takes(
+        290.0,
+        Facts {
+            throttled: 0.5,
+            ..servant("a", 1000, 990)
+        },
+    );
+    let unknown = |facts| Facts {
+        used: None,
+        ..facts
+    };
+    let rest = unknown(servant("b", 0, 0));
+    let content = unknown(takes(50.0, servant("c", 2800, 0)));
+    let changed = changes(&[near, rest, content], Instant::now());
+    let quotas = changed
+        .iter()
+        .filter_map(|(id, quota, ..)| Some((&**id, (*quota)?)));
+    // The content one is thought to need all that it has.
+    assert_eq!(quotas.collect::<Vec<_>>(), [("a", 1200)]);
+}
+
+#[test]
 fn a_weight_that_was_asked_for_stays() {
     let asked = Facts {
         weighed: true,
@@ -248,7 +302,7 @@ fn machine(kinds: &[(u64, bool, bool)]) -> Vec<Facts<'static>> {
 
 fn measure(all: &mut [Facts<'_>], kinds: &[(u64, bool, bool)], seen: &[Seen]) {
     for ((one, (_, _, measured)), seen) in all.iter_mut().zip(kinds).zip(seen) {
-        one.used = seen.used.min(one.quota);
+        one.used = Some(seen.used.min(one.quota));
         one.throttled = seen.throttled;
         one.waited = seen.waited;
         one.measured = measured.then_some(Measured {
@@ -339,7 +393,7 @@ impl Plant {
     /// Its robot asks again as soon as it is answered.
     fn run(&self, one: &mut Facts<'_>, cores: u64) {
         let cloud = self.work * 1000.0 / cores.max(1) as f64;
-        one.used = cores;
+        one.used = Some(cores);
         one.throttled = if cores + 10 >= one.quota { 0.4 } else { 0.0 };
         one.waited = if cores + 10 < one.quota { 0.4 } else { 0.0 };
         if one.goal.is_some() {

@@ -72,6 +72,11 @@ fn servant() -> Servant {
         enforced: Some(limits()),
         cgroup_version: 2,
         usage: Some(usage()),
+        response: Some(api::ResponseTimes {
+            requests: 1,
+            p50_ms: 1.5,
+            p95_ms: 1.5,
+        }),
         pids: vec![1],
         dropped: 0,
         down: vec![NodeDown {

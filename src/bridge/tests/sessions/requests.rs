@@ -1,0 +1,152 @@
+//! How long requests take, as the daemon is told.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge::{BridgeOptions, Called};
+use bytes::Bytes;
+use ros::bus::{ServiceHandler, ServiceType};
+use serde_json::json;
+use tokio::sync::mpsc;
+
+use super::actions::serve;
+use super::support::{Client, World, connected, patient, patiently};
+
+type Told = mpsc::UnboundedReceiver<Option<Duration>>;
+
+/// Options of a bridge whose requests are told, and where. `pair`: the topics on which clients ask.
+fn telling(pair: Option<&str>) -> (BridgeOptions, Told) {
+    let (sender, told) = mpsc::unbounded_channel();
+    let options = BridgeOptions {
+        called: Called::by(move |took| {
+            let _ = sender.send(took);
+        }),
+        pair: pair.map(|pair| pair.parse().unwrap()),
+        ..patient()
+    };
+    (options, told)
+}
+
+async fn next(told: &mut Told) -> Option<Duration> {
+    patiently(told.recv()).await.unwrap()
+}
+
+struct Refuses;
+
+#[async_trait::async_trait]
+impl ServiceHandler for Refuses {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        match request[0] {
+            0 => Ok(Bytes::copy_from_slice(&request[8..])),
+            _ => Err("not today".to_owned()),
+        }
+    }
+}
+
+#[tokio::test]
+async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() {
+    let (options, mut told) = telling(None);
+    let world = World::with(options).await;
+    let def = world.registry.service("x_msgs/Add").unwrap();
+    let _served = world
+        .node
+        .serve("/add", ServiceType::of(&def), Arc::new(Refuses))
+        .await
+        .unwrap();
+    let there = |graph: &ros::bus::Graph| graph.services.contains_key("/add");
+    world.in_graph(there).await;
+    let (mut client, mut own) = (world.client().await, world.client().await);
+    let call = |service: &str, a: u8| json!({"op": "call_service", "service": service, "args": {"a": a, "b": 2}});
+    // Answered by another client of the same robot.
+    own.send(json!({"op": "advertise_service", "service": "/own", "type": "x_msgs/Add"}))
+        .await;
+    let there = |graph: &ros::bus::Graph| graph.services.contains_key("/own");
+    world.in_graph(there).await;
+    client.settled().await;
+    client.send(call("/own", 0)).await;
+    let asked = own.json().await;
+    own.send(json!({"op": "service_response", "id": asked["id"], "service": "/own", "values": {"sum": 1}, "result": true}))
+        .await;
+    assert_eq!(client.json().await["result"], true);
+    for (a, answered) in [(0, true), (1, false)] {
+        client.send(call("/add", a)).await;
+        assert_eq!(client.json().await["result"], answered);
+        assert_eq!(next(&mut told).await.is_some(), answered);
+    }
+    assert!(told.try_recv().is_err(), "no more than those");
+}
+
+#[tokio::test]
+async fn goals_are_told_but_for_those_that_their_client_cancels() {
+    let (options, mut told) = telling(None);
+    let world = World::with(options).await;
+    let other = world.another_bridge().await;
+    let mut server = Client::connect(&other, Default::default()).await;
+    serve(&mut server).await;
+    let mut user = world.client().await;
+    for (id, result, succeeds) in [("g", true, true), ("h", false, false)] {
+        user.send(json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Count", "args": {"to": 3}}))
+            .await;
+        let asked = server.json().await;
+        server
+            .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 4, "result": result}))
+            .await;
+        assert_eq!(user.json().await["id"], id);
+        assert_eq!(next(&mut told).await.is_some(), succeeds, "{id}");
+    }
+    user.send(json!({"op": "send_action_goal", "id": "c", "action": "/count", "action_type": "x_msgs/Count", "args": {"to": 3}}))
+        .await;
+    let asked = server.json().await;
+    user.send(json!({"op": "cancel_action_goal", "id": "c", "action": "/count"}))
+        .await;
+    assert_eq!(server.json().await["op"], "cancel_action_goal");
+    server
+        .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 5, "result": true}))
+        .await;
+    assert_eq!(user.json().await["id"], "c");
+    assert!(told.try_recv().is_err(), "its end was its client's choice");
+}
+
+#[tokio::test]
+async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
+    let (options, mut told) = telling(Some("/place -> /found by stamp"));
+    let world = World::with(options).await;
+    let mut asked = world.node_subscribes("/place", "x_msgs/Place").await;
+    let found = world.node_publishes("/found", "x_msgs/Place", false).await;
+    let mut client = world.client().await;
+    let metrics = world.bridge.metrics();
+    client
+        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
+        .await;
+    let place = |secs: u32| json!({"header": {"stamp": {"secs": secs, "nsecs": 5}}});
+    let publish = |secs| json!({"op": "publish", "topic": "/place", "msg": place(secs)});
+    // What waits for the node to connect is no time of the node's.
+    client.send(publish(1)).await;
+    patiently(asked.messages.recv()).await.unwrap();
+    client.settled().await;
+    assert_eq!(metrics.asked.get(), 0, "nobody hears an answer");
+    client
+        .send(json!({"op": "subscribe", "topic": "/found"}))
+        .await;
+    client.settled().await;
+    connected(&*found, 1).await;
+    for secs in [2, 3] {
+        client.send(publish(secs)).await;
+        patiently(asked.messages.recv()).await.unwrap();
+    }
+    assert_eq!(metrics.asked.get(), 2);
+    // The first was not noted, of the next ones each is answered once; the fourth was never asked.
+    for secs in [1, 3, 2, 2, 4] {
+        found.publish(world.message("x_msgs/Place", place(secs)));
+        assert_eq!(client.json().await["op"], "publish");
+    }
+    assert!(next(&mut told).await.is_some());
+    assert!(next(&mut told).await.is_some());
+    assert!(told.try_recv().is_err(), "no more than those");
+    client
+        .send(json!({"op": "unsubscribe", "topic": "/found"}))
+        .await;
+    client.send(publish(5)).await;
+    client.settled().await;
+    assert_eq!(metrics.asked.get(), 2, "nobody hears an answer any more");
+}

@@ -1,0 +1,130 @@
+//! On which topics robots ask a servant and are answered.
+
+use package::interface::{Direction, Interface, Topic};
+use qos::{Correlation, Pair};
+use ros::schema::Registry;
+
+/// The input whose messages are requests and the outputs that answer them, where the interface has one such pair and leaves
+/// no doubt which. By stamps there is none. Where the next output would be the answer, there has to be one input and one
+/// output, and nothing else to ask: what a node publishes at its own pace would be taken for an answer.
+pub fn asked_by_topic(interface: &Interface) -> Option<Pair> {
+    let registry = Registry::new();
+    for (key, text) in &interface.definitions {
+        // Of a type that is not usable no message is recognised.
+        let _ = registry.insert(key, text);
+    }
+    let end = |topic: &Topic| {
+        let of_type = registry.message(&topic.type_name).ok()?;
+        Some(qos::Topic {
+            name: topic.name.clone(),
+            type_name: topic.type_name.clone(),
+            stamped: of_type.has_header(),
+        })
+    };
+    let ends = |direction: Direction| -> Vec<qos::Topic> {
+        let topics = interface.topics.iter();
+        // A latched output tells a state.
+        let topics = topics.filter(|it| it.direction == direction && !it.latched);
+        topics.filter_map(end).collect()
+    };
+    let (inputs, outputs) = (ends(Direction::Input), ends(Direction::Output));
+    let mut pairs = qos::find(&inputs, &outputs, None).ok()?.pairs;
+    let pair = pairs.pop().filter(|_| pairs.is_empty())?;
+    let others = |ends: &[qos::Topic], of: &Pair| -> Vec<qos::Topic> {
+        let is_of = |name: &String| *name == of.input || of.outputs.contains(name);
+        let others = ends.iter().filter(|end| !is_of(&end.name));
+        others.cloned().collect()
+    };
+    let finds = |inputs: &[qos::Topic], outputs: &[qos::Topic]| {
+        qos::find(inputs, outputs, None).is_ok_and(|found| !found.pairs.is_empty())
+    };
+    let alone = || {
+        interface.services.is_empty()
+            && interface.actions.is_empty()
+            && !finds(&others(&inputs, &pair), &outputs)
+            && !finds(&inputs, &others(&outputs, &pair))
+    };
+    let certain = pair.by == Some(Correlation::Stamp) || alone();
+    certain.then_some(pair)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An interface with these topics, each `<` or `>` with its name and type, and these services.
+    fn interface(topics: &[&str], services: &[&str]) -> Interface {
+        let topics = topics.iter().map(|topic| {
+            let (end, rest) = topic.split_at(1);
+            let (name, type_name) = rest.split_once(' ').expect("a type");
+            let direction = if end == "<" { "input" } else { "output" };
+            let latched = name.ends_with("latched");
+            serde_json::json!({ "name": name, "type": type_name, "direction": direction, "latched": latched })
+        });
+        let services = services
+            .iter()
+            .map(|name| serde_json::json!({ "name": name, "type": "x/Ask" }));
+        let definitions = serde_json::json!({
+            "x/msg/Text": "string data\n",
+            "x/msg/Stamped": "std_msgs/Header header\n",
+            "std_msgs/msg/Header": "uint32 seq\ntime stamp\nstring frame_id\n",
+        });
+        let interface = serde_json::json!({
+            "topics": topics.collect::<Vec<_>>(),
+            "services": services.collect::<Vec<_>>(),
+            "definitions": definitions,
+        });
+        serde_json::from_value(interface).expect("an interface")
+    }
+
+    #[test]
+    fn what_leaves_no_doubt_is_a_pair() {
+        for (topics, services, expected) in [
+            (
+                &["</in x/Stamped", ">/out x/Stamped"][..],
+                &[][..],
+                "/in -> /out by stamp",
+            ),
+            // With stamps others do not matter.
+            (
+                &[
+                    "</in x/Stamped",
+                    "</also x/Text",
+                    ">/out x/Stamped",
+                    ">/beat x/Text",
+                ],
+                &["/ask"],
+                "/in -> /out by stamp",
+            ),
+            (
+                &["</in x/Text", ">/out x/Text"],
+                &[],
+                "/in -> /out by arrival",
+            ),
+            (
+                &["</in x/Text", ">/out x/Text", ">/state_latched x/Text"],
+                &[],
+                "/in -> /out by arrival",
+            ),
+            (
+                &["</in x/Text", ">/out x/Text", ">/rosout x/Text"],
+                &[],
+                "/in -> /out by arrival",
+            ),
+            // Which of them?
+            (&["</in x/Text", "</also x/Text", ">/out x/Text"], &[], ""),
+            (&["</in x/Text", ">/out x/Text", ">/beat x/Text"], &[], ""),
+            (&["</in x/Text", ">/out x/Text"], &["/ask"], ""),
+            (&["</in x/Text", ">/state_latched x/Text"], &[], ""),
+            (&["</in x/Text"], &[], ""),
+            (&[">/out x/Text"], &[], ""),
+            // Nobody knows what it is.
+            (&["</in x/Missing", ">/out x/Text"], &[], ""),
+            (&[], &["/ask"], ""),
+        ] {
+            let found = asked_by_topic(&interface(topics, services));
+            let words = found.map(|pair| pair.to_string()).unwrap_or_default();
+            assert_eq!(words, expected, "{topics:?} {services:?}");
+        }
+    }
+}
