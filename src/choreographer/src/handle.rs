@@ -424,7 +424,13 @@ impl Lease {
         }
         // Until then its limits are those that it begins with.
         self.reached(Phase::Created).await?;
-        inner.agree(&self.handle, who, stated).await
+        let (inner, handle) = (Arc::clone(inner), Arc::clone(&self.handle));
+        let (who, stated) = (who.clone(), stated.clone());
+        // Its client may go away meanwhile; what is begun is done.
+        let agreed = tokio::spawn(async move { inner.agree(&handle, &who, &stated).await });
+        agreed
+            .await
+            .map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
     /// Waits until the servant's interface is there.

@@ -45,6 +45,14 @@ pub enum Unchanged {
 impl Choreographer {
     /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.
     pub async fn set_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
+        let (whole, id) = (self.clone(), id.to_owned());
+        // Whoever asks may go away meanwhile; what is begun is done.
+        let set = tokio::spawn(async move { whole.set(&id, change).await });
+        set.await
+            .map_err(|_| Error::Internal("changing a servant's limits"))?
+    }
+
+    async fn set(&self, id: &str, change: Limits) -> Result<(), Error> {
         let handle = self.servant(id)?;
         // One change after the other: what is promised, in force and remembered must be of the same.
         let _turn = handle.limits_turn().await;
@@ -235,14 +243,21 @@ impl Inner {
         let container = handle.container().ok_or_else(unreached)?;
         let promise = handle.promise().ok_or_else(unreached)?;
         let before = handle.all_asked();
-        promise.change(self.promised(&after.promised()))?;
+        let (has, wanted) = (
+            self.promised(&before.promised()),
+            self.promised(&after.promised()),
+        );
+        // What is more is promised before the kernel gives it, and what is less given to others only once the kernel has
+        // taken it: else more would be promised than there is where it refuses.
+        promise.change(has.max(wanted))?;
         if let Err(error) = container.set_limits(engine_limits(&change)).await {
             // What the kernel took of it before it refused the rest is taken back.
             let _ = container.set_limits(engine_limits(&before.limits())).await;
-            let _ = promise.change(self.promised(&before.promised()));
+            promise.change(has)?;
             return Err(error.into());
         }
         handle.set_asked(after);
+        promise.change(wanted)?;
         Ok(in_words(&limits_of(&container.enforced().limits)))
     }
 }

@@ -129,6 +129,45 @@ async fn what_the_operator_sets_stays_whatever_the_robot_states() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_the_kernel_does_not_take_from_a_servant_is_given_to_nobody() {
+    let world = World::new();
+    world.engine.program("/eats", |process| async move {
+        process.allocate(100 << 20).await;
+        process.advertise("/greeting", "std_msgs/String");
+        std::future::pending().await
+    });
+    world.publish("greet", "/eats", |_| {});
+    let daemon = world.daemon();
+    let small = [("cpus", "0.1"), ("memory", "800M")];
+    let has = ready(&daemon, stating("r1", &small)).await;
+    let waits = [("cpus", "0.1"), ("memory", "500M")];
+    let waits = daemon.ensure(stating("r2", &waits)).expect("a lease");
+    let mut standing = waits.handle().watch_standing();
+    standing.wait_for(Option::is_some).await.expect("it waits");
+    let less = api::Limits {
+        memory: Some(api::Size(64 << 20)),
+        ..api::Limits::default()
+    };
+    let refused = daemon.set_limits(&has.handle().id, less).await;
+    let refused = refused.expect_err("it uses more").to_string();
+    assert!(refused.contains("of memory are in use"), "{refused}");
+    assert_eq!(
+        daemon.admission().look().1,
+        Amount::new(0.1, 800 << 20),
+        "what is promised is what the servant has"
+    );
+    assert!(standing.borrow().is_some(), "the other one waits on");
+    let less = api::Limits {
+        memory: Some(api::Size(200 << 20)),
+        ..api::Limits::default()
+    };
+    let set = daemon.set_limits(&has.handle().id, less).await;
+    set.expect("it uses less");
+    waits.ready().await.expect("there is room now");
+    assert_eq!(daemon.admission().look().1, Amount::new(0.2, 700 << 20));
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_servant_is_not_made_smaller_than_what_it_uses() {
     let world = World::new();
     world.engine.program("/eats", |process| async move {
