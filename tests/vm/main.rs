@@ -69,7 +69,10 @@ fn main() -> ExitCode {
             who_takes_too_much_memory_is_told_so,
             a_fork_bomb_ends_when_its_servant_does,
         ],
-        stories![sla: what_robots_state_becomes_what_the_kernel_enforces_and_is_kept],
+        stories![
+            sla: what_robots_state_becomes_what_the_kernel_enforces_and_is_kept,
+            the_controller_moves_cores_and_nobody_loses_what_was_promised
+        ],
         stories![confinement:
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,

@@ -153,3 +153,105 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
     );
     Ok(())
 }
+
+/// Of a request that takes a core all of its time, so long.
+const LITTLE_WORK: &str = "3000000";
+
+/// Microseconds of each period that a servant may use.
+fn quota(id: &str) -> anyhow::Result<u64> {
+    let max = control(id, "cpu.max")?;
+    let quota = max.split(' ').next().unwrap_or_default();
+    quota.parse().with_context(|| format!("cpu.max is {max}"))
+}
+
+pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdict {
+    let daemon = daemon()?;
+    let mut alone = daemon.robot(&format!("{SERVICE}?robot=alone&cpus=1"))?;
+    let little = |robot: &mut Robot| -> anyhow::Result<f64> {
+        let asked = Instant::now();
+        tries(robot, "work", LITTLE_WORK)?;
+        Ok(asked.elapsed().as_secs_f64())
+    };
+    little(&mut alone)?;
+    let times: anyhow::Result<Vec<f64>> = (0..7).map(|_| little(&mut alone)).collect();
+    let took = median(times?);
+    let servant = id(&daemon, "alone")?;
+    daemon.deployer().types(&["stop", &servant])?.succeeded()?;
+    // With a quarter of a core it takes four times as long. Its robot speaks rosbridge: the daemon measures its calls.
+    let accepts = format!("{:.4}", took * 2.0);
+    let near = format!("{SERVICE}?robot=near&cpus=0.25&max_rrt={accepts}");
+    let mut near = daemon.robot(&near)?;
+    let mut owner = daemon.robot(&format!("{SERVICE}?robot=owner&cpus=0.25"))?;
+    let mut plain = daemon.robot(&format!("{SERVICE}?robot=plain"))?;
+    for (robot, what) in [
+        (&mut near, "rest"),
+        (&mut owner, "burn"),
+        (&mut plain, "burn"),
+    ] {
+        tries(robot, what, "1")?;
+    }
+    let ids = [
+        id(&daemon, "near")?,
+        id(&daemon, "owner")?,
+        id(&daemon, "plain")?,
+    ];
+    let quotas = || -> anyhow::Result<Vec<u64>> { ids.iter().map(|id| quota(id)).collect() };
+    let at_first = quotas()?;
+    ensure!(at_first[..2] == [25_000, 25_000], "{at_first:?}");
+    let mut seen = Vec::new();
+    let mut promises_hold = |now: &[u64]| -> anyhow::Result<()> {
+        if seen.last().is_none_or(|last: &Vec<u64>| last != now) {
+            seen.push(now.to_vec());
+        }
+        ensure!(now[0] >= 25_000 && now[1] == 25_000, "{seen:?}");
+        Ok(())
+    };
+    support::until("cores for the one that is near", || {
+        little(&mut near)?;
+        let now = quotas()?;
+        promises_hold(&now)?;
+        let moved = now[0] > at_first[0] && now[2] < at_first[2];
+        Ok(if moved {
+            Ok(())
+        } else {
+            Err(format!("{now:?}"))
+        })
+    })?;
+    let events = daemon.api("/api/v1/events?limit=1000")?;
+    let told = events.as_array().context("events")?.iter();
+    let mut told = told.filter(|event| event["kind"] == "cores-moved");
+    let reason = told.find(|event| event["robot"] == "near");
+    println!(
+        "        {}",
+        reason.context("an event of it")?["message"]
+            .as_str()
+            .unwrap_or_default()
+    );
+    let shown = told_of(&daemon, "near", "response")?;
+    ensure!(shown["requests"].as_u64() > Some(0), "{shown}");
+    // It asks no more, and gives back what it had.
+    support::until("what it was promised, and no more", || {
+        let now = quotas()?;
+        promises_hold(&now)?;
+        let back = now == at_first;
+        Ok(if back {
+            Ok(())
+        } else {
+            Err(format!("{now:?}"))
+        })
+    })?;
+    println!("        cpu.max of near, owner, plain: {seen:?}");
+    for robot in [&mut owner, &mut plain] {
+        tries(robot, "rest", "")?;
+    }
+    daemon
+        .deployer()
+        .types(&["stop", "--service", SERVICE])?
+        .succeeded()
+        .map(|_| ())
+}
+
+/// A field of what is told of a robot's servant.
+fn told_of(daemon: &Daemon, robot: &str, field: &str) -> anyhow::Result<Value> {
+    Ok(told(daemon, robot)?[field].clone())
+}
