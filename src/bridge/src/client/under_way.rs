@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
+use budget::{Permit, UNCOUNTED};
 use rosbridge::Payload;
 
 use super::Client;
@@ -12,6 +13,8 @@ pub(super) struct UnderWay {
     client: Arc<Client>,
     /// Of its arguments.
     bytes: usize,
+    /// For those, where the client has more of them than nobody counts.
+    _permit: Option<Permit>,
 }
 
 impl Drop for UnderWay {
@@ -31,9 +34,10 @@ impl Client {
         let bytes = args.map_or(0, |args| args.bytes.len());
         let before = self.under_way.fetch_add(1, Ordering::Relaxed);
         let bytes_before = self.under_way_bytes.fetch_add(bytes, Ordering::Relaxed);
-        let guard = UnderWay {
+        let mut guard = UnderWay {
             client: self.clone(),
             bytes,
+            _permit: None,
         };
         if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
             return Err(format!(
@@ -45,6 +49,11 @@ impl Client {
             return Err(format!(
                 "{limit} calls and goals of this client are under way already; wait for some to end"
             ));
+        }
+        if bytes_before.saturating_add(bytes) > UNCOUNTED {
+            // They wait for a servant, perhaps for long.
+            let permit = self.budget.take(bytes);
+            guard._permit = Some(permit.map_err(|full| format!("field \"args\": {full}"))?);
         }
         Ok(guard)
     }

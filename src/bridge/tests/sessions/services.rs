@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use bridge::BridgeOptions;
+use bridge::{BridgeOptions, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use rosbridge::{CallService, Compression, Format, Frame, Op, Payload};
@@ -204,6 +204,41 @@ async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
     assert_eq!(client.json().await["values"], json!({"sum": 3}));
     client.send_text(&padded("/fast", "third", 5_000)).await;
     assert_eq!(client.json().await["values"], json!({"sum": 3}));
+}
+
+#[tokio::test]
+async fn what_waits_for_an_answer_counts_in_the_clients_budget() {
+    let world = World::with(patient()).await;
+    let gate = Arc::new(Notify::new());
+    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
+    let budget = budget::Budget::new("client x", 350_000);
+    let mut client = world
+        .client_with(SessionOptions {
+            budget: budget.clone(),
+            ..SessionOptions::default()
+        })
+        .await;
+    let call = json!({"op": "call_service", "id": "i", "service": "/slow", "args": [1, 2]});
+    let call = call
+        .to_string()
+        .replace("[1", &format!("[{}1", " ".repeat(100_000)));
+    for _ in 0..10 {
+        client.send_text(&call).await;
+    }
+    // Each answer that comes now is a refusal: nobody has opened the gate.
+    for _ in 0..7 {
+        let answer = client.json().await;
+        assert_eq!(answer["result"], false);
+        let words = answer["values"].as_str().expect("a reason");
+        assert!(words.contains("memory for client x"), "{words}");
+    }
+    patiently(async {
+        while budget.used() > 0 {
+            gate.notify_one();
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
 }
 
 #[tokio::test]

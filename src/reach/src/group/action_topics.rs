@@ -10,6 +10,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
@@ -30,6 +31,13 @@ use super::goals::GroupClient;
 const STATUS: Duration = Duration::from_millis(200);
 /// How long the status names a goal that has ended, as action servers do.
 const REMEMBERED: Duration = Duration::from_secs(5);
+/// Goals of one robot that may be under way at once; one more is rejected. A node would hold them in its own memory: here it
+/// is the daemon's.
+const GOALS: usize = 256;
+/// Goals that have ended and are remembered.
+const ENDED: usize = 256;
+/// Bytes of a goal's id, which each status repeats.
+const LONGEST_ID: usize = 1024;
 
 /// One of the five.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -82,13 +90,24 @@ pub(super) struct ActionTopics {
     node: PeerId,
     client: GroupClient,
     state: Mutex<State>,
+    /// Counts the goals under way.
+    budget: Budget,
     matched: watch::Sender<Matched>,
     numbers: std::sync::atomic::AtomicU64,
 }
 
+/// A goal of the robot's.
+struct Known {
+    state: GoalState,
+    /// For what is held of it while it is under way.
+    permit: Option<Permit>,
+    /// When it ended.
+    ended: Option<Instant>,
+}
+
 #[derive(Default)]
 struct State {
-    goals: HashMap<String, (GoalState, Option<Instant>)>,
+    goals: HashMap<String, Known>,
     listeners: Vec<(End, MessageSender)>,
     /// Somebody is told of the status again and again.
     ticking: bool,
@@ -101,6 +120,7 @@ impl ActionTopics {
         (name, node): (&str, &str),
         of: &Arc<ActionDef>,
         registry: &Registry,
+        budget: &Budget,
     ) -> Result<Arc<ActionTopics>, BusError> {
         let types = End::ALL.into_iter().map(|(end, suffix)| {
             let type_name = end.type_name(&of.name);
@@ -123,6 +143,7 @@ impl ActionTopics {
             node,
             client: GroupClient::new(group, robot, name, of),
             state: Mutex::default(),
+            budget: budget.clone(),
             matched: watch::Sender::new(Matched { peers: vec![peer] }),
             numbers: Default::default(),
         }))
@@ -202,12 +223,9 @@ impl ActionTopics {
     fn tell_status(&self, state: &mut State) {
         let now = Instant::now();
         let old = |ended: Option<Instant>| ended.is_some_and(|at| now > at + REMEMBERED);
-        state.goals.retain(|_, (_, ended)| !old(*ended));
-        let states: Vec<GoalState> = state
-            .goals
-            .values()
-            .map(|(state, _)| state.clone())
-            .collect();
+        state.goals.retain(|_, goal| !old(goal.ended));
+        let goals = state.goals.values();
+        let states: Vec<GoalState> = goals.map(|goal| goal.state.clone()).collect();
         let bytes = messages::write_states(Time::now(), states.iter());
         self.tell(state, End::Status, bytes);
     }
@@ -223,23 +241,52 @@ impl ActionTopics {
                 .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
             goal.id = format!("{}-{number}", self.name);
         }
+        if goal.id.len() > LONGEST_ID {
+            tracing::debug!(
+                "a goal of {} has an id of {} bytes",
+                self.name,
+                goal.id.len()
+            );
+            return;
+        }
         let id = goal.id.clone();
         {
             let mut state = self.state.lock();
-            let known = GoalState {
-                goal,
-                status: Status::Active,
-                text: String::new(),
-            };
             if state
                 .goals
                 .get(&id)
-                .is_some_and(|(_, ended)| ended.is_none())
+                .is_some_and(|goal| goal.ended.is_none())
             {
                 tracing::debug!("a goal of {} has the id of another, {id}", self.name);
                 return;
             }
-            state.goals.insert(id.clone(), (known, None));
+            let room = state.room().and_then(|()| {
+                self.budget
+                    .take(body.len())
+                    .map_err(|full| full.to_string())
+            });
+            let (permit, refused) = match room {
+                Ok(permit) => (Some(permit), None),
+                Err(text) => (None, Some(text)),
+            };
+            let known = Known {
+                state: GoalState {
+                    goal,
+                    status: Status::Active,
+                    text: String::new(),
+                },
+                permit,
+                ended: None,
+            };
+            state.goals.insert(id.clone(), known);
+            if let Some(text) = refused {
+                let end = GoalEnd {
+                    outcome: Outcome::Rejected,
+                    text,
+                    result: self.nothing(),
+                };
+                return self.end(&mut state, &id, end);
+            }
             self.tell_status(&mut state);
         }
         let events = Ear {
@@ -250,10 +297,13 @@ impl ActionTopics {
         self.client.send(&id, body, Arc::new(events));
     }
 
-    fn cancel(&self, bytes: &Bytes) {
-        let Some(GoalId { stamp, id }) = messages::read_cancel(bytes) else {
-            return;
-        };
+    /// Cancels all goals of the robot.
+    pub(super) fn cancel_all(&self) {
+        self.cancel(&GoalId::default());
+    }
+
+    fn cancel(&self, GoalId { stamp, id }: &GoalId) {
+        let (stamp, id) = (*stamp, id.as_str());
         let named = |of: &GoalId| of.id == id;
         let before = |of: &GoalId| {
             let at = |time: Time| (time.secs, time.nsecs);
@@ -262,10 +312,11 @@ impl ActionTopics {
         let all = id.is_empty() && stamp == Time::default();
         let state = self.state.lock();
         let goals = state.goals.values();
-        let goals = goals.filter(|(goal, ended)| {
-            ended.is_none() && (all || named(&goal.goal) || before(&goal.goal))
+        let goals = goals.filter(|known| {
+            let goal = &known.state.goal;
+            known.ended.is_none() && (all || named(goal) || before(goal))
         });
-        let ids: Vec<String> = goals.map(|(goal, _)| goal.goal.id.clone()).collect();
+        let ids: Vec<String> = goals.map(|goal| goal.state.goal.id.clone()).collect();
         drop(state);
         ids.iter().for_each(|id| self.client.cancel(id));
     }
@@ -274,12 +325,21 @@ impl ActionTopics {
         let end = end.unwrap_or_else(|text| GoalEnd {
             outcome: Outcome::Aborted,
             text,
-            result: vec![0; self.of.result.min_size()].into(),
+            result: self.nothing(),
         });
-        let mut state = self.state.lock();
-        let Some((goal, ended)) = state.goals.get_mut(id) else {
+        self.end(&mut self.state.lock(), id, end);
+    }
+
+    /// A result that says nothing.
+    fn nothing(&self) -> Bytes {
+        vec![0; self.of.result.min_size()].into()
+    }
+
+    fn end(&self, state: &mut State, id: &str, end: GoalEnd) {
+        let Some(known) = state.goals.get_mut(id) else {
             return;
         };
+        let goal = &mut known.state;
         goal.status = match end.outcome {
             Outcome::Succeeded => Status::Succeeded,
             Outcome::Canceled => Status::Preempted,
@@ -288,11 +348,42 @@ impl ActionTopics {
             Outcome::Unknown => Status::Lost,
         };
         goal.text = end.text;
-        *ended = Some(Instant::now());
         let goal = goal.clone();
-        self.tell_status(&mut state);
+        known.ended = Some(Instant::now());
+        known.permit = None;
+        state.forget_some();
+        self.tell_status(state);
         let bytes = messages::write_state(Time::now(), &goal, &end.result);
-        self.tell(&mut state, End::Result, bytes);
+        self.tell(state, End::Result, bytes);
+    }
+}
+
+impl State {
+    /// Whether there is room for one more goal, or why not.
+    fn room(&self) -> Result<(), String> {
+        let goals = self.goals.values();
+        let count = goals.filter(|goal| goal.ended.is_none()).count();
+        match count < GOALS {
+            true => Ok(()),
+            false => Err(format!(
+                "{count} goals of this robot are under way already; wait for some to end"
+            )),
+        }
+    }
+
+    /// Of too many goals that have ended, those that did first are forgotten.
+    fn forget_some(&mut self) {
+        let ended = |goals: &HashMap<String, Known>| {
+            goals.values().filter(|goal| goal.ended.is_some()).count()
+        };
+        while ended(&self.goals) > ENDED {
+            let over = self.goals.iter();
+            let over = over.filter_map(|(id, goal)| Some((goal.ended?, id)));
+            let Some(first) = over.min().map(|(_, id)| id.clone()) else {
+                return;
+            };
+            self.goals.remove(&first);
+        }
     }
 }
 
@@ -321,7 +412,11 @@ impl Publisher for Mouth {
     fn publish(&self, bytes: Bytes) {
         match self.end {
             End::Goal => self.topics.goal(&bytes),
-            _ => self.topics.cancel(&bytes),
+            _ => {
+                if let Some(which) = messages::read_cancel(&bytes) {
+                    self.topics.cancel(&which);
+                }
+            }
         }
     }
 
@@ -338,10 +433,11 @@ struct Ear {
 impl GoalEvents for Ear {
     fn feedback(&self, feedback: Bytes) {
         let mut state = self.topics.state.lock();
-        let Some((goal, None)) = state.goals.get(&self.id).cloned() else {
+        let known = state.goals.get(&self.id);
+        let Some(known) = known.filter(|goal| goal.ended.is_none()) else {
             return;
         };
-        let bytes = messages::write_state(Time::now(), &goal, &feedback);
+        let bytes = messages::write_state(Time::now(), &known.state, &feedback);
         self.topics.tell(&mut state, End::Feedback, bytes);
     }
 
@@ -349,3 +445,6 @@ impl GoalEvents for Ear {
         self.topics.ended(&self.id, end);
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::Budget;
 use bytes::Bytes;
 use package::interface::Interface;
 use parking_lot::Mutex;
@@ -76,6 +77,8 @@ pub(super) struct GroupBus {
     pub(super) group: Arc<Group>,
     pub(super) robot: Robot,
     registry: Arc<Registry>,
+    /// Counts what waits here for servants.
+    budget: Budget,
     /// By name, as far as they are used by their topics.
     actions: Mutex<HashMap<String, Arc<ActionTopics>>>,
 }
@@ -100,15 +103,31 @@ impl GroupBus {
             reason: error.to_string(),
         })?;
         let names = (&*action.name, &*action.node);
-        let topics = ActionTopics::new(&self.group, self.robot, names, &of, &self.registry)?;
+        let topics = ActionTopics::new(
+            &self.group,
+            self.robot,
+            names,
+            &of,
+            &self.registry,
+            &self.budget,
+        )?;
         actions.insert(action.name.clone(), Arc::clone(&topics));
         Ok((end, topics))
     }
 }
 
+impl Drop for GroupBus {
+    fn drop(&mut self) {
+        // Goals outlive who sent them, or their results would be lost with a connection; not their robot's place.
+        for topics in self.actions.lock().values() {
+            topics.cancel_all();
+        }
+    }
+}
+
 impl Group {
-    /// A bus for one robot; `registry` holds the definitions of its actions.
-    pub fn bus(self: &Arc<Self>, registry: &Arc<Registry>) -> Arc<dyn Bus> {
+    /// A bus for one robot; `registry` holds the definitions of its actions, what waits for servants counts in `budget`.
+    pub fn bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
         let robot = self
             .robots
             .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
@@ -116,6 +135,7 @@ impl Group {
             group: Arc::clone(self),
             robot,
             registry: Arc::clone(registry),
+            budget: budget.clone(),
             actions: Mutex::default(),
         })
     }

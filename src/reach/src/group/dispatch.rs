@@ -12,7 +12,8 @@
 //!   and goes to a servant that is added meanwhile. Robots that wait have turns: one with a thousand calls holds nobody up.
 //! - A servant carries out goals of one action for one robot at a time, since most action servers take one goal and give up
 //!   the one before for it: another robot's goal would end this robot's. A robot's next goal goes where its goal is, so that
-//!   the node treats both as it would if it were this robot's alone.
+//!   the node treats both as it would if it were this robot's alone. While others wait for the action, at most [`AHEAD`] of
+//!   its goals do so, or one that sends a new goal each second would have the servant for ever; the next ones wait for their turn.
 //! - A request that a lost servant had may have been carried out: it is asked again where the service is idempotent, at most
 //!   [`ATTEMPTS`] times in all (it may be what ends the servants), and fails elsewhere. One that a servant did not take waits
 //!   for its next turn.
@@ -24,6 +25,8 @@ use ros::turns::Turns;
 
 /// How many servants in all may be lost with a request before it fails.
 pub const ATTEMPTS: usize = 3;
+/// So many goals of a robot that has a servant go before those of others who wait for it.
+pub const AHEAD: usize = 8;
 
 /// A request.
 pub type Ticket = u64;
@@ -109,8 +112,8 @@ struct Request {
 #[derive(Debug, Default)]
 struct Servant {
     calls: usize,
-    /// By action, the robot whose goals it carries out, and how many.
-    goals: BTreeMap<Lane, (Robot, usize)>,
+    /// By action, whose goals it carries out.
+    goals: BTreeMap<Lane, Goals>,
     /// It gets no more.
     retired: bool,
     /// It does not take requests at the moment.
@@ -119,9 +122,23 @@ struct Servant {
     asked: u64,
 }
 
+/// Goals of one action that a servant carries out.
+#[derive(Debug)]
+struct Goals {
+    robot: Robot,
+    count: usize,
+    /// So many were begun while others waited.
+    ahead: usize,
+}
+
 impl Servant {
+    /// It can be asked.
+    fn is_open(&self) -> bool {
+        !self.retired && !self.paused
+    }
+
     fn load(&self) -> usize {
-        self.calls + self.goals.values().map(|(_, count)| count).sum::<usize>()
+        self.calls + self.goals.values().map(|goals| goals.count).sum::<usize>()
     }
 }
 
@@ -300,9 +317,9 @@ impl Dispatcher {
         };
         if request.lane == CALLS {
             servant.calls -= 1;
-        } else if let Some((_, count)) = servant.goals.get_mut(&request.lane) {
-            *count -= 1;
-            if *count == 0 {
+        } else if let Some(goals) = servant.goals.get_mut(&request.lane) {
+            goals.count -= 1;
+            if goals.count == 0 {
                 servant.goals.remove(&request.lane);
             }
         }
@@ -360,7 +377,7 @@ impl Dispatcher {
         let mut open: Vec<(Member, &Servant)> = self
             .servants
             .iter()
-            .filter(|(_, servant)| !servant.retired && !servant.paused)
+            .filter(|(_, servant)| servant.is_open())
             .map(|(member, servant)| (*member, servant))
             .collect();
         let wanted = match lane {
@@ -370,9 +387,21 @@ impl Dispatcher {
         if lane == CALLS {
             open.retain(|(_, servant)| servant.calls < self.rules.window);
         } else {
-            let of = |servant: &Servant| servant.goals.get(&lane).map(|(robot, _)| *robot);
-            match open.iter().find(|(_, servant)| of(servant) == Some(robot)) {
-                Some((member, _)) => return vec![*member],
+            let of = |servant: &Servant| {
+                servant
+                    .goals
+                    .get(&lane)
+                    .map(|goals| (goals.robot, goals.ahead))
+            };
+            let own = open.iter().find_map(|(member, servant)| {
+                let (has, ahead) = of(servant)?;
+                (has == robot).then_some((*member, ahead))
+            });
+            match own {
+                Some((member, ahead)) if ahead < AHEAD || !self.others_wait(robot, lane) => {
+                    return vec![member];
+                }
+                Some(_) => return Vec::new(),
                 None => open.retain(|(_, servant)| of(servant).is_none()),
             }
         }
@@ -382,6 +411,17 @@ impl Dispatcher {
         open.sort_by_key(|(member, servant)| (servant.load(), servant.asked, *member));
         open.truncate(wanted);
         open.into_iter().map(|(member, _)| member).collect()
+    }
+
+    /// Whether another robot waits in this lane that no servant carries out a goal for.
+    fn others_wait(&self, robot: Robot, lane: Lane) -> bool {
+        let mut waiting = self.waiting.keys();
+        waiting.any(|(other, of)| *of == lane && *other != robot && !self.has_servant(*other, lane))
+    }
+
+    fn has_servant(&self, robot: Robot, lane: Lane) -> bool {
+        let mut open = self.servants.values().filter(|servant| servant.is_open());
+        open.any(|servant| servant.goals.get(&lane).is_some_and(|of| of.robot == robot))
     }
 
     /// Has servants work at what waits, as far as they can.
@@ -413,12 +453,21 @@ impl Dispatcher {
         if let Some(request) = self.requests.get_mut(&ticket) {
             request.at.insert(member);
         }
+        let others = lane != CALLS && self.others_wait(robot, lane);
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.asked += 1;
-            match lane {
-                CALLS => servant.calls += 1,
-                _ => servant.goals.entry(lane).or_insert((robot, 0)).1 += 1,
+            if lane == CALLS {
+                servant.calls += 1;
+                return;
             }
+            let goals = servant.goals.entry(lane).or_insert(Goals {
+                robot,
+                count: 0,
+                ahead: 0,
+            });
+            // The first one was its turn.
+            goals.ahead += usize::from(others && goals.count > 0);
+            goals.count += 1;
         }
     }
 }

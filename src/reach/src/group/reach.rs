@@ -25,7 +25,7 @@ pub struct Seat {
 impl Seat {
     /// A place for one robot. `registry` holds the definitions of the service's types.
     pub fn new(group: &Arc<Group>, registry: Arc<Registry>, options: BridgeOptions) -> Seat {
-        let bus = group.bus(&registry);
+        let bus = group.bus(&registry, &options.budget);
         Seat {
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
             bus,

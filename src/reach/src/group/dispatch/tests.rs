@@ -70,6 +70,41 @@ fn a_servant_carries_out_goals_of_one_robot_at_a_time() {
 }
 
 #[test]
+fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
+    let mut group = group(RULES, 1);
+    assert_eq!(group.ask(1, &goal()).1, [Order::Ask(1, 1)]);
+    // Each takes the place of the one before, as action servers do.
+    let mut before = 1;
+    let mut next = |group: &mut Dispatcher| {
+        let (ticket, orders) = group.ask(1, &goal());
+        let begins = orders == [Order::Ask(ticket, 1)];
+        if begins {
+            assert_eq!(group.ended(before, 1, End::Answered).1, []);
+            before = ticket;
+        }
+        (begins, before)
+    };
+    for _ in 0..100 {
+        assert!(next(&mut group).0, "nobody else waits");
+    }
+    let (other, orders) = group.ask(2, &goal());
+    assert_eq!(orders, []);
+    let ahead = (0..100).filter(|_| next(&mut group).0).count();
+    assert_eq!(ahead, AHEAD);
+    let (_, last) = next(&mut group);
+    assert_eq!(
+        group.ended(last, 1, End::Answered).1,
+        [Order::Ask(other, 1)],
+        "the first robot's next ones wait for their turn"
+    );
+    let first = other + 1 + AHEAD as u64;
+    assert_eq!(
+        group.ended(other, 1, End::Answered).1.first(),
+        Some(&Order::Ask(first, 1))
+    );
+}
+
+#[test]
 fn what_a_lost_servant_had_fails_or_is_asked_again() {
     let mut strict = group(RULES, 2);
     strict.ask(1, &Kind::Call);
@@ -331,6 +366,23 @@ impl World {
         let count = waiting.clone().count();
         assert_eq!(self.group.load().waiting, count);
         assert_eq!(self.group.load().under_way, open.len() - count);
+        let has_servant = |of: &Seen| {
+            let mut same = open.iter();
+            same.any(|other| {
+                let here = other.kind == of.kind && other.robot == of.robot;
+                here && self
+                    .members
+                    .keys()
+                    .filter(able)
+                    .any(|it| other.at.contains(it))
+            })
+        };
+        let others_wait = |seen: &Seen| {
+            let mut others = open.iter().filter(|other| other.at.is_empty());
+            others.any(|other| {
+                other.kind == seen.kind && other.robot != seen.robot && !has_servant(other)
+            })
+        };
         // Nothing waits for what could be asked.
         for seen in waiting {
             let able: Vec<&Member> = self.members.keys().filter(able).collect();
@@ -340,7 +392,10 @@ impl World {
                     Kind::Call => {
                         here.filter(|other| other.kind == Kind::Call).count() < self.rules.window
                     }
-                    _ => here.all(|other| other.kind != seen.kind || other.robot == seen.robot),
+                    // A robot's further goals stand back for others'.
+                    _ => here.all(|other| {
+                        other.kind != seen.kind || (other.robot == seen.robot && !others_wait(seen))
+                    }),
                 }
             });
             let wanted = match seen.kind {
