@@ -318,6 +318,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
             Unchanged::Untenable(untenable) => kind_of_terms(untenable),
             Unchanged::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
             Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
+            Unchanged::Many => (S::CONFLICT, "too-many", "too many state something"),
         },
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
         C::NoRollout(_) => (S::NOT_FOUND, "no-rollout", "no rollout"),
@@ -354,6 +355,9 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
             Unchanged::Full(_) => "try again later; it keeps what it has until then".into(),
             Unchanged::Used { used, .. } => {
                 format!("state memory={used} or more, or end it with: cloudroidctl stop")
+            }
+            Unchanged::Many => {
+                "let these stubs state nothing, or end the servant with: cloudroidctl stop".into()
             }
         },
         C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),

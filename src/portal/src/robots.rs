@@ -35,6 +35,8 @@ const POLICY: u16 = 1008;
 const STUB_AHEAD: usize = 64 * 1024;
 /// Words about where a robot stands that may wait to be sent.
 const NEWS: usize = 4;
+/// Bytes of a node's name.
+const LONGEST_NODE: usize = 256;
 
 /// `/`: the page, or the default service.
 pub async fn root(
@@ -143,9 +145,11 @@ impl Asked {
                 "a link needs the robot's id: ?robot=ID".to_owned(),
             ));
         }
+        let node = guard::query(uri.query(), "node").unwrap_or_default();
+        check_node(&node).map_err(Error::BadRequest)?;
         let stated = Stated::read(guard::pairs(uri.query()));
         Ok(Asked {
-            node: guard::query(uri.query(), "node").unwrap_or_default(),
+            node,
             stated: stated.map_err(Error::Unstatable)?,
             link,
             service,
@@ -153,6 +157,18 @@ impl Asked {
             shared,
             resume: guard::query(uri.query(), "resume").filter(|token| !token.is_empty()),
         })
+    }
+}
+
+/// Refuses what cannot name a node; it is kept with what its stub states, and shown.
+fn check_node(node: &str) -> Result<(), String> {
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "_/".contains(c);
+    match node.len() <= LONGEST_NODE && node.chars().all(is_name) {
+        true => Ok(()),
+        false => Err(format!(
+            "node={:?} does not name a node; write letters, digits, _ and /, at most {LONGEST_NODE}",
+            node.chars().take(LONGEST_NODE).collect::<String>()
+        )),
     }
 }
 
@@ -461,6 +477,18 @@ async fn left<S: AsyncRead + Unpin>(io: &mut S, kept: &mut BytesMut) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_cannot_name_a_node_is_refused() {
+        let long = "/".to_owned() + &"n".repeat(LONGEST_NODE - 1);
+        for node in ["", "/detector", "ns/node_2", "/_anonymous_1", &long] {
+            assert_eq!(check_node(node), Ok(()), "{node}");
+        }
+        for node in ["/a b", "/a\nb", "<svg>", "/é", &(long + "n")] {
+            let refused = check_node(node).expect_err(node);
+            assert!(refused.len() < LONGEST_NODE + 200, "{refused}");
+        }
+    }
 
     #[test]
     fn who_holds_the_resume_token_comes_back_to_the_same_servant() {

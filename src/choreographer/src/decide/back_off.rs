@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 /// After the second failure in a row.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(300);
+/// The same where the pause is that of several robots, and what one of them sent may have ended the servant.
+const LONGEST_SHARED: Duration = Duration::from_secs(4);
 /// A servant that was ready for so long before it failed had recovered.
 pub const RECOVERED: Duration = Duration::from_secs(60);
 /// So long after its pause a failure is forgotten.
@@ -24,10 +26,11 @@ pub struct Failing {
     pub again: Instant,
 }
 
-/// A servant of `revision` has failed at `now`, after it was ready for `ready_for` if it ever was.
+/// A servant of `revision` has failed at `now`, after it was ready for `ready_for` if it ever was. `shared`: the pause is that of
+/// several robots.
 pub fn after_failure(
     before: Option<&Failing>,
-    revision: u64,
+    (revision, shared): (u64, bool),
     ready_for: Option<Duration>,
     reason: &str,
     now: Instant,
@@ -39,10 +42,15 @@ pub fn after_failure(
     let failures = before
         .filter(counts)
         .map_or(1, |before| before.failures.saturating_add(1));
+    // One that was never ready has met no robot.
+    let longest = match shared && ready_for.is_some() {
+        true => LONGEST_SHARED,
+        false => LONGEST_PAUSE,
+    };
     let pause = match failures {
         1 => Duration::ZERO,
         // 2^9 s is longer than the longest.
-        n => LONGEST_PAUSE.min(FIRST_PAUSE * 2u32.pow((n - 2).min(9))),
+        n => longest.min(FIRST_PAUSE * 2u32.pow((n - 2).min(9))),
     };
     Failing {
         revision,
@@ -74,7 +82,7 @@ mod tests {
         let mut now = Instant::now();
         let mut failing: Option<Failing> = None;
         let mut fails = |revision, ready_for, after| {
-            let next = after_failure(failing.as_ref(), revision, ready_for, "died", now);
+            let next = after_failure(failing.as_ref(), (revision, false), ready_for, "died", now);
             let pause = (next.again - now).as_secs();
             now = next.again + after;
             failing = Some(next);
@@ -89,6 +97,21 @@ mod tests {
         assert_eq!(fails(2, None, none), 0, "another revision");
         assert_eq!(fails(2, None, FORGOTTEN), 1);
         assert_eq!(fails(2, None, none), 0, "long ago");
+    }
+
+    #[test]
+    fn no_robot_keeps_others_that_share_its_pause_away_for_long() {
+        let now = Instant::now();
+        let failing = |ready_for| {
+            let mut before: Option<Failing> = None;
+            for _ in 0..20 {
+                let next = after_failure(before.as_ref(), (1, true), ready_for, "died", now);
+                before = Some(next);
+            }
+            before.expect("it failed").again - now
+        };
+        assert_eq!(failing(Some(Duration::ZERO)), LONGEST_SHARED);
+        assert_eq!(failing(None), LONGEST_PAUSE, "no robot has done that");
     }
 
     #[test]
@@ -114,7 +137,7 @@ mod tests {
             let mut now = Instant::now();
             let mut before: Option<Failing> = None;
             for gap in gaps {
-                let next = after_failure(before.as_ref(), 1, None, "died", now);
+                let next = after_failure(before.as_ref(), (1, false), None, "died", now);
                 let pause = next.again - now;
                 prop_assert!(pause <= LONGEST_PAUSE);
                 prop_assert_eq!(pause.is_zero(), next.failures == 1);

@@ -26,6 +26,8 @@ const FEW: f64 = 0.7;
 const STEADY: Duration = Duration::from_secs(1);
 /// After a servant could not be started.
 const PAUSE: Duration = Duration::from_secs(5);
+/// Places of one group that their robots have left, and that are kept for when these come back.
+pub(crate) const LEFT: usize = 256;
 
 /// A group at one moment.
 #[derive(Debug, Clone, Copy)]
@@ -111,6 +113,14 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
         return (Some(Step::Retire(reason)), Since::default());
     }
     (None, since)
+}
+
+/// Which of the places that robots have left (until when each is kept, and its id) are given up: those that were left first. A
+/// place takes no capacity, so that nothing else bounds how many there are, and robots are free to give themselves new names.
+pub(crate) fn given_up(mut left: Vec<(u64, &str)>) -> Vec<&str> {
+    left.sort_unstable();
+    left.truncate(left.len().saturating_sub(LEFT));
+    left.into_iter().map(|(_, id)| id).collect()
 }
 
 #[cfg(test)]
@@ -245,6 +255,20 @@ mod tests {
             assert!((1..=4).contains(ready), "{ready} servants");
         }
         steps
+    }
+
+    #[test]
+    fn places_that_were_left_first_are_given_up_first() {
+        let ids: Vec<String> = (0..LEFT + 2).map(|number| format!("s{number}")).collect();
+        // Not in the order in which they were left.
+        let left = |count: usize| {
+            let left = ids.iter().take(count).rev().enumerate();
+            left.map(|(until, id)| (until as u64, id.as_str()))
+                .collect()
+        };
+        assert_eq!(given_up(left(LEFT)), Vec::<&str>::new());
+        let last = [&*ids[LEFT + 1], &*ids[LEFT]];
+        assert_eq!(given_up(left(LEFT + 2)), last);
     }
 
     proptest! {

@@ -52,7 +52,8 @@ impl BackOffs {
             failing.retain(|_, known| !is_forgotten(known, now));
         }
         let key = (service.to_owned(), robot.to_owned());
-        let next = after_failure(failing.get(&key), revision.number, ready_for, reason, now);
+        let of = (revision.number, robot == NAMELESS);
+        let next = after_failure(failing.get(&key), of, ready_for, reason, now);
         failing.insert(key, next.clone());
         next
     }

@@ -36,6 +36,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
     inner.note_end(&handle, &outcome);
+    inner.rollouts.note_gone(&handle);
     if matches!(outcome, Err(Failure::Broken { .. })) {
         inner.rollouts.note_servant(&handle, true);
     }

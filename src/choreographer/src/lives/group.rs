@@ -25,7 +25,7 @@ use tokio::time::Instant;
 use super::driver::{self, Beginning};
 use super::reaching::Measures;
 use super::{Inner, Servants};
-use crate::decide::group::{Facts, Since, Step, look};
+use crate::decide::group::{Facts, Since, Step, given_up, look};
 use crate::decide::placement::Placement;
 use crate::handle::{Failure, Handle};
 use crate::lives::lifetime::unneeded;
@@ -271,6 +271,7 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
         if *seats.borrow_and_update() == 0 && inner.groups.leave(&shares) {
             break None;
         }
+        give_up_places(&inner, &shares);
         let facts = facts(&inner, &shares, failed);
         let (step, next) = look(&facts, since, Instant::now().into_std());
         since = next;
@@ -305,19 +306,30 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
     }
 }
 
-/// The shortest response time that a robot of the group wishes for.
-fn desired(inner: &Inner, shares: &Shares) -> Option<Duration> {
-    let servants = inner.servants.lock();
-    let of = |handle: &&Arc<Handle>| {
+/// The places of robots in the group.
+fn places<'a>(servants: &'a Servants, shares: &'a Shares) -> impl Iterator<Item = &'a Arc<Handle>> {
+    servants.all.values().filter(|handle| {
         handle.is_place()
             && handle.revision.number == shares.revision.number
             && handle.service() == shares.revision.service
-    };
-    let terms = servants
-        .all
-        .values()
-        .filter(of)
-        .map(|handle| handle.terms());
+    })
+}
+
+/// Ends places that robots have left, where those are too many.
+fn give_up_places(inner: &Inner, shares: &Shares) {
+    let servants = inner.servants.lock();
+    let left = places(&servants, shares);
+    let left = left.filter(|handle| !handle.is_ending() && handle.connections() == 0);
+    let left = left.filter_map(|handle| Some((handle.idle_until()?, &*handle.id)));
+    for id in given_up(left.collect()) {
+        servants.all[id].end("robots have left more places than are kept");
+    }
+}
+
+/// The shortest response time that a robot of the group wishes for.
+fn desired(inner: &Inner, shares: &Shares) -> Option<Duration> {
+    let servants = inner.servants.lock();
+    let terms = places(&servants, shares).map(|handle| handle.terms());
     let times = terms.flat_map(|terms| terms.stated.into_values());
     times
         .filter_map(|stated| Some(stated.sla.rrt?.duration()))

@@ -23,6 +23,9 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// `cpu.weight` where nobody has asked for one.
 pub(super) const PLAIN_WEIGHT: u64 = 100;
 
+/// Nodes of one robot whose stubs may state something: what they say is kept, and written down, for as long as the servant lives.
+const STATING: usize = 64;
+
 /// Why a servant is not resized.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Unchanged {
@@ -40,6 +43,9 @@ pub enum Unchanged {
         /// What it would have.
         wanted: Size,
     },
+    /// Too many clients of one robot state something.
+    #[error("{STATING} nodes of its robot have stated something already")]
+    Many,
 }
 
 impl Choreographer {
@@ -131,6 +137,14 @@ impl Inner {
         if all.insert(who.to_owned(), stated.clone()).as_ref() == Some(stated) {
             // Another connection of the same client was faster.
             return Ok(());
+        }
+        if all.len() > STATING {
+            return Err(Error::NotResized {
+                servant: handle.id.clone(),
+                service: handle.service().to_owned(),
+                stated: stated.to_string(),
+                reason: Box::new(Unchanged::Many),
+            });
         }
         let measured = before.terms.measured.clone();
         let terms = self.offering(&handle.revision, |_| measured, |offer| terms(&all, offer))?;

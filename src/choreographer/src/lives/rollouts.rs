@@ -67,6 +67,19 @@ impl Rollouts {
         });
     }
 
+    /// A robot without a name is gone: it does not come back, and another takes its place in the canary.
+    pub(crate) fn note_gone(&self, handle: &Handle) {
+        let mut kept = self.kept.lock();
+        let rollout = kept.by_service.get_mut(handle.service());
+        if let Some(rollout) = rollout.filter(|_| handle.anonymous) {
+            let before = rollout.robots.len();
+            rollout.robots.retain(|robot| *robot != handle.robot);
+            if rollout.robots.len() < before {
+                kept.changed.insert(handle.service().to_owned());
+            }
+        }
+    }
+
     fn note(
         &self,
         service: &str,

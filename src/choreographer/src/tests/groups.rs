@@ -12,6 +12,7 @@ use tokio::sync::Semaphore;
 
 use super::servants::World;
 use super::*;
+use crate::decide::group::LEFT;
 
 const LONG: Duration = Duration::from_secs(600);
 
@@ -315,4 +316,28 @@ async fn a_daemon_that_comes_after_uses_the_servants_that_are_there() {
     shop.answers.add_permits(1);
     assert!(call(&bus, "again").await.is_ok());
     assert_eq!(shop.world.engine.servants(), servants);
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
+    let shop = Shop::new(api::Shared::default());
+    let daemon = shop.world.daemon();
+    let began = tokio::time::Instant::now();
+    let (_lease, bus) = robot(&daemon, "stays").await;
+    for number in 0..2 * LEFT {
+        drop(robot(&daemon, &format!("r{number}")).await);
+    }
+    let (last, _) = robot(&daemon, "last").await;
+    let id = last.handle().id.clone();
+    drop(last);
+    until(&daemon, |group| group.robots <= LEFT + 1).await;
+    assert!(
+        began.elapsed() < options().grace,
+        "all of them were kept until their time was over"
+    );
+    // Who left last finds its place, and who stayed was not disturbed.
+    let (last, _) = robot(&daemon, "last").await;
+    assert_eq!(last.handle().id, id);
+    shop.answers.add_permits(1);
+    assert!(call(&bus, "still").await.is_ok());
 }

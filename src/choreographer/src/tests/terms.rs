@@ -461,3 +461,28 @@ async fn a_robot_that_is_refused_again_and_again_does_not_fill_the_journal() {
         .filter(|told| told.contains("180 more refusals"));
     assert_eq!(more.count(), 1, "{told:?}");
 }
+
+#[tokio::test(start_paused = true)]
+async fn stubs_of_ever_new_nodes_do_not_make_what_is_stated_grow_without_end() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    let _stays = ready(&daemon, stating("r1", &[("cpus", "0.5")])).await;
+    let mut refused = None;
+    for number in 0..1000 {
+        let request = stating("r1", &[("aux.width", &number.to_string())]);
+        let request = request.by_stub(&format!("/node{number}"));
+        let lease = daemon.ensure(request).expect("a lease");
+        if let Err(error) = lease.admitted().await {
+            refused = Some((number, error.to_string()));
+            break;
+        }
+    }
+    let (number, error) = refused.expect("that are too many");
+    assert_eq!(number, 63, "the first client stated something, too");
+    assert!(error.contains("64 nodes of its robot"), "{error}");
+    // Who has stated something may state something else.
+    let known = stating("r1", &[("aux.width", "7")]).by_stub("/node3");
+    let known = daemon.ensure(known).expect("a lease").admitted().await;
+    assert!(known.is_ok(), "{known:?}");
+}

@@ -86,6 +86,24 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn robots_without_names_do_not_use_up_the_places_of_a_canary() {
+    let world = two();
+    let daemon = keeps(&world);
+    let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
+    begun.await.expect("it begins");
+    for robot in ["~aaaaaa", "~bbbbbb"] {
+        let request = ServantRequest::new("greet", robot).anonymous();
+        let lease = daemon.ensure(request).expect("a lease");
+        assert_eq!(lease.handle().revision.number, 2, "{robot}");
+        let handle = Arc::clone(lease.handle());
+        drop(lease);
+        handle.ended().await;
+    }
+    drop(gets(&daemon, "r1", 2).await);
+    drop(gets(&daemon, "r2", 1).await);
+}
+
+#[tokio::test(start_paused = true)]
 async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
     let world = two();
     let daemon = keeps(&world);
