@@ -134,7 +134,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
                     keeper.end();
                 }
                 mirror.session().report(&FromRobot::Signal { signal });
-                let up = *mirror.session().up().borrow();
+                let up = mirror.session().is_up();
                 let patience = if up { FAREWELL } else { Duration::ZERO };
                 let mut exit = mirror.exit();
                 tokio::select! {

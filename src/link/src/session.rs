@@ -189,6 +189,12 @@ impl<O: Order> Session<O> {
         self.up.subscribe()
     }
 
+    /// Whether the peer is there now. Nothing stays borrowed: a second look in the same expression, with a change that waits
+    /// between the two, would wait for ever.
+    pub fn is_up(&self) -> bool {
+        *self.up.borrow()
+    }
+
     /// The peer's clock against ours.
     pub fn clock(&self) -> Option<Sample> {
         self.state.lock().clock.best()

@@ -423,7 +423,7 @@ impl Hub {
     fn feeder(&self, topic: &str) -> Option<String> {
         let links = self.links.lock();
         let mut listening = links.values().filter(|link| link.listens_to(topic));
-        let first = listening.clone().find(|link| *link.session.up().borrow());
+        let first = listening.clone().find(|link| link.session.is_up());
         first
             .or_else(|| listening.next())
             .map(|link| link.node.clone())

@@ -160,7 +160,7 @@ pub async fn report(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             return;
         };
         let session = mirror.session();
-        if *session.up().borrow() {
+        if session.is_up() {
             let requests = std::mem::take(&mut *promise.reports.waiting.lock());
             if !requests.is_empty() {
                 session.report(&FromRobot::Requests(requests));

@@ -301,7 +301,7 @@ impl Hub {
         let links = self.links.lock();
         let suitable = || links.values().filter(|link| suits(link));
         let own = suitable().find(|link| link.node == node);
-        let up = || suitable().find(|link| *link.session.up().borrow());
+        let up = || suitable().find(|link| link.session.is_up());
         own.or_else(up).or_else(|| suitable().next()).cloned()
     }
 }

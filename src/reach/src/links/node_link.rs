@@ -148,7 +148,7 @@ impl NodeLink {
     pub(super) fn is_connected(&self) -> bool {
         // One that is new has exchanged nothing yet.
         let fresh = self.session.clock().is_none();
-        self.lease.try_lock().is_err() && (fresh || *self.session.up().borrow())
+        self.lease.try_lock().is_err() && (fresh || self.session.is_up())
     }
 
     pub(super) fn listens_to(&self, topic: &str) -> bool {
@@ -158,14 +158,12 @@ impl NodeLink {
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
         let (given, left_out) = self.outputs.left_out();
-        // Looked at one by one: what is borrowed within the expression below stays borrowed to its end, and `duplicates` looks at
-        // the same again. Two readers with a writer between them would wait for each other.
-        let up = *self.session.up().borrow();
+        // Before the expression below, to whose end they would stay locked: `duplicates` looks at other links.
         let dropped = self.dropped.lock().clone();
         let requests = self.requests.lock().iter().cloned().collect();
         LinkStatus {
             node: self.node.clone(),
-            up,
+            up: self.session.is_up(),
             round_trip: self.session.round_trip().map(milliseconds),
             clock: self
                 .session

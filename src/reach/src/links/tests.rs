@@ -285,3 +285,43 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
         [("/detect".to_owned(), 2), ("/detect".to_owned(), 15)]
     );
 }
+
+#[tokio::test]
+async fn asking_how_a_link_is_doing_holds_up_no_connection() {
+    let (hub, _nodes) = hub().await;
+    let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
+    let link = hub.links.lock()["/detect"].clone();
+    // Whoever asks comes as far as to the links of other machines …
+    let held = hub.links.lock();
+    let (sender, thread) = std::sync::mpsc::channel();
+    let asked = Arc::clone(&link);
+    let asking = std::thread::spawn(move || {
+        let own = std::fs::read_link("/proc/thread-self").expect("this thread");
+        sender.send(own).expect("it is awaited");
+        asked.status()
+    });
+    let state = std::path::Path::new("/proc")
+        .join(thread.recv().expect("it runs"))
+        .join("stat");
+    let asleep = || std::fs::read_to_string(&state).is_ok_and(|state| state.contains(") S "));
+    while !asleep() {
+        std::thread::yield_now();
+    }
+    // … while a connection begins and ends.
+    let (sender, over) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build();
+        let (_, cloud) = duplex(1 << 16);
+        let mut socket = WebSocket::new(cloud, b"", MAX_FRAME, MAX_RECORD);
+        runtime
+            .expect("a runtime")
+            .block_on(link.session.run(&mut socket, &*link));
+        let _ = sender.send(());
+    });
+    over.recv_timeout(PATIENCE)
+        .expect("the connection waits for whoever asks");
+    drop(held);
+    assert_eq!(asking.join().expect("no panic").node, "/detect");
+}
