@@ -78,8 +78,10 @@ impl Meter {
     }
 
     /// An output came, `age` after its stamp (zero where it has none); what was [`missed`](Self::missed) until `now`
-    /// was asked for before. Gives T, and none where there is nothing to compare with.
+    /// was asked for before. Gives T, and none where there is nothing to compare with. While none is awaited nothing is
+    /// noted: one that was on its way when the last subscriber left is followed by none.
     pub fn output(&mut self, now: Instant, age: Duration) -> Option<Duration> {
+        self.deadline?;
         let counted = std::mem::take(&mut self.counted);
         match &mut self.kind {
             Kind::Rate { over, arrivals } => {
@@ -188,6 +190,7 @@ mod tests {
     fn an_output_that_is_too_old_when_it_comes_counts_once() {
         let mut meter = meter("measure.age = { output = '/m', desire = 0.5, max = 1 }");
         let start = Instant::now() + Duration::from_secs(100);
+        meter.start(start);
         assert_eq!(meter.output(start, 3000 * MS), None);
         assert_eq!(meter.missed(start), 1);
         assert_eq!(meter.output(start + 100 * MS, Duration::ZERO), None);

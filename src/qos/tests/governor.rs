@@ -531,6 +531,33 @@ fn frames_per_second_start_the_local_original_and_stop_the_robot() {
 }
 
 #[test]
+fn a_frame_that_was_on_its_way_when_nobody_listened_any_more_awaits_no_other() {
+    for measure in [
+        r#"{"frames_per_second": {"output": "/found", "desire": 10, "min": 4}}"#,
+        r#"{"age": {"output": "/found", "desire": 0.1, "max": 0.25}}"#,
+    ] {
+        let mut robot = Robot::new(json(&format!(
+            r#"{{"measure": {measure}, "local": "cold", "initial": 5,
+                "safe_stop": {{"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}}}"#
+        )));
+        robot.governor.wanted(robot.now, "/found", true);
+        robot.after(100);
+        assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
+        robot.governor.wanted(robot.now, "/found", false);
+        robot.after(10);
+        let q = robot.q();
+        let _ = robot.found(Side::Cloud, 2);
+        let done = robot.after(60_000);
+        assert!(done.is_empty(), "{measure}: {done:?}");
+        assert_eq!(robot.q(), q, "{measure}");
+        // Who listens again is promised frames again.
+        robot.governor.wanted(robot.now, "/found", true);
+        let done = robot.after(300);
+        assert_eq!(done[0], "safe stop", "{measure}: {done:?}");
+    }
+}
+
+#[test]
 fn a_crash_of_the_local_original_brings_calls_back_to_the_cloud() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
     robot.governor.local(robot.now, LocalState::Ready);
