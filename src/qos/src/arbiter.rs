@@ -58,7 +58,9 @@ pub struct Arbiter<P> {
     limits: Limits,
     next: u64,
     requests: BTreeMap<RequestId, Record<P>>,
-    /// One for each request that still awaits its T_max or its end.
+    /// How many of them are inputs.
+    inputs: usize,
+    /// One for each of them ([`Record::timer`]): its T_max, or the end of its patience.
     timers: BTreeSet<(Instant, RequestId)>,
     /// Inputs that nobody answered by T_max, the oldest first.
     stragglers: VecDeque<RequestId>,
@@ -71,6 +73,8 @@ pub(crate) struct Record<P> {
     pub(crate) payload: Option<P>,
     pub(crate) asked_at: Instant,
     pub(crate) deadline: Instant,
+    /// When it is looked at again.
+    timer: Instant,
     pub(crate) cloud: Leg,
     pub(crate) local: Leg,
     /// Whose answer was taken, per output.
@@ -124,6 +128,7 @@ impl<P: Clone> Arbiter<P> {
             limits,
             next: 0,
             requests: BTreeMap::new(),
+            inputs: 0,
             timers: BTreeSet::new(),
             stragglers: VecDeque::new(),
         }
@@ -153,11 +158,14 @@ impl<P: Clone> Arbiter<P> {
             Kind::Call(_) => 1,
             Kind::Input { outputs, .. } => *outputs,
         };
+        let deadline = now + t_max;
         let record = Record {
             kind,
             payload: Some(payload),
             asked_at: now,
-            deadline: now + t_max,
+            deadline,
+            // At T_max it is still in time.
+            timer: deadline + Duration::from_nanos(1),
             cloud: Leg::NotAsked,
             local: Leg::NotAsked,
             owners: vec![None; outputs],
@@ -168,9 +176,8 @@ impl<P: Clone> Arbiter<P> {
             cloud_time: None,
             answer_time: None,
         };
-        // At T_max it is still in time.
-        let passed = record.deadline + Duration::from_nanos(1);
-        self.timers.insert((passed, id));
+        self.inputs += usize::from(!record.is_call());
+        self.timers.insert((record.timer, id));
         self.requests.insert(id, record);
         id
     }
@@ -259,7 +266,14 @@ impl<P: Clone> Arbiter<P> {
 
     /// Nobody wants the answer any more; what comes is dropped.
     pub fn cancel(&mut self, id: RequestId) {
-        self.requests.remove(&id);
+        self.remove(id);
+    }
+
+    fn remove(&mut self, id: RequestId) -> Option<Record<P>> {
+        let record = self.requests.remove(&id)?;
+        self.timers.remove(&(record.timer, id));
+        self.inputs -= usize::from(!record.is_call());
+        Some(record)
     }
 
     /// A call is over when everybody who was asked has spoken; inputs stay until their patience ends, because
@@ -270,7 +284,7 @@ impl<P: Clone> Arbiter<P> {
             record.is_call() && !record.is_open() && record.awaits_nobody() && counts(record)
         };
         if self.requests.get(&id).is_some_and(over) {
-            self.requests.remove(&id);
+            self.remove(id);
         }
     }
 
@@ -326,17 +340,17 @@ impl<P: Clone> Arbiter<P> {
         self.timers.first().map(|(at, _)| *at)
     }
 
-    /// More is remembered than may be.
+    /// More inputs are remembered than may be.
     pub(crate) fn is_crowded(&self) -> bool {
-        self.requests.len() > self.limits.requests
+        self.inputs > self.limits.requests
     }
 
     /// Requests whose T_max has passed since the last call, and those that are forgotten now.
     pub(crate) fn expire(&mut self, now: Instant) -> (Vec<RequestId>, Vec<(RequestId, Record<P>)>) {
         let (mut overdue, mut forgotten) = (Vec::new(), Vec::new());
         while let Some((at, id)) = self.timers.first().copied().filter(|(at, _)| *at <= now) {
-            self.timers.pop_first();
             let Some(record) = self.requests.get_mut(&id) else {
+                self.timers.pop_first();
                 continue;
             };
             if !record.overdue {
@@ -344,15 +358,17 @@ impl<P: Clone> Arbiter<P> {
                 if !record.is_call() && record.payload.is_some() {
                     self.stragglers.push_back(id);
                 }
-                overdue.push(id);
-                self.timers.insert((at + self.limits.patience, id));
+                record.timer = at + self.limits.patience;
             } else if record.is_call() && record.is_open() {
                 // Somebody waits for it, as long as it takes. Whether it can come at all is looked at again later.
-                overdue.push(id);
-                self.timers.insert((now + self.limits.patience, id));
-            } else if let Some(record) = self.requests.remove(&id) {
-                forgotten.push((id, record));
+                record.timer = now + self.limits.patience;
+            } else {
+                forgotten.extend(self.remove(id).map(|record| (id, record)));
+                continue;
             }
+            overdue.push(id);
+            self.timers.pop_first();
+            self.timers.insert((record.timer, id));
         }
         while self.stragglers.len() > STRAGGLERS {
             let oldest = self.stragglers.pop_front();
@@ -361,13 +377,12 @@ impl<P: Clone> Arbiter<P> {
             }
         }
         if self.is_crowded() {
-            let crowd = self.requests.len() - self.limits.requests;
+            let crowd = self.inputs - self.limits.requests;
             let inputs = self.requests.iter().filter(|(_, record)| !record.is_call());
             let oldest: Vec<RequestId> = inputs.map(|(id, _)| *id).take(crowd).collect();
             for id in oldest {
-                forgotten.extend(self.requests.remove(&id).map(|record| (id, record)));
+                forgotten.extend(self.remove(id).map(|record| (id, record)));
             }
-            self.timers.retain(|(_, id)| self.requests.contains_key(id));
         }
         (overdue, forgotten)
     }
@@ -456,8 +471,9 @@ mod tests {
             };
             arbiter.open(now, MAX, kind, 7);
             arbiter.expire(now);
-            assert!(arbiter.requests.len() <= 10, "{}", arbiter.requests.len());
-            assert!(arbiter.timers.len() <= 11, "{}", arbiter.timers.len());
+            assert!(arbiter.inputs <= 10, "{}", arbiter.inputs);
+            assert_eq!(arbiter.requests.len(), arbiter.inputs + 1);
+            assert_eq!(arbiter.timers.len(), arbiter.requests.len());
         }
         let (overdue, _) = arbiter.expire(now + MAX);
         assert!(overdue.is_empty(), "at T_max it is still in time");

@@ -558,6 +558,37 @@ fn a_frame_that_was_on_its_way_when_nobody_listened_any_more_awaits_no_other() {
 }
 
 #[test]
+fn without_a_promise_no_call_is_remembered_that_is_over() {
+    let mut robot = Robot::new(json(r#"{"measure": {"link": {"after": 1}}}"#));
+    // Of those that the cloud answered …
+    for _ in 0..100 {
+        let id = robot.call("sum");
+        let verdict = robot.governor.answered(robot.now, Side::Cloud, id);
+        assert_eq!(verdict, Verdict::Deliver);
+    }
+    assert_eq!(robot.governor.deadline(), None);
+    // … those that the local original answered, whom nobody asks the cloud for …
+    robot.governor.link_down(robot.now);
+    robot.after(1000);
+    robot.governor.local(robot.now, LocalState::Ready);
+    let told = robot.outcomes.len();
+    for _ in 0..10_000 {
+        let id = robot.call("sum");
+        let verdict = robot.governor.answered(robot.now, Side::Local, id);
+        assert_eq!(verdict, Verdict::Deliver);
+    }
+    assert_eq!(robot.governor.deadline(), None);
+    robot.effects();
+    let outcomes = &robot.outcomes[told..];
+    assert_eq!(outcomes.len(), 10_000, "they are told of");
+    assert!(outcomes.iter().all(|outcome| outcome.cloud.is_none()));
+    // … and those that nobody waits for any more.
+    let id = robot.call("sum");
+    robot.governor.cancel(robot.now, id);
+    assert_eq!(robot.governor.deadline(), None);
+}
+
+#[test]
 fn a_crash_of_the_local_original_brings_calls_back_to_the_cloud() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
     robot.governor.local(robot.now, LocalState::Ready);

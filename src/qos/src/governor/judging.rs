@@ -39,6 +39,10 @@ impl<P: Clone> Governor<P> {
             }
         }
         let verdict = self.arbiter.answer_with(now, id, side, output);
+        if answers && verdict == Verdict::Deliver && self.sla.is_of_link() {
+            // No time is promised that could pass: there is nothing more to learn about it.
+            self.arbiter.judge(id, None);
+        }
         if answers && (side == Side::Cloud || verdict == Verdict::Deliver) {
             self.announce(id);
         }
