@@ -1,5 +1,6 @@
 //! What a service is given beyond its container, seen from inside. Told on the host and in the virtual machine.
 
+use std::io::ErrorKind;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 
@@ -21,7 +22,6 @@ impl Specification {
     /// Of devices of this kind: one, `zero`, with a hook that must not be run.
     pub fn write(kind: &str) -> anyhow::Result<Specification> {
         let directory = PathBuf::from("/var/run/cdi");
-        std::fs::create_dir_all(&directory)?;
         let path = directory.join(format!("cloudroid-story-{}.json", std::process::id()));
         let hook = serde_json::json!({"hookName": "createRuntime", "path": "/bin/false", "args": ["false", "story"]});
         let text = serde_json::json!({
@@ -33,8 +33,18 @@ impl Specification {
                 "hooks": [hook],
             }}],
         });
-        std::fs::write(&path, text.to_string())?;
-        Ok(Specification(path))
+        loop {
+            std::fs::create_dir_all(&directory)?;
+            // Whole or not at all: other daemons of this machine read it, too.
+            let new = path.with_extension("new");
+            let written = std::fs::write(&new, text.to_string());
+            match written.and_then(|()| std::fs::rename(&new, &path)) {
+                Ok(()) => return Ok(Specification(path)),
+                // Somebody else's was the last in it, and has gone with the directory.
+                Err(error) if error.kind() == ErrorKind::NotFound => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
     }
 }
 
