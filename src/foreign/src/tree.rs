@@ -113,23 +113,6 @@ impl Tree {
         self.open_and_read(path.as_ref(), limit, INSIDE)
     }
 
-    /// What a process whose root this tree is finds at `path`, itself not followed where it is a link; none when there is
-    /// nothing.
-    pub fn kind_in_root(&self, path: impl AsRef<Path>) -> Option<FileType> {
-        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-        let resolve = ResolveFlags::IN_ROOT | ResolveFlags::NO_MAGICLINKS;
-        rustix::fs::openat2(
-            &self.directory,
-            path.as_ref(),
-            flags,
-            Mode::empty(),
-            resolve,
-        )
-        .and_then(rustix::fs::fstat)
-        .ok()
-        .map(|stat| FileType::from_raw_mode(stat.st_mode))
-    }
-
     /// Names in it, without `.` and `..`, in no order.
     pub fn names(&self) -> Result<Vec<OsString>, Error> {
         let names = crate::walk::names(&self.directory)
@@ -280,22 +263,6 @@ mod tests {
                 Found::Nothing => "nothing",
             };
             assert_eq!(found, expected, "{path}");
-        }
-    }
-
-    #[test]
-    fn a_path_is_looked_up_as_if_the_tree_were_the_root() {
-        let (_place, tree) = world();
-        for (path, kind) in [
-            ("d/f", Some(FileType::RegularFile)),
-            ("into/f", Some(FileType::RegularFile)),
-            ("../../d", Some(FileType::Directory)),
-            ("out", Some(FileType::Symlink)),
-            ("../secret", None),
-            ("out/x", None),
-            ("/etc/passwd", None),
-        ] {
-            assert_eq!(tree.kind_in_root(path), kind, "{path}");
         }
     }
 

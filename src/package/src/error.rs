@@ -108,14 +108,6 @@ pub enum Error {
         /// What was found.
         found: String,
     },
-    /// A name that a service cannot have.
-    #[error("{name:?} cannot be a service's name: {problem}; choose another with --name")]
-    ServiceName {
-        /// What was given.
-        name: String,
-        /// Why not.
-        problem: String,
-    },
     /// A stub cannot be put together.
     #[error(
         "the image holds no package.xml of {package}, so robots could not install a stub of it; push it with its share directory"

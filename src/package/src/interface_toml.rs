@@ -6,10 +6,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use crate::interface::Interface;
-use crate::{Error, names, read};
-
-/// The largest interface file: definitions of everything are in it.
-const MAX_BYTES: u64 = 16 << 20;
+use crate::{Error, names};
 
 /// Keys that may stand in each table of a file.
 const KEYS: [(&str, &[&str]); 6] = [
@@ -40,11 +37,6 @@ impl Interface {
             parameter.value = parameter.value.take().and_then(without_nulls);
         }
         toml::to_string_pretty(&writable).expect("an interface without nulls is TOML")
-    }
-
-    /// Reads a file. See [`Interface::from_toml`].
-    pub fn read_toml(path: &Path) -> Result<Self, Error> {
-        Self::from_toml(&read::text(path, MAX_BYTES)?, path)
     }
 
     /// Parses the text of a file, whose path is for messages. A supplement only needs names, types and the
@@ -305,12 +297,5 @@ value = 0.5
             let message = parse(&text).unwrap_err().to_string();
             assert!(message.contains(reason), "{reason:?} is not in: {message}");
         }
-        let missing = Interface::read_toml(Path::new("/not/there.toml"))
-            .unwrap_err()
-            .to_string();
-        assert!(
-            missing.starts_with("cannot open /not/there.toml"),
-            "{missing}"
-        );
     }
 }

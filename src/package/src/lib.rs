@@ -8,7 +8,7 @@
 //!   layers, inventory, interface ──stub──▶ the files that a robot installs in the package's place
 //! ```
 //!
-//! Everything here comes from strangers: names are checked before anyone puts them into a path or a command, sizes
+//! Everything here is untrusted: names are checked before anyone puts them into a path or a command, sizes
 //! are bounded, and no symbolic link leads out of the tree that is read.
 
 #![forbid(unsafe_code)]

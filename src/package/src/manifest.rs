@@ -80,11 +80,6 @@ impl Kind {
 }
 
 impl Manifest {
-    /// Reads a file.
-    pub fn read(path: &Path, variables: &Variables) -> Result<Self, Error> {
-        Self::parse(&read::text(path, MAX_BYTES)?, path, variables)
-    }
-
     /// Reads `path` in the foreign tree `root`, through links that stay in it.
     pub(crate) fn read_inside(
         root: &Path,
@@ -449,7 +444,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("package.xml");
         let read = || {
-            Manifest::read(&path, &Variables::ros(1, "noetic"))
+            Manifest::read_inside(directory.path(), &path, &Variables::ros(1, "noetic"))
                 .unwrap_err()
                 .to_string()
         };

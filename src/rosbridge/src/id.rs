@@ -20,14 +20,6 @@ impl Id<'_> {
             Id::Integer(number) => Id::Integer(number),
         }
     }
-
-    /// The same, borrowed.
-    pub fn borrowed(&self) -> Id<'_> {
-        match self {
-            Id::Text(text) => Id::Text(Cow::Borrowed(text)),
-            Id::Integer(number) => Id::Integer(*number),
-        }
-    }
 }
 
 impl fmt::Display for Id<'_> {
