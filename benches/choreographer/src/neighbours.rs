@@ -49,7 +49,7 @@ fn times(config: &str, limits: &[&str]) -> Result<Vec<f64>> {
     for count in NEIGHBOURS {
         beside(&daemon, &mut greedy, count)?;
         calls(&mut robot, SETTLES, PAUSE)?;
-        medians.push(median(calls(&mut robot, LASTS, PAUSE)?));
+        medians.push(median(&calls(&mut robot, LASTS, PAUSE)?));
         eprintln!("{count} neighbours: {:.1} ms", medians[medians.len() - 1]);
     }
     drop(greedy);

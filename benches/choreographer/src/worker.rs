@@ -64,9 +64,8 @@ pub(crate) fn place() -> Result<tempfile::TempDir> {
 }
 
 /// The middle one.
-pub(crate) fn median(mut times: Vec<f64>) -> f64 {
-    times.sort_by(f64::total_cmp);
-    times.get(times.len() / 2).copied().unwrap_or(f64::NAN)
+pub(crate) fn median(times: &[f64]) -> f64 {
+    bench_report::quantile(times, 0.5).unwrap_or(f64::NAN)
 }
 
 /// Cores of this machine.

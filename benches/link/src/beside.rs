@@ -33,16 +33,14 @@ struct Trips {
     p99: f64,
 }
 
-fn quantiles(mut times: Vec<Duration>) -> Trips {
-    times.sort_unstable();
-    let rank = |share: f64| {
-        let at = (times.len() as f64 * share).ceil() as usize;
-        let time = times.get(at.max(1) - 1);
+fn quantiles(times: &[Duration]) -> Trips {
+    let milliseconds = |share| {
+        let time = bench_report::quantile(times, share);
         time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
     };
     Trips {
-        p50: rank(0.5),
-        p99: rank(0.99),
+        p50: milliseconds(0.5),
+        p99: milliseconds(0.99),
     }
 }
 
@@ -93,7 +91,7 @@ fn through_the_link(
         times.push(begun.elapsed());
         std::thread::sleep(PAUSE);
     }
-    Ok(quantiles(times))
+    Ok(quantiles(&times))
 }
 
 /// Trips over the shaped network, alone and beside pictures.

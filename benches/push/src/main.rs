@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target, Times};
+use bench_report::{Report, Target};
 use bench_servant::{Daemon, Pushed, full, space};
 use rand::{RngCore, SeedableRng, rngs::StdRng};
 
@@ -90,17 +90,11 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
         probes.push(probe);
         totals.push(again.total);
     }
-    let median = |mut list: Vec<Duration>| {
-        list.sort_unstable();
-        Times {
-            name: String::new(),
-            sorted: list,
-        }
-        .median()
-        .as_secs_f64()
+    let median = |times: &[Duration]| {
+        bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64())
     };
     let first_probe = first.step(PROBE).context("a push tells of its probe")?;
-    let probe = median(probes);
+    let probe = median(&probes);
     report
         .figure(
             format!("{size}, again: layers made"),
@@ -112,7 +106,7 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
         .figure(
             format!("{size}, again: without the probe"),
             "s",
-            median(rests),
+            median(&rests),
         )
         .beside("first push", (first.total - first_probe).as_secs_f64())
         .reach(Target::AtMost(BOUND))
@@ -121,7 +115,7 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
         .figure(
             format!("{size}, again: with the probe"),
             "s",
-            median(totals),
+            median(&totals),
         )
         .beside("first push", first.total.as_secs_f64());
     Ok(())
