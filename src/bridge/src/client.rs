@@ -47,7 +47,7 @@ pub(crate) struct Client {
     under_way_bytes: AtomicUsize,
     ended: CancellationToken,
     subscriptions: Mutex<subscribing::Subscribed>,
-    topic_publishers: Mutex<publishing::Outlets>,
+    topic_publishers: Mutex<publishing::TopicPublishers>,
     services: Mutex<serving::Services>,
     actions: Mutex<actions::Actions>,
 }

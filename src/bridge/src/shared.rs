@@ -160,7 +160,7 @@ impl Shared {
             }
             None => Fanout::start(self, topic, message_type),
         };
-        let topic_publishers = self.outlets_of(topic);
+        let topic_publishers = self.publishers_of(topic);
         for message in topic_publishers
             .iter()
             .filter_map(|topic_publisher| topic_publisher.latched())
@@ -210,7 +210,7 @@ impl Shared {
         }
     }
 
-    fn outlets_of(&self, topic: &str) -> Vec<Arc<TopicPublisher>> {
+    fn publishers_of(&self, topic: &str) -> Vec<Arc<TopicPublisher>> {
         self.topic_publishers
             .lock()
             .get(topic)
@@ -222,7 +222,7 @@ impl Shared {
 
     /// Whether the client that published so still does.
     pub(crate) fn has_outlet(&self, topic: &str, id: &PeerId) -> bool {
-        self.outlets_of(topic)
+        self.publishers_of(topic)
             .iter()
             .any(|topic_publisher| topic_publisher.id == *id)
     }
@@ -254,7 +254,7 @@ impl Shared {
 
     /// What clients of this bridge publish on a topic, known before the graph shows it.
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
-        let topic_publishers = self.outlets_of(topic);
+        let topic_publishers = self.publishers_of(topic);
         let known = topic_publishers
             .first()
             .map(|topic_publisher| topic_publisher.message_type.name());

@@ -19,11 +19,11 @@
 //!             │ ask                                          │ facts
 //!             ▼                                              ▼
 //!   ┌ lives ───────────────────────────────────────────────────────────────────────────┐
-//!   │ ensure, waiting, limits     driver ─ starting ─ lifetime ─ nodes     spares      │
+//!   │ ensure, waiting, limits     driver ─ starting ─ lifetime ─ nodes     warm_pool   │
 //!   └──────┬──────────────────────────────────┬──────────────────────────────┬─────────┘
 //!      facts ▼ ▲ what to do, and why      facts ▼ ▲                      facts ▼ ▲
 //!   ┌ decide ──────────────────────────────────────────────────────────────────────────┐
-//!   │ placement, admission,             lifetime, nodes                 spares         │
+//!   │ placement, admission,             lifetime, nodes                 warm_pool      │
 //!   │ capacity, demand                  adoption                                       │
 //!   └──────────────────────────────────────────────────────────────────────────────────┘
 //! ```

@@ -78,11 +78,11 @@ fn show(doctor: &api::Doctor) -> anyhow::Result<()> {
         table.row([mark.to_owned(), check.name.clone(), check.found.clone()]);
     }
     table.print()?;
-    let mendable = doctor
+    let fixable = doctor
         .checks
         .iter()
         .filter(|check| check.status != CheckStatus::Ok);
-    for check in mendable {
+    for check in fixable {
         if let Some(fix) = &check.fix {
             output::line(&format!("\nto fix {}:\n    {fix}", check.name))?;
         }

@@ -1,4 +1,4 @@
-//! Makes files below a directory whose content strangers decide, so that none can appear anywhere else.
+//! Makes files below a directory whose content is untrusted, so that none can appear anywhere else.
 //!
 //! Every directory on the way is opened by `openat2`, which keeps even symbolic links to absolute paths inside
 //! (`RESOLVE_IN_ROOT`) or refuses them (`RESOLVE_BENEATH | RESOLVE_NO_SYMLINKS`); the last name is only ever used

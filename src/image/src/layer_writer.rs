@@ -1,4 +1,4 @@
-//! Turns the entries of a layer into a directory for an overlay mount, whatever a stranger put into the layer.
+//! Turns the entries of a layer into a directory for an overlay mount, whatever the untrusted layer holds.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -141,7 +141,7 @@ impl LayerWriter {
                 self.adorn_unopened(&parent, name, metadata)
                     .map_err(failed)?;
             }
-            // A container gets its own /dev; a stranger's device node would reach the host's disks.
+            // A container gets its own /dev; an untrusted device node would reach the host's disks.
             Kind::Character | Kind::Block => {
                 tracing::debug!(
                     entry = shown(&entry.name),

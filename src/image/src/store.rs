@@ -55,7 +55,7 @@ impl Store {
     pub fn open(images: &Path, layers: &Path) -> Result<Self, Error> {
         files::make_private_directory(images)?;
         files::make_private_directory(layers)?;
-        // Extracted layers hold set-uid files of strangers: nobody else on the host may reach them.
+        // Extracted layers hold untrusted set-uid files: nobody else on the host may reach them.
         for private in [images, layers] {
             rustix::fs::chmod(private, rustix::fs::Mode::RWXU)
                 .map_err(|error| Error::file("change the rights of", private, error))?;

@@ -1,6 +1,6 @@
 //! Turns a file tree into tar entries, always the same ones for the same tree.
 //!
-//! The tree may be the work of strangers (a build): it is walked by directory descriptors, no symbolic link is
+//! The tree may be untrusted (a build wrote it): it is walked by directory descriptors, no symbolic link is
 //! followed, nothing that would block is opened.
 
 use std::collections::HashMap;

@@ -1,4 +1,4 @@
-//! Unpacks archives that strangers sent: files, directories and links, and nothing outside of the destination.
+//! Unpacks untrusted archives: files, directories and links, and nothing outside of the destination.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};

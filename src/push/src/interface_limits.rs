@@ -9,7 +9,7 @@ const LONGEST_NAME: usize = 1024;
 /// Of those together.
 const MOST_NAMES: usize = 20_000;
 
-/// Refuses an interface that no robot could use: it is what strangers' nodes registered, and goes into the database, to
+/// Refuses an interface that no robot could use: it is what untrusted nodes registered, and goes into the database, to
 /// every client and into stubs.
 pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
     let topics = interface.topics.iter().map(|topic| &topic.name);

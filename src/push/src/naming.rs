@@ -136,7 +136,7 @@ fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Vec<(usize, String)> {
             .then(|| graph.nodes.keys().find(|node| *node != NODE))
             .flatten();
         let said = own.or(only.map(|name| name.trim_start_matches('/')));
-        // Whatever a program registers is what a stranger says.
+        // What a program registers is untrusted.
         let said = said
             .map(|name| without_host(without_random_end(name), host))
             .filter(|name| is_graph_name(&format!("/{name}")));

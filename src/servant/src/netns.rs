@@ -132,7 +132,7 @@ struct Order {
 }
 
 /// One thread of the process does nothing but enter namespaces and open sockets there. It never goes back, so that
-/// there is no way back that could fail and leave a shared thread in a stranger's network.
+/// there is no way back that could fail and leave a shared thread in a servant's network.
 fn opener() -> &'static mpsc::Sender<Order> {
     static OPENER: OnceLock<mpsc::Sender<Order>> = OnceLock::new();
     OPENER.get_or_init(|| {

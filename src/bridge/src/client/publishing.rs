@@ -25,7 +25,7 @@ const DEFAULT_QUEUE: u64 = 100;
 
 /// A client's topics, by their absolute names.
 #[derive(Default)]
-pub(super) struct Outlets {
+pub(super) struct TopicPublishers {
     open: HashMap<String, Advertised>,
     untyped: HashMap<String, Vec<Untyped>>,
     /// Topics of which the client has been told why nothing can be published on them.
@@ -39,7 +39,7 @@ struct Advertised {
     ids: HashSet<Option<Id<'static>>>,
 }
 
-impl Outlets {
+impl TopicPublishers {
     /// How many advertisements there are.
     fn count(&self) -> usize {
         let known = self.open.values();

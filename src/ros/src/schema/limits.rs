@@ -1,4 +1,4 @@
-//! How large a definition may be. Definitions come from strangers (a publisher's connection header, a pushed
+//! How large a definition may be. Definitions are untrusted (a publisher's connection header, a pushed
 //! package), and a few bytes of text can ask for a message of gigabytes.
 
 /// Longest text of one definition, and of one concatenated definition from a publisher's header.
