@@ -9,7 +9,7 @@ use bytes::Bytes;
 use link::RobotSession;
 use link::control::{FromRobot, Served};
 use parking_lot::Mutex;
-use ros::bus::{BusError, Digest, Graph, ServiceProvider};
+use ros::bus::{BusError, CallFate, Digest, Graph, ServiceProvider};
 
 use super::Mirror;
 use crate::local;
@@ -177,9 +177,13 @@ impl Mirror {
     }
 }
 
-/// Whether a call failed since who serves is not who did.
+/// Whether a call failed since who serves is not who did, or is not there: whoever answers that it failed, is.
 fn is_of_the_provider(error: &BusError) -> bool {
-    !matches!(error, BusError::CallFailed { .. } | BusError::Closed)
+    match error {
+        BusError::CallFailed { fate, .. } => *fate != CallFate::Answered,
+        BusError::Closed => false,
+        _ => true,
+    }
 }
 
 /// Tells the cloud when a service that it was told of has gone, until the mirror ends.
@@ -215,6 +219,25 @@ mod tests {
     impl ServiceHandler for Echo {
         async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
             Ok(request)
+        }
+    }
+
+    #[test]
+    fn a_service_is_taken_back_when_its_node_does_not_answer_any_more() {
+        let failed = |fate| BusError::CallFailed {
+            service: "/map".to_owned(),
+            reason: "no".to_owned(),
+            fate,
+        };
+        for (error, taken_back) in [
+            (failed(CallFate::Answered), false),
+            (failed(CallFate::NotTaken), true),
+            // The connection to its node broke in the middle of the call.
+            (failed(CallFate::Unknown), true),
+            (BusError::NoService("/map".to_owned()), true),
+            (BusError::Closed, false),
+        ] {
+            assert_eq!(is_of_the_provider(&error), taken_back, "{error:?}");
         }
     }
 
