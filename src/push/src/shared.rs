@@ -21,15 +21,16 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
         );
     }
     let (min, max) = (shared.min, shared.max);
-    if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
-        return refused(format!(
-            "--min {min} and --max {max} should be 1 <= MIN <= MAX <= {MOST}"
-        ));
-    }
+    // First: it is what --min is where nobody says that.
     if !(1..=max).contains(&shared.replicas) {
         return refused(format!(
             "--replicas {} should be between 1 and --max, which is {max}",
             shared.replicas
+        ));
+    }
+    if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
+        return refused(format!(
+            "--min {min} and --max {max} should be 1 <= MIN <= MAX <= {MOST}"
         ));
     }
     if !(1..=MOST).contains(&shared.calls) {
@@ -86,6 +87,16 @@ mod tests {
             (
                 Shared {
                     replicas: 5,
+                    ..fine
+                },
+                false,
+                "--replicas 5",
+            ),
+            (
+                Shared {
+                    replicas: 5,
+                    min: 5,
+                    max: 2,
                     ..fine
                 },
                 false,
