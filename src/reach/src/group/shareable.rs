@@ -5,7 +5,8 @@
 //! |---|---|
 //! | a service, an action | shown to each robot |
 //! | logs, diagnostics, parameters of dynamic_reconfigure, bonds (topics, by type) | not shown; nobody outside the servant gets them |
-//! | any other topic, in or out (tf and the clock too) | refused |
+//! | any other topic, in or out (tf, the clock and latched ones too) | refused |
+//! | a node that writes parameters, unless dynamic_reconfigure has it do so | refused: it keeps something |
 //! | `set_parameters`, loggers, nodelets (services, by type) | not shown: they change the node for all |
 //! | a service whose answer says nothing (`std_srvs/Empty`), `std_srvs/SetBool` | refused: it can only be there for what the node keeps |
 //! | a service that it looks for on its robot | refused: which robot's would that be |
@@ -33,6 +34,12 @@ const ADMINISTER: [&str; 4] = [
     "topic_tools/",
 ];
 
+/// Transforms.
+const TRANSFORMS: [&str; 2] = ["tf2_msgs/TFMessage", "tf/tfMessage"];
+
+/// Who serves this writes its own parameters when it starts.
+const RECONFIGURE: &str = "dynamic_reconfigure/Reconfigure";
+
 /// A service of this type turns something on or off in the node.
 const SWITCH: &str = "std_srvs/SetBool";
 
@@ -53,8 +60,20 @@ pub fn check(interface: &Interface) -> Result<(), Unshareable> {
     let mut found = Vec::new();
     let topics = interface.topics.iter();
     for topic in topics.filter(|topic| !UNNEEDED.contains(&&*topic.type_name)) {
+        let transforms = TRANSFORMS.contains(&&*topic.type_name);
         let (verb, of) = match topic.direction {
+            Direction::Input if transforms => (
+                "subscribes to",
+                "transforms of all robots would be one tree to it",
+            ),
             Direction::Input => ("subscribes to", "one robot's messages would reach all"),
+            Direction::Output if transforms => {
+                ("publishes", "its transforms would be in every robot's tree")
+            }
+            Direction::Output if topic.latched => (
+                "publishes, latched,",
+                "what it made of one robot's messages last would be kept for all",
+            ),
             Direction::Output => (
                 "publishes",
                 "what it makes of one robot's messages would reach all",
@@ -64,6 +83,21 @@ pub fn check(interface: &Interface) -> Result<(), Unshareable> {
             "it {verb} {} ({}): {of}",
             topic.name, topic.type_name
         ));
+    }
+    let of_clients = |node: &str| {
+        let mut services = interface.services.iter();
+        services.any(|it| it.node == node && it.type_name == RECONFIGURE)
+    };
+    for parameter in &interface.parameters {
+        let mut nodes = parameter.written_by.iter();
+        if let Some(node) = nodes
+            .find(|node| !(of_clients(node) && parameter.name.starts_with(&format!("{node}/"))))
+        {
+            found.push(format!(
+                "its node {node} writes the parameter {}: what it keeps there is of all robots' requests",
+                parameter.name
+            ));
+        }
     }
     for need in &interface.needs {
         found.push(format!(
@@ -156,7 +190,9 @@ mod tests {
     #[test]
     fn what_one_robot_would_see_of_another_is_refused_with_what_was_found() {
         let topic = |name: &str, of: &str, direction: &str| {
-            let topic = json!({ "name": name, "type": of, "direction": direction });
+            let latched = name == "/map";
+            let topic =
+                json!({ "name": name, "type": of, "direction": direction, "latched": latched });
             found(|it| push(it, "topics", topic)).join("; ")
         };
         for (name, of, direction, expected) in [
@@ -170,9 +206,26 @@ mod tests {
                 "/map",
                 "nav_msgs/OccupancyGrid",
                 "output",
-                "it publishes /map",
+                "it publishes, latched, /map (nav_msgs/OccupancyGrid): what it made",
             ),
-            ("/tf", "tf2_msgs/TFMessage", "input", "it subscribes to /tf"),
+            (
+                "/found",
+                "x_msgs/Found",
+                "output",
+                "it publishes /found (x_msgs/Found): what it makes",
+            ),
+            (
+                "/tf",
+                "tf2_msgs/TFMessage",
+                "input",
+                "it subscribes to /tf (tf2_msgs/TFMessage): transforms of all robots",
+            ),
+            (
+                "/tf_static",
+                "tf/tfMessage",
+                "output",
+                "it publishes /tf_static (tf/tfMessage): its transforms",
+            ),
             (
                 "/clock",
                 "rosgraph_msgs/Clock",
@@ -185,6 +238,30 @@ mod tests {
         }
         let calls = found(|it| it["needs"] = json!([{ "name": "/get_map" }]));
         assert_eq!(calls, ["it calls /get_map, which each robot serves itself"]);
+    }
+
+    #[test]
+    fn a_node_that_keeps_something_in_parameters_is_refused() {
+        for (name, node, refused) in [
+            ("/seen", "/adder", true),
+            ("/finder/last", "/finder", true),
+            // As dynamic_reconfigure has it do.
+            ("/adder/gain", "/adder", false),
+        ] {
+            let service = json!({
+                "name": "/adder/set_parameters", "type": "dynamic_reconfigure/Reconfigure", "node": "/adder",
+            });
+            let found = found(|it| {
+                push(it, "services", service);
+                it["parameters"] = json!([
+                    { "name": "/adder/word", "read_by": ["/adder"] },
+                    { "name": name, "written_by": [node] },
+                ]);
+            });
+            let words = format!("its node {node} writes the parameter {name}");
+            assert_eq!(found.len(), usize::from(refused), "{found:?}");
+            assert!(found.iter().all(|it| it.starts_with(&words)), "{found:?}");
+        }
     }
 
     #[test]
