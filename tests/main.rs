@@ -294,6 +294,7 @@ fn main() -> ExitCode {
             goals_of_robots_do_not_meet,
             what_robots_cannot_share_is_refused_with_what_was_found,
             of_two_replicas_the_first_answers_and_the_cost_is_shown,
+            stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed,
         ],
         stories![survival:
             what_cannot_be_removed_keeps_no_daemon_down,

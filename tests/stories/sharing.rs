@@ -6,12 +6,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
 use anyhow::{Context, ensure};
+use bytes::Bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use ros::bus::{Bus, Publisher, Qos, Subscription};
+use ros::ros1::Ros1Bus;
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::Robot;
+use support::robot::{PATIENCE, Robot};
+use support::site::{Running, Site, registered, string};
 use support::world::world;
 
 const SERVICE: &str = "sharer_cpp";
@@ -287,5 +291,245 @@ pub fn of_two_replicas_the_first_answers_and_the_cost_is_shown() -> Verdict {
         "{}",
         shown.stdout
     );
+    Ok(())
+}
+
+/// A robot with a stub of the service, and an application of its own.
+struct Linked {
+    name: &'static str,
+    /// As the robot has them: the node, its service, its action.
+    node: &'static str,
+    work: &'static str,
+    count: &'static str,
+    site: Site,
+    app: Arc<Ros1Bus>,
+    stub: Running,
+}
+
+impl Linked {
+    fn new(
+        daemon: &Daemon,
+        name: &'static str,
+        argv: &[&str],
+        [node, work, count]: [&'static str; 3],
+    ) -> anyhow::Result<Linked> {
+        let site = Site::new()?;
+        let app = site.node("/app")?;
+        let toml = format!(
+            "server = \"ws://{}\"\nservice = \"{SERVICE}\"\nrobot = \"{name}\"\nlocal = \"none\"\ndesire = 30.0\nmax = 60.0\n",
+            daemon.address
+        );
+        let stub = site.stub_with(&toml, SERVICE, "sharer", argv)?;
+        let all = |graph: &ros::bus::Graph| registered(graph, node).len() >= 6;
+        site.until(&app, "what the node serves", all)
+            .with_context(|| format!("the stub said:\n{}", stub.said()))?;
+        Ok(Linked {
+            name,
+            node,
+            work,
+            count,
+            site,
+            app,
+            stub,
+        })
+    }
+
+    /// Who was answered, and by which servant.
+    fn works(&self, who: &str, seconds: f64) -> anyhow::Result<(String, String)> {
+        let request = [&string(who)[..], &seconds.to_le_bytes()].concat();
+        let answer = self.site.calls(&self.app, self.work, &request)?;
+        let mut words = Words(&answer);
+        Ok((words.next()?, words.next()?))
+    }
+
+    fn hears_of(&self, end: &str) -> anyhow::Result<Subscription> {
+        let heard = self
+            .site
+            .hears(&self.app, &format!("{}/{end}", self.count))?;
+        let mut publishers = heard.matched.clone();
+        let there = publishers.wait_for(|it| it.connected() > 0);
+        let there = async { tokio::time::timeout(PATIENCE, there).await.is_ok() };
+        ensure!(self.site.runtime.block_on(there), "{end} has no publisher");
+        Ok(heard)
+    }
+
+    /// Where goals are published.
+    fn goals(&self) -> anyhow::Result<Box<dyn Publisher>> {
+        let topic = format!("{}/goal", self.count);
+        let advertised = async {
+            let of = self.app.topic_type(&topic).await?;
+            self.app.advertise(&topic, of, Qos::keep_last(10)).await
+        };
+        let goals = self.site.runtime.block_on(advertised)?;
+        self.site.connected(&*goals, 1)?;
+        Ok(goals)
+    }
+}
+
+/// Strings of a serialized message, one after the other.
+struct Words<'a>(&'a [u8]);
+
+impl Words<'_> {
+    fn next(&mut self) -> anyhow::Result<String> {
+        let (length, rest) = self.0.split_first_chunk().context("a length")?;
+        let length = usize::try_from(u32::from_le_bytes(*length))?;
+        let (word, rest) = rest.split_at_checked(length).context("a string")?;
+        self.0 = rest;
+        Ok(String::from_utf8_lossy(word).into_owned())
+    }
+
+    fn skip(&mut self, bytes: usize) -> anyhow::Result<()> {
+        self.0 = self.0.get(bytes..).context("more bytes")?;
+        Ok(())
+    }
+}
+
+/// A serialized goal to count.
+fn goal(id: &str, who: &str, to: i32) -> Bytes {
+    let header = [&[0; 12][..], &string("")].concat();
+    let goal_id = [&[0; 8][..], &string(id)].concat();
+    [&header[..], &goal_id, &string(who), &to.to_le_bytes()]
+        .concat()
+        .into()
+}
+
+/// Of a serialized feedback or result: the goal's id, its status, and who.
+fn about(message: &[u8]) -> anyhow::Result<(String, u8, String)> {
+    let mut words = Words(message);
+    words.skip(12)?;
+    words.next()?;
+    words.skip(8)?;
+    let id = words.next()?;
+    let status = *words.0.first().context("a status")?;
+    words.skip(1)?;
+    words.next()?;
+    Ok((id, status, words.next()?))
+}
+
+pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed() -> Verdict {
+    let daemon = pushed("sharing-stubs", "", &["--min", "2", "--max", "2"])?;
+    let own = ["/sharer", "/work", "/count"];
+    let mut plain = Linked::new(&daemon, "plain", &[], own)?;
+    let front = Linked::new(
+        &daemon,
+        "front",
+        &["__ns:=/front", "__name:=hands"],
+        ["/front/hands", "/front/work", "/front/count"],
+    )?;
+    let argv = ["work:=/plan", "count:=tally", "_speed:=3"];
+    let other = Linked::new(&daemon, "other", &argv, ["/sharer", "/plan", "/tally"])?;
+    // The names of the original, and its types.
+    for robot in [&plain, &front, &other] {
+        let graph = robot.app.graph().borrow().clone();
+        let count = robot.count;
+        let expected = [
+            format!("publishes {count}/feedback [sharer_cpp/CountActionFeedback]"),
+            format!("publishes {count}/result [sharer_cpp/CountActionResult]"),
+            format!("publishes {count}/status [actionlib_msgs/GoalStatusArray]"),
+            format!("serves {}", robot.work),
+            format!("subscribes {count}/cancel [actionlib_msgs/GoalID]"),
+            format!("subscribes {count}/goal [sharer_cpp/CountActionGoal]"),
+        ];
+        let found = registered(&graph, robot.node);
+        ensure!(found == expected.into(), "{}: {found:#?}", robot.name);
+    }
+    // What would change the node for all is not heeded, and that is said.
+    other.stub.says("~speed")?;
+    let before = group(&daemon, "two servants", |group| ready(group) == 2)?;
+    ensure!(before["robots"] == 3, "{before:#}");
+
+    // Goals do not meet: each robot hears of its own alone.
+    let mut heard = [&plain, &front].map(|robot| {
+        Ok::<_, anyhow::Error>((robot.hears_of("feedback")?, robot.hears_of("result")?))
+    });
+    for (robot, id) in [(&plain, "mine"), (&front, "mine")] {
+        robot.goals()?.publish(goal(id, robot.name, 5));
+    }
+    for (robot, heard) in [&plain, &front].into_iter().zip(&mut heard) {
+        let (feedback, result) = heard
+            .as_mut()
+            .map_err(|error| anyhow::anyhow!("{error:#}"))?;
+        let first = about(&robot.site.next(feedback)?.bytes)?;
+        ensure!(first.0 == "mine" && first.2 == robot.name, "{first:?}");
+        let end = about(&robot.site.next(result)?.bytes)?;
+        // Succeeded.
+        ensure!(end == ("mine".into(), 3, robot.name.into()), "{end:?}");
+        while let Some(more) = feedback.messages.try_recv() {
+            let more = about(&more.bytes)?;
+            ensure!(more.2 == robot.name, "{more:?}");
+        }
+    }
+
+    // One has a call that its servant will not end.
+    let request = [&string("plain")[..], &3600f64.to_le_bytes()].concat();
+    let long = {
+        let app = Arc::clone(&plain.app);
+        let call = async move { app.call("/work", request.into(), PATIENCE * 10).await };
+        plain.site.runtime.spawn(call)
+    };
+    let victim = daemon.awaits(
+        &format!("/api/v1/services/{SERVICE}"),
+        "the servant that has it",
+        |service| {
+            let servants = service["groups"][0]["servants"].as_array()?;
+            let busy = servants.iter().find(|one| one["under_way"] == 1)?;
+            Some(busy["id"].as_str()?.to_owned())
+        },
+    )?;
+    let killed = Arc::new(AtomicBool::new(false));
+    let working: Vec<_> = [front, other]
+        .into_iter()
+        .map(|robot| {
+            let killed = Arc::clone(&killed);
+            thread::spawn(move || -> anyhow::Result<(Linked, usize)> {
+                let (mut answered, mut after) = (0, 0);
+                while after < 5 {
+                    after += usize::from(killed.load(Ordering::SeqCst));
+                    let who = format!("{} {answered}", robot.name);
+                    match robot.works(&who, 0.01) {
+                        Ok((said, _)) => {
+                            ensure!(said == who, "not its own: {said}");
+                            answered += 1;
+                        }
+                        Err(error) => {
+                            ensure!(format!("{error:#}").contains("--idempotent"), "{error:#}")
+                        }
+                    }
+                }
+                Ok((robot, answered))
+            })
+        })
+        .collect();
+    group(&daemon, "answers of both", |group| {
+        group["answered"].as_u64() > Some(20)
+    })?;
+    fails(&daemon, &victim)?;
+    group(&daemon, "another in its place", |group| {
+        ready(group) == 2 && !group["servants"].to_string().contains(&victim)
+    })?;
+    killed.store(true, Ordering::SeqCst);
+    let refused = plain.site.runtime.block_on(long)?;
+    let words = refused.err().map(|error| error.to_string());
+    let words = words.context("a lost call was answered")?;
+    ensure!(
+        words.contains(&victim) && words.contains("--idempotent"),
+        "{words}"
+    );
+    for robot in working {
+        let (robot, answered) = robot
+            .join()
+            .map_err(|_| anyhow::anyhow!("a robot panicked"))??;
+        ensure!(answered > 0, "{} was never answered", robot.name);
+    }
+    let (said, place) = plain.works("still", 0.0)?;
+    ensure!(said == "still" && place != victim, "{said} {place}");
+    // roslaunch's way to end it.
+    plain.stub.signal(Signal::SIGINT)?;
+    let status = plain.stub.ends()?;
+    ensure!(status.code() == Some(0), "{status}: {}", plain.stub.said());
+    plain.site.until(&plain.app, "an empty graph", |graph| {
+        registered(graph, plain.node).is_empty()
+    })?;
+    group(&daemon, "two servants still", |group| ready(group) == 2)?;
     Ok(())
 }

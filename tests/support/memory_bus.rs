@@ -361,16 +361,6 @@ impl Bus for MemoryBus {
         }))
     }
 
-    async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
-        self.call_typed(service, &Digest::any(), request, timeout)
-            .await
-    }
-
     async fn call_typed(
         &self,
         service: &str,

@@ -83,6 +83,7 @@ use handle::Anew;
 use lives::Inner;
 use lives::back_off::BackOffs;
 use lives::driver::{self, Beginning};
+use lives::group::is_place;
 use lives::hung;
 use lives::warm_pool::{self, WarmPool};
 
@@ -159,15 +160,13 @@ impl Choreographer {
             }
             // Nobody who waits for capacity is overtaken by one that takes what was promised ahead.
             let default_names = request.stub.is_none() && inner.admission.is_calm();
-            let (placement, warm) = match revision.plan.shared {
-                None => inner
-                    .warm_pool
-                    .place(has.as_ref(), &revision, default_names),
-                // A place in a group needs no container.
-                Some(_) => (
-                    place(has.as_ref(), None, revision.number, &revision.image),
-                    None,
-                ),
+            let (placement, warm) = if is_place(&revision, &request.robot) {
+                // It needs no container.
+                let placement = place(has.as_ref(), None, revision.number, &revision.image);
+                (placement, None)
+            } else {
+                let asks = (&*request.robot, default_names);
+                inner.warm_pool.place(has.as_ref(), &revision, asks)
             };
             let ends = match placement {
                 Placement::Keep(id) => {
@@ -393,7 +392,8 @@ impl Choreographer {
         Ok(replay.into_trial(service))
     }
 
-    /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name.
+    /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name. Of a service that robots share
+    /// it is one of its own, beside the group.
     fn measured(&self, service: &str, why: &str) -> Result<Measured, Error> {
         let robot = format!("~{why}-{}", names::random(6));
         let lease = self.ensure(ServantRequest::new(service, &robot).anonymous())?;

@@ -7,15 +7,19 @@
 //!  robot B ─▶ Bridge, links ─▶ GroupBus B ─┘             └─▶ Bus of servant 2
 //! ```
 //!
-//! A robot reaches the group by a bus of its own that shows the services and actions of the interface, and nothing else: no
-//! topic, no parameter, no node of another robot. What can be shared so is told by [`shareable`].
+//! A robot reaches the group by buses of its own that show services and actions of the interface, and nothing else: no
+//! topic, no parameter, no node of another robot. Its rosbridge clients have the deployer's names, its stubs those that the
+//! nodes would have on the robot. What can be shared so is told by [`shareable`].
 
 mod action_topics;
 mod bus;
 pub mod dispatch;
 mod goals;
-mod reach;
+mod names;
+mod nodes;
+mod seat;
 pub mod shareable;
+mod view;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -35,12 +39,17 @@ use tokio::time::{Instant, sleep_until, timeout};
 
 use dispatch::{Dispatcher, End, Kind, Load, Lost, Member, Order, Robot, Rules, Ticket};
 
-pub use reach::Seat;
+use view::View;
+
+pub use seat::seat;
 
 /// A servant that did not take a request is asked again when its graph has changed, and not sooner than after this.
 const PAUSE: Duration = Duration::from_millis(100);
 /// And not later.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+
+/// A mean of less tells of single requests.
+const SPAN: Duration = Duration::from_millis(200);
 
 /// What was counted of a group's requests.
 #[derive(Debug, Default)]
@@ -85,7 +94,9 @@ pub struct Group {
     interface: Interface,
     state: Mutex<State>,
     members: watch::Sender<BTreeMap<Member, Arc<Servant>>>,
-    graph: watch::Sender<Arc<Graph>>,
+    /// What robots see of the interface as it was deployed, and the same as a graph.
+    whole: Arc<View>,
+    graph: Arc<Graph>,
     counts: Counts,
     robots: AtomicU64,
 }
@@ -96,6 +107,8 @@ struct State {
     doors: HashMap<Ticket, mpsc::UnboundedSender<Told>>,
     /// Requests times microseconds, and until when they are counted.
     busy: (u128, Instant),
+    /// Requests at a time in the mean, until then.
+    mean: (f64, Instant),
 }
 
 /// What whoever follows a request is told.
@@ -127,6 +140,11 @@ impl Servant {
         actions.insert(name.to_owned(), Arc::clone(&opened));
         Ok(opened)
     }
+
+    /// The action could not be opened: whoever needs it next opens it anew.
+    fn forget_action(&self, name: &str) {
+        self.actions.lock().remove(name);
+    }
 }
 
 impl Group {
@@ -138,11 +156,12 @@ impl Group {
         rules: Rules,
     ) -> Arc<Group> {
         let interface = shareable::shown(interface);
-        let graph = Arc::new(bus::graph_of(&interface));
+        let whole = Arc::new(View::whole(&interface));
         let state = State {
             dispatcher: Dispatcher::new(rules),
             doors: HashMap::new(),
             busy: (0, Instant::now()),
+            mean: (0.0, Instant::now()),
         };
         Arc::new(Group {
             ros,
@@ -150,7 +169,8 @@ impl Group {
             interface,
             state: Mutex::new(state),
             members: watch::Sender::default(),
-            graph: watch::Sender::new(graph),
+            graph: Arc::new(whole.graph(1)),
+            whole,
             counts: Counts::default(),
             robots: AtomicU64::new(0),
         })
@@ -181,6 +201,11 @@ impl Group {
         self.decide(|dispatcher| ((), dispatcher.retire(member)));
     }
 
+    /// A servant that was to be asked no more is asked again.
+    pub fn take_back(&self, member: Member) {
+        self.decide(|dispatcher| ((), dispatcher.take_back(member)));
+    }
+
     /// A servant is gone, for this reason.
     pub fn leave(&self, member: Member, reason: &str) {
         let servant = self.members.borrow().get(&member).cloned();
@@ -203,19 +228,18 @@ impl Group {
         self.state.lock().dispatcher.load_of(member)
     }
 
-    /// How many requests there have been at a time in the mean, since this was asked last.
+    /// How many requests there have been at a time in the mean, since this was asked last: over [`SPAN`] at least, until then what
+    /// it was before.
     pub fn mean_load(&self) -> f64 {
         let mut state = self.state.lock();
-        let since = state.busy.1;
-        state.count(Instant::now());
-        let (busy, until) = (std::mem::take(&mut state.busy.0), state.busy.1);
-        let micros = (until - since).as_micros().max(1);
-        let Load { waiting, under_way } = state.dispatcher.load();
-        drop(state);
-        match until == since {
-            true => (waiting + under_way) as f64,
-            false => busy as f64 / micros as f64,
+        let now = Instant::now();
+        let span = now.saturating_duration_since(state.mean.1);
+        if span >= SPAN {
+            state.count(now);
+            let busy = std::mem::take(&mut state.busy.0);
+            state.mean = (busy as f64 / span.as_micros() as f64, now);
         }
+        state.mean.0
     }
 
     /// What was counted.
@@ -257,16 +281,17 @@ impl Group {
     }
 
     /// Begins to ask for something.
-    fn begin(self: &Arc<Self>, robot: Robot, kind: &Kind) -> Errand {
+    fn begin(self: &Arc<Self>, robot: Robot, kind: Kind) -> Errand {
         let (door, told) = mpsc::unbounded_channel();
         let mut state = self.state.lock();
         state.count(Instant::now());
-        let (ticket, orders) = state.dispatcher.ask(robot, kind);
+        let (ticket, orders) = state.dispatcher.ask(robot, &kind);
         state.doors.insert(ticket, door);
         self.tell(&mut state, orders);
         drop(state);
         Errand {
             group: Arc::clone(self),
+            kind,
             ticket,
             told,
             over: false,
@@ -274,15 +299,15 @@ impl Group {
     }
 
     /// A servant that did not take a request is asked again soon: a node that is being started again registers its services.
-    fn resume_later(self: &Arc<Self>, servant: &Servant) {
-        let (group, member) = (Arc::downgrade(self), servant.member);
+    fn resume_later(self: &Arc<Self>, servant: &Servant, kind: &Kind) {
+        let (group, member, kind) = (Arc::downgrade(self), servant.member, kind.clone());
         let mut graph = servant.bus.graph();
         graph.mark_unchanged();
         tokio::spawn(async move {
             tokio::time::sleep(PAUSE).await;
             let _ = timeout(LONGEST_PAUSE - PAUSE, graph.changed()).await;
             if let Some(group) = group.upgrade() {
-                group.decide(|dispatcher| ((), dispatcher.resume(member)));
+                group.decide(|dispatcher| ((), dispatcher.resume(member, &kind)));
             }
         });
     }
@@ -299,7 +324,7 @@ impl Group {
         type Asked<'a> = BoxFuture<'a, Result<(Arc<Servant>, Result<Bytes, BusError>), Aborted>>;
         let began = Instant::now();
         let deadline = began + patience;
-        let mut errand = self.begin(robot, &Kind::Call);
+        let mut errand = self.begin(robot, Kind::Call(service.into()));
         let mut asked: FuturesUnordered<Asked<'_>> = FuturesUnordered::new();
         let mut handles: Vec<(Member, AbortHandle)> = Vec::new();
         let mut last: Option<Arc<Servant>> = None;
@@ -410,6 +435,7 @@ impl State {
 /// A request under way; withdrawn when it is dropped.
 struct Errand {
     group: Arc<Group>,
+    kind: Kind,
     ticket: Ticket,
     told: mpsc::UnboundedReceiver<Told>,
     over: bool,
@@ -431,7 +457,7 @@ impl Errand {
             .fetch_add(wasted, Ordering::Relaxed);
         self.over |= answered;
         if end == End::NotTaken {
-            self.group.resume_later(servant);
+            self.group.resume_later(servant, &self.kind);
         }
         answered
     }
@@ -446,5 +472,34 @@ impl Drop for Errand {
             let orders = state.dispatcher.withdraw(self.ticket);
             self.group.tell(&mut state, orders);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn requests_at_a_time_are_a_mean_over_time() {
+        let rules = Rules {
+            window: 1,
+            replicas: 1,
+            idempotent: false,
+        };
+        let group = Group::new(RosVersion::One, "noetic", &Interface::default(), rules);
+        let second = Duration::from_secs(1);
+        let begin = || group.begin(1, Kind::Call("/work".into()));
+        let one = begin();
+        tokio::time::sleep(second).await;
+        let other = begin();
+        tokio::time::sleep(second).await;
+        assert_eq!(group.mean_load(), 1.5, "one for a second, two for another");
+        // A moment later nothing else is known.
+        drop((one, other));
+        tokio::time::sleep(second / 1000).await;
+        assert_eq!(group.mean_load(), 1.5);
+        tokio::time::sleep(second).await;
+        let load = group.mean_load();
+        assert!((0.0..0.01).contains(&load), "{load}");
     }
 }

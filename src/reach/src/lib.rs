@@ -15,6 +15,7 @@
 pub mod egress;
 mod ends;
 pub mod group;
+mod in_process;
 pub mod links;
 mod local;
 pub mod master;

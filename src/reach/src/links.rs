@@ -25,7 +25,7 @@ mod turns;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -46,7 +46,7 @@ use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
 use link::{MAX_FRAME, MAX_RECORD};
 
-use crate::Flow;
+use crate::{Flow, Tenant};
 use attempts::Attempts;
 use duplicates::Machine;
 use node_link::NodeLink;
@@ -86,6 +86,12 @@ pub trait Nodes: Send + Sync + 'static {
     fn measured(&self, _request: &Request) {}
     /// Something that whoever looks after the server should know of this robot.
     fn warn(&self, kind: &str, text: &str);
+    /// What this robot gives its node, and the node that answers in its place does not heed; in words.
+    fn unheeded(&self, _hello: &Hello) -> Option<String> {
+        None
+    }
+    /// From now on the nodes are this one's.
+    fn bind(&self, _tenant: Weak<dyn Tenant>) {}
 }
 
 /// Habits of a hub.
@@ -392,6 +398,10 @@ impl Hub {
         let untold = self.parameters.untold();
         if !untold.is_empty() {
             link.session.report(&FromCloud::Parameters(untold));
+        }
+        if let Some(text) = self.nodes.unheeded(hello) {
+            let warning = true;
+            link.session.report(&FromCloud::Notice { warning, text });
         }
         // What the node has set before there was a link to tell.
         if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {

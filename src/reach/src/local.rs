@@ -1,27 +1,19 @@
 //! Servants of this host's engine: reached in this process, by sockets in their network namespaces.
 
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 
 use async_trait::async_trait;
-use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use futures_util::future::BoxFuture;
-use link::session::Lost;
-use package::interface::Interface;
 use ros::JoinOptions;
-use ros::bus::{Bus, Graph, RosVersion};
-use ros::sizes::Seen;
+use ros::bus::RosVersion;
 use servant::engine::Servant;
 use servant::local::{LocalEngine, LocalServant};
-use tokio::sync::watch;
 
 use crate::egress::{self, Relays};
-use crate::links::{self, Hub, HubOptions, LinkStatus};
+use crate::in_process::{Behind, InProcess};
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
-use crate::trial::{self, Material, Pace, Replay};
-use crate::{
-    Error, Flow, Look, Observer, Opener, Reach, ReachOptions, Recorded, Stream, Tenant, master,
-};
+use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, master};
 
 /// The name of our node in every servant's graph.
 const NODE: &str = "/cloudroid_bridge";
@@ -74,30 +66,14 @@ impl Opener for LocalOpener {
         let registry = Arc::clone(&recorded.registry);
         let relays = self.relays(&local, &recorded.egress).await;
         let nodes = Arc::new(LinkedNodes::new(recorded, servant, observer));
-        let hub = Hub::new(
-            servant.id(),
-            Arc::clone(&bus),
-            Arc::clone(&registry),
-            Arc::clone(&nodes) as Arc<dyn links::Nodes>,
-            HubOptions {
-                grace: options.grace,
-                budget: options.budget.clone(),
-                unfinished: options.unfinished,
-                ..HubOptions::default()
-            },
-        );
-        let options = BridgeOptions {
-            budget: options.budget,
-            ..options.bridge
-        };
-        let bridge = Bridge::new(Arc::clone(&bus), registry, options);
-        Ok(Arc::new(LocalReach {
+        let behind = Behind {
+            id: servant.id().to_owned(),
+            linked: (Arc::clone(&bus), nodes),
             bus,
-            bridge,
-            hub,
-            nodes,
-            _relays: relays,
-        }))
+            registry,
+            keeps: Box::new(relays),
+        };
+        Ok(Arc::new(InProcess::new(behind, options)))
     }
 
     async fn look(
@@ -122,88 +98,5 @@ impl Opener for LocalOpener {
         servant
             .and_then(|servant| servant.processes().ok())
             .unwrap_or_default()
-    }
-}
-
-/// ROS, sessions, links and routes out of one servant.
-struct LocalReach {
-    bus: Arc<dyn Bus>,
-    bridge: Arc<Bridge>,
-    hub: Arc<Hub>,
-    /// What the robot's stubs have started.
-    nodes: Arc<LinkedNodes>,
-    _relays: Relays,
-}
-
-#[async_trait]
-impl Reach for LocalReach {
-    fn bus(&self) -> Arc<dyn Bus> {
-        Arc::clone(&self.bus)
-    }
-
-    fn graph(&self) -> watch::Receiver<Arc<Graph>> {
-        self.bus.graph()
-    }
-
-    async fn serve_rosbridge(
-        &self,
-        client: Waiting<Stream>,
-        options: SessionOptions,
-    ) -> SessionEnd {
-        self.bridge.serve_waiting(client, options).await
-    }
-
-    async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {
-        self.hub.serve(stream, read_ahead).await
-    }
-
-    fn links(&self) -> Vec<LinkStatus> {
-        self.hub.status()
-    }
-
-    fn flows(&self) -> Vec<Flow> {
-        let metrics = self.bridge.metrics();
-        let clients = Flow {
-            node: String::new(),
-            // What nobody listens to the answers of need not be answered.
-            inputs: metrics.asked.get() + metrics.calls.get(),
-            outputs: metrics.received.get() + metrics.answers.get(),
-        };
-        let mut flows = self.hub.flows();
-        flows.push(clients);
-        flows
-    }
-
-    fn inputs(&self) -> Vec<(String, Seen)> {
-        let mut inputs = self.hub.inputs();
-        inputs.extend(self.bridge.inputs());
-        inputs
-    }
-
-    fn metrics(&self) -> &Metrics {
-        self.bridge.metrics()
-    }
-
-    async fn replay(
-        &self,
-        service: &str,
-        interface: &Interface,
-        material: &Material,
-        pace: &Pace,
-    ) -> Result<Replay, Error> {
-        trial::replay(&self.bus, service, interface, material, pace).await
-    }
-
-    fn bind(&self, tenant: Weak<dyn Tenant>) {
-        self.nodes.bind(tenant);
-    }
-
-    fn close_sessions(&self, reason: &str) {
-        self.bridge.close(reason);
-    }
-
-    fn close(&self, reason: &str) {
-        self.hub.close(reason);
-        self.bridge.close(reason);
     }
 }

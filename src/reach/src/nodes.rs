@@ -1,16 +1,14 @@
 //! What a servant does for its robot's stubs: nodes are started and ended one by one, as roslaunch does on the robot.
 
 mod planned;
+mod told;
 
 use std::path::Path;
-use std::sync::{Arc, OnceLock, Weak};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Weak};
 
-use api::Level;
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request};
-use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::NodeSpec;
@@ -21,32 +19,15 @@ use crate::{Observer, Recorded, Tenant, how_it_ended};
 
 use planned::Planned;
 
+pub(crate) use told::Told;
+
 /// Lines that wait for a slow link; more are lost, and stand in the servant's log.
 const LINES: usize = 256;
-/// So many decisions of a robot become events within this time; more are left out, for a robot can tell any number.
-const DECISIONS: (u32, Duration) = (60, Duration::from_secs(60));
-/// Characters of what a robot says in an event.
-const WORDS: usize = 400;
-
-/// Kinds of a robot's decisions that are known.
-const KINDS: [&str; 7] = [
-    "local-takes-over",
-    "local-hands-back",
-    "local-answers-too",
-    "cloud-answers-alone",
-    "local-missing",
-    "local-crashed",
-    "state-lost",
-];
 
 /// The nodes of one servant.
 pub struct LinkedNodes {
     recorded: Recorded,
-    observer: Arc<dyn Observer>,
-    /// Decisions since then.
-    decisions: Mutex<(Instant, u32)>,
-    /// A container is made before anybody asks for it.
-    tenant: OnceLock<Weak<dyn Tenant>>,
+    told: Told,
     container: Arc<dyn Servant>,
     planned: Planned,
 }
@@ -60,24 +41,10 @@ impl LinkedNodes {
     ) -> LinkedNodes {
         LinkedNodes {
             recorded,
-            observer,
-            decisions: Mutex::new((Instant::now(), 0)),
-            tenant: OnceLock::new(),
+            told: Told::new(container.id(), observer),
             container: Arc::clone(container),
             planned: Planned::default(),
         }
-    }
-
-    /// From now on it serves this one.
-    pub fn bind(&self, tenant: Weak<dyn Tenant>) {
-        let _ = self.tenant.set(tenant);
-    }
-
-    fn tenant(&self) -> Result<Arc<dyn Tenant>, String> {
-        self.tenant
-            .get()
-            .and_then(Weak::upgrade)
-            .ok_or_else(|| "the servant has ended".to_owned())
     }
 
     /// Where the program runs: as on the robot, or where ROS's own default leads.
@@ -110,26 +77,35 @@ impl LinkedNodes {
 
 /// The program that a stub's node stands for. A robot says which, so nothing but what the push recorded is run: other
 /// programs of the image, by whatever path, are not.
-fn program<'a>(recorded: &'a Recorded, node: &Node) -> Option<&'a String> {
+pub(crate) fn program<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a String, String> {
     let same = node.package == recorded.package;
-    recorded
-        .inventory
-        .programs
-        .get(&node.executable)
-        .filter(|_| same)
+    let programs = &recorded.inventory.programs;
+    let known = programs.get(&node.executable).filter(|_| same);
+    known.ok_or_else(|| {
+        format!(
+            "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",
+            recorded.service, node.executable, node.package
+        )
+    })
+}
+
+/// The revision's own nodes that run this executable.
+pub(crate) fn running<'a>(
+    recorded: &'a Recorded,
+    executable: &str,
+) -> impl Iterator<Item = &'a NodeSpec> {
+    recorded.nodes.iter().filter(move |planned| {
+        let mut programs = planned.argv.iter().map(Path::new);
+        programs.any(|path| path.file_name().is_some_and(|name| *name == *executable))
+    })
 }
 
 #[async_trait]
 impl Nodes for LinkedNodes {
     async fn start(&self, node: &Node) -> Result<(), String> {
-        let tenant = self.tenant()?;
-        self.observer.fits(node.revision, &node.image)?;
-        let Some(program) = program(&self.recorded, node) else {
-            return Err(format!(
-                "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",
-                self.recorded.service, node.executable, node.package
-            ));
-        };
+        let tenant = self.told.tenant()?;
+        self.told.observer().fits(node.revision, &node.image)?;
+        let program = program(&self.recorded, node)?;
         self.end_planned(&*tenant).await;
         let identity = self.recorded.flavour.identity(&node.name);
         let mut argv = vec![program.clone()];
@@ -160,6 +136,7 @@ impl Nodes for LinkedNodes {
 
     async fn ended(&self, node: &str) -> Exit {
         let limits = self
+            .told
             .tenant()
             .map(|tenant| tenant.limits())
             .unwrap_or_default();
@@ -183,14 +160,7 @@ impl Nodes for LinkedNodes {
 
     fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)> {
         let plan = &self.recorded;
-        let same = |planned: &&NodeSpec| {
-            let mut programs = planned.argv.iter().map(Path::new);
-            programs.any(|path| {
-                path.file_name()
-                    .is_some_and(|name| *name == *node.executable)
-            })
-        };
-        let Some(planned) = plan.nodes.iter().find(same) else {
+        let Some(planned) = running(plan, &node.executable).next() else {
             return Vec::new();
         };
         let private = format!("{}/", planned.name);
@@ -214,48 +184,19 @@ impl Nodes for LinkedNodes {
     }
 
     fn decided(&self, node: &str, decision: &Decision) {
-        let Ok(tenant) = self.tenant() else { return };
-        let count = {
-            let mut decisions = self.decisions.lock();
-            if decisions.0.elapsed() > DECISIONS.1 {
-                *decisions = (Instant::now(), 0);
-            }
-            decisions.1 = decisions.1.saturating_add(1);
-            decisions.1
-        };
-        if count > DECISIONS.0 {
-            tracing::debug!(
-                servant = self.container.id(),
-                ?decision,
-                "one of too many decisions"
-            );
-            return;
-        }
-        let known = KINDS.iter().find(|kind| **kind == decision.kind);
-        let kind = known.copied().unwrap_or("local-other");
-        let text: String = decision.text.chars().take(WORDS).collect();
-        let ago = match decision.ago {
-            ago if (2.0..1e9).contains(&ago) => format!(", {ago:.0} s ago"),
-            _ => String::new(),
-        };
-        let robot = tenant.robot();
-        let message = format!("robot {robot}: {node}: {text}{ago}");
-        let level = if decision.warning {
-            Level::Warning
-        } else {
-            Level::Info
-        };
-        self.observer.event(level, kind, &message, Some(robot));
+        self.told.decided(node, decision);
     }
 
     fn measured(&self, request: &Request) {
-        self.observer.measured(request);
+        self.told.observer().measured(request);
     }
 
     fn warn(&self, kind: &str, text: &str) {
-        let tenant = self.tenant().ok();
-        let robot = tenant.as_ref().map(|tenant| tenant.robot());
-        self.observer.event(Level::Warning, kind, text, robot);
+        self.told.warn(kind, text);
+    }
+
+    fn bind(&self, tenant: Weak<dyn Tenant>) {
+        self.told.bind(tenant);
     }
 
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
@@ -320,7 +261,7 @@ mod tests {
             revision: None,
             image: String::new(),
         };
-        program(&recorded(), &node).cloned()
+        program(&recorded(), &node).ok().cloned()
     }
 
     #[test]

@@ -154,7 +154,10 @@ pub trait Bus: Send + Sync + 'static {
         service: &str,
         request: Bytes,
         timeout: Duration,
-    ) -> Result<Bytes, BusError>;
+    ) -> Result<Bytes, BusError> {
+        self.call_typed(service, &Digest::any(), request, timeout)
+            .await
+    }
     /// The same, unless the server's type has meanwhile another digest than the request was serialized by.
     async fn call_typed(
         &self,

@@ -11,8 +11,9 @@
 //! | fewer than 0.7 (n - 1) | `calm` | one fewer, down to the least |
 //!
 //! One more servant makes the first bound of `n + 1`, and the last one is below half of it, so that a load that stays as it is
-//! never makes a group grow and shrink in turns. While a servant starts or one retires, nothing else changes. A servant
-//! that could not be started is tried again after a pause.
+//! never makes a group grow and shrink in turns. While a servant starts, nothing else changes. Where one more is wanted and one
+//! retires, which may take as long as its last request, that one is taken back. A servant that could not be started is tried
+//! again after a pause.
 
 use std::time::{Duration, Instant};
 
@@ -55,6 +56,8 @@ pub(crate) struct Facts {
 pub(crate) enum Step {
     /// One more servant, for this reason.
     Start(String),
+    /// The one that retires is asked again, for this reason.
+    TakeBack(String),
     /// One retires, for this reason.
     Retire(String),
 }
@@ -72,15 +75,19 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
     let (least, most) = (least.max(1), most.max(least).max(1));
     let there = facts.ready + facts.starting;
     let rests = facts.failed.is_some_and(|failed| now < failed + PAUSE);
+    let one_more = |reason: String| match facts.retiring {
+        0 => (!rests).then_some(Step::Start(reason)),
+        _ => Some(Step::TakeBack(reason)),
+    };
     if there < least {
         // The first servants are started at once, all of them.
         let reason = match there {
             0 => "a robot asks for the service".to_owned(),
             _ => format!("{least} servants are wanted at least"),
         };
-        return ((!rests).then_some(Step::Start(reason)), Since::default());
+        return (one_more(reason), Since::default());
     }
-    if facts.starting > 0 || facts.retiring > 0 {
+    if facts.starting > 0 {
         return (None, Since::default());
     }
     let servants = facts.ready as f64;
@@ -95,7 +102,7 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
     };
     let has_been =
         |since: Option<Instant>, long: Duration| since.is_some_and(|at| now >= at + long);
-    if has_been(since.many, STEADY) && there < most && !rests {
+    if has_been(since.many, STEADY) && there < most && (facts.retiring > 0 || !rests) {
         let requests = facts.requests;
         let reason = match late {
             Some((takes, may)) => format!(
@@ -103,7 +110,7 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
             ),
             None => format!("{requests:.1} requests at a time are many for {there} servants"),
         };
-        return (Some(Step::Start(reason)), Since::default());
+        return (one_more(reason), Since::default());
     }
     if has_been(since.few, facts.calm) && there > least {
         let reason = format!(
@@ -156,6 +163,7 @@ mod tests {
     fn what_makes_a_group_grow_and_shrink() {
         let words = |step: Option<Step>| match step {
             Some(Step::Start(reason)) => format!("start: {reason}"),
+            Some(Step::TakeBack(reason)) => format!("take back: {reason}"),
             Some(Step::Retire(reason)) => format!("retire: {reason}"),
             None => String::new(),
         };
@@ -212,13 +220,31 @@ mod tests {
                 CALM,
                 "",
             ),
+            // One that retires may take for ever: the group grows and shrinks all the same.
             (
                 Facts {
                     retiring: 1,
                     ..facts(2, 0.0)
                 },
                 CALM,
-                "",
+                "retire: 0.0 requests at a time are few for 2 servants",
+            ),
+            (
+                Facts {
+                    retiring: 1,
+                    failed: Some(now),
+                    ..facts(1, 10.0)
+                },
+                STEADY,
+                "take back: 10.0 requests at a time are many for 1 servants",
+            ),
+            (
+                Facts {
+                    retiring: 1,
+                    ..facts(0, 0.0)
+                },
+                LOOKS,
+                "take back: a robot asks for the service",
             ),
             (
                 Facts {
@@ -242,7 +268,7 @@ mod tests {
             let (step, next) = look(&facts(*ready, *load), since, now);
             since = next;
             match step {
-                Some(Step::Start(_)) => {
+                Some(Step::Start(_) | Step::TakeBack(_)) => {
                     *ready += 1;
                     steps.0 += 1;
                 }

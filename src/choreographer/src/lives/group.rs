@@ -3,28 +3,26 @@
 //! starts and ends them as [`group`](crate::decide::group) decides, and lives while there is a place.
 //!
 //! ```text
-//!  robot ─▶ Handle (place) ─▶ Seat ─┐                        ┌─▶ Lease ─▶ Handle `~group-1-1` ─▶ container
-//!  robot ─▶ Handle (place) ─▶ Seat ─┴▶ reach::group::Group ◀─┴─▶ Lease ─▶ Handle `~group-1-2` ─▶ container
+//!  robot ─▶ Handle (place) ─▶ seat ─┐                        ┌─▶ Lease ─▶ Handle `~group-1-1` ─▶ container
+//!  robot ─▶ Handle (place) ─▶ seat ─┴▶ reach::group::Group ◀─┴─▶ Lease ─▶ Handle `~group-1-2` ─▶ container
 //! ```
 
 use std::collections::{BTreeSet, HashMap};
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use api::{GroupServant, Phase, Shared};
-use bridge::BridgeOptions;
 use catalogue::names;
 use parking_lot::Mutex;
 use reach::group::dispatch::{Member, Rules};
-use reach::group::{Group, Seat};
+use reach::group::{Group, seat};
 use store::RevisionRecord;
 use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
 use super::driver::{self, Beginning};
-use super::reaching::Measures;
-use super::{Inner, Servants};
+use super::{Inner, Servants, reaching};
 use crate::decide::group::{Facts, Since, Step, given_up, look};
 use crate::decide::placement::Placement;
 use crate::handle::{Failure, Handle};
@@ -33,7 +31,9 @@ use crate::{Choreographer, Lease};
 
 /// A group's load is looked at so often.
 const LOOKS: Duration = Duration::from_millis(250);
-/// Before the name of a group where a robot's name stands: no robot can have it.
+/// Why the servants of a group end that has no robot.
+const UNUSED: &str = "no robot uses the service";
+/// Before the name of a group where a robot's name stands.
 const NAMED: &str = "~group-";
 
 /// All groups, by service and revision.
@@ -87,8 +87,18 @@ impl Drop for Place {
 impl Handle {
     /// Whether it is a robot's place in a group, rather than a container.
     pub fn is_place(&self) -> bool {
-        self.revision.plan.shared.is_some() && !self.robot.starts_with(NAMED)
+        is_place(&self.revision, &self.robot)
     }
+}
+
+/// Whether what this one is given of a revision is a place in a group.
+pub(crate) fn is_place(revision: &RevisionRecord, robot: &str) -> bool {
+    revision.plan.shared.is_some() && !is_of_no_robot(robot)
+}
+
+/// Whether a servant of this robot's name serves none: it is a group's, or is measured. No robot can be named so.
+pub(crate) fn is_of_no_robot(robot: &str) -> bool {
+    robot.starts_with('~')
 }
 
 impl Groups {
@@ -117,6 +127,10 @@ impl Groups {
         let over = matches!(*shares.state.borrow(), Stage::Over(_));
         if !over && *shares.seats.borrow() > 0 {
             return false;
+        }
+        // Under the lock: a robot that comes now begins a group, which must not find these and lose them.
+        for one in shares.servants.lock().iter() {
+            one.lease.handle().end(UNUSED);
         }
         let key = (shares.revision.service.clone(), shares.revision.number);
         if all
@@ -206,7 +220,7 @@ pub(super) async fn sit(
 }
 
 /// Gives the robot its place as soon as a servant answers; comes back when none does any more.
-async fn seated(inner: &Inner, handle: &Handle, shares: &Shares) -> Failure {
+async fn seated(inner: &Inner, handle: &Arc<Handle>, shares: &Shares) -> Failure {
     let mut state = shares.state.subscribe();
     let mut reached = async |ready: bool| {
         let there = |stage: &Stage| match stage {
@@ -227,16 +241,16 @@ async fn seated(inner: &Inner, handle: &Handle, shares: &Shares) -> Failure {
     if let Err(failure) = reached(true).await {
         return failure;
     }
-    let registry = match inner.catalogue.known(&handle.revision).await {
-        Ok(known) => known.registry,
+    let known = match inner.catalogue.known(&handle.revision).await {
+        Ok(known) => known,
         Err(error) => return Failure::broken(format!("cannot be used: {error}")),
     };
-    let options = BridgeOptions {
-        budget: inner.memory.servant(&handle.id),
-        called: Measures::of(inner, &handle.revision, &handle.id).called(),
-        ..inner.options.bridge.clone()
-    };
-    handle.set_reach(Arc::new(Seat::new(&shares.group, registry, options)));
+    let (options, observer) = reaching::habits(inner, &handle.revision, &handle.id);
+    let recorded = reaching::recorded(&handle.revision, known);
+    let reach = seat(&shares.group, &handle.id, recorded, options, observer);
+    let tenant: Weak<Handle> = Arc::downgrade(handle);
+    reach.bind(tenant);
+    handle.set_reach(reach);
     handle.set_phase(Phase::Ready);
     let took = store::now().saturating_sub(handle.created);
     let message = format!(
@@ -283,6 +297,7 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
                     break Some(Failure::broken("was not started: the daemon is ending"));
                 }
             }
+            Some(Step::TakeBack(reason)) => take_back(&inner, &shares, &reason),
             Some(Step::Retire(reason)) => retire(&inner, &shares, &reason),
             None => {}
         }
@@ -300,9 +315,8 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
     }
     for one in std::mem::take(&mut *shares.servants.lock()) {
         if let Some(member) = one.member {
-            shares.group.leave(member, "no robot uses it");
+            shares.group.leave(member, UNUSED);
         }
-        one.lease.handle().end("no robot uses the service");
     }
 }
 
@@ -480,6 +494,29 @@ fn retire(inner: &Inner, shares: &Shares, reason: &str) {
     shares.look.notify_one();
 }
 
+/// Of those that retire, the one with the fewest requests gets more again.
+fn take_back(inner: &Inner, shares: &Shares, reason: &str) {
+    let mut servants = shares.servants.lock();
+    let retiring = servants.iter_mut().filter(|one| one.retiring);
+    let fewest = retiring.min_by_key(|one| {
+        let load = one.member.map_or(0, |member| shares.group.load_of(member));
+        (load, one.number)
+    });
+    let Some(one) = fewest else { return };
+    one.retiring = false;
+    if let Some(member) = one.member {
+        shares.group.take_back(member);
+    }
+    let handle = one.lease.handle();
+    let message = format!(
+        "servant {} of {} answers robots again: {reason}",
+        handle.id, shares.revision.service
+    );
+    inner
+        .journal
+        .info("shared-servant", &message, &handle.about());
+}
+
 /// A group's servant of this number: the one that is there, or a new one; none if the daemon is ending.
 fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) -> Option<Lease> {
     let robot = format!("{NAMED}{}-{number}", revision.number);
@@ -495,7 +532,7 @@ fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) ->
     if let Some(handle) = has {
         return Some(Lease::new(Arc::clone(handle)));
     }
-    let (placement, warm) = inner.warm_pool.place(None, revision, false);
+    let (placement, warm) = inner.warm_pool.place(None, revision, (&robot, false));
     debug_assert!(matches!(placement, Placement::Start { ends: None, .. }));
     let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
     let handle = Arc::new(Handle::new(

@@ -22,8 +22,31 @@ pub(crate) async fn open(
     revision: &Arc<RevisionRecord>,
     container: &Arc<dyn Servant>,
 ) -> Result<Arc<dyn Reach>, reach::Error> {
+    let (options, observer) = habits(inner, revision, container.id());
+    let recorded = Box::pin(async {
+        let known = inner.catalogue.known(revision).await;
+        // What runs is to be reached all the same.
+        let known = known.unwrap_or_else(|error| {
+            tracing::warn!(
+                "what the image of {} holds is not known: {error}",
+                revision.service
+            );
+            Known::default()
+        });
+        recorded(revision, known)
+    });
+    let opener = &inner.opener;
+    opener.open(container, recorded, options, observer).await
+}
+
+/// How a servant, or a robot's place in a group, is reached, and who hears of what it and its robot tell.
+pub(crate) fn habits(
+    inner: &Inner,
+    revision: &Arc<RevisionRecord>,
+    id: &str,
+) -> (ReachOptions, Arc<dyn Observer>) {
     let memory = &inner.memory;
-    let measures = Measures::of(inner, revision, container.id());
+    let measures = Measures::of(inner, revision, id);
     let options = ReachOptions {
         ros: revision.flavour.ros.bus(),
         bridge: BridgeOptions {
@@ -32,21 +55,17 @@ pub(crate) async fn open(
             ..inner.options.bridge.clone()
         },
         grace: inner.options.grace,
-        budget: memory.servant(container.id()),
+        budget: memory.servant(id),
         unfinished: memory.unfinished,
     };
     let reports = Reports {
-        id: container.id().to_owned(),
+        id: id.to_owned(),
         revision: Arc::clone(revision),
         catalogue: Arc::clone(&inner.catalogue),
         journal: inner.journal.clone(),
         measures,
     };
-    let recorded = Box::pin(recorded(inner, revision));
-    let opener = &inner.opener;
-    opener
-        .open(container, recorded, options, Arc::new(reports))
-        .await
+    (options, Arc::new(reports))
 }
 
 /// Where the times of requests to one servant are noted: for the controller, rollouts, and whoever looks.
@@ -96,19 +115,12 @@ impl Measures {
     }
 }
 
-async fn recorded(inner: &Inner, revision: &RevisionRecord) -> Recorded {
-    let known = inner.catalogue.known(revision).await;
-    // What runs is to be reached all the same.
+/// What is recorded of a revision, and found in its image.
+pub(crate) fn recorded(revision: &RevisionRecord, known: Known) -> Recorded {
     let Known {
         inventory,
         registry,
-    } = known.unwrap_or_else(|error| {
-        tracing::warn!(
-            "what the image of {} holds is not known: {error}",
-            revision.service
-        );
-        Known::default()
-    });
+    } = known;
     let plan = &revision.plan;
     Recorded {
         service: revision.service.clone(),

@@ -19,6 +19,7 @@ use servant::engine::{ContainerState, Servant};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
+use super::group::is_of_no_robot;
 use super::waiting::Permit;
 use super::{Inner, reaching, starting};
 use crate::Error;
@@ -159,13 +160,13 @@ impl Warm {
 
 impl WarmPool {
     /// Decides which servant a robot is given that asks for this revision and `has` that servant so far. Where a new one is
-    /// to be made of a warm container, gives that; and remembers that the service was asked for. `default_names`: the robot
-    /// takes the revision's nodes as they are.
+    /// to be made of a warm container, gives that; and remembers that the service was asked for, and that a robot has arrived
+    /// if `robot` names one. `default_names`: it takes the revision's nodes as they are.
     pub(crate) fn place<'a>(
         &self,
         has: Option<&decide::Servant<'a>>,
         revision: &RevisionRecord,
-        default_names: bool,
+        (robot, default_names): (&str, bool),
     ) -> (Placement<'a>, Option<Warm>) {
         let mut kept = self.kept.lock();
         let service = &revision.service;
@@ -179,10 +180,12 @@ impl WarmPool {
         let now = Instant::now();
         kept.asked_for.retain(|asked| asked != service);
         kept.asked_for.push(service.clone());
-        let arrivals = kept.arrivals.entry(service.clone());
-        arrivals
-            .or_insert_with(|| Arrivals::new(now.into_std()))
-            .arrived(now.into_std());
+        if !is_of_no_robot(robot) {
+            let arrivals = kept.arrivals.entry(service.clone());
+            arrivals
+                .or_insert_with(|| Arrivals::new(now.into_std()))
+                .arrived(now.into_std());
+        }
         let taken = id.and_then(|id| kept.take(&id));
         if taken.is_some() {
             kept.leads.entry(service.clone()).or_default().taken(now);

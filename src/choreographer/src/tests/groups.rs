@@ -7,7 +7,10 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use futures_util::future::join_all;
 use in_memory::Process;
-use ros::bus::{Bus, BusError, ServiceHandler};
+use ros::bus::{
+    ActionClient, ActionHandler, Bus, BusError, GoalEnd, GoalEvents, Outcome, ServiceHandler,
+};
+use ros::schema::{ActionDef, Registry};
 use tokio::sync::Semaphore;
 
 use super::servants::World;
@@ -33,11 +36,43 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// A world in which `/echo` can be called, as often as there are permits.
+/// Takes goals, ends none, and does not care when they are cancelled.
+struct Deaf(Arc<AtomicUsize>);
+
+impl ActionHandler for Deaf {
+    fn goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+        self.0.fetch_add(1, Ordering::SeqCst);
+        Ok(())
+    }
+    fn cancel(&self, _id: &str) {}
+    fn failed(&self, _reason: &str) {}
+}
+
+/// The action that it serves.
+fn count() -> Arc<ActionDef> {
+    let text = "int32 to\n---\nint32 at\n---\nint32 at\n".to_owned();
+    let definitions = [("x_msgs/action/Count".to_owned(), text)].into();
+    let registry = Registry::from_definitions(&definitions).expect("definitions");
+    registry.action("x_msgs/Count").expect("an action")
+}
+
+/// The ends of a client's goals.
+#[derive(Default)]
+struct Ends(Mutex<Vec<Result<GoalEnd, String>>>);
+
+impl GoalEvents for Ends {
+    fn feedback(&self, _feedback: Bytes) {}
+    fn ended(&self, end: Result<GoalEnd, String>) {
+        self.0.lock().push(end);
+    }
+}
+
+/// A world in which `/echo` can be called, as often as there are permits, and `/count` takes goals.
 struct Shop {
     world: World,
     answers: Arc<Semaphore>,
     asked: Arc<AtomicUsize>,
+    goals: Arc<AtomicUsize>,
 }
 
 impl Shop {
@@ -45,13 +80,17 @@ impl Shop {
         let world = World::new();
         let (answers, asked) = (Arc::new(Semaphore::new(0)), Arc::<AtomicUsize>::default());
         let (gives, counts) = (Arc::clone(&answers), Arc::clone(&asked));
+        let goals = Arc::<AtomicUsize>::default();
+        let taken = Arc::clone(&goals);
         world.engine.program("/echo", move |process: Process| {
             let echo = Echo {
                 servant: process.servant().to_owned(),
                 answers: Arc::clone(&gives),
                 asked: Arc::clone(&counts),
             };
+            let deaf = Arc::new(Deaf(Arc::clone(&taken)));
             async move {
+                let _counts = process.serve_action("/count", &count(), deaf);
                 let _served = process.serve("/echo", "x_msgs/Echo", Arc::new(echo)).await;
                 std::future::pending().await
             }
@@ -60,6 +99,8 @@ impl Shop {
             let service = serde_json::json!({ "name": "/echo", "type": "x_msgs/Echo", "md5": "*" });
             record.interface.topics.clear();
             record.interface.services = vec![serde_json::from_value(service).expect("a service")];
+            let action = serde_json::json!({ "name": "/count", "type": "x_msgs/Count" });
+            record.interface.actions = vec![serde_json::from_value(action).expect("an action")];
             record.plan.shared = Some(shared);
             record.plan.limits.cpus = Some(0.1);
         });
@@ -67,6 +108,7 @@ impl Shop {
             world,
             answers,
             asked,
+            goals,
         }
     }
 }
@@ -95,6 +137,18 @@ async fn call(bus: &Arc<dyn Bus>, words: &str) -> Result<String, String> {
     let answer = bus.call("/echo", Bytes::from(words.to_owned()), LONG).await;
     let answer = answer.map_err(|error: BusError| error.to_string())?;
     Ok(String::from_utf8_lossy(&answer).into_owned())
+}
+
+/// A client of `/count` that has sent so many goals.
+async fn counts(bus: &Arc<dyn Bus>, goals: usize) -> (Box<dyn ActionClient>, Arc<Ends>) {
+    let client = bus.action_client("/count", &count()).expect("an action");
+    client.ready(LONG).await.expect("it is served");
+    let ends = Arc::<Ends>::default();
+    for number in 0..goals {
+        let goal = Bytes::from_static(&[1, 0, 0, 0]);
+        client.send(&number.to_string(), goal, ends.clone());
+    }
+    (client, ends)
 }
 
 /// Waits until the group is so.
@@ -340,4 +394,76 @@ async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
     assert_eq!(last.handle().id, id);
     shop.answers.add_permits(1);
     assert!(call(&bus, "still").await.is_ok());
+}
+
+#[tokio::test(start_paused = true)]
+async fn servants_of_a_group_are_no_robots_that_arrive() {
+    let shop = Shop::new(api::Shared {
+        min: 8,
+        max: 8,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon_with(|options| options.warm_pool = 8);
+    daemon.keep_warm_pool();
+    let (_lease, _bus) = robot(&daemon, "r1").await;
+    until(&daemon, |group| ready(group) == 8).await;
+    for _ in 0..100 {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let (ahead, _) = daemon.warm_pool();
+        assert!(ahead <= 1, "{ahead} for robots that have not come");
+    }
+    daemon.end_warm_pool().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_is_measured_of_a_shared_service_is_a_servant_of_its_own() {
+    let shop = Shop::new(api::Shared::default());
+    let daemon = shop.world.daemon();
+    let request = ServantRequest::new("echo", "~calibrate-1").anonymous();
+    let lease = daemon.ensure(request).expect("a lease");
+    let bus = lease.ready().await.expect("ready").bus();
+    shop.answers.add_permits(1);
+    assert!(call(&bus, "measured").await.is_ok());
+    // Limits of a container are changed, and no robot's call meets the measurement.
+    assert!(lease.handle().container().is_some());
+    assert!(daemon.groups("echo").is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_goal_that_its_node_does_not_end_holds_up_others_only_while_its_robot_is_there() {
+    let shop = Shop::new(api::Shared {
+        max: 1,
+        ..api::Shared::default()
+    });
+    let daemon = shop.world.daemon();
+    let (_one, one) = robot(&daemon, "one").await;
+    let (_two, two) = robot(&daemon, "two").await;
+    let (client, _) = counts(&one, 1).await;
+    let (_other, _) = counts(&two, 1).await;
+    tokio::time::sleep(LONG).await;
+    assert_eq!(shop.goals.load(Ordering::SeqCst), 1, "the robot's alone");
+    drop(client);
+    let taken = async {
+        while shop.goals.load(Ordering::SeqCst) < 2 {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    };
+    let taken = tokio::time::timeout(LONG, taken).await;
+    assert!(taken.is_ok(), "the other's waits for ever");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_has_no_more_than_so_many_goals() {
+    let shop = Shop::new(api::Shared::default());
+    let daemon = shop.world.daemon();
+    let (_one, bus) = robot(&daemon, "one").await;
+    let (client, ends) = counts(&bus, 300).await;
+    // One with an id that another has.
+    client.send("7", Bytes::from_static(&[1, 0, 0, 0]), ends.clone());
+    tokio::time::sleep(LONG).await;
+    assert_eq!(shop.goals.load(Ordering::SeqCst), 256);
+    let ends = ends.0.lock();
+    let rejected = ends.iter().flatten();
+    let rejected = rejected.filter(|end| end.outcome == Outcome::Rejected);
+    assert_eq!((ends.len(), rejected.count()), (45, 45), "{ends:?}");
 }

@@ -297,9 +297,9 @@ impl ActionTopics {
         self.client.send(&id, body, Arc::new(events));
     }
 
-    /// Cancels all goals of the robot.
+    /// The robot's node or the robot has gone: its goals are cancelled, and not followed for long.
     pub(super) fn cancel_all(&self) {
-        self.cancel(&GoalId::default());
+        self.client.leave();
     }
 
     fn cancel(&self, GoalId { stamp, id }: &GoalId) {

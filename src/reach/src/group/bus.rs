@@ -1,108 +1,58 @@
-//! A group as one robot's bus: services and actions of the interface, nothing else.
+//! A group as one robot's bus: services and actions of the interface, nothing else, under the names of a [`View`].
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use budget::Budget;
 use bytes::Bytes;
-use package::interface::Interface;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, Digest, Graph,
-    Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription, TopicNodes, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Publisher, Qos,
+    RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::watch;
 
 use super::Group;
-use super::action_topics::{ActionTopics, End, topics_of};
+use super::action_topics::{ActionTopics, End};
 use super::dispatch::Robot;
 use super::goals::GroupClient;
-
-/// The name of a node that the interface does not tell.
-const SOMEBODY: &str = "/shared";
-
-/// What a robot sees of an interface.
-pub(super) fn graph_of(interface: &Interface) -> Graph {
-    let named = |node: &str| match node {
-        "" => SOMEBODY.to_owned(),
-        node => node.to_owned(),
-    };
-    let services = interface.services.iter();
-    let services: BTreeMap<String, String> = services
-        .map(|service| (service.name.clone(), named(&service.node)))
-        .collect();
-    let actions = interface.actions.iter().map(|action| {
-        let nodes = ActionNodes {
-            type_name: action.type_name.clone(),
-            servers: vec![named(&action.node)],
-            topics: topics_of(&action.name).map(|(_, topic)| topic).collect(),
-            ..ActionNodes::default()
-        };
-        (action.name.clone(), nodes)
-    });
-    let topics = interface.actions.iter().flat_map(|action| {
-        topics_of(&action.name).map(|(end, topic)| {
-            let mut ends = TopicNodes {
-                type_name: end.type_name(&action.type_name),
-                ..TopicNodes::default()
-            };
-            let here = match end.is_of_clients() {
-                true => &mut ends.subscribers,
-                false => &mut ends.publishers,
-            };
-            here.push(named(&action.node));
-            (topic, ends)
-        })
-    });
-    let topics: BTreeMap<String, TopicNodes> = topics.collect();
-    let actions: BTreeMap<String, ActionNodes> = actions.collect();
-    let nodes = services
-        .values()
-        .chain(actions.values().flat_map(|action| action.servers.iter()));
-    Graph {
-        generation: 1,
-        nodes: nodes.map(|node| (node.clone(), String::new())).collect(),
-        services: services.clone(),
-        actions: actions.clone(),
-        topics,
-        ..Graph::default()
-    }
-}
+use super::view::{Shown, View};
 
 /// One robot's.
 pub(super) struct GroupBus {
-    pub(super) group: Arc<Group>,
-    pub(super) robot: Robot,
+    group: Arc<Group>,
+    robot: Robot,
     registry: Arc<Registry>,
     /// Counts what waits here for servants.
     budget: Budget,
-    /// By name, as far as they are used by their topics.
-    actions: Mutex<HashMap<String, Arc<ActionTopics>>>,
+    view: Mutex<Arc<View>>,
+    graph: watch::Sender<Arc<Graph>>,
+    /// By name in the interface and node, as far as they are used by their topics.
+    actions: Mutex<HashMap<(String, String), Arc<ActionTopics>>>,
 }
 
 impl GroupBus {
     /// The end of an action that a topic is.
     fn end(&self, topic: &str) -> Result<(End, Arc<ActionTopics>), BusError> {
-        let actions = self.group.interface.actions.iter();
-        let found = actions
-            .flat_map(|action| topics_of(&action.name).map(move |(end, name)| (action, end, name)))
-            .find(|(.., name)| name == topic);
-        let Some((action, end, _)) = found else {
+        let view = self.view();
+        let Some((action, end)) = view.action_of(topic) else {
             return Err(BusError::NotShared(format!("topic {topic}")));
         };
+        let Shown { of: name, node } = &action.shown;
         let mut actions = self.actions.lock();
-        if let Some(known) = actions.get(&action.name) {
+        let key = (name.clone(), node.clone());
+        if let Some(known) = actions.get(&key) {
             return Ok((end, Arc::clone(known)));
         }
         let of = self.registry.action(&action.type_name);
         let of = of.map_err(|error| BusError::Protocol {
-            what: format!("action {}", action.name),
+            what: format!("action {name}"),
             reason: error.to_string(),
         })?;
-        let names = (&*action.name, &*action.node);
+        let names = (&**name, &**node);
         let topics = ActionTopics::new(
             &self.group,
             self.robot,
@@ -111,42 +61,96 @@ impl GroupBus {
             &self.registry,
             &self.budget,
         )?;
-        actions.insert(action.name.clone(), Arc::clone(&topics));
+        actions.insert(key, Arc::clone(&topics));
         Ok((end, topics))
+    }
+
+    pub(super) fn interface(&self) -> &package::interface::Interface {
+        &self.group.interface
+    }
+
+    fn view(&self) -> Arc<View> {
+        Arc::clone(&self.view.lock())
+    }
+
+    /// From now on it shows this. Goals of actions that are not shown any more are cancelled.
+    pub(super) fn show(&self, view: View) {
+        let mut actions = self.actions.lock();
+        let mut now = self.view.lock();
+        let shown = |(name, node): &(String, String)| {
+            let mut all = view.actions.values().map(|action| &action.shown);
+            all.any(|shown| shown.of == *name && shown.node == *node)
+        };
+        actions.retain(|key, topics| {
+            let stays = shown(key);
+            if !stays {
+                topics.cancel_all();
+            }
+            stays
+        });
+        self.graph
+            .send_modify(|graph| *graph = Arc::new(view.graph(graph.generation + 1)));
+        *now = Arc::new(view);
     }
 }
 
 impl Drop for GroupBus {
+    /// Goals outlive who sent them, or their results would be lost with a connection; not their robot's place.
     fn drop(&mut self) {
-        // Goals outlive who sent them, or their results would be lost with a connection; not their robot's place.
-        for topics in self.actions.lock().values() {
-            topics.cancel_all();
-        }
+        self.actions
+            .get_mut()
+            .values()
+            .for_each(|action| action.cancel_all());
     }
 }
 
 impl Group {
-    /// A bus for one robot; `registry` holds the definitions of its actions, what waits for servants counts in `budget`.
-    pub fn bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
+    /// Two buses for one robot, one that shows the interface as it was deployed, and one that shows nothing yet; `registry`
+    /// holds the definitions of its actions, what waits for servants counts in `budget`.
+    pub(super) fn buses(
+        self: &Arc<Self>,
+        registry: &Arc<Registry>,
+        budget: &Budget,
+    ) -> (Arc<GroupBus>, Arc<GroupBus>) {
         let robot = self
             .robots
             .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        Arc::new(GroupBus {
-            group: Arc::clone(self),
-            robot,
-            registry: Arc::clone(registry),
-            budget: budget.clone(),
-            actions: Mutex::default(),
-        })
+        let bus = |view: &Arc<View>, graph: &Arc<Graph>| {
+            Arc::new(GroupBus {
+                group: Arc::clone(self),
+                robot,
+                registry: Arc::clone(registry),
+                budget: budget.clone(),
+                view: Mutex::new(Arc::clone(view)),
+                graph: watch::Sender::new(Arc::clone(graph)),
+                actions: Mutex::default(),
+            })
+        };
+        (
+            bus(&self.whole, &self.graph),
+            bus(&Arc::default(), &Arc::default()),
+        )
     }
 
+    /// The first of them.
+    #[cfg(test)]
+    pub(super) fn bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
+        self.buses(registry, budget).0
+    }
+
+    fn service(&self, name: &str) -> Option<&package::interface::Service> {
+        let mut services = self.interface.services.iter();
+        services.find(|service| service.name == name)
+    }
+}
+
+impl GroupBus {
+    /// The service that the robot knows by this name.
     fn service(&self, name: &str) -> Result<&package::interface::Service, BusError> {
-        let found = self
-            .interface
-            .services
-            .iter()
-            .find(|service| service.name == name);
-        found.ok_or_else(|| BusError::NoService(name.to_owned()))
+        let view = self.view();
+        let shown = view.services.get(name);
+        let known = shown.and_then(|shown| self.group.service(&shown.of));
+        known.ok_or_else(|| BusError::NoService(name.to_owned()))
     }
 }
 
@@ -161,7 +165,7 @@ impl Bus for GroupBus {
     }
 
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {
-        self.group.graph.subscribe()
+        self.graph.subscribe()
     }
 
     async fn subscribe(
@@ -189,16 +193,6 @@ impl Bus for GroupBus {
         }
     }
 
-    async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
-        self.call_typed(service, &Digest::any(), request, timeout)
-            .await
-    }
-
     async fn call_typed(
         &self,
         service: &str,
@@ -206,19 +200,19 @@ impl Bus for GroupBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        self.group.service(service)?;
+        let known = self.service(service)?;
         let group = &self.group;
         group
-            .call(self.robot, service, digest, request, timeout)
+            .call(self.robot, &known.name, digest, request, timeout)
             .await
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
-        let known = self.group.service(service)?;
+        let known = self.service(service)?;
         if known.md5.is_empty() {
             let servant = self.group.members.borrow().values().next().cloned();
             let servant = servant.ok_or_else(|| BusError::NoService(service.to_owned()))?;
-            return servant.bus.service_type(service).await;
+            return servant.bus.service_type(&known.name).await;
         }
         Ok(ServiceType::new(&*known.type_name, &known.md5))
     }
@@ -242,16 +236,12 @@ impl Bus for GroupBus {
         action: &str,
         of: &Arc<ActionDef>,
     ) -> Result<Box<dyn ActionClient>, BusError> {
-        let mut known = self.group.interface.actions.iter();
-        if !known.any(|known| known.name == action) {
+        let view = self.view();
+        let Some(known) = view.actions.get(action) else {
             return Err(BusError::NotShared(format!("action {action}")));
-        }
-        Ok(Box::new(GroupClient::new(
-            &self.group,
-            self.robot,
-            action,
-            of,
-        )))
+        };
+        let client = GroupClient::new(&self.group, self.robot, &known.shown.of, of);
+        Ok(Box::new(client))
     }
 
     fn serve_action(

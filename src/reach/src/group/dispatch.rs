@@ -9,7 +9,8 @@
 //! ```
 //!
 //! - A servant has at most [`Rules::window`] calls under way; the rest wait here, so that what waits is lost with no servant,
-//!   and goes to a servant that is added meanwhile. Robots that wait have turns: one with a thousand calls holds nobody up.
+//!   and goes to a servant that is added meanwhile. Robots that wait have turns: one with a thousand calls holds nobody up,
+//!   and neither does one that calls a service which no servant serves at the moment.
 //! - A servant carries out goals of one action for one robot at a time, since most action servers take one goal and give up
 //!   the one before for it: another robot's goal would end this robot's. A robot's next goal goes where its goal is, so that
 //!   the node treats both as it would if it were this robot's alone. While others wait for the action, at most [`AHEAD`] of
@@ -36,10 +37,10 @@ pub type Member = u64;
 pub type Robot = u64;
 
 /// What is asked for.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// A call of a service.
-    Call,
+    /// A call of the service of this name.
+    Call(Arc<str>),
     /// A goal of the action of this name.
     Goal(Arc<str>),
 }
@@ -95,9 +96,8 @@ pub struct Load {
     pub under_way: usize,
 }
 
-/// Calls, or the goals of one action.
+/// The calls of one service, or the goals of one action.
 type Lane = u32;
-const CALLS: Lane = 0;
 
 #[derive(Debug)]
 struct Request {
@@ -116,8 +116,8 @@ struct Servant {
     goals: BTreeMap<Lane, Goals>,
     /// It gets no more.
     retired: bool,
-    /// It does not take requests at the moment.
-    paused: bool,
+    /// What it does not take at the moment.
+    paused: BTreeSet<Lane>,
     /// Requests that it was ever asked.
     asked: u64,
 }
@@ -133,8 +133,8 @@ struct Goals {
 
 impl Servant {
     /// It can be asked.
-    fn is_open(&self) -> bool {
-        !self.retired && !self.paused
+    fn is_open(&self, lane: Lane) -> bool {
+        !self.retired && !self.paused.contains(&lane)
     }
 
     fn load(&self) -> usize {
@@ -147,7 +147,9 @@ impl Servant {
 pub struct Dispatcher {
     rules: Rules,
     tickets: Ticket,
-    actions: BTreeMap<Arc<str>, Lane>,
+    lanes: BTreeMap<Kind, Lane>,
+    /// Those of calls.
+    calls: BTreeSet<Lane>,
     servants: BTreeMap<Member, Servant>,
     requests: BTreeMap<Ticket, Request>,
     waiting: BTreeMap<(Robot, Lane), VecDeque<Ticket>>,
@@ -165,7 +167,8 @@ impl Dispatcher {
                 idempotent: rules.idempotent || rules.replicas > 1,
             },
             tickets: 0,
-            actions: BTreeMap::new(),
+            lanes: BTreeMap::new(),
+            calls: BTreeSet::new(),
             servants: BTreeMap::new(),
             requests: BTreeMap::new(),
             waiting: BTreeMap::new(),
@@ -188,19 +191,33 @@ impl Dispatcher {
         self.next()
     }
 
-    /// Asks a servant no more until it is [resumed](Self::resume).
-    fn pause(&mut self, member: Member) {
+    /// A servant that was to be asked no more is asked again.
+    pub fn take_back(&mut self, member: Member) -> Vec<Order> {
         if let Some(servant) = self.servants.get_mut(&member) {
-            servant.paused = true;
-        }
-    }
-
-    /// A servant that did not take a request is asked again.
-    pub fn resume(&mut self, member: Member) -> Vec<Order> {
-        if let Some(servant) = self.servants.get_mut(&member) {
-            servant.paused = false;
+            servant.retired = false;
         }
         self.next()
+    }
+
+    /// A servant that did not take a request is asked for such again.
+    pub fn resume(&mut self, member: Member, kind: &Kind) -> Vec<Order> {
+        let lane = self.lanes.get(kind);
+        if let (Some(servant), Some(lane)) = (self.servants.get_mut(&member), lane) {
+            servant.paused.remove(lane);
+        }
+        self.next()
+    }
+
+    fn lane(&mut self, kind: &Kind) -> Lane {
+        if let Some(known) = self.lanes.get(kind) {
+            return *known;
+        }
+        let lane = self.lanes.len() as Lane;
+        self.lanes.insert(kind.clone(), lane);
+        if matches!(kind, Kind::Call(_)) {
+            self.calls.insert(lane);
+        }
+        lane
     }
 
     /// A servant is gone, with what it worked at.
@@ -224,13 +241,7 @@ impl Dispatcher {
     pub fn ask(&mut self, robot: Robot, kind: &Kind) -> (Ticket, Vec<Order>) {
         self.tickets += 1;
         let ticket = self.tickets;
-        let lane = match kind {
-            Kind::Call => CALLS,
-            Kind::Goal(action) => {
-                let next = self.actions.len() as Lane + 1;
-                *self.actions.entry(Arc::clone(action)).or_insert(next)
-            }
-        };
+        let lane = self.lane(kind);
         let request = Request {
             robot,
             lane,
@@ -247,9 +258,10 @@ impl Dispatcher {
     /// A servant's work at a request has ended. Whether that is the request's answer, and what is to be done.
     pub fn ended(&mut self, ticket: Ticket, member: Member, end: End) -> (bool, Vec<Order>) {
         let known = self.requests.get(&ticket);
-        if !known.is_some_and(|request| request.at.contains(&member)) {
+        let Some(request) = known.filter(|request| request.at.contains(&member)) else {
             return (false, Vec::new());
-        }
+        };
+        let lane = request.lane;
         let mut orders = Vec::new();
         match end {
             End::Answered => {
@@ -258,7 +270,9 @@ impl Dispatcher {
                 orders.extend(others.into_iter().map(|other| Order::Drop(ticket, other)));
             }
             End::NotTaken => {
-                self.pause(member);
+                if let Some(servant) = self.servants.get_mut(&member) {
+                    servant.paused.insert(lane);
+                }
                 self.release(ticket, member);
                 self.again(ticket, &mut orders);
             }
@@ -315,7 +329,7 @@ impl Dispatcher {
         let Some(servant) = self.servants.get_mut(&member) else {
             return;
         };
-        if request.lane == CALLS {
+        if self.calls.contains(&request.lane) {
             servant.calls -= 1;
         } else if let Some(goals) = servant.goals.get_mut(&request.lane) {
             goals.count -= 1;
@@ -377,14 +391,15 @@ impl Dispatcher {
         let mut open: Vec<(Member, &Servant)> = self
             .servants
             .iter()
-            .filter(|(_, servant)| servant.is_open())
+            .filter(|(_, servant)| servant.is_open(lane))
             .map(|(member, servant)| (*member, servant))
             .collect();
-        let wanted = match lane {
-            CALLS => self.rules.replicas.min(open.len()),
-            _ => 1,
+        let is_call = self.calls.contains(&lane);
+        let wanted = match is_call {
+            true => self.rules.replicas.min(open.len()),
+            false => 1,
         };
-        if lane == CALLS {
+        if is_call {
             open.retain(|(_, servant)| servant.calls < self.rules.window);
         } else {
             let of = |servant: &Servant| {
@@ -420,7 +435,10 @@ impl Dispatcher {
     }
 
     fn has_servant(&self, robot: Robot, lane: Lane) -> bool {
-        let mut open = self.servants.values().filter(|servant| servant.is_open());
+        let mut open = self
+            .servants
+            .values()
+            .filter(|servant| servant.is_open(lane));
         open.any(|servant| servant.goals.get(&lane).is_some_and(|of| of.robot == robot))
     }
 
@@ -453,10 +471,10 @@ impl Dispatcher {
         if let Some(request) = self.requests.get_mut(&ticket) {
             request.at.insert(member);
         }
-        let others = lane != CALLS && self.others_wait(robot, lane);
+        let others = !self.calls.contains(&lane) && self.others_wait(robot, lane);
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.asked += 1;
-            if lane == CALLS {
+            if self.calls.contains(&lane) {
                 servant.calls += 1;
                 return;
             }

@@ -22,6 +22,10 @@ use super::{Errand, Group, Servant, Told, lost_in_words};
 
 /// For an action server of a servant that has its interface.
 const CONNECTS: Duration = Duration::from_secs(10);
+/// Goals of one action of one robot that have not ended; more are rejected.
+const MOST: usize = 256;
+/// How long a node may take to end a goal whose robot has gone. Then its servant carries out other robots' goals.
+const GONE: Duration = Duration::from_secs(10);
 
 /// One action, as a robot's.
 pub(super) struct GroupClient {
@@ -30,6 +34,7 @@ pub(super) struct GroupClient {
     name: Arc<str>,
     of: Arc<ActionDef>,
     goals: Arc<Mutex<HashMap<String, CancellationToken>>>,
+    gone: CancellationToken,
 }
 
 impl GroupClient {
@@ -45,7 +50,13 @@ impl GroupClient {
             name: name.into(),
             of: Arc::clone(of),
             goals: Arc::default(),
+            gone: CancellationToken::new(),
         }
+    }
+
+    /// Nobody waits for the goals any more: they are cancelled, and not followed for long.
+    pub(super) fn leave(&self) {
+        self.gone.cancel();
     }
 }
 
@@ -56,10 +67,11 @@ impl ActionClient for GroupClient {
         let any = async {
             loop {
                 let now = members.borrow_and_update().clone();
+                // One that is going says no; others may still answer.
                 let clients = now
                     .values()
-                    .map(|servant| servant.action(&self.name, &self.of));
-                let clients: Vec<_> = clients.collect::<Result<_, _>>()?;
+                    .filter_map(|servant| servant.action(&self.name, &self.of).ok());
+                let clients: Vec<_> = clients.collect();
                 let opened = clients.iter().map(|client| client.ready(patience));
                 let mut opened: FuturesUnordered<_> = opened.collect();
                 tokio::select! {
@@ -77,19 +89,40 @@ impl ActionClient for GroupClient {
     }
 
     fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        let cancelled = CancellationToken::new();
-        self.goals.lock().insert(id.to_owned(), cancelled.clone());
+        let cancelled = self.gone.child_token();
+        {
+            let mut goals = self.goals.lock();
+            let refused = match goals.len() {
+                _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
+                MOST.. => Some(format!(
+                    "{MOST} goals of this robot have not ended; wait for one of them"
+                )),
+                _ => None,
+            };
+            if let Some(text) = refused {
+                let end = GoalEnd {
+                    outcome: Outcome::Rejected,
+                    text,
+                    result: vec![0; self.of.result.min_size()].into(),
+                };
+                // Not at once: whoever sends may hold what hears of it.
+                tokio::spawn(async move { events.ended(Ok(end)) });
+                return;
+            }
+            goals.insert(id.to_owned(), cancelled.clone());
+        }
+        let errand = self
+            .group
+            .begin(self.robot, Kind::Goal(Arc::clone(&self.name)));
         let goal = Goal {
-            // Robots do not know each other's ids.
-            id: format!("{}-{id}", self.robot),
+            // Robots, and nodes of one robot, do not know each other's ids.
+            id: format!("{}-{id}", errand.ticket),
             body: goal,
             name: Arc::clone(&self.name),
             of: Arc::clone(&self.of),
             cancelled,
+            gone: self.gone.clone(),
         };
-        let errand = self
-            .group
-            .begin(self.robot, &Kind::Goal(Arc::clone(&self.name)));
         let (goals, id) = (Arc::clone(&self.goals), id.to_owned());
         tokio::spawn(async move {
             let end = goal.follow(errand, &events).await;
@@ -107,9 +140,7 @@ impl ActionClient for GroupClient {
 
 impl Drop for GroupClient {
     fn drop(&mut self) {
-        for cancelled in self.goals.lock().values() {
-            cancelled.cancel();
-        }
+        self.leave();
     }
 }
 
@@ -119,6 +150,8 @@ struct Goal {
     name: Arc<str>,
     of: Arc<ActionDef>,
     cancelled: CancellationToken,
+    /// Its robot has gone.
+    gone: CancellationToken,
 }
 
 /// What a servant says of a goal.
@@ -162,6 +195,11 @@ impl Goal {
         let mut at: Option<(Arc<Servant>, Arc<dyn ActionClient>)> = None;
         let mut last: Option<Arc<Servant>> = None;
         let mut told_to_end = false;
+        let given_up = async {
+            self.gone.cancelled().await;
+            tokio::time::sleep(GONE).await;
+        };
+        let mut given_up = std::pin::pin!(given_up);
         loop {
             tokio::select! {
                 biased;
@@ -192,6 +230,9 @@ impl Goal {
                         }
                         Err(error) => {
                             tracing::debug!("servant {} takes no goal: {error}", servant.id);
+                            if matches!(error, BusError::CallFailed { .. }) {
+                                servant.forget_action(&self.name);
+                            }
                             errand.ended(&servant, End::NotTaken);
                         }
                     }
@@ -223,6 +264,14 @@ impl Goal {
                         return Err(self.failed(&group, last.as_deref(), why));
                     }
                 },
+                () = &mut given_up => {
+                    let at = at.as_ref().map_or("no servant", |(servant, _)| servant.id.as_str());
+                    let words = format!(
+                        "its robot has gone, and {at} does not end it after {GONE:?}: other robots' goals go there, too"
+                    );
+                    tracing::warn!("goal {} of {}: {words}", self.id, self.name);
+                    return Err(words);
+                }
                 () = self.cancelled.cancelled(), if !told_to_end => {
                     told_to_end = true;
                     match &at {

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Lender, Lent, ServiceHandler, ServiceType};
+use ros::bus::{BusError, Digest, Lender, Lent, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
@@ -290,8 +290,11 @@ pub(super) async fn begin(hub: &Arc<Hub>) {
     let begun = hub
         .lends
         .get_or_try_init(|| async { hub.bus.lending()?.lend(lender).await });
-    if let Err(error) = begun.await {
-        tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot");
+    match begun.await {
+        Ok(()) | Err(BusError::NotOffered(_)) => {}
+        Err(error) => {
+            tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot")
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::ParamValue;
+use ros::bus::{BusError, ParamValue};
 use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
@@ -45,6 +45,9 @@ impl Known {
     pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
         let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
         hub.skew.leave(hello.keep_stamps || simulated);
+        let Ok(parameters) = hub.bus.parameters() else {
+            return;
+        };
         let there = match hub.bus.parameter("/").await {
             Ok(ParamValue::Map(there)) => there,
             _ => BTreeMap::new(),
@@ -57,9 +60,7 @@ impl Known {
         }
         for (key, value) in hub.nodes.parameters(&hello.node) {
             // The robot shall see what its node really has.
-            if let Ok(parameters) = hub.bus.parameters() {
-                let _ = parameters.set(&key, value).await;
-            }
+            let _ = parameters.set(&key, value).await;
         }
     }
 
@@ -82,9 +83,12 @@ impl Known {
     }
 
     async fn set(&self, hub: &Hub, key: String, value: ParamValue) {
+        // Where there are none, what is given in vain was told when the link began.
+        let Ok(parameters) = hub.bus.parameters() else {
+            return;
+        };
         self.set.lock().insert(key.clone(), value.clone());
-        let set = async { hub.bus.parameters()?.set(&key, value).await };
-        if let Err(error) = set.await {
+        if let Err(error) = parameters.set(&key, value).await {
             tracing::warn!(key, %error, "a parameter of the robot cannot be set");
         }
     }
@@ -100,10 +104,13 @@ impl Known {
                     hub.parameters.report(&hub, key, value);
                 }
             });
-            Ok::<_, ros::bus::BusError>(task.abort_handle())
+            Ok::<_, BusError>(task.abort_handle())
         });
-        if let Err(error) = begun.await {
-            tracing::warn!(%error, "parameters that nodes set do not reach the robot");
+        match begun.await {
+            Ok(_) | Err(BusError::NotOffered(_)) => {}
+            Err(error) => {
+                tracing::warn!(%error, "parameters that nodes set do not reach the robot");
+            }
         }
     }
 

@@ -354,16 +354,6 @@ impl Bus for Ros1Bus {
         publications::advertise(&self.inner, topic, of, qos, End::User).await
     }
 
-    async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
-        self.call_typed(service, &Digest::any(), request, timeout)
-            .await
-    }
-
     async fn call_typed(
         &self,
         service: &str,

@@ -1,8 +1,10 @@
 //! What a program of a node sees of the world.
 
+use std::any::Any;
 use std::sync::Arc;
 
-use ros::bus::{Bus, Graph, ServiceHandler, ServiceType, TopicNodes};
+use ros::bus::{ActionHandler, ActionNodes, Bus, Graph, ServiceHandler, ServiceType, TopicNodes};
+use ros::schema::ActionDef;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
 
@@ -54,6 +56,28 @@ impl Process {
         let name = self.node.name.clone();
         self.register(|graph| {
             graph.services.insert(service.to_owned(), name);
+        });
+        Box::new((served, node))
+    }
+
+    /// Serves an action for as long as what this gives lives.
+    pub fn serve_action(
+        &self,
+        action: &str,
+        of: &Arc<ActionDef>,
+        handler: Arc<dyn ActionHandler>,
+    ) -> Box<dyn Any + Send + Sync> {
+        let node = self.servant.system.join(&self.node.name);
+        let served = node.serve_action(action, of, handler);
+        let served = served.unwrap_or_else(|error| panic!("{error}"));
+        let server = self.node.name.clone();
+        self.register(|graph| {
+            let ends = ActionNodes {
+                type_name: of.name.clone(),
+                servers: vec![server],
+                ..ActionNodes::default()
+            };
+            graph.actions.insert(action.to_owned(), ends);
         });
         Box::new((served, node))
     }

@@ -151,7 +151,8 @@ async fn a_goal_with_an_endless_id_is_not_taken() {
 async fn robots_with_goals_of_one_name_hear_of_their_own() {
     let (group, bus) = group();
     let mut one = Robot::of(&bus).await;
-    let mut other = Robot::of(&another(&group)).await;
+    let another = another(&group);
+    let mut other = Robot::of(&another).await;
     one.sends("same", 8);
     other.sends("same", 8);
     assert_eq!(waiting(&group), 2);

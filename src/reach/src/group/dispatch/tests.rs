@@ -16,6 +16,10 @@ fn group(rules: Rules, members: u64) -> Dispatcher {
     group
 }
 
+fn call() -> Kind {
+    Kind::Call("/work".into())
+}
+
 fn goal() -> Kind {
     Kind::Goal("/count".into())
 }
@@ -23,23 +27,23 @@ fn goal() -> Kind {
 #[test]
 fn the_servant_with_the_fewest_requests_is_asked() {
     let mut group = group(RULES, 2);
-    assert_eq!(group.ask(7, &Kind::Call), (1, vec![Order::Ask(1, 1)]));
-    assert_eq!(group.ask(7, &Kind::Call), (2, vec![Order::Ask(2, 2)]));
+    assert_eq!(group.ask(7, &call()), (1, vec![Order::Ask(1, 1)]));
+    assert_eq!(group.ask(7, &call()), (2, vec![Order::Ask(2, 2)]));
     assert_eq!(group.ended(2, 2, End::Answered), (true, vec![]));
-    assert_eq!(group.ask(8, &Kind::Call), (3, vec![Order::Ask(3, 2)]));
+    assert_eq!(group.ask(8, &call()), (3, vec![Order::Ask(3, 2)]));
     // Of two that have as many, the one that was asked less often.
     assert_eq!(group.ended(3, 2, End::Answered), (true, vec![]));
     assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
-    assert_eq!(group.ask(8, &Kind::Call), (4, vec![Order::Ask(4, 1)]));
+    assert_eq!(group.ask(8, &call()), (4, vec![Order::Ask(4, 1)]));
 }
 
 #[test]
 fn what_finds_no_place_waits_and_robots_have_turns() {
     let mut group = group(RULES, 1);
     for _ in 0..5 {
-        group.ask(1, &Kind::Call);
+        group.ask(1, &call());
     }
-    group.ask(2, &Kind::Call);
+    group.ask(2, &call());
     let load = Load {
         waiting: 4,
         under_way: 2,
@@ -107,7 +111,7 @@ fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
 #[test]
 fn what_a_lost_servant_had_fails_or_is_asked_again() {
     let mut strict = group(RULES, 2);
-    strict.ask(1, &Kind::Call);
+    strict.ask(1, &call());
     let orders = strict.leave(1);
     let fails = [Order::Drop(1, 1), Order::Fail(1, Lost::NotAskedAgain)];
     assert_eq!(orders, fails);
@@ -118,7 +122,7 @@ fn what_a_lost_servant_had_fails_or_is_asked_again() {
         ..RULES
     };
     let mut group = group(rules, 4);
-    group.ask(1, &Kind::Call);
+    group.ask(1, &call());
     assert_eq!(group.leave(1), [Order::Drop(1, 1), Order::Ask(1, 2)]);
     assert_eq!(
         group.ended(1, 2, End::Lost),
@@ -132,11 +136,16 @@ fn what_a_lost_servant_had_fails_or_is_asked_again() {
 #[test]
 fn what_was_not_taken_waits_for_a_servant_that_takes_it() {
     let mut group = group(RULES, 2);
-    group.ask(1, &Kind::Call);
+    group.ask(1, &call());
     assert_eq!(group.ended(1, 1, End::NotTaken).1, [Order::Ask(1, 2)]);
     assert_eq!(group.ended(1, 2, End::NotTaken).1, []);
     assert_eq!(group.load().waiting, 1);
-    assert_eq!(group.resume(1), [Order::Ask(1, 1)]);
+    // Neither for long what is served, be it of another robot or of the same.
+    let other = Kind::Call("/rest".into());
+    assert_eq!(group.ask(2, &other).1, [Order::Ask(2, 1)]);
+    assert_eq!(group.ask(1, &other).1, [Order::Ask(3, 2)]);
+    assert_eq!(group.resume(1, &other), []);
+    assert_eq!(group.resume(1, &call()), [Order::Ask(1, 1)]);
 }
 
 #[test]
@@ -147,15 +156,15 @@ fn of_replicas_the_first_answer_counts() {
     };
     let mut group = group(rules, 1);
     // There is one only.
-    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(1, 1)]);
+    assert_eq!(group.ask(1, &call()).1, [Order::Ask(1, 1)]);
     group.join(2);
-    let (ticket, orders) = group.ask(1, &Kind::Call);
+    let (ticket, orders) = group.ask(1, &call());
     assert_eq!(orders, [Order::Ask(ticket, 2), Order::Ask(ticket, 1)]);
     let answered = group.ended(ticket, 1, End::Answered);
     assert_eq!(answered, (true, vec![Order::Drop(ticket, 2)]));
     assert_eq!(group.ended(ticket, 2, End::Answered), (false, vec![]));
     // One that is lost leaves it to the other; then it is asked again.
-    let (ticket, _) = group.ask(1, &Kind::Call);
+    let (ticket, _) = group.ask(1, &call());
     assert_eq!(group.ended(ticket, 2, End::Lost), (false, vec![]));
     let (_, orders) = group.ended(ticket, 1, End::Lost);
     assert_eq!(orders.len(), 2, "{orders:?}");
@@ -164,13 +173,14 @@ fn of_replicas_the_first_answer_counts() {
 #[test]
 fn a_retired_servant_ends_what_it_has_and_gets_no_more() {
     let mut group = group(RULES, 2);
-    group.ask(1, &Kind::Call);
+    group.ask(1, &call());
     assert_eq!(group.retire(1), []);
-    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(2, 2)]);
-    assert_eq!(group.ask(1, &Kind::Call).1, [Order::Ask(3, 2)]);
-    assert_eq!(group.ask(1, &Kind::Call).1, [], "though it has a place");
+    assert_eq!(group.ask(1, &call()).1, [Order::Ask(2, 2)]);
+    assert_eq!(group.ask(1, &call()).1, [Order::Ask(3, 2)]);
+    assert_eq!(group.ask(1, &call()).1, [], "though it has a place");
     assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
     assert_eq!(group.load_of(1), 0);
+    assert_eq!(group.take_back(1), [Order::Ask(4, 1)]);
 }
 
 /// What happens to a group. Numbers choose one of what there is, if there is any.
@@ -213,13 +223,19 @@ struct Seen {
     over: bool,
 }
 
+impl Seen {
+    fn is_call(&self) -> bool {
+        matches!(self.kind, Kind::Call(_))
+    }
+}
+
 /// The world around a dispatcher.
 struct World {
     rules: Rules,
     group: Dispatcher,
     members: BTreeMap<Member, bool>,
     joined: Member,
-    paused: BTreeSet<Member>,
+    paused: BTreeSet<(Member, Kind)>,
     seen: BTreeMap<Ticket, Seen>,
 }
 
@@ -229,8 +245,9 @@ impl World {
             match order {
                 Order::Ask(ticket, member) => {
                     assert_eq!(self.members.get(&member), Some(&false), "it is asked");
-                    assert!(!self.paused.contains(&member), "it does not take any");
                     let seen = self.seen.get_mut(&ticket).expect("asked for");
+                    let paused = (member, seen.kind.clone());
+                    assert!(!self.paused.contains(&paused), "it does not take any");
                     assert!(!seen.over, "{ticket} is over");
                     assert!(seen.at.insert(member), "{ticket} is there already");
                     assert!(seen.lost == 0 || self.rules.idempotent, "asked again");
@@ -267,7 +284,7 @@ impl World {
                     return;
                 };
                 self.members.remove(&member);
-                self.paused.remove(&member);
+                self.paused.retain(|(of, _)| *of != member);
                 for seen in self
                     .seen
                     .values_mut()
@@ -286,15 +303,16 @@ impl World {
                 }
             }
             Step::Resumes(which) => {
-                if let Some(member) = nth(self.paused.iter(), which) {
-                    self.paused.remove(&member);
-                    let orders = self.group.resume(member);
+                let which = which % self.paused.len().max(1);
+                if let Some((member, kind)) = self.paused.iter().nth(which).cloned() {
+                    self.paused.remove(&(member, kind.clone()));
+                    let orders = self.group.resume(member, &kind);
                     self.carry_out(orders);
                 }
             }
             Step::Asks { robot, action } => {
                 let kind = match action {
-                    0 | 1 => Kind::Call,
+                    0 | 1 => Kind::Call(format!("/{action}").into()),
                     number => Kind::Goal(format!("/{number}").into()),
                 };
                 let (ticket, orders) = self.group.ask(robot, &kind);
@@ -319,7 +337,7 @@ impl World {
                 let seen = self.seen.get_mut(&ticket).expect("asked for");
                 seen.at.remove(&member);
                 match end {
-                    End::NotTaken => drop(self.paused.insert(member)),
+                    End::NotTaken => drop(self.paused.insert((member, seen.kind.clone()))),
                     End::Lost => seen.lost += 1,
                     End::Answered => {
                         assert!(!seen.over, "answered twice");
@@ -347,18 +365,17 @@ impl World {
         for seen in self.seen.values().filter(|seen| seen.over) {
             assert!(seen.at.is_empty(), "nobody waits for it");
         }
-        let able = |member: &&Member| !self.members[*member] && !self.paused.contains(*member);
         for member in self.members.keys() {
             let here: Vec<&&Seen> = open
                 .iter()
                 .filter(|seen| seen.at.contains(member))
                 .collect();
             assert_eq!(self.group.load_of(*member), here.len());
-            let calls = here.iter().filter(|seen| seen.kind == Kind::Call).count();
+            let calls = here.iter().filter(|seen| seen.is_call()).count();
             assert!(calls <= self.rules.window, "{calls} calls");
             for seen in &here {
                 let crosses = |other: &&&Seen| other.kind == seen.kind && other.robot != seen.robot;
-                let goal = seen.kind != Kind::Call;
+                let goal = !seen.is_call();
                 assert!(!goal || !here.iter().any(crosses), "of two robots");
             }
         }
@@ -366,15 +383,17 @@ impl World {
         let count = waiting.clone().count();
         assert_eq!(self.group.load().waiting, count);
         assert_eq!(self.group.load().under_way, open.len() - count);
+        let able = |member: &Member, kind: &Kind| {
+            !self.members[member] && !self.paused.contains(&(*member, kind.clone()))
+        };
         let has_servant = |of: &Seen| {
             let mut same = open.iter();
             same.any(|other| {
                 let here = other.kind == of.kind && other.robot == of.robot;
-                here && self
-                    .members
-                    .keys()
-                    .filter(able)
-                    .any(|it| other.at.contains(it))
+                here && other
+                    .at
+                    .iter()
+                    .any(|it| self.members.contains_key(it) && able(it, &of.kind))
             })
         };
         let others_wait = |seen: &Seen| {
@@ -385,12 +404,13 @@ impl World {
         };
         // Nothing waits for what could be asked.
         for seen in waiting {
-            let able: Vec<&Member> = self.members.keys().filter(able).collect();
+            let members = self.members.keys();
+            let able: Vec<&Member> = members.filter(|it| able(it, &seen.kind)).collect();
             let free = able.iter().filter(|member| {
                 let mut here = open.iter().filter(|other| other.at.contains(**member));
                 match seen.kind {
-                    Kind::Call => {
-                        here.filter(|other| other.kind == Kind::Call).count() < self.rules.window
+                    Kind::Call(_) => {
+                        here.filter(|other| other.is_call()).count() < self.rules.window
                     }
                     // A robot's further goals stand back for others'.
                     _ => here.all(|other| {
@@ -399,13 +419,13 @@ impl World {
                 }
             });
             let wanted = match seen.kind {
-                Kind::Call => self.rules.replicas.min(able.len()).max(1),
+                Kind::Call(_) => self.rules.replicas.min(able.len()).max(1),
                 _ => 1,
             };
             assert!(free.count() < wanted, "{seen:?} waits");
         }
         for seen in &open {
-            let most = if seen.kind == Kind::Call {
+            let most = if seen.is_call() {
                 self.rules.replicas
             } else {
                 1

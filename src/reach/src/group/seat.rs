@@ -1,0 +1,30 @@
+//! A group as one robot's [`Reach`]: a bridge and a hub of links of its own, so that its clients share what there is for clients
+//! of one robot, and nothing with another's.
+
+use std::sync::Arc;
+
+use super::Group;
+use super::nodes::SharedNodes;
+use crate::in_process::{Behind, InProcess};
+use crate::{Observer, Reach, ReachOptions, Recorded};
+
+/// A place for one robot; `place` is its id.
+pub fn seat(
+    group: &Arc<Group>,
+    place: &str,
+    recorded: Recorded,
+    options: ReachOptions,
+    observer: Arc<dyn Observer>,
+) -> Arc<dyn Reach> {
+    let registry = Arc::clone(&recorded.registry);
+    let (bus, linked) = group.buses(&registry, &options.budget);
+    let nodes = SharedNodes::new(Arc::clone(&linked), recorded, place, observer);
+    let behind = Behind {
+        id: place.to_owned(),
+        bus,
+        linked: (linked, Arc::new(nodes)),
+        registry,
+        keeps: Box::new(()),
+    };
+    Arc::new(InProcess::new(behind, options))
+}

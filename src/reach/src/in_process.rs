@@ -1,0 +1,149 @@
+//! A servant, or a robot's place in a group, that is reached in this process.
+
+use std::any::Any;
+use std::sync::{Arc, Weak};
+
+use async_trait::async_trait;
+use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
+use link::session::Lost;
+use package::interface::Interface;
+use ros::bus::{Bus, Graph};
+use ros::schema::Registry;
+use ros::sizes::Seen;
+use tokio::sync::watch;
+
+use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
+use crate::trial::{self, Material, Pace, Replay};
+use crate::{Error, Flow, Reach, ReachOptions, Stream, Tenant};
+
+/// A bus, the bridge before it, and the hub of its links.
+pub(crate) struct InProcess {
+    bus: Arc<dyn Bus>,
+    bridge: Arc<Bridge>,
+    hub: Arc<Hub>,
+    /// What the robot's stubs have started.
+    nodes: Arc<dyn Nodes>,
+    /// What must be there while this is.
+    _keeps: Box<dyn Any + Send + Sync>,
+}
+
+/// What clients and links are set before.
+pub(crate) struct Behind {
+    /// The id of the servant, or of the robot's place.
+    pub(crate) id: String,
+    /// What rosbridge clients see …
+    pub(crate) bus: Arc<dyn Bus>,
+    /// … and what stubs see, with the nodes that they start and end.
+    pub(crate) linked: (Arc<dyn Bus>, Arc<dyn Nodes>),
+    pub(crate) registry: Arc<Registry>,
+    pub(crate) keeps: Box<dyn Any + Send + Sync>,
+}
+
+impl InProcess {
+    pub(crate) fn new(behind: Behind, options: ReachOptions) -> InProcess {
+        let Behind {
+            id,
+            bus,
+            linked: (linked, nodes),
+            registry,
+            keeps,
+        } = behind;
+        let habits = HubOptions {
+            grace: options.grace,
+            budget: options.budget.clone(),
+            unfinished: options.unfinished,
+            ..HubOptions::default()
+        };
+        let hub = Hub::new(
+            &id,
+            linked,
+            Arc::clone(&registry),
+            Arc::clone(&nodes),
+            habits,
+        );
+        let options = BridgeOptions {
+            budget: options.budget,
+            ..options.bridge
+        };
+        InProcess {
+            bridge: Bridge::new(Arc::clone(&bus), registry, options),
+            bus,
+            hub,
+            nodes,
+            _keeps: keeps,
+        }
+    }
+}
+
+#[async_trait]
+impl Reach for InProcess {
+    fn bus(&self) -> Arc<dyn Bus> {
+        Arc::clone(&self.bus)
+    }
+
+    fn graph(&self) -> watch::Receiver<Arc<Graph>> {
+        self.bus.graph()
+    }
+
+    async fn serve_rosbridge(
+        &self,
+        client: Waiting<Stream>,
+        options: SessionOptions,
+    ) -> SessionEnd {
+        self.bridge.serve_waiting(client, options).await
+    }
+
+    async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {
+        self.hub.serve(stream, read_ahead).await
+    }
+
+    fn links(&self) -> Vec<LinkStatus> {
+        self.hub.status()
+    }
+
+    fn flows(&self) -> Vec<Flow> {
+        let metrics = self.bridge.metrics();
+        let clients = Flow {
+            node: String::new(),
+            // What nobody listens to the answers of need not be answered.
+            inputs: metrics.asked.get() + metrics.calls.get(),
+            outputs: metrics.received.get() + metrics.answers.get(),
+        };
+        let mut flows = self.hub.flows();
+        flows.push(clients);
+        flows
+    }
+
+    fn inputs(&self) -> Vec<(String, Seen)> {
+        let mut inputs = self.hub.inputs();
+        inputs.extend(self.bridge.inputs());
+        inputs
+    }
+
+    fn metrics(&self) -> &Metrics {
+        self.bridge.metrics()
+    }
+
+    async fn replay(
+        &self,
+        service: &str,
+        interface: &Interface,
+        material: &Material,
+        pace: &Pace,
+    ) -> Result<Replay, Error> {
+        trial::replay(&self.bus, service, interface, material, pace).await
+    }
+
+    fn bind(&self, tenant: Weak<dyn Tenant>) {
+        self.nodes.bind(tenant);
+    }
+
+    fn close_sessions(&self, reason: &str) {
+        self.bridge.close(reason);
+    }
+
+    fn close(&self, reason: &str) {
+        self.hub.close(reason);
+        self.bridge.close(reason);
+    }
+}

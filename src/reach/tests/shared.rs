@@ -1,0 +1,407 @@
+//! Stubs of a service that robots share: a group of two servants with real Masters, and robots' ends made by hand.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bridge::BridgeOptions;
+use budget::Budget;
+use bytes::Bytes;
+use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, Node, Request, Welcome};
+use link::record::Record;
+use link::session::{receive_open, send_open};
+use link::{Handler, MAX_FRAME, MAX_RECORD, RobotSession, SessionOptions};
+use package::interface::Interface;
+use package::inventory::Inventory;
+use reach::group::dispatch::Rules;
+use reach::group::{Group, seat};
+use reach::{Observer, Reach, ReachOptions, Recorded, Tenant};
+use ros::bus::{Bus, ParamValue, RosVersion, ServiceHandler, ServiceType};
+use ros::net::HostSockets;
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use ros::schema::Registry;
+use serde_json::json;
+use tokio::io::DuplexStream;
+use tokio::sync::{Semaphore, mpsc};
+use tokio::time::timeout;
+use ws::WebSocket;
+
+/// Only bounds how long a failing test takes.
+const LONG: Duration = Duration::from_secs(120);
+
+/// Answers what it was asked with its servant's name; "long" is never answered.
+struct Worker {
+    servant: &'static str,
+    asked: Semaphore,
+}
+
+#[async_trait]
+impl ServiceHandler for Worker {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        self.asked.add_permits(1);
+        if &request[..] == b"long" {
+            std::future::pending::<()>().await;
+        }
+        let asked = String::from_utf8_lossy(&request);
+        Ok(format!("{asked} by {}", self.servant).into())
+    }
+}
+
+/// A servant of the group.
+struct Member {
+    bus: Arc<Ros1Bus>,
+    worker: Arc<Worker>,
+    _node: Arc<Ros1Bus>,
+    _serves: Box<dyn Send + Sync>,
+}
+
+async fn member(servant: &'static str) -> Member {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions::default());
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
+    let (bus, node) = (join("/bridge").await, join("/worker").await);
+    let worker = Arc::new(Worker {
+        servant,
+        asked: Semaphore::new(0),
+    });
+    let node = node.unwrap();
+    let serves = node.serve("/work", work(), worker.clone()).await;
+    Member {
+        bus: bus.unwrap(),
+        worker,
+        _node: node,
+        _serves: serves.unwrap(),
+    }
+}
+
+fn work() -> ServiceType {
+    ServiceType::new("x_msgs/Work", "0123456789abcdef0123456789abcdef")
+}
+
+struct Nobody;
+
+impl Observer for Nobody {
+    fn fits(&self, _: Option<u64>, _: &str) -> Result<(), String> {
+        Ok(())
+    }
+    fn event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
+    fn measured(&self, _: &Request) {}
+}
+
+impl Tenant for Nobody {
+    fn robot(&self) -> &str {
+        "rover"
+    }
+    fn limits(&self) -> api::Limits {
+        api::Limits::default()
+    }
+    fn take_over(&self) -> bool {
+        false
+    }
+}
+
+/// A service of one node, `/worker`, that serves `/work`, one of its own, and an action.
+fn group() -> Arc<Group> {
+    let md5 = work().digest.to_string();
+    let interface = json!({
+        "services": [
+            { "name": "/work", "type": "x_msgs/Work", "md5": md5, "node": "/worker" },
+            { "name": "/worker/set", "type": "x_msgs/Work", "md5": md5, "node": "/worker" },
+        ],
+        "actions": [{ "name": "/count", "type": "x_msgs/Count", "node": "/worker" }],
+    });
+    let interface: Interface = serde_json::from_value(interface).unwrap();
+    let rules = Rules {
+        window: 8,
+        replicas: 1,
+        idempotent: false,
+    };
+    Group::new(RosVersion::One, "noetic", &interface, rules)
+}
+
+fn recorded() -> Recorded {
+    let node = json!({ "name": "/worker", "argv": ["/opt/lib/works/worker"] });
+    let definition = "int32 at\n---\nint32 at\n---\nint32 at\n".to_owned();
+    let definitions = [("x_msgs/action/Count".to_owned(), definition)].into();
+    Recorded {
+        service: "works".into(),
+        package: "works".into(),
+        flavour: Default::default(),
+        environment: Default::default(),
+        nodes: vec![serde_json::from_value(node).unwrap()],
+        parameters: Default::default(),
+        inventory: Arc::new(Inventory {
+            programs: [("worker".into(), "/opt/lib/works/worker".into())].into(),
+            ..Inventory::default()
+        }),
+        registry: Arc::new(Registry::from_definitions(&definitions).unwrap()),
+        egress: Vec::new(),
+    }
+}
+
+/// What a robot's end is told.
+#[derive(Debug)]
+enum Told {
+    Graph(Graph),
+    Answer(u32, Result<Bytes, String>),
+    Notice(String),
+    Exited(Exit),
+}
+
+struct Ear(mpsc::UnboundedSender<Told>);
+
+impl Handler<FromCloud> for Ear {
+    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+        let told = match record {
+            Record::Answer { id, response, .. } => Told::Answer(id, response),
+            Record::Control(FromCloud::Graph(graph)) => Told::Graph(graph),
+            Record::Control(FromCloud::Notice { text, .. }) => Told::Notice(text),
+            Record::Control(FromCloud::Exited(exit)) => Told::Exited(exit),
+            _ => return,
+        };
+        let _ = self.0.send(told);
+    }
+}
+
+/// A robot's place, and the keeper of what it belongs to.
+fn place(group: &Arc<Group>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
+    let options = ReachOptions {
+        ros: RosVersion::One,
+        bridge: BridgeOptions::default(),
+        grace: Duration::from_secs(30),
+        budget: Budget::unlimited(),
+        unfinished: LONG,
+    };
+    let reach = seat(group, "place", recorded(), options, Arc::new(Nobody));
+    let tenant: Arc<dyn Tenant> = Arc::new(Nobody);
+    let weak: Weak<dyn Tenant> = Arc::downgrade(&tenant);
+    reach.bind(weak);
+    (reach, tenant)
+}
+
+/// A stub's end of a link.
+struct Stub {
+    session: Arc<RobotSession>,
+    told: mpsc::UnboundedReceiver<Told>,
+}
+
+fn hello(node: &str, argv: &[&str]) -> Hello {
+    Hello {
+        run: format!("run of {node}"),
+        node: Node {
+            name: node.to_owned(),
+            package: "works".to_owned(),
+            executable: "worker".to_owned(),
+            argv: argv.iter().map(|&argument| argument.to_owned()).collect(),
+            ..Node::default()
+        },
+        ..Hello::default()
+    }
+}
+
+/// Says hello on a new connection; how that is answered.
+async fn says(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
+    let (theirs, ours) = tokio::io::duplex(1 << 16);
+    let reach = Arc::clone(reach);
+    tokio::spawn(async move { reach.serve_link(Box::new(theirs), &[]).await });
+    let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
+    send_open(&mut socket, hello).await.unwrap();
+    let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+    (socket, welcome)
+}
+
+async fn stub(reach: &Arc<dyn Reach>, mut hello: Hello) -> Stub {
+    let session = Arc::new(RobotSession::new(SessionOptions {
+        ping: Duration::from_secs(1),
+        silent: Duration::from_secs(2),
+        lost: Duration::from_secs(20),
+        max_age: None,
+    }));
+    hello.next = session.position().2;
+    let (mut socket, welcome) = says(reach, &hello).await;
+    let Welcome::Accepted {
+        received,
+        ahead,
+        next,
+        ..
+    } = welcome
+    else {
+        panic!("{welcome:?}");
+    };
+    session.reconnect(received, &ahead, next);
+    let (ear, told) = mpsc::unbounded_channel();
+    let runs = Arc::clone(&session);
+    tokio::spawn(async move { runs.run(&mut socket, &Ear(ear)).await });
+    Stub { session, told }
+}
+
+impl Stub {
+    async fn hears(&mut self) -> Told {
+        let told = timeout(LONG, self.told.recv()).await;
+        told.expect("something should be told").unwrap()
+    }
+
+    /// The next graph: names of services, of topics that the node listens to, and of topics that it publishes.
+    async fn graph(&mut self) -> (Graph, [BTreeSet<String>; 3]) {
+        loop {
+            if let Told::Graph(graph) = self.hears().await {
+                let services = graph.services.iter().map(|it| it.name.clone()).collect();
+                let inputs = graph.inputs.iter().map(|it| it.topic.clone()).collect();
+                let outputs = graph.outputs.iter().map(|it| it.topic.clone()).collect();
+                return (graph, [services, inputs, outputs]);
+            }
+        }
+    }
+
+    /// Asks for something; the answer.
+    async fn asks(&mut self, channel: u32, request: &str) -> Result<String, String> {
+        let asked = self.session.call(channel, request.to_owned().into());
+        self.answer(asked).await
+    }
+
+    async fn answer(&mut self, asked: u32) -> Result<String, String> {
+        loop {
+            if let Told::Answer(id, answer) = self.hears().await {
+                assert_eq!(id, asked, "of another call");
+                return answer.map(|it| String::from_utf8_lossy(&it).into_owned());
+            }
+        }
+    }
+}
+
+fn channel(graph: &Graph, service: &str) -> u32 {
+    let mut services = graph.services.iter();
+    services
+        .find(|it| it.name == service)
+        .expect(service)
+        .channel
+}
+
+fn set<const N: usize>(names: [&str; N]) -> BTreeSet<String> {
+    names.map(str::to_owned).into()
+}
+
+#[tokio::test]
+async fn stubs_have_their_robots_names_and_the_groups_answers() {
+    let group = group();
+    let members = [member("one").await, member("two").await];
+    for member in &members {
+        group.join(member.worker.servant, member.bus.clone());
+    }
+    let ((first, _one), (second, _two)) = (place(&group), place(&group));
+    let mut plain = stub(&first, hello("/worker", &[])).await;
+    let mut front = hello("/front/hands", &["work:=/plan", "count:=tally"]);
+    front.run = "another".to_owned();
+    let mut front = stub(&second, front).await;
+    let (graph, names) = plain.graph().await;
+    let inputs = set(["/count/cancel", "/count/goal"]);
+    let outputs = set(["/count/feedback", "/count/result", "/count/status"]);
+    assert_eq!(names, [set(["/work", "/worker/set"]), inputs, outputs]);
+    let (theirs, names) = front.graph().await;
+    assert_eq!(names[0], set(["/front/hands/set", "/plan"]));
+    assert_eq!(names[1], set(["/front/tally/cancel", "/front/tally/goal"]));
+    // Each call to the servant that has the least to do, each answer to who asked.
+    let (work, plan) = (channel(&graph, "/work"), channel(&theirs, "/plan"));
+    let mut by = BTreeSet::new();
+    for number in 0..4 {
+        let asked = [format!("plain {number}"), format!("front {number}")];
+        for (stub, channel, words) in [(&mut plain, work, &asked[0]), (&mut front, plan, &asked[1])]
+        {
+            let answer = stub.asks(channel, words).await.unwrap();
+            let (said, servant) = answer.split_once(" by ").unwrap();
+            assert_eq!(said, words);
+            by.insert(servant.to_owned());
+        }
+    }
+    assert_eq!(by, set(["one", "two"]));
+    // Rosbridge clients of the same robot keep the deployer's names.
+    let shown = second.graph().borrow().services.clone();
+    assert!(shown.contains_key("/work") && !shown.contains_key("/plan"));
+}
+
+#[tokio::test]
+async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
+    let group = group();
+    let members = [member("one").await, member("two").await];
+    let ids = members
+        .each_ref()
+        .map(|member| group.join(member.worker.servant, member.bus.clone()));
+    let (reach, _tenant) = place(&group);
+    let mut stub = stub(&reach, hello("/worker", &[])).await;
+    let work = channel(&stub.graph().await.0, "/work");
+    let asked = stub.session.call(work, "long".into());
+    let has = |at: usize| members[at].worker.asked.acquire();
+    let lost = tokio::select! {
+        permit = has(0) => { permit.unwrap().forget(); 0 }
+        permit = has(1) => { permit.unwrap().forget(); 1 }
+    };
+    group.leave(ids[lost], "its power went");
+    let reason = stub.answer(asked).await.unwrap_err();
+    let servant = members[lost].worker.servant;
+    assert!(
+        reason.contains(servant) && reason.contains("its power went"),
+        "{reason}"
+    );
+    assert!(reason.contains("--idempotent"), "{reason}");
+    let other = members[1 - lost].worker.servant;
+    let answer = stub.asks(work, "again").await;
+    assert_eq!(answer, Ok(format!("again by {other}")));
+}
+
+#[tokio::test]
+async fn a_stub_that_is_told_to_end_takes_its_names_back() {
+    let group = group();
+    let (reach, _tenant) = place(&group);
+    let mut one = stub(&reach, hello("/one", &[])).await;
+    let mut other = stub(&reach, hello("/other", &["work:=/plan"])).await;
+    assert_eq!(other.graph().await.1[0], set(["/other/set", "/plan"]));
+    assert_eq!(one.graph().await.1[0], set(["/one/set", "/work"]));
+    one.session.report(&FromRobot::Signal { signal: 2 });
+    let exit = loop {
+        if let Told::Exited(exit) = one.hears().await {
+            break exit;
+        }
+    };
+    assert_eq!(exit.code, Some(0), "{exit:?}");
+    assert_eq!(reach.links().len(), 2, "its link ends with its stub");
+    // Another signal is none of the node's ends.
+    other.session.report(&FromRobot::Signal { signal: 18 });
+    other.session.report(&FromRobot::Signal { signal: 15 });
+    let exit = loop {
+        if let Told::Exited(exit) = other.hears().await {
+            break exit;
+        }
+    };
+    assert!(exit.text.contains("/other"), "{exit:?}");
+}
+
+#[tokio::test]
+async fn what_a_robot_gives_the_shared_node_in_vain_is_told_and_other_programs_are_refused() {
+    let group = group();
+    let (reach, _tenant) = place(&group);
+    let mut gives = hello("/worker", &["_speed:=3"]);
+    let own = ParamValue::Map([("gain".to_owned(), ParamValue::Int(1))].into());
+    gives.parameters = [("worker".to_owned(), own)].into();
+    let mut stub = stub(&reach, gives).await;
+    let told = loop {
+        if let Told::Notice(told) = stub.hears().await {
+            break told;
+        }
+    };
+    for words in ["works", "/worker", "~gain, ~speed", "--shared"] {
+        assert!(told.contains(words), "{told}");
+    }
+    let mut stranger = hello("/shell", &[]);
+    stranger.node.executable = "sh".to_owned();
+    let (_, welcome) = says(&reach, &stranger).await;
+    match welcome {
+        Welcome::Refused { reason, again } => {
+            assert!(reason.contains("was not pushed with") && !again, "{reason}");
+        }
+        accepted => panic!("{accepted:?}"),
+    }
+}
