@@ -18,7 +18,6 @@
 //! Times are seconds, or text such as `100ms`. Keys of others (`robot`, `token`, `resume`) are not looked at.
 
 mod agreement;
-mod span;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -29,7 +28,7 @@ use serde::{Deserialize, Serialize};
 use crate::size::Size;
 use agreement::rate;
 pub use agreement::{Goal, Measure, Sla};
-pub use span::{NotASpan, Span};
+pub use qos::{NotASpan, Span};
 
 /// What begins the key of an auxiliary parameter.
 pub const AUX: &str = "aux.";

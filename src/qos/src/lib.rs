@@ -39,6 +39,7 @@ mod request;
 mod satisfaction;
 mod sla;
 mod sla_error;
+mod span;
 
 pub use arbiter::{Arbiter, Limits, Verdict};
 pub use decider::{Decider, Event, LocalState, Why};
@@ -54,3 +55,4 @@ pub use request::{Failure, Key, Leg, RequestId, Side, Sides, Stamp};
 pub use satisfaction::{DEFAULT_CAP, Satisfaction, Step};
 pub use sla::{Local, Measure, Mode, SafeStop, Sla, Warm};
 pub use sla_error::SlaError;
+pub use span::{NotASpan, Span};

@@ -1,6 +1,5 @@
 //! What the robot is promised, as written in its parameters, its launch file or its configuration.
 
-mod span;
 #[cfg(test)]
 mod tests;
 mod written;

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Span;
 use super::Unstatable;
-use super::span::Span;
 
 /// Frames per second beyond which it is a mistake of units.
 const MOST_FPS: f64 = 1e6;

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use super::span::{LONGEST, Span, interval, positive};
 use super::{Local, Measure, Mode, SafeStop, Sla, Times, Warm};
 use crate::pair::Pair;
 use crate::satisfaction::{DEFAULT_CAP, below};
 use crate::sla_error::SlaError;
+use crate::span::{LONGEST, Span};
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -156,7 +156,7 @@ impl Written {
             initial,
             cap,
             unreached: match self.unreached {
-                Some(span) => span.check("unreached")?,
+                Some(span) => span.duration(),
                 None => UNREACHED.max(times.t_max),
             },
             mode: self.mode,
@@ -202,8 +202,8 @@ impl WrittenMeasure {
             }
             Self::Age(age) => {
                 absolute_or_none("measure.age.output", &age.output)?;
-                let desire = age.desire.check("measure.age.desire")?;
-                let max = age.max.check("measure.age.max")?;
+                let desire = age.desire.duration();
+                let max = age.max.duration();
                 if max < desire {
                     return Err(SlaError::new(
                         "measure.age.max",
@@ -217,7 +217,7 @@ impl WrittenMeasure {
                 Ok((Measure::Age { output: age.output }, times))
             }
             Self::Link(link) => {
-                let after = link.after.check("measure.link.after")?;
+                let after = link.after.duration();
                 // Requests wait as long as whoever asks does.
                 let times = Times {
                     t_desire: LONGEST,
@@ -232,14 +232,9 @@ impl WrittenMeasure {
 impl Times {
     fn check(prefix: &str, desire: Option<Span>, max: Option<Span>) -> Result<Self, SlaError> {
         let given = |name: &str, value: Option<Span>| {
-            let field = format!("{prefix}{name}");
-            match value {
-                Some(span) => span.check(&field),
-                None => Err(SlaError::new(
-                    &field,
-                    "is missing; give it in seconds, such as 0.3",
-                )),
-            }
+            let missing = "is missing; give it in seconds, such as 0.3";
+            let missing = || SlaError::new(&format!("{prefix}{name}"), missing);
+            value.map(Span::duration).ok_or_else(missing)
         };
         let t_desire = given("t_desire", desire)?;
         let t_max = given("t_max", max)?;
@@ -269,4 +264,23 @@ fn absolute_or_none(field: &str, topic: &str) -> Result<(), SlaError> {
         return Ok(());
     }
     absolute(field, topic)
+}
+
+/// The time between two frames of a rate.
+fn interval(field: &str, rate: f64) -> Result<Duration, SlaError> {
+    let interval = Span::seconds(1.0 / rate).map(Span::duration);
+    interval.ok_or_else(|| {
+        let reason = format!("{rate} frames a second are not between one a day and a billion");
+        SlaError::new(field, reason)
+    })
+}
+
+fn positive(field: &str, value: f64) -> Result<(), SlaError> {
+    if value.is_finite() && value > 0.0 && (4.0 * value).is_normal() {
+        return Ok(());
+    }
+    Err(SlaError::new(
+        field,
+        format!("{value} is not a positive number"),
+    ))
 }

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Beyond a day it is a mistake of units.
-const LONGEST: Duration = Duration::from_secs(86_400);
+/// Beyond a day it is a mistake of units, and far below it sums of deadlines cannot overflow.
+pub(crate) const LONGEST: Duration = Duration::from_secs(86_400);
 
 /// A positive time up to a day, exact to the nanosecond. Written as text such as `"100ms"`; read also as a number of
 /// seconds.
