@@ -25,7 +25,10 @@ pub struct Spec {
     pub resident: serde_json::Value,
 }
 
-/// Hard limits; none means the engine's default.
+/// Of a number in [`Limits`] (memory, processes, bytes a second) that is changed: none again.
+pub const UNLIMITED: u64 = u64::MAX;
+
+/// Hard limits; none means the engine's default, and of a servant that runs: as it is.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Limits {

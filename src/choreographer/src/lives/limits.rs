@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use api::{Limits, Size, Stated, Terms};
 use servant::engine::Servant;
+use servant::spec::UNLIMITED;
 
 use super::Inner;
 use crate::decide::admission::Refused;
@@ -222,7 +223,7 @@ impl Inner {
             return Ok(None);
         }
         let (earlier, told) = (before.limits(), after.terms.clone());
-        let change = changed(&earlier, &after.limits());
+        let change = changed(&earlier, &after.limits(), self.options.cores);
         if let (Some(wanted), Some(container)) = (change.memory, handle.container())
             && earlier.memory.is_none_or(|earlier| wanted < earlier)
             && let Ok(usage) = container.usage().await
@@ -266,7 +267,8 @@ impl Inner {
         promise.change(has.max(wanted))?;
         if let Err(error) = container.set_limits(engine_limits(&change)).await {
             // What the kernel took of it before it refused the rest is taken back.
-            let _ = container.set_limits(engine_limits(&before.limits())).await;
+            let back = changed(&change, &before.limits(), self.options.cores);
+            let _ = container.set_limits(engine_limits(&back)).await;
             promise.change(has)?;
             return Err(error.into());
         }
@@ -281,8 +283,9 @@ pub(super) async fn fit(
     container: &dyn Servant,
     made: &Limits,
     limits: &Limits,
+    cores: f64,
 ) -> Result<(), servant::Error> {
-    let change = changed(made, limits);
+    let change = changed(made, limits, cores);
     if change != Limits::default() {
         container.set_limits(engine_limits(&change)).await?;
     }
@@ -299,7 +302,8 @@ pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Se
     }
     let _turn = handle.limits_turn().await;
     let before = Limits {
-        cpus: has.cpus,
+        // Of one that may have all cores nothing is taken back.
+        cpus: has.cpus.filter(|_| wanted.cpus.is_some()),
         cpu_weight: has.cpu_weight,
         ..Limits::default()
     };
@@ -310,6 +314,7 @@ pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Se
             cpu_weight: wanted.cpu_weight.or(has.cpu_weight.and(Some(PLAIN_WEIGHT))),
             ..Limits::default()
         },
+        inner.options.cores,
     );
     if change == Limits::default() {
         return;
@@ -338,19 +343,67 @@ pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Se
     }
 }
 
-/// Those of `after` that are not so before: some, such as a cpuset on cgroup v1, cannot be set again.
-fn changed(before: &Limits, after: &Limits) -> Limits {
-    fn new<T: PartialEq>(before: Option<T>, after: Option<T>) -> Option<T> {
-        after.filter(|after| before.as_ref() != Some(after))
+/// What has to be set for a servant of the limits `before` to have those of `after`: what is the same is left out, since some
+/// limits, such as a cpuset on cgroup v1, cannot be set again. What `after` says nothing of is none again, all of this
+/// machine's `cores`, and the kernel's weight; a cpuset stays.
+fn changed(before: &Limits, after: &Limits, cores: f64) -> Limits {
+    fn new<T: PartialEq>(before: Option<T>, after: Option<T>, none: Option<T>) -> Option<T> {
+        match after {
+            None => none.filter(|_| before.is_some()),
+            after => after.filter(|after| before.as_ref() != Some(after)),
+        }
     }
+    let unlimited = Some(UNLIMITED);
+    let size = unlimited.map(Size);
     Limits {
-        cpus: new(before.cpus, after.cpus),
-        cpu_weight: new(before.cpu_weight, after.cpu_weight),
-        memory: new(before.memory, after.memory),
-        memory_high: new(before.memory_high, after.memory_high),
-        pids: new(before.pids, after.pids),
-        io_read: new(before.io_read, after.io_read),
-        io_write: new(before.io_write, after.io_write),
-        cpuset: new(before.cpuset, after.cpuset),
+        cpus: new(before.cpus, after.cpus, Some(cores)),
+        cpu_weight: new(before.cpu_weight, after.cpu_weight, Some(PLAIN_WEIGHT)),
+        memory: new(before.memory, after.memory, size),
+        memory_high: new(before.memory_high, after.memory_high, size),
+        pids: new(before.pids, after.pids, unlimited),
+        io_read: new(before.io_read, after.io_read, size),
+        io_write: new(before.io_write, after.io_write, size),
+        cpuset: new(before.cpuset, after.cpuset, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_later_terms_say_nothing_of_is_none_again() {
+        let size = |bytes| Some(Size(bytes));
+        let before = Limits {
+            cpus: Some(1.0),
+            cpu_weight: Some(1000),
+            memory: size(64),
+            memory_high: size(32),
+            pids: Some(9),
+            io_read: size(8),
+            io_write: size(9),
+            cpuset: "0-1".parse().ok(),
+        };
+        let after = Limits {
+            memory: size(64),
+            io_write: size(7),
+            ..Limits::default()
+        };
+        let none = size(UNLIMITED);
+        let change = Limits {
+            cpus: Some(4.0),
+            cpu_weight: Some(100),
+            memory: None,
+            memory_high: none,
+            pids: Some(UNLIMITED),
+            io_read: none,
+            io_write: size(7),
+            cpuset: None,
+        };
+        assert_eq!(changed(&before, &after, 4.0), change);
+        let nothing = Limits::default();
+        assert_eq!(changed(&before, &before, 4.0), nothing);
+        assert_eq!(changed(&nothing, &nothing, 4.0), nothing);
+        assert_eq!(changed(&nothing, &after, 4.0), after);
     }
 }

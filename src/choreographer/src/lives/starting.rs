@@ -55,7 +55,9 @@ fn planned(handle: &Handle) -> Vec<NodeSpec> {
 pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
     let warm = warm?;
     let limits = handle.limits();
-    if let Err(error) = limits::fit(&*warm.container, &warm.limits, &limits).await {
+    if let Err(error) =
+        limits::fit(&*warm.container, &warm.limits, &limits, inner.options.cores).await
+    {
         tracing::debug!("a warm container cannot be given {limits:?}: {error}");
         warm.end(inner).await;
         return None;

@@ -1,7 +1,7 @@
 //! Limits that were asked for and are not in force, and why.
 
 use crate::engine::Enforced;
-use crate::spec::Limits;
+use crate::spec::{Limits, UNLIMITED};
 
 /// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
 /// thousandth of one.
@@ -13,6 +13,15 @@ pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
         (None, _) => true,
     };
     let number = |value: Option<u64>| value.map(|value| value as f64);
+    // Where it is to be none again, none is in force.
+    let enforced = Limits {
+        memory: enforced.memory.or(none(asked.memory)),
+        memory_high: enforced.memory_high.or(none(asked.memory_high)),
+        pids: enforced.pids.or(none(asked.pids)),
+        io_read: enforced.io_read.or(none(asked.io_read)),
+        io_write: enforced.io_write.or(none(asked.io_write)),
+        ..*enforced
+    };
     if !close(asked.cpus, enforced.cpus, 0.001) {
         missing.push("cpus");
     }
@@ -40,6 +49,10 @@ pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
         missing.push("cpuset");
     }
     missing
+}
+
+fn none(asked: Option<u64>) -> Option<u64> {
+    asked.filter(|limit| *limit == UNLIMITED)
 }
 
 /// The same in words, each with the reason.
@@ -84,6 +97,16 @@ mod tests {
         };
         assert_eq!(missing(&asked, &got), ["pids"]);
         assert_eq!(missing(&Limits::default(), &got), [""; 0]);
+        let lifted = Limits {
+            pids: Some(UNLIMITED),
+            io_read: Some(UNLIMITED),
+            ..Limits::default()
+        };
+        let still = Limits {
+            io_read: Some(1 << 20),
+            ..Limits::default()
+        };
+        assert_eq!(missing(&lifted, &still), ["io_read"]);
     }
 
     #[test]

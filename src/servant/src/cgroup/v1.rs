@@ -8,7 +8,7 @@ use super::files::{read_field, read_number};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
 use crate::host::pressure_of_cgroup;
-use crate::spec::Limits;
+use crate::spec::{Limits, UNLIMITED};
 
 /// Microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
@@ -40,22 +40,31 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     if let Some(memory) = limits.memory {
         // With swap may not be below without swap, in neither direction of the change: so both, twice.
         for _ in 0..2 {
-            write("memory", "memory.limit_in_bytes", memory.to_string());
-            write("memory", "memory.memsw.limit_in_bytes", memory.to_string());
+            let memory = number(memory, "-1");
+            write("memory", "memory.limit_in_bytes", memory.clone());
+            write("memory", "memory.memsw.limit_in_bytes", memory);
         }
     }
     if let Some(pids) = limits.pids {
-        write("pids", "pids.max", pids.to_string());
+        write("pids", "pids.max", number(pids, "max"));
     }
     if let Some(disk) = &cgroup.disk {
         for (name, limit) in [(READ, limits.io_read), (WRITE, limits.io_write)] {
             if let Some(limit) = limit {
-                write("blkio", name, format!("{disk} {limit}"));
+                write("blkio", name, format!("{disk} {}", number(limit, "0")));
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
         write("cpuset", "cpuset.cpus", cores::print(cpuset));
+    }
+}
+
+/// A limit, or what stands for none in its file.
+fn number(limit: u64, none: &str) -> String {
+    match limit {
+        UNLIMITED => none.to_owned(),
+        limit => limit.to_string(),
     }
 }
 

@@ -6,7 +6,7 @@ use super::files::{read_field, read_number, read_of_device};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
 use crate::host::pressure_of_cgroup;
-use crate::spec::Limits;
+use crate::spec::{Limits, UNLIMITED};
 
 /// Microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
@@ -29,26 +29,35 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
         write("cpu", "cpu.weight", weight.to_string());
     }
     if let Some(memory) = limits.memory {
-        write("memory", "memory.max", memory.to_string());
+        write("memory", "memory.max", number(memory));
         write("memory", "memory.swap.max", "0".into());
         // Half a servant is of no use: the nodes that were spared would wait for the one that was not.
         write("memory", "memory.oom.group", "1".into());
     }
     if let Some(high) = limits.memory_high {
-        write("memory", "memory.high", high.to_string());
+        write("memory", "memory.high", number(high));
     }
     if let Some(pids) = limits.pids {
-        write("pids", "pids.max", pids.to_string());
+        write("pids", "pids.max", number(pids));
     }
     if let Some(disk) = &cgroup.disk {
         for (key, limit) in [("rbps", limits.io_read), ("wbps", limits.io_write)] {
             if let Some(limit) = limit {
+                let limit = number(limit);
                 write("io", "io.max", format!("{disk} {key}={limit}"));
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
         write("cpuset", "cpuset.cpus", cores::print(cpuset));
+    }
+}
+
+/// A limit, or none again.
+fn number(limit: u64) -> String {
+    match limit {
+        UNLIMITED => "max".to_owned(),
+        limit => limit.to_string(),
     }
 }
 

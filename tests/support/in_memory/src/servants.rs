@@ -12,7 +12,7 @@ use servant::Error;
 use servant::engine::{
     ContainerState, Enforced, LogLine, LogStart, NodeEvent, NodeExit, Servant, Usage,
 };
-use servant::spec::{Limits, NodeSpec, Spec};
+use servant::spec::{Limits, NodeSpec, Spec, UNLIMITED};
 use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::engine::World;
@@ -315,7 +315,15 @@ impl Servant for MemoryServant {
                 reason: format!("{held} bytes of memory are in use"),
             });
         }
-        self.limits.send_modify(|known| *known = limits.or(known));
+        self.limits.send_modify(|known| {
+            let lifted = |limit: &mut Option<u64>| *limit = limit.filter(|it| *it != UNLIMITED);
+            *known = limits.or(known);
+            lifted(&mut known.memory);
+            lifted(&mut known.memory_high);
+            lifted(&mut known.pids);
+            lifted(&mut known.io_read);
+            lifted(&mut known.io_write);
+        });
         Ok(self.enforced())
     }
 
