@@ -113,6 +113,15 @@ impl Error {
 }
 
 impl Error {
+    /// Whether a robot is refused for as long as it asks for the same, on a machine of this configuration: for what it states, or since
+    /// its servant fits on no machine that is empty.
+    pub fn is_final(&self) -> bool {
+        use choreographer::Error as C;
+        let error = self.of_choreographer();
+        matches!(error, Some(C::Terms(_) | C::Full(Refused::TooBig { .. })))
+            || matches!(error, Some(C::NotResized { reason, .. }) if !matches!(&**reason, Unchanged::Full(_)))
+    }
+
     /// Whether a robot is refused for what it states: then it is told in one line what it could.
     fn is_of_terms(&self) -> bool {
         matches!(

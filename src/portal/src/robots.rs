@@ -351,7 +351,7 @@ async fn session(
     let taking = servant(&app, &asked, &caller, lease, &news);
     let (lease, reach) = match waiting.until_told(taking, told).await {
         Ok(Ok(taken)) => taken,
-        Ok(Err(error)) => return waiting.refuse(TRY_AGAIN_LATER, &error.in_a_line()).await,
+        Ok(Err(error)) => return waiting.refuse(code(&error), &error.in_a_line()).await,
         // With its lease its place in the queue is given up, and the servant that only it could have used.
         Err(end) => {
             tracing::debug!("a robot left before {} was ready: {end:?}", asked.service);
@@ -385,6 +385,14 @@ async fn session(
         SessionEnd::Lost(reason) => {
             tracing::info!("lost {} at servant {}: {reason}", handle.robot, handle.id)
         }
+    }
+}
+
+/// With which code a robot's connection is closed that has no servant.
+fn code(error: &Error) -> u16 {
+    match error.is_final() {
+        true => POLICY,
+        false => TRY_AGAIN_LATER,
     }
 }
 

@@ -279,16 +279,40 @@ impl Book {
 
     /// `ticket` asks. With the answer come those who are admitted since they were overtaken once more.
     pub fn ask(&mut self, ticket: Ticket, ask: Ask) -> (Verdict, Vec<Admitted>) {
+        self.enter(ticket, ask, None)
+    }
+
+    /// `ticket` asks again, which has waited before and was overtaken so often then: it stands where it stood, also where as many
+    /// wait as may.
+    pub fn ask_again(
+        &mut self,
+        ticket: Ticket,
+        ask: Ask,
+        overtaken: u32,
+    ) -> (Verdict, Vec<Admitted>) {
+        self.enter(ticket, ask, Some(overtaken))
+    }
+
+    /// How often one that waits was overtaken.
+    pub fn overtaken(&self, ticket: Ticket) -> Option<u32> {
+        let mut waiting = self.waiting.iter();
+        waiting
+            .find(|one| one.ticket == ticket)
+            .map(|one| one.overtaken)
+    }
+
+    fn enter(&mut self, ticket: Ticket, ask: Ask, again: Option<u32>) -> (Verdict, Vec<Admitted>) {
         if let Err(refused) = self.check(ask.wanted) {
             return (Verdict::Refused(refused), Vec::new());
         }
         let waiter = Waiter {
             ticket,
             ask,
-            overtaken: 0,
+            overtaken: again.unwrap_or(0),
         };
         let robots = self.waiting.iter().filter(|one| one.is_robot()).count();
-        self.waiting.push(waiter);
+        let at = self.waiting.partition_point(|one| one.ticket < ticket);
+        self.waiting.insert(at, waiter);
         let mut admitted = self.admit();
         let own = admitted.iter().position(|one| one.ticket == ticket);
         let verdict = match own {
@@ -296,7 +320,7 @@ impl Book {
                 admitted.remove(own);
                 Verdict::Admitted
             }
-            None if waiter.is_robot() && robots >= self.queue => {
+            None if waiter.is_robot() && robots >= self.queue && again.is_none() => {
                 self.waiting.retain(|one| one.ticket != ticket);
                 Verdict::Refused(Refused::QueueFull { waiting: robots })
             }
@@ -544,6 +568,30 @@ mod tests {
         }
         let (verdict, others) = book.ask(last, Ask::robot(cores(0.01), 9));
         assert_eq!((verdict, tickets(others)), (Verdict::Admitted, vec![0]));
+    }
+
+    #[test]
+    fn who_comes_back_stands_where_it_stood() {
+        let mut book = machine(2, 2.0);
+        for ticket in [1, 2] {
+            assert_eq!(ask(&mut book, ticket, 1.0, Robot), Verdict::Waits);
+        }
+        assert_eq!(book.overtaken(1), Some(0));
+        assert!(book.leave(1).is_empty());
+        assert_eq!(ask(&mut book, 3, 1.0, Robot), Verdict::Waits);
+        // Two wait, which is as many as may: a new one is refused, and one that had a place is not.
+        let full = Verdict::Refused(Refused::QueueFull { waiting: 2 });
+        assert_eq!(ask(&mut book, 4, 1.0, Robot), full);
+        let (verdict, others) = book.ask_again(1, Ask::robot(cores(1.0), 0), OVERTAKEN);
+        assert_eq!((verdict, others), (Verdict::Waits, vec![]));
+        assert_eq!(book.overtaken(1), Some(OVERTAKEN));
+        let order: Vec<Ticket> = book.places().map(|(ticket, _)| ticket).collect();
+        assert_eq!(order, [1, 2, 3]);
+        assert_eq!(tickets(book.release(cores(2.0))), [1, 2]);
+        // Who is served at once needs no place.
+        let (verdict, _) = machine(2, 0.0).ask_again(1, Ask::robot(cores(1.0), 0), 3);
+        assert_eq!(verdict, Verdict::Admitted);
+        assert_eq!(book.overtaken(9), None);
     }
 
     #[test]

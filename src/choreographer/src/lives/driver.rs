@@ -237,7 +237,10 @@ async fn admit(
     let ask = Ask::robot(wanted, handle.priority());
     let make_room = || inner.make_room();
     let admission = &inner.admission;
-    let admitted = admission.admit(ask, deadline, handle.stands(), make_room);
+    // A robot that named no name is nobody's when it comes back.
+    let who = format!("{} {}", handle.service(), handle.robot);
+    let who = (!handle.anonymous).then_some(&*who);
+    let admitted = admission.admit_as(who, ask, deadline, handle.stands(), make_room);
     admitted.await.map_err(Failure::Full)
 }
 

@@ -8,11 +8,17 @@ use std::time::Duration;
 
 use parking_lot::Mutex;
 use tokio::sync::{oneshot, watch};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::decide::Amount;
 use crate::decide::admission::{Admitted, Ask, Book, Origin, Place, Refused, Ticket, Verdict};
 use crate::decide::capacity::{Lacking, Push};
+
+/// A robot that waited in vain and asks again within this time stands where it stood.
+const KEPT: Duration = Duration::from_secs(30);
+/// Places that are kept at most.
+const MOST_KEPT: usize = 1000;
 
 /// The machine's capacity for servants, shared by all who ask for some.
 #[derive(Clone)]
@@ -26,7 +32,16 @@ struct Desk {
     doors: HashMap<Ticket, Door>,
     /// Pushes that were admitted.
     pushes: HashMap<Ticket, Working>,
+    /// Of robots that waited in vain.
+    kept: HashMap<String, Kept>,
     tickets: Ticket,
+}
+
+/// The place of one that does not wait just now.
+struct Kept {
+    ticket: Ticket,
+    overtaken: u32,
+    since: Instant,
 }
 
 struct Door {
@@ -137,6 +152,7 @@ impl Admission {
             book: Book::new(capacity, queue),
             doors: HashMap::new(),
             pushes: HashMap::new(),
+            kept: HashMap::new(),
             tickets: 0,
         };
         Admission {
@@ -272,12 +288,34 @@ impl Admission {
         stands: watch::Sender<Option<Standing>>,
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Refused> {
+        self.admit_as(None, ask, deadline, stands, on_wait).await
+    }
+
+    /// The same for `who`: where it has waited in vain lately, it stands where it stood.
+    pub(crate) async fn admit_as(
+        &self,
+        who: Option<&str>,
+        ask: Ask,
+        deadline: Duration,
+        stands: watch::Sender<Option<Standing>>,
+        on_wait: impl FnOnce(),
+    ) -> Result<Permit, Refused> {
         let standing = stands.subscribe();
-        let (_waiting, admitted) = {
+        let (waiting, admitted) = {
             let mut desk = self.desk.lock();
-            desk.tickets += 1;
-            let ticket = desk.tickets;
-            let (verdict, others) = desk.book.ask(ticket, ask);
+            let kept = who.and_then(|who| desk.kept.remove(who));
+            let kept = kept.filter(|kept| kept.since.elapsed() < KEPT);
+            let (ticket, (verdict, others)) = match kept {
+                Some(kept) => (
+                    kept.ticket,
+                    desk.book.ask_again(kept.ticket, ask, kept.overtaken),
+                ),
+                None => {
+                    desk.tickets += 1;
+                    let ticket = desk.tickets;
+                    (ticket, desk.book.ask(ticket, ask))
+                }
+            };
             let told = self.admitted(&mut desk, others);
             let outcome = match verdict {
                 Verdict::Admitted => {
@@ -310,6 +348,9 @@ impl Admission {
         match tokio::time::timeout(deadline, admitted).await {
             Ok(Ok(permit)) => Ok(permit),
             _ => {
+                if let Some(who) = who {
+                    self.desk.lock().keep(who, waiting.ticket);
+                }
                 let standing = standing.borrow().clone();
                 Err(late(deadline, standing, self.stalled()))
             }
@@ -337,6 +378,22 @@ fn late(waited: Duration, standing: Option<Standing>, stalled: Option<String>) -
 }
 
 impl Desk {
+    /// Keeps the place of one that waits, for when it asks again.
+    fn keep(&mut self, who: &str, ticket: Ticket) {
+        let Some(overtaken) = self.book.overtaken(ticket) else {
+            return;
+        };
+        self.kept.retain(|_, kept| kept.since.elapsed() < KEPT);
+        if self.kept.len() < MOST_KEPT {
+            let kept = Kept {
+                ticket,
+                overtaken,
+                since: Instant::now(),
+            };
+            self.kept.insert(who.to_owned(), kept);
+        }
+    }
+
     /// Tells robots that wait where they stand now, where that has changed.
     fn tell(&self) {
         for (ticket, place) in self.book.places() {
@@ -421,6 +478,63 @@ mod tests {
         );
         small.expect("fits once the big one has gone");
         assert_eq!(room.look().2, 0, "nobody waits any more");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_waited_in_vain_and_asks_again_soon_stands_where_it_stood() {
+        let room = machine();
+        let all = robot(&room, 2.0, SECOND, || {}).await.expect("it is free");
+        let asks = |who, patience| {
+            let (stands, ask) = (watch::Sender::new(None), Ask::robot(Amount::new(1.0, 0), 0));
+            let (watched, room) = (stands.subscribe(), room.clone());
+            let waiting =
+                async move { room.admit_as(Some(who), ask, patience, stands, || {}).await };
+            (watched, waiting)
+        };
+        let place = |stands: &watch::Receiver<Option<Standing>>| {
+            let stands = stands.borrow();
+            stands.as_ref().map(|stands| stands.place.place)
+        };
+        let (_, late) = asks("a", SECOND);
+        let (other, behind) = asks("b", SECOND * 100);
+        let behind = tokio::spawn(behind);
+        late.await.expect_err("nothing is free");
+        assert_eq!(place(&other), Some(1));
+        let (stands, again) = asks("a", SECOND);
+        let (again, ()) = tokio::join!(again, async {
+            tokio::task::yield_now().await;
+            assert_eq!((place(&stands), place(&other)), (Some(1), Some(2)));
+        });
+        again.expect_err("nothing is free");
+        // Too late, and as somebody else.
+        tokio::time::sleep(KEPT).await;
+        for who in ["a", "c"] {
+            let (stands, again) = asks(who, SECOND);
+            let (again, ()) = tokio::join!(again, async {
+                tokio::task::yield_now().await;
+                assert_eq!((place(&stands), place(&other)), (Some(2), Some(1)), "{who}");
+            });
+            again.expect_err("nothing is free");
+        }
+        drop(all);
+        behind.await.expect("no panic").expect("it is the first");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn kept_places_are_few() {
+        let room = Admission::new(Amount::new(0.0, 0), 2 * MOST_KEPT);
+        let waits = (0..MOST_KEPT + 10).map(|number| {
+            let (room, ask) = (room.clone(), Ask::robot(Amount::NONE, 0));
+            room.stall(Some("it swaps".into()));
+            async move {
+                let who = format!("robot {number}");
+                let stands = watch::Sender::new(None);
+                let refused = room.admit_as(Some(&who), ask, SECOND, stands, || {}).await;
+                refused.expect_err("nobody is admitted");
+            }
+        });
+        futures_util::future::join_all(waits).await;
+        assert_eq!(room.desk.lock().kept.len(), MOST_KEPT);
     }
 
     #[tokio::test(start_paused = true)]
