@@ -1,20 +1,24 @@
 //! The configuration file: TOML, every key optional, unknown keys refused by name.
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
+mod class;
 mod options;
+mod time;
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use anyhow::{Context, bail};
-use api::{Limits, Size, Sla};
+use api::{Limits, Size};
 use choreographer::limits::check as check_limits;
 use portal::Tokens;
-use serde::{Deserialize, Deserializer};
+use serde::Deserialize;
 use servant::local::grants::Allow;
+
+pub use class::Class;
+pub use time::Time;
 
 /// Everything that can be configured.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -53,22 +57,6 @@ pub struct Config {
     pub push: Push,
     /// What pushes may ask for beyond a container.
     pub allow: Allow,
-}
-
-/// A class of robots.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Class {
-    /// Who has the greater one is served first; 0 without a class.
-    pub priority: i32,
-    /// Cores that a robot may ask for.
-    pub max_cpus: Option<f64>,
-    /// Memory that a robot may ask for.
-    pub max_memory: Option<Size>,
-    /// The SLA of robots that state neither one nor resources.
-    pub sla: Sla,
-    /// Limits where neither the robot nor the push says anything.
-    pub limits: Limits,
 }
 
 /// Whether limits that cannot be set are an error.
@@ -243,10 +231,6 @@ pub struct Push {
     pub pids: u64,
 }
 
-/// A duration: `"500ms"`, `"30s"`, `"5m"`, `"1h"`, or a number of seconds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Time(pub Duration);
-
 impl Default for Config {
     fn default() -> Self {
         Config {
@@ -354,50 +338,6 @@ impl Default for Push {
     }
 }
 
-impl Class {
-    /// Priorities are from minus this to this.
-    const PRIORITIES: i32 = 1000;
-
-    fn check(&self, name: &str) -> anyhow::Result<()> {
-        if let Err(reason) = api::sla::name(name) {
-            bail!("class {reason}");
-        }
-        let most = Self::PRIORITIES;
-        if !(-most..=most).contains(&self.priority) {
-            bail!(
-                "priority = {} is not between -{most} and {most}",
-                self.priority
-            );
-        }
-        let caps = Limits {
-            cpus: self.max_cpus,
-            memory: self.max_memory,
-            ..Limits::default()
-        };
-        if let Err(error) = check_limits(&caps) {
-            bail!("max_{error}");
-        }
-        self.sla.check().context("sla")?;
-        check_limits(&self.limits).context("limits")?;
-        let limits = &self.limits;
-        if let (Some(has), Some(most)) = (limits.cpus, self.max_cpus)
-            && has > most
-        {
-            bail!(
-                "limits: cpus = {has} is more than max_cpus = {most}; lower it, or raise max_cpus"
-            );
-        }
-        if let (Some(has), Some(most)) = (limits.memory, self.max_memory)
-            && has > most
-        {
-            bail!(
-                "limits: memory = {has} is more than max_memory = {most}; lower it, or raise max_memory"
-            );
-        }
-        Ok(())
-    }
-}
-
 impl Capacity {
     /// Beyond this nobody has what was promised.
     const MOST_OVERCOMMIT: f64 = 100.0;
@@ -437,49 +377,6 @@ impl Push {
             pids: Some(self.pids),
             ..Limits::default()
         })?)
-    }
-}
-
-impl Time {
-    const fn seconds(seconds: u64) -> Time {
-        Time(Duration::from_secs(seconds))
-    }
-
-    fn parse(text: &str) -> Option<Time> {
-        let text = text.trim();
-        let number_ends = text
-            .find(|c: char| !c.is_ascii_digit() && c != '.')
-            .unwrap_or(text.len());
-        let (number, unit) = text.split_at(number_ends);
-        let number: f64 = number.parse().ok()?;
-        let factor = match unit.trim() {
-            "ms" => 0.001,
-            "s" | "" => 1.0,
-            "m" | "min" => 60.0,
-            "h" => 3600.0,
-            _ => return None,
-        };
-        Duration::try_from_secs_f64(number * factor).ok().map(Time)
-    }
-}
-
-impl<'de> Deserialize<'de> for Time {
-    fn deserialize<D: Deserializer<'de>>(source: D) -> Result<Self, D::Error> {
-        #[derive(Deserialize)]
-        #[serde(untagged)]
-        enum Written {
-            Number(f64),
-            Text(String),
-        }
-        let written = match Written::deserialize(source)? {
-            Written::Number(seconds) => seconds.to_string(),
-            Written::Text(text) => text,
-        };
-        Time::parse(&written).ok_or_else(|| {
-            serde::de::Error::custom(format!(
-                "{written:?} is not a duration; write a number with ms, s, m or h, such as \"30s\""
-            ))
-        })
     }
 }
 
@@ -666,21 +563,6 @@ mod tests {
     }
 
     #[test]
-    fn durations_are_read_as_people_write_them() {
-        let config =
-            Config::parse("[servant]\ngrace = \"500ms\"\nstart = 5\n[portal]\ndrain = \"1.5m\"")
-                .expect("valid");
-        assert_eq!(config.servant.grace.0, Duration::from_millis(500));
-        assert_eq!(config.servant.start.0, Duration::from_secs(5));
-        assert_eq!(config.portal.drain.0, Duration::from_secs(90));
-        let refused = Config::parse("[servant]\ngrace = \"soon\"")
-            .expect_err("no duration")
-            .to_string();
-        assert!(refused.contains("\"soon\" is not a duration"), "{refused}");
-        Config::parse("[servant]\ngrace = \"-1s\"").expect_err("negative");
-    }
-
-    #[test]
     fn the_network_needs_a_token() {
         let open = Config {
             listen: "0.0.0.0:9090".parse().expect("an address"),
@@ -714,63 +596,6 @@ mod tests {
             let config = Config::parse(&format!("[limits]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[limits]"), "{refused}");
-        }
-    }
-
-    #[test]
-    fn classes_are_read_and_what_they_cannot_be_is_named() {
-        let config = Config::parse(
-            "[class.default]\nmax_cpus = 1\nmax_memory = \"1G\"\n\
-             [class.urgent]\npriority = 10\nsla = { rrt = \"100ms\", max_rrt = 0.3 }\nlimits = { cpus = 0.5 }",
-        )
-        .expect("valid");
-        config.check().expect("they work together");
-        let classes = config.choreographer().classes;
-        assert_eq!(classes["default"].caps.memory, Some(Size(1 << 30)));
-        let urgent = &classes["urgent"];
-        assert_eq!((urgent.priority, urgent.limits.cpus), (10, Some(0.5)));
-        assert_eq!(urgent.sla.max_rrt, api::Span::millis(300));
-        for (text, words) in [
-            ("[class.\"a b\"]", &["[class.a b]", "is not a name"][..]),
-            (
-                "[class.a]\npriority = 2000",
-                &["[class.a]", "between -1000 and 1000"],
-            ),
-            ("[class.a]\nmax_cpus = 0", &["max_cpus = 0 is not between"]),
-            (
-                "[class.a]\nmax_memory = \"1K\"",
-                &["max_memory = 1K is too little"],
-            ),
-            (
-                "[class.a]\nsla = { rrt = 2, max_rrt = 1 }",
-                &["sla", "rrt (2s) is greater than max_rrt (1s)"],
-            ),
-            ("[class.a]\nlimits = { pids = 1 }", &["limits", "pids = 1"]),
-            (
-                "[class.a]\nmax_cpus = 1\nlimits = { cpus = 2 }",
-                &["cpus = 2 is more than max_cpus = 1", "raise max_cpus"],
-            ),
-            (
-                "[class.a]\nmax_memory = \"1G\"\nlimits = { memory = \"2G\" }",
-                &["memory = 2G is more than max_memory = 1G"],
-            ),
-        ] {
-            let config = Config::parse(text).expect("well-formed");
-            let refused = format!("{:#}", config.check().expect_err(text));
-            for words in words {
-                assert!(refused.contains(words), "{text}: {refused}");
-            }
-        }
-        for (text, words) in [
-            ("[class.a]\nprio = 1", "prio"),
-            ("[class.a]\nsla = { rtt = 1 }", "rtt"),
-            (
-                "[class.a]\nsla = { rrt = \"soon\" }",
-                "\"soon\" is not a time",
-            ),
-        ] {
-            let refused = format!("{:#}", Config::parse(text).expect_err(text));
-            assert!(refused.contains(words), "{refused}");
         }
     }
 
