@@ -169,6 +169,8 @@ fn main() -> ExitCode {
         stories![terms:
             a_robot_is_given_what_its_sla_costs,
             a_stub_states_what_its_robot_says_before_it_is_admitted,
+            a_robot_that_says_nothing_of_its_pictures_pays_for_those_that_it_sends,
+            what_a_stub_passes_on_is_measured_as_well,
         ],
         stories![launched:
             roslaunch_cannot_tell_the_stub_from_the_original,

@@ -7,8 +7,8 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::Robot;
-use support::site::Site;
-use support::world::world;
+use support::site::{Site, string};
+use support::world::{FIXTURE, GREETER, Service, world};
 
 const MIB: u64 = 1 << 20;
 
@@ -180,7 +180,8 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     ] {
         let mut rover = daemon.robot(&format!("greeter_cpp?robot=rover&{query}"))?;
         rover.hears_status(words)?;
-        rover.hears_close()?;
+        let code = u16::from(rover.hears_close()?.code);
+        ensure!(code == 1008, "it will be refused again: {code}");
     }
     let (cpus, memory, kept) = in_force(&daemon, "rover")?;
     ensure!((cpus, memory) == (Some(2.0), Some(256)), "{kept:#}");
@@ -191,7 +192,8 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     // There are four cores.
     let mut greedy = daemon.robot("greeter_cpp?robot=plain&class=urgent&cpus=2.5")?;
     greedy.hears_status("state what fits: cpus=")?;
-    greedy.hears_close()?;
+    let code = u16::from(greedy.hears_close()?.code);
+    ensure!(code == 1013, "there may be room later: {code}");
     // What a robot would get, without being one.
     let line = [
         "sla",
@@ -275,5 +277,118 @@ pub fn a_stub_states_what_its_robot_says_before_it_is_admitted() -> Verdict {
     ];
     let third = run(&direct)?;
     ensure!(enforced(&third) == (Some(1.25), Some(300)), "{third:#}");
+    Ok(())
+}
+
+/// A service whose rows cost more for what is larger: half a core up to the first value of a parameter, one and a half up to
+/// the second.
+fn sized(name: &str, service: &Service, key: &str, sizes: [&str; 2]) -> anyhow::Result<Daemon> {
+    let daemon = world()
+        .own(name)
+        .config("[capacity]\ncpus = 4.0\n")
+        .start()?;
+    let deployer = daemon.deployer();
+    let package = service.package.context("a package")?;
+    deployer.pushes(package, service.arguments)?.succeeded()?;
+    for (cpus, size) in ["0.5", "1.5"].into_iter().zip(sizes) {
+        let aux = format!("{key}={size}");
+        let row = ["--rrt", "100ms", "--cpus", cpus, "--aux", &aux];
+        let verb = ["sla", "set", service.name];
+        deployer
+            .types(&[&verb[..], &row[..]].concat())?
+            .succeeded()?;
+    }
+    Ok(daemon)
+}
+
+/// Waits until a servant was resized for messages of this size.
+fn resized(daemon: &Daemon, size: &str) -> anyhow::Result<()> {
+    let words = format!("sends messages of aux.{size}");
+    daemon.awaits_event(&words, |event| {
+        let message = event["message"].as_str().unwrap_or_default();
+        event["kind"] == "terms-changed" && message.contains(&words)
+    })?;
+    Ok(())
+}
+
+pub fn a_robot_that_says_nothing_of_its_pictures_pays_for_those_that_it_sends() -> Verdict {
+    let daemon = sized("measured", &FIXTURE, "width", ["320", "1280"])?;
+    let cores = || -> anyhow::Result<Option<f64>> {
+        let servant = daemon.servant_of(FIXTURE.name, "seer")?;
+        Ok(servant["enforced"]["cpus"].as_f64())
+    };
+    let mut robot = daemon.robot(&format!("{}?robot=seer&rrt=100ms", FIXTURE.name))?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    ensure!(cores()? == Some(1.5), "nobody knows yet how large they are");
+    robot.says(json!({"op": "advertise", "topic": "/camera", "type": "sensor_msgs/Image"}))?;
+    let mut shows = |width: u32| {
+        let picture = json!({"width": width, "height": 240, "encoding": "mono8", "data": ""});
+        robot.says(json!({"op": "publish", "topic": "/camera", "msg": picture}))
+    };
+    for _ in 0..10 {
+        shows(320)?;
+    }
+    resized(&daemon, "width=320")?;
+    ensure!(cores()? == Some(0.5));
+    shows(640)?;
+    resized(&daemon, "width=640")?;
+    ensure!(cores()? == Some(1.5));
+    // For larger ones there is no row: it keeps what it has.
+    shows(1920)?;
+    daemon.awaits_event("what cannot be had", |event| {
+        let message = event["message"].as_str().unwrap_or_default();
+        event["kind"] == "terms-refused" && message.contains("aux.width=1920")
+    })?;
+    ensure!(cores()? == Some(1.5));
+    let deployer = daemon.deployer();
+    let said = deployer.types(&["explain", "seer"])?.succeeded()?.stdout;
+    ensure!(said.contains("aux.width=640"), "{said}");
+    // What one more would cost that does say it.
+    let fit = [
+        "--format",
+        "json",
+        "fit",
+        FIXTURE.name,
+        "--rrt",
+        "100ms",
+        "--aux",
+        "width=320",
+    ];
+    let fit = deployer.types(&fit)?.succeeded()?.stdout;
+    let fit: Value = serde_json::from_str(&fit)?;
+    ensure!(fit["cpus"] == 0.5 && fit["expected"]["rrt"] == 0.1, "{fit}");
+    Ok(())
+}
+
+pub fn what_a_stub_passes_on_is_measured_as_well() -> Verdict {
+    let daemon = sized("measured-stub", &GREETER, "bytes", ["1000", "100000"])?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let stated = [("desire", 0.1), ("max", 0.2)];
+    for (key, value) in stated {
+        let name = format!("/greeter/cloudroid/{key}");
+        site.runtime
+            .block_on(app.set(&name, ParamValue::Double(value)))?;
+    }
+    let overlay = site.installs(
+        &daemon,
+        "greeter_cpp",
+        "robot = \"linked\"\nlocal = \"none\"\n",
+    )?;
+    let stub = site.runs(&overlay, "greeter_cpp", "greeter", &[])?;
+    let serves = |graph: &Graph| graph.services.contains_key("/greeter/count");
+    let there = site.until(&app, "the service", serves);
+    there.with_context(|| format!("the stub said:\n{}", stub.said()))?;
+    ensure!(in_force(&daemon, "linked")?.0 == Some(1.5));
+    let names = site.says(&app, "/greeter/name", false)?;
+    site.connected(&*names, 1)?;
+    for _ in 0..10 {
+        names.publish(string("ada"));
+    }
+    resized(&daemon, "bytes=7")?;
+    ensure!(in_force(&daemon, "linked")?.0 == Some(0.5));
+    names.publish(string(&"a".repeat(5000)));
+    resized(&daemon, "bytes=5004")?;
+    ensure!(in_force(&daemon, "linked")?.0 == Some(1.5));
     Ok(())
 }

@@ -34,6 +34,22 @@ pub struct Fit {
     /// So many of its kind would fit, idle servants being ended for them; none: as many as one likes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub more: Option<u64>,
+    /// How long requests of one more would take, as far as that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expected: Option<Expected>,
+    /// Robots share the servants of this service: so many there are. Where there is one, one more robot needs no room.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shared: Option<u64>,
+}
+
+/// How long requests would take.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct Expected {
+    /// What 19 of 20 do not exceed, seconds.
+    pub rrt: f64,
+    /// How that is known, in words.
+    pub from: String,
 }
 
 /// What one more would cost another servant.
@@ -50,4 +66,13 @@ pub struct Cost {
     pub cpus: f64,
     /// What it would have left of them.
     pub left: f64,
+    /// What 19 of 20 of its requests did not exceed lately, seconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rrt: Option<f64>,
+    /// The same with what would be left of the cores.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub later: Option<f64>,
+    /// The longest that its robot accepts, seconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub accepts: Option<f64>,
 }

@@ -30,7 +30,7 @@ pub use calibration::{Calibration, CalibrationEvent, CalibrationOptions};
 pub use cpuset::CpuSet;
 pub use doctor::{Check, CheckStatus, Doctor};
 pub use event::{Event, Level};
-pub use fit::{Cost, Fit};
+pub use fit::{Cost, Expected, Fit};
 pub use grants::{Grants, Volume};
 pub use group::{Group, GroupServant, Shared};
 pub use interface::Interface;

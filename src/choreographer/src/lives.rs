@@ -159,15 +159,7 @@ impl Inner {
     pub(crate) fn make_room(self: &Arc<Self>) {
         let servants = self.servants.lock();
         let warm = self.warm_pool.promised(self);
-        let warm = warm.iter().map(|(id, promised, ending)| Servant {
-            id,
-            revision: 0,
-            connections: 0,
-            promised: Some(*promised),
-            // Before any that a robot may come back to.
-            idle_until: Some(0),
-            ending: *ending,
-        });
+        let warm = warm_facts(&warm);
         let all = servants.all.values().map(|handle| self.facts(handle));
         let (lacking, pushes) = self.admission.lacking();
         let Room { ends, give_way } = capacity::make_room(lacking, warm.chain(all), &pushes);
@@ -201,6 +193,19 @@ impl Inner {
         servants.take_back(handle);
         servants.all.remove(&handle.id);
     }
+}
+
+/// Containers that were made ahead and are promised something, as decisions see them: id, promise, whether it ends.
+pub(crate) fn warm_facts(warm: &[(String, Amount, bool)]) -> impl Iterator<Item = Servant<'_>> {
+    warm.iter().map(|(id, promised, ending)| Servant {
+        id,
+        revision: 0,
+        connections: 0,
+        promised: Some(*promised),
+        // Before any that a robot may come back to.
+        idle_until: Some(0),
+        ending: *ending,
+    })
 }
 
 impl Servants {

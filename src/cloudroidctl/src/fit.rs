@@ -40,20 +40,50 @@ fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
         return Ok(());
     }
     output::line("\nif it used all of that, these would have less than they use now")?;
-    let mut table = Table::new(&["SERVANT", "ROBOT", "CORES", "LEFT"]);
+    let mut table = Table::new(&[
+        "SERVANT", "ROBOT", "CORES", "LEFT", "RRT", "THEN", "ACCEPTS",
+    ]);
     for cost in &fit.costs {
         table.row([
             cost.servant.clone(),
             cost.robot.clone(),
             format!("{:.2}", cost.cpus),
             format!("{:.2}", cost.left),
+            time(cost.rrt),
+            time(cost.later),
+            time(cost.accepts),
         ]);
     }
     table.print()
 }
 
+/// A time in whole milliseconds; a dash where it is not known.
+fn time(seconds: Option<f64>) -> String {
+    seconds.map_or_else(
+        || "-".to_owned(),
+        |seconds| format!("{:.0} ms", seconds * 1000.0),
+    )
+}
+
 /// The answer in sentences.
 fn in_words(service: &str, fit: &api::Fit) -> String {
+    let expected = fit.expected.as_ref().map(|expected| {
+        let rrt = time(Some(expected.rrt));
+        format!(
+            "\n19 of 20 of its requests would take up to {rrt} ({})",
+            expected.from
+        )
+    });
+    let expected = expected.unwrap_or_default();
+    if let Some(servants @ 1..) = fit.shared {
+        let servants = match servants {
+            1 => "1 servant".to_owned(),
+            more => format!("{more} servants"),
+        };
+        return format!(
+            "robots share {servants} of {service}; one more robot needs no room{expected}"
+        );
+    }
     let wanted = format!(
         "one more servant of {service} is promised {} cores and {} of memory",
         fit.cpus, fit.memory
@@ -78,7 +108,7 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
         Some(more) => format!("{more} would fit, and no further one"),
     };
     format!(
-        "{wanted}; {} cores and {} are free\n{answer}\n{more}",
+        "{wanted}; {} cores and {} are free\n{answer}\n{more}{expected}",
         fit.free_cpus, fit.free_memory
     )
 }
@@ -101,6 +131,8 @@ mod tests {
             lacking_memory: Size(0),
             costs: Vec::new(),
             more: Some(1),
+            expected: None,
+            shared: None,
         }
     }
 
@@ -120,7 +152,35 @@ mod tests {
             stalled: Some("this machine swaps".into()),
             ..now.clone()
         };
+        let expected = api::Fit {
+            expected: Some(api::Expected {
+                rrt: 0.11,
+                from: "row 3 of the dictionary".into(),
+            }),
+            ..fit()
+        };
+        let shared = api::Fit {
+            shared: Some(2),
+            ..expected.clone()
+        };
+        let none_yet = api::Fit {
+            shared: Some(0),
+            ..fit()
+        };
+        assert_eq!(
+            (time(None).as_str(), time(Some(0.0126)).as_str()),
+            ("-", "13 ms")
+        );
         for (fit, words) in [
+            (
+                expected,
+                "no further one\n19 of 20 of its requests would take up to 110 ms (row 3",
+            ),
+            (
+                shared,
+                "robots share 2 servants of a; one more robot needs no room\n19 of 20",
+            ),
+            (none_yet, "one more servant of a is promised"),
             (
                 fit(),
                 "1 cores and 64M of memory; 0.5 cores and 1G are free",

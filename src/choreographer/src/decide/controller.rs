@@ -58,7 +58,7 @@ pub struct Goal {
 
 impl Goal {
     /// What is not to be exceeded: T_max, or T_desire where that alone is stated.
-    fn bound(self) -> Option<f64> {
+    pub fn bound(self) -> Option<f64> {
         self.max.or(self.desire).filter(|bound| *bound > 0.0)
     }
 }

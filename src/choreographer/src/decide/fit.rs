@@ -1,7 +1,8 @@
-//! Whether one more servant would fit, what that would cost the others, and how many more would.
+//! Whether one more servant would fit, what that would cost the others in cores and in time, and how many more would.
 
 use super::admission::Book;
 use super::capacity::{Lacking, make_room};
+use super::controller::Measured;
 use super::shares::{Claim, fill};
 use super::{Amount, Servant};
 
@@ -12,10 +13,12 @@ pub struct Neighbour<'a> {
     pub servant: Servant<'a>,
     /// Thousandths of a core, on the average over the last seconds.
     pub uses: u64,
+    /// What its requests took lately, where that is known.
+    pub measured: Option<Measured>,
 }
 
 /// How one more would fit.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
     /// It would be admitted at once.
     pub now: bool,
@@ -29,8 +32,19 @@ pub struct Fit {
     pub more: Option<u64>,
 }
 
+impl Fit {
+    /// Of one that needs nothing.
+    pub const NOTHING: Fit = Fit {
+        now: true,
+        ends: Vec::new(),
+        lacking: Amount::NONE,
+        costs: Vec::new(),
+        more: None,
+    };
+}
+
 /// What one more would cost another servant.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Cost {
     /// Its id.
     pub id: String,
@@ -38,6 +52,9 @@ pub struct Cost {
     pub uses: u64,
     /// What it would have left of that: at least what it is promised, as far as it uses that.
     pub left: u64,
+    /// What 19 of 20 of its requests did not exceed lately, and would not then: milliseconds. None where nothing is known, or
+    /// where it would get no time at all.
+    pub times: Option<(f64, f64)>,
 }
 
 /// How one more that is promised `wanted` would fit on a machine of so many `cores` (thousandths): these exist, whatever is
@@ -103,8 +120,20 @@ fn costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<Cost> {
             id: other.servant.id.to_owned(),
             uses: other.uses,
             left,
+            times: other
+                .measured
+                .and_then(|measured| slower(measured, other.uses, left)),
         })
         .collect()
+}
+
+/// What requests take, and would take with what is left of the cores: what they wait and compute in the cloud grows as the
+/// cores shrink, what is spent on the way does not.
+fn slower(measured: Measured, uses: u64, left: u64) -> Option<(f64, f64)> {
+    let Measured { total, cloud } = measured;
+    let cloud = cloud.clamp(0.0, total);
+    let then = total - cloud + cloud * uses as f64 / left as f64;
+    (left > 0).then_some((total, then))
 }
 
 /// How often `part` is in `whole`.
@@ -132,6 +161,7 @@ mod tests {
                 ending: false,
             },
             uses,
+            measured: None,
         }
     }
 
@@ -190,6 +220,30 @@ mod tests {
             "they lack cores already"
         );
         assert_eq!(cost(1.5), [("greedy".to_owned(), 1000)]);
+        // Times grow with what is spent in the cloud.
+        let times = |uses, promised, total, cloud| {
+            let measured = Some(Measured { total, cloud });
+            let one = Neighbour {
+                measured,
+                ..other("one", promised, uses, None)
+            };
+            let fit = fit(Amount::new(3.0, 0), &book(0.0, None), 4000, &[one]);
+            fit.costs[0].times
+        };
+        for (uses, promised, total, cloud, then) in [
+            (2000, 0.0, 100.0, 60.0, Some((100.0, 160.0))),
+            (2000, 0.0, 100.0, 0.0, Some((100.0, 100.0))),
+            // Its robot told nonsense.
+            (2000, 0.0, 100.0, 1e9, Some((100.0, 200.0))),
+            (4000, 0.0, 100.0, 100.0, Some((100.0, 400.0))),
+        ] {
+            assert_eq!(times(uses, promised, total, cloud), then, "{uses} {cloud}");
+        }
+        let nothing = Measured {
+            total: 1.0,
+            cloud: 1.0,
+        };
+        assert_eq!(slower(nothing, 5, 0), None, "for ever");
         let others = [other("small", 0.0, 100, None)];
         let fit = fit(Amount::new(1.0, 0), &book(0.0, None), 4000, &others);
         assert_eq!(fit.costs, []);

@@ -21,6 +21,8 @@ const WHOLE: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(10);
 /// So many requests in vain, one after the other, are enough at a limit.
 const IN_VAIN: usize = 3;
+/// Thousandths of a core below which no servant is limited.
+const LEAST: u64 = 10;
 /// How often its memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -57,7 +59,7 @@ impl Choreographer {
         step(format!("starting a servant of {service} to measure")).await;
         measured.lease.admitted().await?;
         let reach = measured.lease.ready().await?;
-        let ladder = self.limits_for(&measured, options);
+        let ladder = self.limits_for(&measured, options)?;
         let mut measuring = Measuring {
             choreographer: self,
             measured: &measured,
@@ -98,17 +100,29 @@ impl Choreographer {
     }
 
     /// At which limits it is measured: those that are named, else up to all that can be promised to it now.
-    fn limits_for(&self, measured: &Measured, options: &CalibrationOptions) -> Vec<f64> {
+    fn limits_for(
+        &self,
+        measured: &Measured,
+        options: &CalibrationOptions,
+    ) -> Result<Vec<f64>, Error> {
         if !options.cpus.is_empty() {
             let mut named = options.cpus.clone();
             named.sort_by(f64::total_cmp);
             named.dedup();
-            return named;
+            return Ok(named);
         }
         let (capacity, promised, _) = self.admission().look();
         let own = self.inner.promised(&measured.lease.handle().asked());
         let most = capacity.minus(promised.minus(own)).millicpus;
-        decide::ladder(most.max(1))
+        if most < LEAST {
+            let service = measured.lease.handle().service();
+            return Err(Error::Calibration(format!(
+                "there is no room to measure {service}: {} cores are promised to nobody; end servants that are not \
+                 needed, or name the limits with --cpus",
+                most as f64 / 1000.0
+            )));
+        }
+        Ok(decide::ladder(most))
     }
 }
 

@@ -171,6 +171,21 @@ fn ready(group: &api::Group) -> usize {
 }
 
 #[tokio::test(start_paused = true)]
+async fn one_more_robot_of_a_group_that_runs_needs_no_room() {
+    let shop = Shop::new(api::Shared::default());
+    let daemon = shop.world.daemon();
+    let fit = || async {
+        let fit = daemon.fit("echo", api::Stated::default()).await;
+        fit.expect("it is published")
+    };
+    let first = fit().await;
+    assert_eq!((first.shared, first.cpus), (Some(0), 0.1), "{first:?}");
+    let _robot = robot(&daemon, "r1").await;
+    let more = fit().await;
+    assert_eq!((more.shared, more.now, more.cpus), (Some(1), true, 0.0));
+}
+
+#[tokio::test(start_paused = true)]
 async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() {
     let shop = Shop::new(api::Shared {
         min: 2,

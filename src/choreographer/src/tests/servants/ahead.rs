@@ -90,6 +90,22 @@ async fn what_is_kept_ready_ends_before_a_robot_waits() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn whether_one_more_fits_knows_that_what_is_kept_ready_would_end() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    world.publish("map", "/greet", |record| {
+        record.plan.limits.cpus = Some(2.0);
+    });
+    let daemon = keeps(&world, 2);
+    pool(&daemon, (2, 1)).await;
+    let fit = daemon.fit("map", api::Stated::default()).await;
+    let fit = fit.expect("it is published");
+    assert_eq!((fit.lacking_cpus, fit.more), (0.0, Some(1)), "{fit:?}");
+    assert_eq!((fit.now, fit.ends.len()), (false, 1), "{fit:?}");
+    assert_eq!(fit.costs, []);
+}
+
+#[tokio::test(start_paused = true)]
 async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
     let world = World::new();
     world

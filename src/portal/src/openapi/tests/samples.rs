@@ -9,9 +9,10 @@ use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
-    Doctor, Event, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, NodeDown, Phase,
-    Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail,
-    ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
+    Doctor, Event, Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node,
+    NodeDown, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant,
+    ServiceDetail, ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage,
+    Volume,
 };
 use serde_json::Value;
 
@@ -472,12 +473,22 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             robot: "x".into(),
             cpus: 1.5,
             left: 0.5,
+            rrt: Some(0.1),
+            later: Some(0.2),
+            accepts: Some(0.3),
         }],
         more: Some(1),
+        expected: Some(Expected {
+            rrt: 0.1,
+            from: "x".into(),
+        }),
+        shared: Some(1),
     };
     let bare = Fit {
         stalled: None,
         more: None,
+        expected: None,
+        shared: None,
         ..fits.clone()
     };
     let mut samples = vec![
