@@ -16,6 +16,8 @@ mod burglary;
 mod calibration;
 #[path = "stories/calls.rs"]
 mod calls;
+#[path = "stories/candidates.rs"]
+mod candidates;
 #[path = "stories/clients.rs"]
 mod clients;
 #[path = "stories/cross.rs"]
@@ -272,6 +274,14 @@ fn main() -> ExitCode {
             archives_that_reach_out_of_their_tree,
             reserved_and_taken_names,
             a_full_disk_ends_a_push_and_nothing_else,
+        ],
+        stories![candidates:
+            a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it,
+            what_a_robot_says_is_said_to_a_candidate_too,
+            calls_and_goals_are_carried_out_by_a_candidate_too,
+            a_shared_service_is_compared_at_one_robots_calls_and_goals,
+            a_candidate_gives_way_to_a_robot_and_what_was_compared_is_told,
+            a_stubs_node_is_started_in_a_candidate_as_it_is_on_its_robot,
         ],
         stories![rollouts:
             a_canary_that_fails_is_taken_back_and_its_robot_goes_on,

@@ -20,6 +20,7 @@ pub mod push;
 pub mod rollout;
 pub mod servant;
 pub mod service;
+pub mod shadow;
 pub mod size;
 pub mod sla;
 pub mod status;
@@ -42,6 +43,7 @@ pub use servant::{
     BackOff, LogLine, NodeDown, Phase, ResponseTimes, Servant, Stopped, Stream, Terms,
 };
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
+pub use shadow::{Shadow, ShadowEvent, ShadowOptions};
 pub use size::Size;
 pub use sla::{Measure, Sla, Span, Stated};
 pub use status::{Capacity, Clock, Isolation, Status};

@@ -23,6 +23,7 @@
 //! | [`back_off`] | when a servant that failed may be started again | how often in a row, how long it was ready |
 //! | [`rollout`] | which robots a new revision serves first, when it is taken back or promoted | its terms, what was seen of both revisions |
 //! | [`requests`] | on which topics robots ask and are answered | the interface |
+//! | [`shadow`] | what a candidate answers as the present revision does, and what not | the answers of both, what may differ |
 //! | [`hung`] | whether nodes hang | what went to them and came from them, T_max |
 //! | [`warm_pool`] | how many containers each service has ahead, in which the nodes run, which end | what is published, what was asked for last, the forecast, a budget |
 //! | [`forecast`] | how many robots are about to ask | when robots asked |
@@ -49,6 +50,7 @@ pub(crate) mod nodes;
 pub(crate) mod placement;
 pub(crate) mod requests;
 pub(crate) mod rollout;
+pub(crate) mod shadow;
 mod shares;
 mod sketch;
 pub(crate) mod stall;

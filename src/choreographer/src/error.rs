@@ -72,6 +72,9 @@ pub enum Error {
     /// A service cannot be calibrated so.
     #[error("{0}")]
     Calibration(String),
+    /// A revision cannot be compared so with what a robot uses.
+    #[error("{0}")]
+    Shadow(String),
     /// What is published.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),

@@ -17,6 +17,7 @@ mod nodes;
 pub(crate) mod reaching;
 mod recent;
 pub(crate) mod rollouts;
+pub(crate) mod shadow;
 mod starting;
 pub(crate) mod waiting;
 pub(crate) mod warm_pool;

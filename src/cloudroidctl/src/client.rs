@@ -267,7 +267,7 @@ pub fn empty() -> Body {
 }
 
 /// A body as JSON.
-fn json(body: &impl Serialize) -> serde_json::Result<Body> {
+pub fn json(body: &impl Serialize) -> serde_json::Result<Body> {
     Ok(Full::new(Bytes::from(serde_json::to_vec(body)?))
         .map_err(|never| match never {})
         .boxed_unsync())

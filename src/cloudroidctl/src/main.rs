@@ -19,6 +19,7 @@ mod rollout;
 mod servants;
 mod services;
 mod set;
+mod shadow;
 mod sla;
 mod stated;
 mod status;
@@ -72,6 +73,7 @@ enum Verb {
     Logs(logs::Logs),
     Events(events::Events),
     Set(set::Set),
+    Shadow(shadow::Shadow),
     Sla(sla::Sla),
     Stop(stop::Stop),
     Rm(rm::Rm),
@@ -121,6 +123,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Logs(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
         Verb::Set(verb) => verb.run(&client, format).await,
+        Verb::Shadow(verb) => verb.run(&client, format).await,
         Verb::Sla(verb) => verb.run(&client, format).await,
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,

@@ -166,7 +166,7 @@ pub async fn order_rollout(
 /// The largest recording for a trial or a calibration, where its sender may have so much: it is held in memory.
 const LARGEST_TRIAL: usize = 512 << 20;
 /// The longest of other bodies.
-const LARGEST_WORDS: usize = 64 << 10;
+pub(super) const LARGEST_WORDS: usize = 64 << 10;
 
 /// A body, within what its sender may have held.
 pub(super) async fn held(

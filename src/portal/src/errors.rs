@@ -340,7 +340,9 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
-        C::Calibration(_) | C::Reach(reach::Error::Trial(_)) => {
+        C::Calibration(_)
+        | C::Shadow(_)
+        | C::Reach(reach::Error::Trial(_) | reach::Error::Linked(_)) => {
             (S::BAD_REQUEST, "bad-request", "bad request")
         }
         C::Reach(_) => (S::BAD_GATEWAY, "servant-failed", "servant failed"),

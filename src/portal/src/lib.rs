@@ -28,6 +28,7 @@ mod page;
 mod push;
 mod robots;
 mod routes;
+mod shadow;
 mod stubs;
 mod tokens;
 mod views;

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, push, robots, stubs,
+    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, push, robots, shadow, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -205,6 +205,18 @@ pub const ROUTES: &[Route] = &[
             Required::False,
         )
         .streams::<api::CalibrationEvent>()
+    }),
+    at("POST", "/api/v1/services/{name}/shadow", Token, || {
+        post(shadow::shadow)
+    })
+    .described(|| {
+        operation(
+            "shadow",
+            "Gives a robot's requests to a candidate, too, which answers nobody, and compares the answers. The last line is done or \
+             error.",
+        )
+        .takes::<api::ShadowOptions>(Required::True)
+        .streams::<api::ShadowEvent>()
     }),
     at("GET", "/api/v1/services/{name}/sla", Token, || {
         get(dictionary::rows)

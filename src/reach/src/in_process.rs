@@ -5,6 +5,7 @@ use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
+use link::control::Node;
 use link::session::Lost;
 use package::interface::Interface;
 use ros::bus::{Bus, Graph};
@@ -13,12 +14,14 @@ use ros::sizes::Seen;
 use tokio::sync::watch;
 
 use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
+use crate::tap::Tap;
 use crate::trial::{self, Material, Pace, Replay};
-use crate::{Error, Flow, Reach, ReachOptions, Stream, Tenant};
+use crate::{Error, Flow, Linked, Reach, ReachOptions, Stream, Tenant};
 
 /// A bus, the bridge before it, and the hub of its links.
 pub(crate) struct InProcess {
     bus: Arc<dyn Bus>,
+    tap: Arc<Tap>,
     bridge: Arc<Bridge>,
     hub: Arc<Hub>,
     /// What the robot's stubs have started.
@@ -48,6 +51,14 @@ impl InProcess {
             registry,
             keeps,
         } = behind;
+        let tap = Arc::new(Tap::default());
+        let shown = tap.before(Arc::clone(&bus));
+        // Stubs of a robot that shares its servants see these by names of their own.
+        let linked = match std::ptr::addr_eq(Arc::as_ptr(&bus), Arc::as_ptr(&linked)) {
+            true => Arc::clone(&shown),
+            false => linked,
+        };
+        let bus = shown;
         let habits = HubOptions {
             grace: options.grace,
             budget: options.budget.clone(),
@@ -68,6 +79,7 @@ impl InProcess {
         InProcess {
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
             bus,
+            tap,
             hub,
             nodes,
             _keeps: keeps,
@@ -95,6 +107,21 @@ impl Reach for InProcess {
 
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {
         self.hub.serve(stream, read_ahead).await
+    }
+
+    fn tap(&self) -> Option<Arc<Tap>> {
+        Some(Arc::clone(&self.tap))
+    }
+
+    async fn linked(&self) -> Vec<Linked> {
+        self.nodes.running().await
+    }
+
+    async fn start_linked(&self, node: &Node) -> Result<(), Error> {
+        for (key, value) in self.nodes.parameters(node) {
+            self.bus.parameters()?.set(&key, value).await?;
+        }
+        self.nodes.start(node).await.map_err(Error::Linked)
     }
 
     fn links(&self) -> Vec<LinkStatus> {

@@ -23,6 +23,7 @@ mod nodes;
 pub mod readiness;
 mod request_times;
 mod sockets;
+pub mod tap;
 mod trial;
 
 use std::collections::BTreeMap;
@@ -33,7 +34,7 @@ use async_trait::async_trait;
 use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
 use budget::Budget;
 use futures_util::future::BoxFuture;
-use link::control::Request;
+use link::control::{Node, Request};
 use link::session::Lost;
 use package::interface::Interface;
 use package::inventory::Inventory;
@@ -48,6 +49,7 @@ use tokio::sync::watch;
 
 use egress::Relays;
 use links::LinkStatus;
+use tap::Tap;
 
 pub use ends::how_it_ended;
 pub use local::LocalOpener;
@@ -124,6 +126,15 @@ pub struct Flow {
     pub outputs: u64,
 }
 
+/// A node that a stub has started.
+#[derive(Debug, Clone)]
+pub struct Linked {
+    /// As the stub said.
+    pub node: Node,
+    /// Parameters that its push gave it.
+    pub given: Vec<(String, ParamValue)>,
+}
+
 /// A connection behind its upgrade.
 pub type Stream = Box<dyn Io>;
 
@@ -145,8 +156,23 @@ pub trait Reach: Send + Sync + 'static {
     -> SessionEnd;
     /// Serves a stub's connection behind its upgrade, until it ends; `read_ahead` was read from it already.
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
+    /// Where to hear what its robot asks of it; none where nobody can.
+    fn tap(&self) -> Option<Arc<Tap>> {
+        None
+    }
     /// How its links are doing, by node.
     fn links(&self) -> Vec<LinkStatus>;
+    /// Nodes that stubs have started and that run.
+    async fn linked(&self) -> Vec<Linked> {
+        Vec::new()
+    }
+    /// Starts a node as a stub would, with the parameters that the push of this servant's revision gives it.
+    async fn start_linked(&self, node: &Node) -> Result<(), Error> {
+        Err(Error::Linked(format!(
+            "{} is started by stubs alone",
+            node.name
+        )))
+    }
     /// What flows, by who uses it.
     fn flows(&self) -> Vec<Flow> {
         Vec::new()
@@ -218,6 +244,9 @@ pub enum Error {
     /// It is none of the engine's that this reaches.
     #[error("servant {0} does not run here")]
     Elsewhere(String),
+    /// A node of a stub cannot be started.
+    #[error("{0}")]
+    Linked(String),
     /// It cannot be tried with what was given.
     #[error("{0}")]
     Trial(String),

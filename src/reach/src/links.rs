@@ -46,7 +46,7 @@ use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
 use link::{MAX_FRAME, MAX_RECORD};
 
-use crate::{Flow, Tenant};
+use crate::{Flow, Linked, Tenant};
 use attempts::Attempts;
 use duplicates::Machine;
 use node_link::NodeLink;
@@ -74,6 +74,10 @@ pub trait Nodes: Send + Sync + 'static {
     async fn ended(&self, node: &str) -> Exit;
     /// Whether it runs.
     async fn is_running(&self, node: &str) -> bool;
+    /// Those that were started and run, as the robot's stubs said; none where they are not started one by one.
+    async fn running(&self) -> Vec<Linked> {
+        Vec::new()
+    }
     /// Parameters that the deployer gave for this executable: they win over the robot's.
     fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)>;
     /// A path or text of the robot as the servant knows it.

@@ -3,19 +3,21 @@
 mod planned;
 mod told;
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request};
+use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::NodeSpec;
 use tokio::sync::mpsc;
 
 use crate::links::Nodes;
-use crate::{Observer, Recorded, Tenant, how_it_ended};
+use crate::{Linked, Observer, Recorded, Tenant, how_it_ended};
 
 use planned::Planned;
 
@@ -30,6 +32,8 @@ pub struct LinkedNodes {
     told: Told,
     container: Arc<dyn Servant>,
     planned: Planned,
+    /// As they were started last, by name.
+    started: Mutex<BTreeMap<String, Node>>,
 }
 
 impl LinkedNodes {
@@ -44,6 +48,7 @@ impl LinkedNodes {
             told: Told::new(container.id(), observer),
             container: Arc::clone(container),
             planned: Planned::default(),
+            started: Mutex::default(),
         }
     }
 
@@ -126,7 +131,21 @@ impl Nodes for LinkedNodes {
             required: false,
         };
         let started = self.container.start_node(spec).await;
-        started.map_err(|error| format!("{} cannot be started: {error}", node.name))
+        started.map_err(|error| format!("{} cannot be started: {error}", node.name))?;
+        self.started.lock().insert(node.name.clone(), node.clone());
+        Ok(())
+    }
+
+    async fn running(&self) -> Vec<Linked> {
+        let started: Vec<Node> = self.started.lock().values().cloned().collect();
+        let mut running = Vec::new();
+        for node in started {
+            if self.is_running(&node.name).await {
+                let given = self.parameters(&node);
+                running.push(Linked { node, given });
+            }
+        }
+        running
     }
 
     async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {

@@ -37,7 +37,7 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     inner.retire(&handle);
     inner.note_end(&handle, &outcome);
     inner.rollouts.note_gone(&handle);
-    if matches!(outcome, Err(Failure::Broken { .. })) {
+    if matches!(outcome, Err(Failure::Broken { .. })) && !handle.is_candidate() {
         inner.rollouts.note_servant(&handle, true);
     }
     let outcome = match outcome {
@@ -152,6 +152,7 @@ async fn live(
         limits::take_back(inner, handle, &*container).await;
     }
     starting::report_unmet(inner, handle, &container);
+    let permit = kept.as_ref();
     let mut nodes = Nodes::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, reach, &mut nodes, fresh));
     tokio::select! {
@@ -161,6 +162,15 @@ async fn live(
         reason = handle.end_asked() => Ok(reason),
         failure = container_over(&container) => Err(failure),
         reason = unneeded(inner, handle, fresh) => Ok(reason),
+        () = is_needed(permit) => Ok("a robot needs its room".to_owned()),
+    }
+}
+
+/// Comes back when a robot needs what was promised to a servant that gives way.
+async fn is_needed(permit: Option<&Permit>) {
+    match permit {
+        Some(permit) => permit.is_needed().await,
+        None => std::future::pending().await,
     }
 }
 
@@ -188,7 +198,7 @@ async fn run(
         failure = nodes.supervise() => return Err(failure),
     }
     handle.set_phase(Phase::Ready);
-    if fresh {
+    if fresh && !handle.is_candidate() {
         inner.rollouts.note_servant(handle, false);
     }
     inner.warm_pool.look();
@@ -234,7 +244,10 @@ async fn admit(
     {
         return Ok(permit);
     }
-    let ask = Ask::robot(wanted, handle.priority());
+    let ask = match handle.is_candidate() {
+        true => Ask::push(wanted),
+        false => Ask::robot(wanted, handle.priority()),
+    };
     let make_room = || inner.make_room();
     let admission = &inner.admission;
     // A robot that named no name is nobody's when it comes back.

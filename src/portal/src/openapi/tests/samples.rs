@@ -6,13 +6,14 @@ use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use api::push::Layer;
 use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share};
+use api::shadow::{Compared, FieldDifference, NotCompared};
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
     Doctor, Event, Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node,
     NodeDown, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant,
-    ServiceDetail, ServiceSummary, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage,
-    Volume,
+    ServiceDetail, ServiceSummary, Shadow, ShadowEvent, ShadowOptions, Size, Sla, Span, Stated,
+    Status, Stopped, Stream, Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -435,6 +436,31 @@ fn calibration() -> Calibration {
     }
 }
 
+fn shadow() -> Shadow {
+    Shadow {
+        service: "x".into(),
+        compared: vec![Compared {
+            present: Some(TimeSpread::default()),
+            candidate: Some(TimeSpread::default()),
+            fields: vec![FieldDifference::default()],
+            ..Compared::default()
+        }],
+        not_compared: vec![NotCompared::default()],
+        ..Shadow::default()
+    }
+}
+
+fn shadow_options() -> ShadowOptions {
+    ShadowOptions {
+        revision: 2,
+        robot: some("r1"),
+        requests: Some(40),
+        ignore: vec!["x".into()],
+        acting: true,
+        ..ShadowOptions::default()
+    }
+}
+
 fn calibration_options() -> CalibrationOptions {
     CalibrationOptions {
         source: Source::Live,
@@ -492,6 +518,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         ..fits.clone()
     };
     let mut samples = vec![
+        sample("ShadowOptions", shadow_options()),
+        sample("ShadowOptions", ShadowOptions::default()),
         sample("CalibrationOptions", calibration_options()),
         sample("CalibrationOptions", CalibrationOptions::default()),
         sample("Fit", fits),
@@ -563,6 +591,18 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         CalibrationEvent::Error { problem: problem() },
     ] {
         samples.push(sample("CalibrationEvent", event));
+    }
+    for event in [
+        ShadowEvent::Step { title: "x".into() },
+        ShadowEvent::Done {
+            shadow: Box::new(shadow()),
+        },
+        ShadowEvent::Done {
+            shadow: Box::default(),
+        },
+        ShadowEvent::Error { problem: problem() },
+    ] {
+        samples.push(sample("ShadowEvent", event));
     }
     for event in [
         PushEvent::Step { title: "x".into() },

@@ -1,0 +1,83 @@
+//! Nodes that a robot's stubs have started, in a candidate: by the robot's names, and with its parameters.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use reach::Reach;
+use ros::bus::Graph;
+
+use crate::Error;
+use crate::handle::Handle;
+
+/// Those of a Master itself, and of links.
+const OWN: [&str; 5] = [
+    "/run_id",
+    "/rosdistro",
+    "/rosversion",
+    "/roslaunch/",
+    "/cloudroid_runs/",
+];
+/// For the nodes to be where those of the robot's servant are.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Starts in `candidate` what the robot's stubs have started in its servant.
+pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(), Error> {
+    let Some(there) = present.reach() else {
+        return Ok(());
+    };
+    let linked = there.linked().await;
+    if linked.is_empty() {
+        return Err(Error::Shadow(format!(
+            "the stubs of robot {} have started no node since this daemon began; start them again, or compare with another robot",
+            present.robot
+        )));
+    }
+    // What its push gave is the revision's: the candidate's own comes with its nodes.
+    let given: BTreeSet<&str> = linked
+        .iter()
+        .flat_map(|one| one.given.iter().map(|(key, _)| key.as_str()))
+        .collect();
+    let (from, to) = (there.bus(), candidate.bus());
+    let failed = |error| Error::Reach(reach::Error::Bus(error));
+    for key in from
+        .parameters()
+        .map_err(failed)?
+        .names()
+        .await
+        .map_err(failed)?
+    {
+        let own = OWN.iter().any(|own| key.starts_with(own));
+        if own || given.contains(key.as_str()) {
+            continue;
+        }
+        // Deleted meanwhile.
+        let Ok(value) = from.parameter(&key).await else {
+            continue;
+        };
+        let set = to.parameters().map_err(failed)?.set(&key, value).await;
+        set.map_err(failed)?;
+    }
+    for one in &linked {
+        candidate.start_linked(&one.node).await?;
+    }
+    let wanted = from.graph().borrow().clone();
+    let names: Vec<&str> = linked.iter().map(|one| one.node.name.as_str()).collect();
+    let mut graph = to.graph();
+    let there = graph.wait_for(|graph| shows(graph, &wanted, &names));
+    // What is not there by then may come later, or is told as missing.
+    let _ = tokio::time::timeout(PATIENCE, there).await;
+    Ok(())
+}
+
+/// Whether a graph has all that these nodes have in another.
+fn shows(graph: &Graph, wanted: &Graph, nodes: &[&str]) -> bool {
+    let of_them = |node: &String| nodes.contains(&node.as_str());
+    let services = wanted.services.iter().filter(|(_, node)| of_them(node));
+    let topics = wanted.topics.iter();
+    services
+        .into_iter()
+        .all(|(service, _)| graph.services.contains_key(service))
+        && topics
+            .filter(|(_, ends)| ends.publishers.iter().chain(&ends.subscribers).any(of_them))
+            .all(|(topic, _)| graph.topics.contains_key(topic))
+}

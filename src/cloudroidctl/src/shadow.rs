@@ -1,0 +1,237 @@
+//! `shadow`: whether another revision answers a robot's requests as the one does that it uses.
+
+use anyhow::bail;
+use api::calibration::TimeSpread;
+use api::shadow::{Compared, Shadow as Found, ShadowEvent, ShadowOptions};
+use futures_util::StreamExt;
+use hyper::Method;
+
+use crate::client::{self, Client, escaped, json};
+use crate::output::{self, Format, Table};
+
+/// Fields that are shown of each topic, service and action.
+const FIELDS: usize = 8;
+
+/// Give what a robot asks of its servant to a candidate of another revision, too, and say what differs.
+///
+/// The candidate is a servant of its own, started now and ended afterwards. The robot is answered as before; it hears nothing
+/// of the candidate. A robot that needs the candidate's room is given it.
+#[derive(Debug, clap::Args)]
+pub struct Shadow {
+    /// The service.
+    service: String,
+    /// The revision that is the candidate.
+    revision: u64,
+    /// The robot whose requests are taken; the first that uses the service by default.
+    #[arg(long)]
+    robot: Option<String>,
+    /// Seconds for which they are, at most; 60 by default.
+    #[arg(long, value_name = "N")]
+    seconds: Option<f64>,
+    /// So many messages, calls and goals are enough.
+    #[arg(long, value_name = "N")]
+    requests: Option<u64>,
+    /// Two numbers are the same if they are no farther apart than this; where one has a fraction, this times the greater of
+    /// them, if that is above 1. 0.000001 by default.
+    #[arg(long, value_name = "NUMBER")]
+    tolerance: Option<f64>,
+    /// A field that may differ, such as pose.covariance, or detections[].id; may be given several times.
+    #[arg(long, value_name = "FIELD")]
+    ignore: Vec<String>,
+    /// The part by which the candidate's median response time may be longer; 0.1 by default.
+    #[arg(long, value_name = "PART")]
+    bound: Option<f64>,
+    /// Let the candidate use the hosts and devices that its revision is granted, although the robot's servant does.
+    #[arg(long)]
+    acting: bool,
+}
+
+impl Shadow {
+    /// Compares and prints.
+    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+        let found = tokio::select! {
+            found = self.compare(client, format) => found?,
+            _ = tokio::signal::ctrl_c() => bail!("cancelled; the candidate is ended"),
+        };
+        match format {
+            Format::Json => output::json_line(&found),
+            Format::Table => print(&found),
+        }
+    }
+
+    fn options(&self) -> ShadowOptions {
+        let of = ShadowOptions::default();
+        ShadowOptions {
+            revision: self.revision,
+            robot: self.robot.clone(),
+            seconds: self.seconds.unwrap_or(of.seconds),
+            requests: self.requests,
+            tolerance: self.tolerance.unwrap_or(of.tolerance),
+            ignore: self.ignore.clone(),
+            bound: self.bound.unwrap_or(of.bound),
+            acting: self.acting,
+        }
+    }
+
+    async fn compare(&self, client: &Client, format: Format) -> anyhow::Result<Found> {
+        let path = format!("/api/v1/services/{}/shadow", escaped(&self.service));
+        let answer = client
+            .send(Method::POST, &path, json(&self.options())?)
+            .await?;
+        let mut events = client::lines(answer);
+        while let Some(event) = events.next().await {
+            match event? {
+                ShadowEvent::Done { shadow } => return Ok(*shadow),
+                ShadowEvent::Error { problem } => return Err(problem.into()),
+                event if format == Format::Json => output::json_line(&event)?,
+                ShadowEvent::Step { title } => output::line(&format!("== {title}"))?,
+            }
+        }
+        bail!("the daemon broke off the comparison")
+    }
+}
+
+fn print(found: &Found) -> anyhow::Result<()> {
+    for line in summary(found) {
+        output::line(&line)?;
+    }
+    if !found.compared.is_empty() {
+        output::line("")?;
+        table(&found.compared).print()?;
+    }
+    for row in found.compared.iter().filter(|row| !row.fields.is_empty()) {
+        output::line("")?;
+        for line in fields(found, row) {
+            output::line(&line)?;
+        }
+    }
+    if found.not_compared.is_empty() {
+        return Ok(());
+    }
+    output::line("\nnot compared")?;
+    for note in &found.not_compared {
+        let times = match note.count {
+            0 => String::new(),
+            count => format!(" ({count} times)"),
+        };
+        output::line(&format!("  {}: {}{times}", note.what, note.why))?;
+    }
+    Ok(())
+}
+
+fn summary(found: &Found) -> [String; 2] {
+    [
+        format!(
+            "revision {} of {} beside revision {}, with {} requests of robot {} in {:.1} s ({})",
+            found.candidate,
+            found.service,
+            found.revision,
+            found.given,
+            found.robot,
+            found.seconds,
+            found.ended
+        ),
+        format!("{}: {}", found.verdict, found.why),
+    ]
+}
+
+fn table(rows: &[Compared]) -> Table {
+    let mut table = Table::new(&[
+        "KIND",
+        "NAME",
+        "EQUAL",
+        "DIFFERENT",
+        "MISSING",
+        "SURPLUS",
+        "P50/P95 MS",
+        "CANDIDATE",
+    ]);
+    for row in rows {
+        table.row([
+            row.kind.to_string(),
+            row.name.clone(),
+            row.equal.to_string(),
+            row.different.to_string(),
+            row.missing.to_string(),
+            row.surplus.to_string(),
+            times(row.present.as_ref()),
+            times(row.candidate.as_ref()),
+        ]);
+    }
+    table
+}
+
+fn times(times: Option<&TimeSpread>) -> String {
+    times.map_or("-".to_owned(), |times| {
+        format!("{:.1}/{:.1}", times.p50, times.p95)
+    })
+}
+
+/// The fields of a topic, service or action that differ.
+fn fields(found: &Found, row: &Compared) -> Vec<String> {
+    let mut lines = vec![format!("{} differs in", row.name)];
+    for field in row.fields.iter().take(FIELDS) {
+        let name = match field.field.as_str() {
+            "" => "the whole",
+            name => name,
+        };
+        lines.push(format!(
+            "  {name}, in {} answers: {} of revision {}, {} of revision {}",
+            field.answers, field.present, found.revision, field.candidate, found.candidate
+        ));
+    }
+    let more = row.fields.len().saturating_sub(FIELDS);
+    if more > 0 {
+        lines.push(format!("  and {more} more; --format json has them all"));
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use api::shadow::{FieldDifference, Verdict};
+
+    use super::*;
+
+    #[test]
+    fn what_differs_is_told_by_its_name_with_both_values() {
+        let field = |name: &str| FieldDifference {
+            field: name.into(),
+            answers: 2,
+            present: "3".into(),
+            candidate: "103".into(),
+        };
+        let row = Compared {
+            name: "/add_two".into(),
+            different: 2,
+            fields: (0..10).map(|number| field(&format!("f{number}"))).collect(),
+            ..Compared::default()
+        };
+        let found = Found {
+            service: "adder".into(),
+            robot: "r1".into(),
+            revision: 1,
+            candidate: 2,
+            verdict: Verdict::Different,
+            why: "2 of 2 answers are not the same: /add_two".into(),
+            ended: "its time is over".into(),
+            given: 2,
+            ..Found::default()
+        };
+        let lines = fields(&found, &row);
+        assert_eq!(lines.len(), 10);
+        assert_eq!(
+            lines[1],
+            "  f0, in 2 answers: 3 of revision 1, 103 of revision 2"
+        );
+        assert!(lines[9].contains("2 more"), "{lines:?}");
+        let whole = Compared {
+            fields: vec![field("")],
+            ..row
+        };
+        assert!(fields(&found, &whole)[1].starts_with("  the whole, in 2 answers"));
+        assert!(summary(&found)[0].contains("with 2 requests of robot r1"));
+        assert!(summary(&found)[1].starts_with("different: 2 of 2"));
+        assert_eq!(times(None), "-");
+    }
+}

@@ -1,0 +1,119 @@
+//! `POST /api/v1/services/NAME/shadow`: options as JSON in the body, events as JSON lines in the answer.
+
+use std::sync::Arc;
+
+use api::{ShadowEvent, ShadowOptions};
+use axum::Extension;
+use axum::body::Body;
+use axum::extract::{Path, State};
+use axum::response::Response;
+use futures_util::StreamExt;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::api_v1::{LARGEST_WORDS, held, lines};
+use super::guard::Caller;
+use crate::app::App;
+use crate::errors::Error;
+
+/// Events that a client has not read.
+const EVENTS_AHEAD: usize = 64;
+/// The longest comparison, in seconds.
+const LONGEST: f64 = 86_400.0;
+/// Fields that may be left out.
+const MOST_FIELDS: usize = 100;
+
+/// Compares a revision with what a robot uses.
+pub async fn shadow(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
+    body: Body,
+) -> Result<Response, Error> {
+    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+    let options: ShadowOptions = serde_json::from_slice(&body)
+        .map_err(|error| Error::BadRequest(format!("the options cannot be read: {error}")))?;
+    check(&options).map_err(Error::BadRequest)?;
+    app.catalogue.current(&name)?;
+    let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
+    let ending = app.ending.clone().cancelled_owned();
+    let work = async move {
+        let choreographer = &app.choreographer;
+        let budget = choreographer.memory().client(&caller.peer.client(None));
+        let shadow = choreographer.shadow(&name, &options, &budget, &events);
+        let event = match shadow.await {
+            Ok(shadow) => ShadowEvent::Done {
+                shadow: Box::new(shadow),
+            },
+            Err(error) => ShadowEvent::Error {
+                problem: Error::from(error).problem(),
+            },
+        };
+        let _ = events.send(event).await;
+    };
+    // Lives in the answer: when the client goes away the answer is dropped, and the candidate with it.
+    let work = AbortOnDropHandle::new(tokio::spawn(work));
+    let events = ReceiverStream::new(receiver).take_until(ending);
+    Ok(lines(events.map(move |event| {
+        let _ = &work;
+        event
+    })))
+}
+
+/// Refuses what cannot be compared by.
+fn check(options: &ShadowOptions) -> Result<(), String> {
+    let between = |name: &str, value: f64, least: f64, most: f64| match value {
+        value if (least..=most).contains(&value) => Ok(()),
+        value => Err(format!(
+            "{name} = {value} is not between {least} and {most}"
+        )),
+    };
+    if options.revision == 0 {
+        return Err("revision says which one is the candidate; they are counted from 1".to_owned());
+    }
+    between("seconds", options.seconds, 0.1, LONGEST)?;
+    between("tolerance", options.tolerance, 0.0, 1e9)?;
+    between("bound", options.bound, 0.0, 1e6)?;
+    if options.requests == Some(0) {
+        return Err("requests = 0 would compare nothing".to_owned());
+    }
+    if options.ignore.len() > MOST_FIELDS {
+        return Err(format!("at most {MOST_FIELDS} fields may be left out"));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_that_make_no_comparison_are_refused() {
+        let good = ShadowOptions {
+            revision: 2,
+            ..ShadowOptions::default()
+        };
+        assert_eq!(check(&good), Ok(()));
+        type Spoil = fn(&mut ShadowOptions);
+        let spoilt: [(Spoil, &str); 8] = [
+            (|options| options.revision = 0, "counted from 1"),
+            (|options| options.seconds = 0.0, "seconds = 0"),
+            (|options| options.seconds = f64::NAN, "seconds = NaN"),
+            (|options| options.tolerance = -1.0, "tolerance = -1"),
+            (|options| options.tolerance = f64::INFINITY, "tolerance"),
+            (|options| options.bound = -0.1, "bound = -0.1"),
+            (|options| options.requests = Some(0), "requests = 0"),
+            (
+                |options| options.ignore = vec!["x".to_owned(); 101],
+                "100 fields",
+            ),
+        ];
+        for (spoil, words) in spoilt {
+            let mut options = good.clone();
+            spoil(&mut options);
+            let refused = check(&options).expect_err(words);
+            assert!(refused.contains(words), "{refused}");
+        }
+    }
+}
