@@ -27,6 +27,8 @@ const QUEUE: usize = 1024;
 pub struct Tapped {
     /// The same of what is asked and of its answer.
     pub number: u64,
+    /// When it happened.
+    pub at: Instant,
     /// What happens.
     pub what: What,
 }
@@ -185,7 +187,8 @@ impl Tap {
 
 impl Listener {
     fn tell(&self, number: u64, what: What) -> bool {
-        let told = self.told.try_send(Tapped { number, what }).is_ok();
+        let at = Instant::now();
+        let told = self.told.try_send(Tapped { number, at, what }).is_ok();
         if !told {
             self.left_out.fetch_add(1, Ordering::Relaxed);
         }

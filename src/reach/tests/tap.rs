@@ -67,7 +67,7 @@ async fn told(tapping: &mut Tapping) -> Tapped {
 
 /// The number of a call with this request.
 async fn call(tapping: &mut Tapping, wanted: &'static [u8]) -> u64 {
-    let Tapped { number, what } = told(tapping).await;
+    let Tapped { number, what, .. } = told(tapping).await;
     match what {
         What::Call { service, request } => assert_eq!((&*service, &*request), ("/echo", wanted)),
         other => panic!("{other:?}"),
@@ -76,7 +76,7 @@ async fn call(tapping: &mut Tapping, wanted: &'static [u8]) -> u64 {
 }
 
 async fn answer(tapping: &mut Tapping) -> (u64, Answer) {
-    let Tapped { number, what } = told(tapping).await;
+    let Tapped { number, what, .. } = told(tapping).await;
     match what {
         What::Answered { answer, .. } => (number, answer),
         other => panic!("{other:?}"),

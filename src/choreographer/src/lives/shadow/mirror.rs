@@ -220,7 +220,7 @@ impl<'a> Mirror<'a> {
     }
 
     async fn told(&mut self, told: Option<Tapped>, ending: bool) -> Option<End> {
-        let Some(Tapped { number, what }) = told else {
+        let Some(Tapped { number, at, what }) = told else {
             return Some(End::Soon("the robot's servant has ended".to_owned()));
         };
         match what {
@@ -232,7 +232,7 @@ impl<'a> Mirror<'a> {
             // Heard by their topics.
             What::Goal { .. } if self.present.is_linked() => {}
             asked => {
-                self.topics.asked();
+                self.topics.asked(at);
                 let (registry, notes) = (&self.registry, &mut self.notes);
                 self.exchanges.ask(number, asked, registry, notes).await;
             }

@@ -28,8 +28,8 @@ const AHEAD: usize = 256;
 const WAITING: usize = 16 * WINDOW;
 /// For the candidate's nodes to be connected.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Stamps of inputs that are looked for in outputs.
-const STAMPS: usize = 256;
+/// Of which an output may be the answer to any.
+const REQUESTS: usize = 256;
 
 /// Topics of both sides.
 pub(super) struct Topics {
@@ -103,33 +103,33 @@ impl Item {
 #[derive(Default)]
 struct Requests {
     count: u64,
-    last: Option<Instant>,
-    stamps: VecDeque<(Time, Instant)>,
+    /// The last of them, each with its number, its stamp, and when it was asked.
+    last: VecDeque<(u64, Option<Time>, Instant)>,
 }
 
 impl Requests {
     fn asked(&mut self, stamp: Option<Time>, at: Instant) {
         self.count += 1;
-        self.last = Some(at);
         let stamp = stamp.filter(|stamp| *stamp != Time::default());
-        self.stamps.extend(stamp.map(|stamp| (stamp, at)));
-        if self.stamps.len() > STAMPS {
-            self.stamps.pop_front();
+        self.last.push_back((self.count, stamp, at));
+        if self.last.len() > REQUESTS {
+            self.last.pop_front();
         }
     }
 
-    /// How long the request took that an output answers: that with its stamp, or the last, which it is the first to answer.
+    /// How long the request took that an output answers: that with its stamp, or, where none has a stamp, the last one before it,
+    /// which it is the first to answer.
     fn took(&self, stamp: Option<Time>, answered: &mut u64, at: Instant) -> Option<f64> {
-        let first = *answered != self.count;
-        *answered = self.count;
-        let asked = match stamp {
-            Some(stamp) if !self.stamps.is_empty() => {
-                let mut known = self.stamps.iter();
-                known.find(|(known, _)| *known == stamp)?.1
-            }
-            _ => self.last.filter(|_| first)?,
-        };
-        Some(millis(at.saturating_duration_since(asked)))
+        let stamped = stamp.is_some() && self.last.iter().any(|(_, stamp, _)| stamp.is_some());
+        let mut latest_first = self.last.iter().rev();
+        // What was heard may be looked at only after the next request.
+        let (number, _, asked) = latest_first.find(|(_, of, asked)| match stamped {
+            true => *of == stamp,
+            false => *asked <= at,
+        })?;
+        let first = *answered != *number;
+        *answered = *number;
+        (stamped || first).then(|| millis(at.saturating_duration_since(*asked)))
     }
 }
 
@@ -271,10 +271,9 @@ impl Topics {
     }
 
     /// A call or a goal was given to both: outputs may answer it.
-    pub(super) fn asked(&mut self) {
-        let now = Instant::now();
-        self.present.asked(None, now);
-        self.candidate.asked(None, now);
+    pub(super) fn asked(&mut self, at: Instant) {
+        self.present.asked(None, at);
+        self.candidate.asked(None, Instant::now());
     }
 
     /// Whether it is the robot's.
@@ -456,6 +455,11 @@ mod tests {
         for secs in 0..1000 {
             requests.asked(stamp(secs), at(200));
         }
-        assert_eq!(requests.stamps.len(), STAMPS);
+        assert_eq!(requests.last.len(), REQUESTS);
+        // It was heard before the last request was made.
+        let mut requests = Requests::default();
+        requests.asked(None, at(10));
+        requests.asked(None, at(40));
+        assert_eq!(requests.took(None, &mut 0, at(30)), Some(20.0));
     }
 }
