@@ -139,12 +139,12 @@ fn next_in_words(rollout: &Shown) -> Vec<String> {
             ),
         });
     }
-    match (rollout.state, terms.deadline) {
-        (RolloutState::Canary | RolloutState::Draining, Some(deadline)) => words.push(format!(
+    let is_to_end = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
+    if let Some(deadline) = terms.deadline.filter(|_| is_to_end) {
+        words.push(format!(
             "servants of other revisions end {} after it has become the current one",
             time(deadline)
-        )),
-        _ => {}
+        ));
     }
     words
 }

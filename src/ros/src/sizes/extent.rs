@@ -299,7 +299,7 @@ mod tests {
             registry.insert(key, text).expect("valid");
         }
         registry.insert("a/Text", "string text").expect("valid");
-        Extent::of(&*registry.message(name).expect("known"))
+        Extent::of(&registry.message(name).expect("known"))
     }
 
     fn text(text: &str) -> Vec<u8> {
