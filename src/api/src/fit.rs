@@ -21,6 +21,10 @@ pub struct Fit {
     /// Why nobody is admitted now, if so.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stalled: Option<String>,
+    /// As many wait as may: one more that would have to wait is refused.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub full: bool,
     /// It would be admitted at once.
     pub now: bool,
     /// Idle servants that would be ended for it.

@@ -21,7 +21,17 @@ impl Fit {
         let fit: api::Fit = client.get(&self.path()?).await?;
         match format {
             Format::Json => output::json(&fit),
-            Format::Table => print(&self.service, &fit),
+            Format::Table => {
+                print(&self.service, &fit)?;
+                let stated = self.stated.stated()?;
+                if stated.sla.rrt.is_some() && fit.expected.is_none() {
+                    output::line(&format!(
+                        "how long its requests would take is not known: no row of the dictionary says so, and nobody's requests were measured; measure with: cloudroidctl calibrate {}",
+                        self.service
+                    ))?;
+                }
+                Ok(())
+            }
         }
     }
 
@@ -65,6 +75,15 @@ fn time(seconds: Option<f64>) -> String {
     )
 }
 
+/// What is lacking.
+fn lacking(fit: &api::Fit) -> String {
+    let cores = (fit.lacking_cpus > 0.0).then(|| format!("{} cores", fit.lacking_cpus));
+    let memory =
+        (fit.lacking_memory > Size(0)).then(|| format!("{} of memory", fit.lacking_memory));
+    let all: Vec<String> = cores.into_iter().chain(memory).collect();
+    format!("{} are lacking", all.join(" and "))
+}
+
 /// The answer in sentences.
 fn in_words(service: &str, fit: &api::Fit) -> String {
     let expected = fit.expected.as_ref().map(|expected| {
@@ -92,9 +111,14 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
     let answer = match (&fit.stalled, fit.now) {
         (Some(why), _) => format!("it would wait: {why}"),
         (None, true) => "it would be started at once".to_owned(),
+        (None, false) if fit.full => format!(
+            "it would be refused: {} wait already, and no further one may ([capacity] queue)",
+            fit.waiting
+        ),
         (None, false) if lacks => format!(
-            "it would wait: {} cores and {} are lacking, and {} wait already",
-            fit.lacking_cpus, fit.lacking_memory, fit.waiting
+            "it would wait: {}, and {} wait already",
+            lacking(fit),
+            fit.waiting
         ),
         (None, false) => format!(
             "it would be started when these have ended, which are idle: {}",
@@ -125,6 +149,7 @@ mod tests {
             free_memory: Size(1 << 30),
             waiting: 2,
             stalled: None,
+            full: false,
             now: false,
             ends: vec!["a-1".into()],
             lacking_cpus: 0.0,
@@ -142,6 +167,10 @@ mod tests {
             lacking_cpus: 0.5,
             more: Some(0),
             ..fit()
+        };
+        let full = api::Fit {
+            full: true,
+            ..lacking.clone()
         };
         let now = api::Fit {
             now: true,
@@ -188,8 +217,9 @@ mod tests {
             (fit(), "idle: a-1\n1 would fit"),
             (
                 lacking,
-                "0.5 cores and 0 are lacking, and 2 wait already\nnone would fit",
+                "0.5 cores are lacking, and 2 wait already\nnone would fit",
             ),
+            (full, "it would be refused: 2 wait already"),
             (now, "at once\nas many"),
             (stalled, "it would wait: this machine swaps"),
         ] {

@@ -411,6 +411,12 @@ fn next_of_terms(untenable: &Untenable) -> String {
         Untenable::Capped { cap, .. } => {
             format!("state {}={} or less", cap.resource, cap.most)
         }
+        Untenable::Beyond { assumed, fits, .. } if !assumed.is_empty() => {
+            let keys: Vec<String> = assumed.keys().map(|key| format!("aux.{key}")).collect();
+            let fits = fits.as_ref().map(|fits| format!(", or what fits: {fits}"));
+            let keys = keys.join(" and ");
+            format!("state {keys}{}", fits.unwrap_or_default())
+        }
         Untenable::Beyond {
             fits: Some(fits), ..
         }

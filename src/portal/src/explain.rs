@@ -27,6 +27,9 @@ const QUEUED: f64 = 0.25;
 /// Milliseconds: less is no queue.
 const QUEUE: f64 = 5.0;
 const LEFT_OUT: f64 = 0.1;
+/// The event of a node that hangs; a cause for so many milliseconds.
+const NODE_HUNG: &str = "node-hung";
+const HANGS_FOR: u64 = 60_000;
 /// The event of a stateful hand-over.
 const STATE_LOST: &str = "state-lost";
 
@@ -200,6 +203,16 @@ fn causes(servants: &[Served], events: &[Event], failing: &[api::BackOff]) -> Ve
             of_link(served, link, &mut say);
         }
     }
+    let hangs = events.iter().rev().find(|event| {
+        let is_there = |served: &Served| Some(&served.servant.id) == event.servant.as_ref();
+        event.kind == NODE_HUNG
+            && store::now().saturating_sub(event.time) < HANGS_FOR
+            && servants.iter().any(is_there)
+    });
+    if let Some(hangs) = hangs {
+        let next = "look at its log, or start it again: rosnode kill, or hung = \"restart\" in [servant]";
+        say(Weight::Blocks, hangs.message.clone(), next.to_owned());
+    }
     // Only the last one: what was lost before that is of an earlier state.
     let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);
     if let Some(lost) = lost {
@@ -223,11 +236,11 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
             Phase::Failed | Phase::Stopped => Weight::Blocks,
             _ => Weight::Slows,
         };
-        say(
-            weight,
-            format!("{id} is {}: {reason}", servant.phase),
-            format!("cloudroidctl logs {id}"),
-        );
+        let next = match servant.phase {
+            Phase::Requested => format!("cloudroidctl fit {}", servant.service),
+            _ => format!("cloudroidctl logs {id}"),
+        };
+        say(weight, format!("{id} is {}: {reason}", servant.phase), next);
     }
     for down in &servant.down {
         let left = down.again.saturating_sub(store::now()).div_ceil(1000);

@@ -258,6 +258,22 @@ impl Book {
         }
     }
 
+    /// So many robots wait, if no further one may, whatever its priority.
+    pub fn full(&self) -> Option<usize> {
+        let robots = self.waiting.iter().filter(|one| one.is_robot()).count();
+        (robots >= self.queue).then_some(robots)
+    }
+
+    /// What robots that wait asked for that would be admitted before one of this priority that came now.
+    pub fn wanted_before(&self, priority: i32) -> Amount {
+        let new = Waiter {
+            ticket: 0,
+            ask: Ask::robot(Amount::NONE, priority),
+            overtaken: 0,
+        };
+        self.wanted_by(|waiter| waiter.is_robot() && waiter.rank() <= new.rank())
+    }
+
     /// What robots that wait asked for.
     pub fn wanted_by_robots(&self) -> Amount {
         self.wanted_by(Waiter::is_robot)

@@ -324,7 +324,7 @@ fn share<'a, 'b: 'a>(
 }
 
 /// On the way back to what it has without a controller: what it was given beyond is halved, as far as its requests are
-/// answered in time without; what it was taken is given back in steps. Neither before [`HOLD`] has passed since the opposite.
+/// answered in time without; what it was taken is given back by doubling. Neither before [`HOLD`] has passed since the opposite.
 fn back(one: &Facts<'_>, now: Instant) -> u64 {
     let to = one.limit.max(one.promised);
     if one.quota > to && elapsed(one.history.raised, now) >= HOLD {
@@ -333,10 +333,7 @@ fn back(one: &Facts<'_>, now: Instant) -> u64 {
         return if one.spares(less) { less } else { one.quota };
     }
     if one.quota < to && elapsed(one.history.lowered, now) >= HOLD {
-        return one
-            .quota
-            .saturating_add(STEP.max(one.quota / GROWTH))
-            .min(to);
+        return one.quota.saturating_add(STEP.max(one.quota)).min(to);
     }
     one.quota.max(one.promised)
 }

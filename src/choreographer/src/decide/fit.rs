@@ -57,11 +57,16 @@ pub struct Cost {
     pub times: Option<(f64, f64)>,
 }
 
-/// How one more that is promised `wanted` would fit on a machine of so many `cores` (thousandths): these exist, whatever is
+/// How one more of this priority that is promised `wanted` would fit on a machine of so many `cores` (thousandths): these exist, whatever is
 /// promised of them.
-pub fn fit(wanted: Amount, book: &Book, cores: u64, others: &[Neighbour<'_>]) -> Fit {
+pub fn fit(
+    (wanted, priority): (Amount, i32),
+    book: &Book,
+    cores: u64,
+    others: &[Neighbour<'_>],
+) -> Fit {
     let free = book.capacity().minus(book.promised());
-    let spoken_for = book.wanted_by_robots();
+    let spoken_for = book.wanted_before(priority);
     let lacking = wanted.plus(spoken_for).minus(free);
     let asked = Lacking {
         all: lacking,
@@ -188,7 +193,7 @@ mod tests {
             (1.0, Some(2.0), false, vec![], 1.0, Some(0)),
             (0.0, None, true, vec![], 0.0, None),
         ] {
-            let fit = fit(Amount::new(wanted, 0), &book(3.0, waits), 4000, &both);
+            let fit = fit((Amount::new(wanted, 0), 0), &book(3.0, waits), 4000, &both);
             let got = (fit.now, fit.ends, fit.lacking, fit.more);
             let ends: Vec<String> = ends.into_iter().map(str::to_owned).collect();
             assert_eq!(
@@ -199,7 +204,7 @@ mod tests {
         }
         let mut stalls = book(3.0, None);
         stalls.stall(Some("it swaps".into()));
-        assert!(!fit(Amount::new(0.5, 0), &stalls, 4000, &both).now);
+        assert!(!fit((Amount::new(0.5, 0), 0), &stalls, 4000, &both).now);
     }
 
     #[test]
@@ -210,7 +215,7 @@ mod tests {
             other("kept", 1.0, 1000, None),
         ];
         let cost = |wanted| {
-            let fit = fit(Amount::new(wanted, 0), &book(2.0, None), 4000, &others);
+            let fit = fit((Amount::new(wanted, 0), 0), &book(2.0, None), 4000, &others);
             let costs = fit.costs.into_iter();
             costs.map(|cost| (cost.id, cost.left)).collect::<Vec<_>>()
         };
@@ -227,7 +232,7 @@ mod tests {
                 measured,
                 ..other("one", promised, uses, None)
             };
-            let fit = fit(Amount::new(3.0, 0), &book(0.0, None), 4000, &[one]);
+            let fit = fit((Amount::new(3.0, 0), 0), &book(0.0, None), 4000, &[one]);
             fit.costs[0].times
         };
         for (uses, promised, total, cloud, then) in [
@@ -245,7 +250,7 @@ mod tests {
         };
         assert_eq!(slower(nothing, 5, 0), None, "for ever");
         let others = [other("small", 0.0, 100, None)];
-        let fit = fit(Amount::new(1.0, 0), &book(0.0, None), 4000, &others);
+        let fit = fit((Amount::new(1.0, 0), 0), &book(0.0, None), 4000, &others);
         assert_eq!(fit.costs, []);
     }
 
@@ -260,7 +265,7 @@ mod tests {
                 let _ = book.ask(ticket, Ask::robot(Amount { millicpus: size, memory: 0 }, 0));
             }
             let wanted = Amount { millicpus: wanted, memory: 0 };
-            let fit = fit(wanted, &book, 4000, &[]);
+            let fit = fit((wanted, 0), &book, 4000, &[]);
             let mut ticket = 100;
             let mut admitted = 0;
             while book.ask(ticket, Ask::robot(wanted, 0)).0 == crate::decide::admission::Verdict::Admitted {

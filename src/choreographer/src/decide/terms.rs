@@ -71,10 +71,12 @@ pub enum Untenable {
         cap: Box<Cap>,
     },
     /// The row that would do is more than it may have.
-    #[error("{goal} needs {needs}, which is more {} than this robot may have: {cap}", cap.resource)]
+    #[error("{goal}{} needs {needs}, which is more {} than this robot may have: {cap}", assumed_in_words(assumed), cap.resource)]
     Beyond {
         /// What was stated, such as `rrt 100ms`.
         goal: String,
+        /// Auxiliary parameters that nobody stated, with the values that need most.
+        assumed: Aux,
         /// Limits, and the row that says so.
         needs: String,
         /// What bounds them.
@@ -83,7 +85,7 @@ pub enum Untenable {
         fits: Option<String>,
     },
     /// No row does.
-    #[error("{service} does not reach {goal}{}: {}", for_what(assumed), best.as_deref().map_or("its dictionary has no row for it".to_owned(), |best| format!("the best that its dictionary knows is {best}")))]
+    #[error("{service} does not reach {goal}{}: {}", for_what(assumed), best.as_deref().map_or("its dictionary has no row for it".to_owned(), |best| format!("the best that it may have is {best}")))]
     Unmet {
         /// The service.
         service: String,
@@ -257,6 +259,7 @@ fn unmet(
     match beyond {
         Some((row, cap)) => Untenable::Beyond {
             goal,
+            assumed,
             needs: named(row),
             cap: Box::new(cap),
             fits,
@@ -285,6 +288,17 @@ pub(crate) fn named(row: &Row) -> String {
     match in_words(&row.limits).as_str() {
         "" => format!("row {} ({row}: the service's own limits)", row.id),
         limits => format!("row {} ({row}: {limits})", row.id),
+    }
+}
+
+/// What was assumed since nobody stated it.
+fn assumed_in_words(assumed: &Aux) -> String {
+    match assumed.is_empty() {
+        true => String::new(),
+        false => format!(
+            " with {}, which is assumed since it is not stated,",
+            pairs_of(assumed)
+        ),
     }
 }
 

@@ -27,6 +27,7 @@ impl Choreographer {
             false => [(String::new(), stated)].into(),
         };
         let terms = inner.terms(&stated, &revision)?;
+        let priority = terms.priority;
         let expected = terms.rows.iter().find(|row| row.measure == Measure::Rrt);
         let expected = expected.map(|row| api::Expected {
             rrt: row.value,
@@ -68,7 +69,7 @@ impl Choreographer {
         let cores = (inner.options.cores * 1000.0).round() as u64;
         let fit = match group {
             Some(1..) => Fit::NOTHING,
-            _ => fit(wanted, &book, cores, &others),
+            _ => fit((wanted, priority), &book, cores, &others),
         };
         let cores = |millicpus: u64| millicpus as f64 / 1000.0;
         let (waiting, free) = (book.waiting(), book.capacity().minus(book.promised()));
@@ -93,6 +94,7 @@ impl Choreographer {
             free_memory: api::Size(free.memory),
             waiting,
             stalled: book.stalled().map(str::to_owned),
+            full: book.full().filter(|_| !fit.now).is_some(),
             now: fit.now,
             ends: fit.ends,
             lacking_cpus: fit.lacking.cpus(),

@@ -32,9 +32,12 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
             if handle.life().phase != Phase::Ready {
                 continue;
             }
-            // Without a T_max there is nothing to measure by.
+            // Without a time there is nothing to measure by.
             let terms = handle.terms();
-            let stated = |who: &str| terms.stated.get(who)?.sla.max_rrt;
+            let stated = |who: &str| {
+                let sla = terms.stated.get(who)?.sla;
+                sla.max_rrt.or(sla.rrt)
+            };
             let flows = handle.reach().map(|reach| reach.flows());
             for flow in flows.unwrap_or_default() {
                 let Some(max) = stated(&flow.node) else {

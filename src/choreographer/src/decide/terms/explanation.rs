@@ -6,8 +6,8 @@ use api::Stated;
 use api::dictionary::{Considered, Explained, ExplainedGoal, Row};
 use api::sla::Goal;
 
-use super::{Cap, Offer, Reading, in_words, named, terms};
-use crate::decide::dictionary::{Shelf, applies};
+use super::{Cap, Offer, Reading, named, terms};
+use crate::decide::dictionary::{Aux, Shelf, applies};
 
 /// What a robot would get that states this, and why.
 pub fn explain(stated: &Stated, offer: &Offer<'_>) -> Explained {
@@ -81,7 +81,18 @@ fn verdict(
             measure.print(goal.desire)
         )
     } else {
-        "would do, too".to_owned()
+        let unsaid = row.aux.iter();
+        let unsaid: Aux = unsaid
+            .filter(|(key, _)| !shelf.aux.contains_key(*key))
+            .map(|(key, value)| (key.clone(), value.clone()))
+            .collect();
+        match unsaid.is_empty() {
+            true => "would do, too".to_owned(),
+            false => format!(
+                "would do with {}, which is not stated",
+                super::pairs_of(&unsaid)
+            ),
+        }
     }
 }
 
@@ -96,9 +107,8 @@ fn next(row: &Row, shelf: &Shelf<'_>, against: impl Fn(&Row) -> Option<Cap>) -> 
     let mut next: Vec<String> = better.into_iter().chain(weaker).collect();
     if next.is_empty() {
         next.push(format!(
-            "there is no other row like {} ({})",
-            named(row),
-            in_words(&row.limits)
+            "there is no other row of this kind than {}",
+            named(row)
         ));
     }
     next

@@ -261,7 +261,7 @@ fn an_sla_that_cannot_be_kept_is_refused_with_what_can() {
         ),
         (
             &[("rrt", "10ms"), ("max_rrt", "20ms"), ("class", "urgent")],
-            "detect does not reach rrt 20ms: the best that its dictionary knows is row 1 (rrt 50ms: cpus 2.5, memory 1G)",
+            "detect does not reach rrt 20ms: the best that it may have is row 1 (rrt 50ms: cpus 2.5, memory 1G)",
         ),
     ] {
         let refused = terms(&stated(query), &offer).expect_err(words);

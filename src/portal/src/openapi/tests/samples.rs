@@ -489,6 +489,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         free_memory: Size(1),
         waiting: 1,
         stalled: some("it swaps"),
+        full: false,
         now: false,
         ends: all("x"),
         lacking_cpus: 1.5,
