@@ -110,7 +110,7 @@ impl Sla {
                 let gone = |row: &&i64| !left.iter().any(|one| one.id == **row);
                 if let Some(row) = verb.rows.iter().find(gone) {
                     bail!(
-                        "{} has no row {row}; nothing was removed; see its rows with: cloudroidctl sla list {}",
+                        "{} has no row \"{row}\"; nothing was removed; see its rows with: cloudroidctl sla list {}",
                         verb.service,
                         verb.service
                     );

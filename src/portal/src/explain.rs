@@ -210,7 +210,8 @@ fn causes(servants: &[Served], events: &[Event], failing: &[api::BackOff]) -> Ve
             && servants.iter().any(is_there)
     });
     if let Some(hangs) = hangs {
-        let next = "look at its log, or start it again: rosnode kill, or hung = \"restart\" in [servant]";
+        let next =
+            "look at its log, or start it again: rosnode kill, or hung = \"restart\" in [servant]";
         say(Weight::Blocks, hangs.message.clone(), next.to_owned());
     }
     // Only the last one: what was lost before that is of an earlier state.
