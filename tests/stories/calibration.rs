@@ -205,6 +205,25 @@ pub fn what_cannot_be_calibrated_is_said() -> Verdict {
 }
 
 /// Says so many words one after the other, each once the one before is answered.
+/// Both topics are connected, and nothing of that is on its way any more.
+fn hears_itself(robot: &mut Robot) -> Verdict {
+    let say = |robot: &mut Robot, word: &str| {
+        robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))
+    };
+    support::until("an answer", || {
+        say(robot, "hello")?;
+        let heard = !robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
+        Ok(if heard {
+            Ok(())
+        } else {
+            Err("none".to_owned())
+        })
+    })?;
+    say(robot, "begin")?;
+    while robot.hears_on("/teller/said")?["data"] != "begin" {}
+    Ok(())
+}
+
 fn talks(robot: &mut Robot, told: &AtomicBool) -> anyhow::Result<(Vec<String>, Vec<String>)> {
     let (mut said, mut heard) = (Vec::new(), Vec::new());
     while !told.load(Ordering::SeqCst) {
@@ -226,6 +245,7 @@ pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> 
     robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
     robot.subscribes("/teller/said")?;
     robot.awaits_subscriber("/teller/say")?;
+    hears_itself(&mut robot)?;
     let over = AtomicBool::new(false);
     let place = world().directory("live")?;
     let curve = place.path().join("curve.svg");

@@ -365,7 +365,12 @@ pub fn a_stubs_node_is_started_in_a_candidate_as_it_is_on_its_robot() -> Verdict
         "{found:#}"
     );
     for name in ["/robot/add", "/robot/sums"] {
-        ensure!(row(&found, name)?["equal"] == 5, "{found:#}");
+        // The last answer may still be on its way when all requests were given.
+        let owed = found["not_compared"].as_array().context("what was not")?;
+        let owed = owed.iter().filter(|one| one["what"] == name);
+        let owed: u64 = owed.filter_map(|one| one["count"].as_u64()).sum();
+        let equal = row(&found, name)?["equal"].as_u64().unwrap_or_default();
+        ensure!(equal + owed == 5 && owed <= 1, "{found:#}");
     }
     none_is_left(&daemon, "adder_py")
 }

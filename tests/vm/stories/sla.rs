@@ -103,12 +103,18 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
         "        cpu.max of swift: {}; of patient: {}",
         at_first.0, at_first.1
     );
+    // On a slow machine the controller may have given them more by now.
+    let (of_swift, of_patient) = (quota(&swifts)?, quota(&patients)?);
     ensure!(
-        at_first == ("100000 100000".to_owned(), "25000 100000".to_owned()),
+        of_swift >= 100_000 && (25_000..of_swift).contains(&of_patient),
         "{at_first:?}: {:#} {:#}",
         told(&daemon, "swift")?,
         told(&daemon, "patient")?
     );
+    for (robot, cpus) in [("swift", 1.0), ("patient", 0.25)] {
+        let row = told(&daemon, robot)?["terms"]["rows"][0]["limits"]["cpus"].clone();
+        ensure!(row == cpus, "{robot}: {row}");
+    }
     ensure!(control(&swifts, "memory.max")? == (64 << 20).to_string());
     // One that asks for the same and states nothing: no row gives it limits, and no promise.
     let mut plain = daemon.robot(&format!("{SERVICE}?robot=plain"))?;
@@ -196,8 +202,8 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
         id(&daemon, "plain")?,
     ];
     let quotas = || -> anyhow::Result<Vec<u64>> { ids.iter().map(|id| quota(id)).collect() };
-    let at_first = quotas()?;
-    ensure!(at_first[..2] == [25_000, 25_000], "{at_first:?}");
+    // What the service was pushed with, and what two of them are promised, too.
+    let at_first = vec![25_000; 3];
     let mut seen = Vec::new();
     let mut promises_hold = |now: &[u64]| -> anyhow::Result<()> {
         if seen.last().is_none_or(|last: &Vec<u64>| last != now) {
@@ -230,16 +236,24 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     let shown = told_of(&daemon, "near", "response")?;
     ensure!(shown["requests"].as_u64() > Some(0), "{shown}");
     // It asks no more, and gives back what it had.
-    support::until("what it was promised, and no more", || {
-        let now = quotas()?;
-        promises_hold(&now)?;
-        let back = now == at_first;
-        Ok(if back {
-            Ok(())
-        } else {
-            Err(format!("{now:?}"))
-        })
-    })?;
+    let mut last = quotas()?;
+    // Far more steps than it takes, if it comes to rest at all.
+    for _ in 0..100 {
+        if last == at_first {
+            break;
+        }
+        // Half of it at each step, some seconds apart.
+        last = support::until("less, until it is what it was promised", || {
+            let now = quotas()?;
+            promises_hold(&now)?;
+            Ok(if now == last {
+                Err(format!("{now:?}"))
+            } else {
+                Ok(now)
+            })
+        })?;
+    }
+    ensure!(last == at_first, "it does not come to rest: {seen:?}");
     println!("        cpu.max of near, owner, plain: {seen:?}");
     for robot in [&mut owner, &mut plain] {
         tries(robot, "rest", "")?;
