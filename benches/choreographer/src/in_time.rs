@@ -10,7 +10,7 @@ use support::daemon::Daemon;
 
 use crate::worker::{self, WORK, calls, cores, robot};
 
-const ROBOTS: [usize; 3] = [2, 4, 8];
+const ROBOTS: [usize; 4] = [2, 4, 6, 8];
 const LASTS: Duration = Duration::from_secs(15);
 /// Until the controller has come to rest.
 const SETTLES: Duration = Duration::from_secs(15);
