@@ -145,7 +145,6 @@ pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed() -> Verdict 
         }
     }
     let failed = by.remove("failed").unwrap_or_default();
-    ensure!(failed < 8, "{failed} failed besides: it had no more");
     ensure!(!by.contains_key(&victim), "its node was busy: {by:?}");
     let after = group(&daemon, "what was counted", |_| true)?;
     ensure!(after["failed"] == failed + 1, "{after:#}");

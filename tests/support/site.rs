@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
@@ -138,6 +139,19 @@ impl Site {
             .block_on(async { tokio::time::timeout(PATIENCE, subscription.messages.recv()).await });
         next.context("a message should come")?
             .context("the topic ended")
+    }
+
+    /// The next message, if one comes in time.
+    pub fn next_within(
+        &self,
+        subscription: &mut Subscription,
+        time: Duration,
+    ) -> anyhow::Result<Option<Message>> {
+        let next = async { tokio::time::timeout(time, subscription.messages.recv()).await };
+        match self.runtime.block_on(next) {
+            Ok(next) => Ok(Some(next.context("the topic ended")?)),
+            Err(_) => Ok(None),
+        }
     }
 
     /// Waits until so many subscribers are connected.

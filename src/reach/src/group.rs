@@ -298,7 +298,8 @@ impl Group {
         }
     }
 
-    /// A servant that did not take a request is asked again soon: a node that is being started again registers its services.
+    /// A servant that did not take a request, or lost it, is asked again soon: a node that is being started again registers its
+    /// services.
     fn resume_later(self: &Arc<Self>, servant: &Servant, kind: &Kind) {
         let (group, member, kind) = (Arc::downgrade(self), servant.member, kind.clone());
         let mut graph = servant.bus.graph();
@@ -456,7 +457,7 @@ impl Errand {
             .wasted
             .fetch_add(wasted, Ordering::Relaxed);
         self.over |= answered;
-        if end == End::NotTaken {
+        if end != End::Answered {
             self.group.resume_later(servant, &self.kind);
         }
         answered

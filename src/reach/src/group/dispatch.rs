@@ -116,7 +116,7 @@ struct Servant {
     goals: BTreeMap<Lane, Goals>,
     /// It gets no more.
     retired: bool,
-    /// What it does not take at the moment.
+    /// What it does not take, or does not answer, at the moment.
     paused: BTreeSet<Lane>,
     /// Requests that it was ever asked.
     asked: u64,
@@ -199,7 +199,7 @@ impl Dispatcher {
         self.next()
     }
 
-    /// A servant that did not take a request is asked for such again.
+    /// A servant that did not take a request, or lost it, is asked for such again.
     pub fn resume(&mut self, member: Member, kind: &Kind) -> Vec<Order> {
         let lane = self.lanes.get(kind);
         if let (Some(servant), Some(lane)) = (self.servants.get_mut(&member), lane) {
@@ -270,16 +270,25 @@ impl Dispatcher {
                 orders.extend(others.into_iter().map(|other| Order::Drop(ticket, other)));
             }
             End::NotTaken => {
-                if let Some(servant) = self.servants.get_mut(&member) {
-                    servant.paused.insert(lane);
-                }
+                self.pause(member, lane);
                 self.release(ticket, member);
                 self.again(ticket, &mut orders);
             }
-            End::Lost => self.lost(ticket, member, &mut orders),
+            End::Lost => {
+                self.pause(member, lane);
+                self.lost(ticket, member, &mut orders);
+            }
         }
         orders.extend(self.next());
         (end == End::Answered, orders)
+    }
+
+    /// A servant that ends requests without carrying them out has the fewest under way: unless it pauses, it would get, and
+    /// lose, all that follow until its end is known.
+    fn pause(&mut self, member: Member, lane: Lane) {
+        if let Some(servant) = self.servants.get_mut(&member) {
+            servant.paused.insert(lane);
+        }
     }
 
     /// Nobody waits for the request's answer any more.
