@@ -4,6 +4,7 @@
 //! A request is answered by one of these types as JSON, by a stream of them as JSON lines ([`NDJSON`]), or by
 //! a [`problem::Problem`] with the HTTP status that it names.
 
+pub mod access;
 pub mod calibration;
 pub mod cpuset;
 pub mod dictionary;

@@ -7,6 +7,7 @@ mod publishing;
 mod serving;
 mod subscribing;
 mod under_way;
+mod withdrawn;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
@@ -21,10 +22,10 @@ use rosbridge::{
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::SessionOptions;
 use crate::outbox::{Control, Goodbye, Outbox};
 use crate::sample::Frame;
 use crate::shared::Shared;
+use crate::{Granted, SessionOptions};
 pub(crate) use inbox::Inbox;
 use under_way::UnderWay;
 
@@ -38,6 +39,8 @@ pub(crate) struct Client {
     pub(crate) outbox: Arc<Outbox>,
     /// Counts what waits for it.
     pub(crate) budget: Budget,
+    /// What it may do.
+    pub(crate) granted: Granted,
     hears_clients: bool,
     resumable: bool,
     level: AtomicU8,
@@ -69,6 +72,7 @@ impl Client {
             name: options.client.clone(),
             outbox,
             budget,
+            granted: options.granted.clone(),
             hears_clients: options.hears_clients,
             resumable: options.resume.is_some(),
             level: AtomicU8::new(options.level as u8),

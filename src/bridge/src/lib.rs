@@ -33,6 +33,7 @@ mod client;
 mod clock;
 mod cut;
 mod fanout;
+mod granted;
 mod kept;
 mod lacking;
 mod lease;
@@ -55,6 +56,7 @@ mod topics;
 mod waiting;
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
+pub use granted::Granted;
 pub use metrics::{Counter, Metrics};
 pub use options::{BridgeOptions, Called, SessionOptions};
 pub use waiting::Waiting;

@@ -10,6 +10,8 @@ use qos::Pair;
 use ros::codec::NonFinite;
 use rosbridge::{FragmentLimits, Level};
 
+use crate::Granted;
+
 /// Limits and habits of one servant's bridge. The defaults suit a robot on Wi-Fi.
 #[derive(Debug, Clone)]
 pub struct BridgeOptions {
@@ -151,6 +153,8 @@ pub struct SessionOptions {
     pub hears_clients: bool,
     /// Budget for unfinished messages of the client; one that does not fit closes its connection (1013).
     pub budget: Budget,
+    /// What it may do.
+    pub granted: Granted,
 }
 
 impl Default for SessionOptions {
@@ -162,6 +166,7 @@ impl Default for SessionOptions {
             level: Level::Error,
             hears_clients: true,
             budget: Budget::unlimited(),
+            granted: Granted::default(),
         }
     }
 }

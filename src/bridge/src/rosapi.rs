@@ -8,6 +8,7 @@ mod typedefs;
 
 use std::sync::Arc;
 
+use access::Grants;
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use serde::Deserialize;
@@ -77,6 +78,11 @@ impl Service {
             || self.name == "node_details"
     }
 
+    /// Whether anybody may call it: it tells of names and types alone, and of those names alone that its caller may use.
+    pub(crate) fn is_filtered(self) -> bool {
+        !self.name.contains("param")
+    }
+
     /// Its definition.
     pub(crate) fn definition(self) -> Result<Arc<ServiceDef>, String> {
         definitions::registry()
@@ -84,15 +90,25 @@ impl Service {
             .map_err(|error| error.to_string())
     }
 
-    /// The response, as JSON, to a request in JSON.
-    pub(crate) async fn answer(self, shared: &Arc<Shared>, args: &[u8]) -> Result<Vec<u8>, String> {
+    /// The response, as JSON, to a request in JSON: what a client with these grants is shown.
+    pub(crate) async fn answer(
+        self,
+        shared: &Arc<Shared>,
+        args: &[u8],
+        grants: &Grants,
+    ) -> Result<Vec<u8>, String> {
         let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
-        let values = self.values(shared, &args).await?;
+        let values = self.values(shared, &args, grants).await?;
         Ok(values.to_string().into_bytes())
     }
 
-    async fn values(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-        let now = graph::with_own_topics(&shared.bus.graph().borrow());
+    async fn values(
+        self,
+        shared: &Arc<Shared>,
+        args: &Args,
+        grants: &Grants,
+    ) -> Result<Value, String> {
+        let now = graph::shown(graph::with_own_topics(&shared.bus.graph().borrow()), grants);
         Ok(match self.name {
             "topics" => graph::topics(&now),
             "topics_for_type" => graph::topics_for_type(&now, &args.type_name),
@@ -106,7 +122,7 @@ impl Service {
             "services" => graph::services(&now),
             "service_node" => graph::service_node(&now, &args.service),
             "service_host" => graph::service_host(&now, &args.service),
-            "service_type" => graph::service_type(shared, &args.service).await,
+            "service_type" => graph::service_type(shared, &args.service, grants).await,
             "services_for_type" => graph::services_for_type(shared, &now, &args.type_name).await,
             "service_providers" => graph::service_providers(shared, &now, &args.service).await,
             "message_details" => typedefs::message(&shared.registry, &args.type_name)?,

@@ -296,9 +296,29 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
         Poll::Pending
     }
 
+    /// Serves the socket until it is to be left; takes back what is not granted any more whenever that changes.
+    async fn serve(&mut self) -> Stop {
+        let mut granted = self.client.granted.clone();
+        loop {
+            if let Some(reason) = granted.ended() {
+                return Stop::Close {
+                    code: 1008,
+                    reason,
+                    readable: true,
+                };
+            }
+            self.client.withdraw();
+            tokio::select! {
+                biased;
+                () = granted.changed() => {}
+                stop = poll_fn(|cx| self.step(cx)) => return stop,
+            }
+        }
+    }
+
     /// Serves the socket until it ends.
     pub(crate) async fn run(mut self) -> SessionEnd {
-        let stop = poll_fn(|cx| self.step(cx)).await;
+        let stop = self.serve().await;
         let patience = self.client.shared.options.close_timeout;
         // What is still in our own buffer has certainly not arrived.
         let arrived = self.socket.queued() == 0;

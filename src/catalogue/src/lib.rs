@@ -63,6 +63,11 @@ impl Catalogue {
         Ok(self.state.service_package(service)?)
     }
 
+    /// Records whose a service is that nobody owns yet.
+    pub fn own(&self, service: &str, owner: &str) -> Result<(), Error> {
+        Ok(self.state.own_service(service, owner)?)
+    }
+
     /// Whether a stub that was made of revision `made_of`, with this image, can use `now`; or why not and what to do.
     pub fn fits(
         &self,

@@ -21,7 +21,7 @@ use tokio::net::{TcpStream, UnixStream};
 const FALLBACK: &str = "127.0.0.1:9090";
 
 /// What to do about a 401.
-const TOKEN_WANTED: &str = "give a token of the daemon's configuration with --token TOKEN or CLOUDROID_TOKEN; root on the \
+const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root on the \
                             daemon's own machine needs none over its socket (--server unix:HOME/run/daemon.sock)";
 
 /// What is sent.

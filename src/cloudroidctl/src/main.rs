@@ -12,6 +12,7 @@ mod fit;
 mod limits;
 mod logs;
 mod output;
+mod policy;
 mod push;
 mod rm;
 mod rollback;
@@ -26,6 +27,7 @@ mod status;
 mod stop;
 mod stub;
 mod terminal;
+mod token;
 mod trial;
 
 use std::process::ExitCode;
@@ -84,6 +86,8 @@ enum Verb {
     Calibrate(Box<calibrate::Calibrate>),
     Explain(explain::Explain),
     Fit(fit::Fit),
+    Token(token::Tokens),
+    Policy(policy::Policy),
     Status(status::Status),
     Doctor(doctor::Doctor),
 }
@@ -134,6 +138,8 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Calibrate(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Fit(verb) => verb.run(&client, format).await,
+        Verb::Token(verb) => verb.run(&client, format).await,
+        Verb::Policy(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
     }

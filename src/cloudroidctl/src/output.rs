@@ -145,6 +145,12 @@ fn span(millis: u64) -> String {
     }
 }
 
+/// Whether a time is over.
+pub fn is_past(time: Millis) -> bool {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    now.is_ok_and(|now| now.as_millis() as Millis >= time)
+}
+
 /// Time of day, UTC.
 pub fn clock(time: Millis) -> String {
     let seconds = time / 1000 % 86_400;

@@ -8,7 +8,7 @@ use anyhow::Context;
 use async_trait::async_trait;
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
-use portal::{App, Machine, Tokens};
+use portal::{App, Machine, Principals, Tokens};
 use push::Pusher;
 use reach::{LocalOpener, Opener};
 use rootfs_builder::Builder;
@@ -33,11 +33,9 @@ pub fn build(
     machine: Machine,
     listen: SocketAddr,
 ) -> anyhow::Result<Arc<App>> {
-    let tokens = Tokens::new(&config.tokens)?;
     let state = Arc::new(State::open(&home.database())?);
     tokio::spawn(store::watch(Arc::clone(&state)));
-    // Names bound to a token that is not known any more would be nobody's for ever.
-    state.release_robots(tokens.hashes())?;
+    let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
     let resources = Resources {
@@ -79,7 +77,7 @@ pub fn build(
     let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
     Ok(Arc::new(App {
-        tokens,
+        principals,
         listen,
         home: home.path().to_owned(),
         state,

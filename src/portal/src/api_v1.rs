@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use access::{Action, Object};
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
 use axum::extract::{Path, Query, State};
@@ -69,17 +70,33 @@ pub struct Which {
 pub async fn events(
     State(app): State<Arc<App>>,
     Query(which): Query<Which>,
+    Extension(caller): Extension<Caller>,
 ) -> Answer<Vec<api::Event>> {
-    Ok(Json(
-        app.state
-            .events(which.since, which.limit.unwrap_or(EVENTS))?,
-    ))
+    let limit = which.limit.unwrap_or(EVENTS);
+    let mut events = app.state.events(which.since, limit)?;
+    let principal = &caller.who.principal;
+    if !principal.sees_all() {
+        // A robot is told of itself, and everybody of services that they see; the machine's own are for those who see it.
+        let own = principal.scope.robot.as_deref();
+        events.retain(|event| {
+            let service = event.service.as_deref();
+            service.is_some_and(|service| caller.sees(&app, service))
+                && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
+        });
+    }
+    Ok(Json(events))
 }
 
 /// All services.
-pub async fn services(State(app): State<Arc<App>>) -> Answer<Vec<api::ServiceSummary>> {
+pub async fn services(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+) -> Answer<Vec<api::ServiceSummary>> {
     let mut services = Vec::new();
     for name in app.state.service_names()? {
+        if !caller.sees(&app, &name) {
+            continue;
+        }
         if let Some(revision) = app.state.current(&name)? {
             services.push(views::summary(&app, &revision));
         }
@@ -284,8 +301,12 @@ pub async fn trial(
 }
 
 /// All servants.
-pub async fn servants(State(app): State<Arc<App>>) -> Json<Vec<api::Servant>> {
-    let handles = app.choreographer.servants();
+pub async fn servants(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+) -> Json<Vec<api::Servant>> {
+    let mut handles = app.choreographer.servants();
+    handles.retain(|handle| caller.sees_servant(&app, handle));
     let described = handles
         .iter()
         .map(|handle| app.choreographer.describe(handle));
@@ -293,8 +314,13 @@ pub async fn servants(State(app): State<Arc<App>>) -> Json<Vec<api::Servant>> {
 }
 
 /// Whose servants have failed again and again, and are not started again yet.
-pub async fn back_offs(State(app): State<Arc<App>>) -> Json<Vec<api::BackOff>> {
-    Json(app.choreographer.back_offs())
+pub async fn back_offs(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+) -> Json<Vec<api::BackOff>> {
+    let mut back_offs = app.choreographer.back_offs();
+    back_offs.retain(|of| caller.sees(&app, &of.service));
+    Json(back_offs)
 }
 
 /// One servant.
@@ -351,7 +377,12 @@ pub struct OfService {
 pub async fn stop_servants(
     State(app): State<Arc<App>>,
     Query(of): Query<OfService>,
+    Extension(caller): Extension<Caller>,
 ) -> Answer<Stopped> {
+    match &of.service {
+        Some(service) => caller.may_at(&app, Action::Operate, service, None)?,
+        None => caller.may(Action::Operate, &Object::MACHINE)?,
+    }
     if let Some(service) = &of.service {
         app.catalogue.current(service)?;
     }
@@ -380,6 +411,7 @@ pub async fn logs(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Query(part): Query<Part>,
+    Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let handle = app.choreographer.servant(&id)?;
     let Some(container) = handle.container() else {
@@ -389,7 +421,14 @@ pub async fn logs(
     if part.follow {
         let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
         // A follower must not keep the daemon from ending.
-        let ending = app.ending.clone().cancelled_owned();
+        let ending = async move {
+            let service = handle.service().to_owned();
+            tokio::select! {
+                () = app.ending.cancelled() => {}
+                // Who shows a token that is revoked reads no further.
+                _ = app.principals.ended(&caller.who, &service, false) => {}
+            }
+        };
         return Ok(lines(printed.map(views::log_line).take_until(ending)));
     }
     let past = container.logs(count, None).await;

@@ -11,7 +11,7 @@ use store::State;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use crate::tokens::Tokens;
+use crate::principals::Principals;
 
 /// What the operator decides of the portal.
 #[derive(Debug, Clone)]
@@ -45,8 +45,8 @@ pub struct Machine {
 pub struct App {
     /// What the operator decides.
     pub options: Options,
-    /// Its tokens.
-    pub tokens: Tokens,
+    /// Who may do what.
+    pub principals: Principals,
     /// Where the portal listens, as bound.
     pub listen: std::net::SocketAddr,
     /// The state directory.

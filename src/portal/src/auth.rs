@@ -9,17 +9,18 @@ use bytes::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use ws::frame::{Header, TEXT, unmask};
 
-use crate::tokens::{AuthMessage, TokenHash, Tokens};
+use crate::tokens::AuthMessage;
 
 /// An auth message is a few short fields.
 const LONGEST: usize = 16 << 10;
 
-/// Reads the first message: the token that it proves, and what was read beyond it.
-pub async fn first_message<S: AsyncRead + Unpin>(
+/// Reads the first message: whom `recognise` says that it proves, given also the time (seconds since 1970), and what was read
+/// beyond it.
+pub async fn first_message<S: AsyncRead + Unpin, T>(
     io: &mut S,
     read_ahead: Bytes,
-    tokens: &Tokens,
-) -> Result<(TokenHash, Bytes), String> {
+    recognise: impl Fn(&AuthMessage, f64) -> Result<T, String>,
+) -> Result<(T, Bytes), String> {
     let mut buffer = BytesMut::from(read_ahead);
     let payload = loop {
         match take_frame(&mut buffer)? {
@@ -38,11 +39,11 @@ pub async fn first_message<S: AsyncRead + Unpin>(
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0.0, |since| since.as_secs_f64());
-    let token = recognise(&payload, tokens, now)?;
-    Ok((token, buffer.freeze()))
+    let who = recognise(&read(&payload)?, now)?;
+    Ok((who, buffer.freeze()))
 }
 
-fn recognise(payload: &[u8], tokens: &Tokens, now: f64) -> Result<TokenHash, String> {
+fn read(payload: &[u8]) -> Result<AuthMessage, String> {
     #[derive(serde::Deserialize)]
     struct Operation {
         op: String,
@@ -56,11 +57,8 @@ fn recognise(payload: &[u8], tokens: &Tokens, now: f64) -> Result<TokenHash, Str
             operation.op
         ));
     }
-    let message: AuthMessage = serde_json::from_slice(payload)
-        .map_err(|error| format!("the auth message cannot be read: {error}"))?;
-    tokens
-        .recognise_auth(&message, now)
-        .map_err(|refusal| refusal.to_string())
+    serde_json::from_slice(payload)
+        .map_err(|error| format!("the auth message cannot be read: {error}"))
 }
 
 /// The payload of one whole text frame, taken out of `buffer`; none while it is not complete.
@@ -88,6 +86,7 @@ fn take_frame(buffer: &mut BytesMut) -> Result<Option<BytesMut>, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tokens::{TokenHash, Tokens};
 
     fn frame(text: &str) -> Vec<u8> {
         let mask = [1, 2, 3, 4];
@@ -111,7 +110,11 @@ mod tests {
         let tokens = Tokens::new(&["open sesame".to_owned()]).expect("a token");
         let (ahead, rest) = sent.split_at(sent.len().min(3));
         let mut rest = rest;
-        first_message(&mut rest, Bytes::copy_from_slice(ahead), &tokens).await
+        let recognise = |message: &AuthMessage, now| {
+            let known = tokens.recognise_auth(message, now);
+            known.map_err(|refusal| refusal.to_string())
+        };
+        first_message(&mut rest, Bytes::copy_from_slice(ahead), recognise).await
     }
 
     #[tokio::test]

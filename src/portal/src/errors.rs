@@ -54,6 +54,31 @@ pub enum Error {
         /// What to do.
         next: String,
     },
+    /// The policy does not allow it.
+    #[error("{what}")]
+    Forbidden {
+        /// Who may not do what.
+        what: String,
+    },
+    /// No token of that name, or it was revoked.
+    #[error("there is no token {name:?} that could be used")]
+    UnknownToken {
+        /// Asked for.
+        name: String,
+        /// Those that there are.
+        exists: Vec<String>,
+    },
+    /// The name is another token's.
+    #[error("there is a token {0:?} already")]
+    TokenExists(String),
+    /// No such rule of the policy.
+    #[error("the policy has no rule {id:?}")]
+    UnknownRule {
+        /// Asked for.
+        id: String,
+        /// Those that there are.
+        exists: Vec<String>,
+    },
     /// Another token owns the robot's name.
     #[error("the robot name {0:?} belongs to another token")]
     RobotTaken(String),
@@ -112,6 +137,14 @@ impl Error {
     }
 }
 
+impl From<access::Refusal> for Error {
+    fn from(refusal: access::Refusal) -> Error {
+        Error::Forbidden {
+            what: refusal.to_string(),
+        }
+    }
+}
+
 impl Error {
     /// Whether a robot is refused for as long as it asks for the same, on a machine of this configuration: for what it states, or since
     /// its servant fits on no machine that is empty.
@@ -157,7 +190,11 @@ impl Error {
             next: self.next(),
             ..Problem::default()
         };
-        if let Error::UnknownRobot { exists, .. } | Error::UnknownRow { exists, .. } = self {
+        if let Error::UnknownRobot { exists, .. }
+        | Error::UnknownRow { exists, .. }
+        | Error::UnknownToken { exists, .. }
+        | Error::UnknownRule { exists, .. } = self
+        {
             problem.exists = exists.clone();
         }
         if let Some(
@@ -239,6 +276,10 @@ impl Error {
             ),
             Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
+            Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
+            Error::UnknownToken { .. } => (S::NOT_FOUND, "unknown-token", "unknown token"),
+            Error::TokenExists(_) => (S::CONFLICT, "token-exists", "name taken"),
+            Error::UnknownRule { .. } => (S::NOT_FOUND, "unknown-rule", "unknown rule"),
             Error::RobotTaken(_) => (S::FORBIDDEN, "robot-taken", "robot name taken"),
             Error::Push(error) => kind_of_push(error),
             Error::Choreographer(error) => kind_of_choreographer(error),
@@ -256,9 +297,17 @@ impl Error {
             Error::UnknownRow { service, .. } => {
                 format!("see those that exist with: cloudroidctl sla list {service}")
             }
+            Error::Forbidden { .. } => {
+                "show a token that may (an admin makes one with: cloudroidctl token create), or ask at the daemon's socket, as root".into()
+            }
+            Error::UnknownToken { .. } => "see those that exist with: cloudroidctl token list".into(),
+            Error::TokenExists(name) => format!(
+                "choose another name, give it another secret with: cloudroidctl token rotate {name}, or end it with: cloudroidctl token revoke {name}"
+            ),
+            Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unauthorised(_) => {
-                "send a token of the configuration: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
+                "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
@@ -283,6 +332,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
     use StatusCode as S;
     use push::Error as P;
     match error {
+        P::NotAllowed(_) => (S::FORBIDDEN, "forbidden", "not allowed"),
         P::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
         P::Options(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
@@ -298,6 +348,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
 fn next_of_push(error: &push::Error) -> Option<String> {
     use push::Error as P;
     let text = match error {
+        P::NotAllowed(_) => "choose another name with --name, or ask its owner".into(),
         P::NameTaken { name, .. } => {
             format!(
                 "choose another name with --name, or remove the service with: cloudroidctl rm {name}"

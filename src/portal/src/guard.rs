@@ -1,11 +1,12 @@
-//! Access control: decides for each request, before its handler, whether the caller may make it. An address that the table
-//! of routes does not open is refused.
+//! Who asks: decided for each request, before its handler. What they may do is decided where the request is routed
+//! ([`crate::allowed`]).
 //!
-//! Where tokens are configured, each TCP request needs one, also from this machine, because requests of a web server in front
+//! Where there are tokens, each TCP request needs one, also from this machine, because requests of a web server in front
 //! of the portal come from this machine, too. Without a token only the page (which asks for one), its assets, `/healthz`
 //! and a robot's WebSocket handshake (whose first message must be rosbridge's `auth`) are answered.
 //!
-//! Where no tokens are configured the portal listens on loopback only, and requests need none. Web pages of other sites must
+//! Where there never was a token the portal listens on loopback only, and requests need none: this machine's users see
+//! everything and are any robot; root and the daemon's own user, at its socket, are admins. Web pages of other sites must
 //! not use the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS
 //! rebinding), with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
@@ -15,6 +16,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use access::Principal;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, Uri, header};
 use axum::middleware::Next;
@@ -24,8 +26,9 @@ use parking_lot::Mutex;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::principals::{self, Identity, Shown, Stored};
 use crate::routes::{self, Access};
-use crate::tokens::{self, TokenHash, Tokens};
+use crate::tokens::{self, Tokens};
 
 /// Shortest time between two log lines about the same refusal.
 const AGAIN: Duration = Duration::from_secs(60);
@@ -67,34 +70,56 @@ impl Peer {
 pub struct Caller {
     /// From where.
     pub peer: Peer,
-    /// The hash of its token. Where no tokens are configured, any token is taken; it then only owns robots' names.
-    pub token: Option<TokenHash>,
-    /// Has access. A caller without gets the page, `/healthz`, and a WebSocket on which it must first send `auth`.
-    pub trusted: bool,
+    /// Who. Nobody gets the page, `/healthz`, and a WebSocket on which it must first send `auth`.
+    pub who: Identity,
 }
 
-/// What of the configuration decides.
+impl Caller {
+    /// Whether it has said who it is, where that is asked for.
+    pub fn is_known(&self) -> bool {
+        !self.who.principal.roles.is_empty()
+    }
+
+    fn new(peer: Peer, principal: Principal, shown: Shown) -> Caller {
+        let who = Identity {
+            principal: Arc::new(principal),
+            shown,
+            token: None,
+            owner: None,
+        };
+        Caller { peer, who }
+    }
+}
+
+/// What decides who asks.
 pub struct Rules<'a> {
     /// The portal is bound to loopback.
     pub loopback: bool,
-    /// The configured tokens.
+    /// Tokens of the configuration.
     pub tokens: &'a Tokens,
+    /// Tokens of the database.
+    pub stored: &'a Stored,
     /// Origins allowed besides loopback's.
     pub origins: &'a [String],
 }
 
 /// Lets a request through with its [`Caller`], or refuses it.
 pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next) -> Response {
-    let rules = Rules {
-        loopback: app.listen.ip().is_loopback(),
-        tokens: &app.tokens,
-        origins: &app.options.origins,
-    };
     let Some(peer) = request.extensions().get::<Peer>().copied() else {
         return Error::Internal("telling who asks").into_response();
     };
-    match rules.admit(peer, request.method(), request.uri(), request.headers()) {
+    let admitted = app.principals.with(|tokens, stored| {
+        let rules = Rules {
+            loopback: app.listen.ip().is_loopback(),
+            tokens,
+            stored,
+            origins: &app.options.origins,
+        };
+        rules.admit(peer, request.method(), request.uri(), request.headers())
+    });
+    match admitted {
         Ok(caller) => {
+            app.principals.note_use(&caller.who, store::now());
             request.extensions_mut().insert(caller);
             next.run(request).await
         }
@@ -130,32 +155,27 @@ impl Rules<'_> {
             return admit_user(peer, uid);
         }
         let given = token_in(uri, headers);
-        if self.loopback && self.tokens.is_empty() {
+        if self.loopback && self.tokens.is_empty() && self.stored.is_empty() {
             check_direct(headers)?;
             self.check_host(headers)?;
             self.check_origin(headers)?;
-            return Ok(Caller {
-                peer,
-                token: given.as_deref().map(tokens::hash),
-                trusted: true,
-            });
+            let mut caller = Caller::new(peer, Principal::local(), Shown::Nothing);
+            // Any token is taken; it only owns robots' names.
+            let token = given.as_deref().map(tokens::hash);
+            caller.who.owner.clone_from(&token);
+            caller.who.token = token;
+            return Ok(caller);
         }
-        let known = given
-            .as_deref()
-            .and_then(|token| self.tokens.recognise(token));
-        match (given, known) {
-            (_, Some(token)) => Ok(Caller {
-                peer,
-                token: Some(token),
-                trusted: true,
-            }),
-            (Some(_), None) => Err(Error::Unauthorised("this token is not known")),
-            (None, None) if is_open(method, uri, headers) => Ok(Caller {
-                peer,
-                token: None,
-                trusted: false,
-            }),
-            (None, None) => Err(Error::Unauthorised("a token is needed")),
+        match given {
+            Some(token) => {
+                let who = principals::recognise(self.tokens, self.stored, &token, store::now());
+                let who = who.map_err(Error::Unauthorised)?;
+                Ok(Caller { peer, who })
+            }
+            None if is_open(method, uri, headers) => {
+                Ok(Caller::new(peer, Principal::nobody(), Shown::Nothing))
+            }
+            None => Err(Error::Unauthorised("a token is needed")),
         }
     }
 
@@ -198,11 +218,11 @@ impl Rules<'_> {
 
 fn admit_user(peer: Peer, uid: u32) -> Result<Caller, Error> {
     if uid == 0 || uid == nix::unistd::geteuid().as_raw() {
-        return Ok(Caller {
-            peer,
-            token: None,
-            trusted: true,
-        });
+        let name = match uid {
+            0 => "root".to_owned(),
+            uid => format!("user {uid}"),
+        };
+        return Ok(Caller::new(peer, Principal::admin(&name), Shown::User));
     }
     Err(Error::Foreign {
         what: format!("user {uid} may not use the daemon's socket"),
@@ -357,13 +377,14 @@ mod tests {
         let rules = Rules {
             loopback: true,
             tokens: &none,
+            stored: &Stored::default(),
             origins: &[],
         };
         assert!(
             ask(&rules)
                 .at("/api/v1/services")
                 .expect("let through")
-                .trusted
+                .is_known()
         );
         for host in ["localhost", "localhost:9090", "[::1]:9090", "127.0.0.1"] {
             ask(&rules).with("host", host).at("/").expect(host);
@@ -384,6 +405,7 @@ mod tests {
         let rules = Rules {
             loopback: true,
             tokens: &none,
+            stored: &Stored::default(),
             origins: &origins,
         };
         assert_eq!(
@@ -416,6 +438,7 @@ mod tests {
         let closed = Rules {
             loopback: true,
             tokens: &none,
+            stored: &Stored::default(),
             origins: &[],
         };
         let refused = ask(&closed)
@@ -441,6 +464,7 @@ mod tests {
         let mut rules = Rules {
             loopback: true,
             tokens: &none,
+            stored: &Stored::default(),
             origins: &[],
         };
         for (name, value) in [
@@ -466,10 +490,11 @@ mod tests {
         let open = Rules {
             loopback: true,
             tokens: &none,
+            stored: &Stored::default(),
             origins: &[],
         };
         let caller = ask(&open).at("/x?robot=r&token=mine").expect("let through");
-        assert_eq!(caller.token, Some(tokens::hash("mine")));
+        assert_eq!(caller.who.token, Some(tokens::hash("mine")));
     }
 
     #[test]
@@ -479,6 +504,7 @@ mod tests {
             let rules = Rules {
                 loopback,
                 tokens: &some,
+                stored: &Stored::default(),
                 origins: &[],
             };
             let far = || ask(&rules).with("host", "localhost");
@@ -501,8 +527,8 @@ mod tests {
                     .at("/api/v1/services?token=open+sesame"),
             ] {
                 let known = known.expect("a known token");
-                assert_eq!(known.token, Some(tokens::hash("open sesame")));
-                assert!(known.trusted);
+                assert_eq!(known.who.token, Some(tokens::hash("open sesame")));
+                assert!(known.who.principal.is(access::Role::Admin));
             }
         }
     }
@@ -513,18 +539,19 @@ mod tests {
         let rules = Rules {
             loopback: true,
             tokens: &some,
+            stored: &Stored::default(),
             origins: &[],
         };
         let handshake = |method: Method| ask(&rules).by(method).with("upgrade", "WebSocket");
         for path in ["/", "/healthz", "/assets/portal.js"] {
             let caller = ask(&rules).at(path).expect(path);
-            assert!(!caller.trusted, "{path}");
+            assert!(!caller.is_known(), "{path}");
             ask(&rules).by(Method::HEAD).at(path).expect(path);
             assert_eq!(ask(&rules).by(Method::POST).at(path), Err(401), "{path}");
         }
         for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
             let caller = handshake(Method::GET).at(path).expect("may send auth");
-            assert!(!caller.trusted, "{path}");
+            assert!(!caller.is_known(), "{path}");
             for method in [Method::HEAD, Method::POST, Method::DELETE, Method::PATCH] {
                 let refused = handshake(method.clone()).at(path);
                 assert_eq!(refused, Err(401), "{method} {path}");
@@ -553,7 +580,8 @@ mod tests {
 
     #[test]
     fn only_root_and_the_daemons_user_use_the_socket() {
-        assert!(admit_user(Peer::Unix(0), 0).expect("root").trusted);
+        let root = admit_user(Peer::Unix(0), 0).expect("root");
+        assert!(root.who.principal.is(access::Role::Admin));
         let other = nix::unistd::geteuid().as_raw().wrapping_add(1);
         assert_eq!(
             admit_user(Peer::Unix(other), other)

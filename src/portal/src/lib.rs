@@ -1,16 +1,17 @@
 //! Everything on the port, and on the daemon's Unix socket: one router.
 //!
 //! ```text
-//!  TCP, Unix ─▶ hyper ─▶ guard (who asks, and may they) ─┬─▶ /            the page, or the default service
-//!                                                        ├─▶ /healthz /metrics /assets
-//!                                                        ├─▶ /api/v1      what cloudroidctl does
-//!                                                        ├─▶ /v2          images, read-only (OCI distribution)
-//!                                                        ├─▶ /stubs       what robots install in a package's place
-//!                                                        └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
+//!  TCP, Unix ─▶ hyper ─▶ guard ─▶ allowed ─┬─▶ /            the page, or the default service
+//!                      who asks    may they  ├─▶ /healthz /metrics /assets
+//!                                            ├─▶ /api/v1      what cloudroidctl does
+//!                                            ├─▶ /v2          images, read-only (OCI distribution)
+//!                                            ├─▶ /stubs       what robots install in a package's place
+//!                                            └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
 
 #![forbid(unsafe_code)]
 
+mod allowed;
 mod api_v1;
 mod app;
 mod auth;
@@ -25,6 +26,8 @@ mod metrics;
 mod oci;
 mod openapi;
 mod page;
+mod policy;
+mod principals;
 mod push;
 mod robots;
 mod routes;
@@ -49,6 +52,7 @@ use tokio::net::{TcpListener, TcpStream, UnixListener};
 use tokio_util::task::TaskTracker;
 
 pub use app::{App, Machine, Options};
+pub use principals::Principals;
 pub use tokens::{TokenError, Tokens};
 
 use guard::Peer;
@@ -61,7 +65,9 @@ const UNSENT: u32 = 128 * 1024;
 /// The routes, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
     let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
-        router.route(route.path, (route.handler)())
+        let allowed =
+            axum::middleware::from_fn_with_state((Arc::clone(&app), route), allowed::allowed);
+        router.route(route.path, (route.handler)().layer(allowed))
     });
     served
         .fallback(routes::nothing)

@@ -2,16 +2,17 @@
 
 use std::sync::Arc;
 
-use axum::Json;
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use serde_json::json;
 use tokio_util::io::ReaderStream;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::guard::Caller;
 
 const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
@@ -23,8 +24,13 @@ pub async fn version() -> Response {
 }
 
 /// `/v2/_catalog`.
-pub async fn catalog(State(app): State<Arc<App>>) -> Result<Response, Error> {
-    Ok(Json(json!({ "repositories": app.state.service_names()? })).into_response())
+pub async fn catalog(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+) -> Result<Response, Error> {
+    let mut names = app.state.service_names()?;
+    names.retain(|name| caller.sees(&app, name));
+    Ok(Json(json!({ "repositories": names })).into_response())
 }
 
 /// `/v2/NAME/tags/list`.
@@ -90,7 +96,8 @@ pub async fn manifest(
 /// `/v2/NAME/blobs/DIGEST`.
 pub async fn blob(
     State(app): State<Arc<App>>,
-    Path((_name, digest)): Path<(String, String)>,
+    Path((name, digest)): Path<(String, String)>,
+    Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let Ok(parsed) = digest.parse::<image::Digest>() else {
         return Ok(refused(
@@ -99,10 +106,25 @@ pub async fn blob(
             &format!("{digest} is not a digest"),
         ));
     };
+    // Blobs lie in one place; who is not told of every service gets those alone that are of this one.
+    let images: Option<Vec<String>> = match caller.who.principal.sees_all() {
+        true => None,
+        false => {
+            let revisions = app.state.revisions(&name)?.into_iter();
+            Some(revisions.map(|revision| revision.image).collect())
+        }
+    };
     let store = Arc::clone(app.catalogue.images());
-    let found = tokio::task::spawn_blocking(move || store.blob(&parsed))
-        .await
-        .map_err(|_| Error::Internal("reading a blob"))??;
+    let found = tokio::task::spawn_blocking(move || {
+        if let Some(images) = images
+            && !is_of(&store, &images, &parsed)?
+        {
+            return Ok(None);
+        }
+        store.blob(&parsed)
+    })
+    .await
+    .map_err(|_| Error::Internal("reading a blob"))??;
     let Some(blob) = found else {
         return Ok(unknown(
             "BLOB_UNKNOWN",
@@ -116,6 +138,28 @@ pub async fn blob(
         (CONTENT_DIGEST, digest),
     ];
     Ok((headers, Body::from_stream(stream)).into_response())
+}
+
+/// Whether a blob is one of these images: its manifest, or named there.
+fn is_of(
+    store: &image::Store,
+    images: &[String],
+    blob: &image::Digest,
+) -> Result<bool, image::Error> {
+    let digest = blob.to_string();
+    for image in images {
+        let manifest = store.manifest(image)?;
+        let names = |bytes: &[u8]| holds(bytes, digest.as_bytes());
+        if *image == digest || manifest.is_some_and(|manifest| names(&manifest.bytes)) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
+/// Whether a text is part of another.
+fn holds(text: &[u8], part: &[u8]) -> bool {
+    text.windows(part.len()).any(|window| window == part)
 }
 
 /// Anything else: pushing by this interface, for one, is not offered.

@@ -4,17 +4,19 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use access::{Action, Standing};
 use api::{PushEvent, PushOptions};
+use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, State};
 use axum::response::{IntoResponse, Response};
 use futures_util::{StreamExt, TryStreamExt};
-use push::Published;
+use push::{Deployer, Published};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
 use super::api_v1::lines;
-use super::guard::query;
+use super::guard::{Caller, query};
 use crate::app::App;
 use crate::errors::Error;
 use crate::views;
@@ -26,15 +28,17 @@ const FAREWELL: Duration = Duration::from_secs(5);
 pub async fn push(
     State(app): State<Arc<App>>,
     OriginalUri(uri): OriginalUri,
+    Extension(caller): Extension<Caller>,
     body: Body,
 ) -> Response {
     let archive = body.into_data_stream().map_err(io::Error::other).boxed();
     let pusher = Arc::clone(&app.pusher);
-    let options = match read_options(uri.query()).and_then(|options| {
-        pusher.check(&options)?;
-        Ok(options)
+    let (options, by) = match read_options(uri.query()).and_then(|options| {
+        let by = deployer(&app, caller);
+        pusher.check(&options, &by)?;
+        Ok((options, by))
     }) {
-        Ok(options) => options,
+        Ok(read) => read,
         Err(error) => {
             pusher.discard(archive);
             return error.into_response();
@@ -43,7 +47,7 @@ pub async fn push(
     let (sender, receiver) = mpsc::channel(push::EVENTS_AHEAD);
     let last = sender.clone();
     // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
-    let guard = pusher.begin(options, archive, sender, |outcome| async move {
+    let guard = pusher.begin(options, by, archive, sender, |outcome| async move {
         let event = match outcome
             .map_err(Error::from)
             .and_then(|done| told(&app, done))
@@ -60,6 +64,24 @@ pub async fn push(
         let _ = &guard;
         event
     }))
+}
+
+/// What the policy lets whoever pushes publish. Decided when its name is known, which without `--name` is after the build.
+fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
+    let principal = &caller.who.principal;
+    let owner = (!principal.is_unscoped()).then(|| principal.name.clone());
+    let app = Arc::clone(app);
+    let may = move |name: &str| {
+        if let Standing::Ended(reason) = app.principals.standing(&caller.who, name) {
+            return Err(reason);
+        }
+        let may = caller.may_at(&app, Action::Deploy, name, None);
+        may.map_err(|error| error.to_string())
+    };
+    Deployer {
+        owner,
+        may: Box::new(may),
+    }
 }
 
 fn told(app: &App, published: Published) -> Result<PushEvent, Error> {

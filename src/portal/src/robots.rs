@@ -5,13 +5,14 @@
 use std::pin::pin;
 use std::sync::Arc;
 
+use access::{Action, Standing};
 use api::Stated;
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
-use bridge::{SessionEnd, SessionOptions, Waiting};
+use bridge::{Granted, SessionEnd, SessionOptions, Waiting};
 use bytes::BytesMut;
 use catalogue::names;
 use hyper::upgrade::{OnUpgrade, Upgraded};
@@ -19,12 +20,12 @@ use hyper_util::rt::TokioIo;
 use reach::{Reach, Stream};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
 use super::guard::{self, Caller, Peer};
-use super::{App, auth, handshake, page};
+use super::{App, allowed, auth, handshake, page};
 use crate::errors::Error;
-use crate::tokens;
+use crate::tokens::{self, AuthMessage};
 use choreographer::{Lease, ServantRequest};
 
 /// Close code for "try again later" (RFC 6455 and its registry).
@@ -52,10 +53,13 @@ pub async fn root(
             .await
             .unwrap_or_else(IntoResponse::into_response),
         // What there is, is told to those who may ask.
-        None if !caller.trusted => Error::Unauthorised("a token is needed").into_response(),
+        None if !caller.is_known() => Error::Unauthorised("a token is needed").into_response(),
         None => {
-            let refusal = app.catalogue.unknown("");
-            Error::from(refusal.unwrap_or_else(|error| error)).into_response()
+            let refusal = allowed::known_to(&app, &caller, "")
+                .and_then(|()| Err(app.catalogue.unknown("")?.into()));
+            refusal.map_or_else(IntoResponse::into_response, |()| {
+                StatusCode::NOT_FOUND.into_response()
+            })
         }
     }
 }
@@ -84,18 +88,20 @@ pub async fn service(
     let answer = if guard::is_upgrade(request.headers()) {
         connect(app, service, caller, request).await
     } else {
-        explain(&app, &service, request.method())
+        explain(&app, &service, &caller, request.method())
     };
     answer.unwrap_or_else(IntoResponse::into_response)
 }
 
 /// What someone is told who opens a service's address in a browser.
-fn explain(app: &App, service: &str, method: &Method) -> Result<Response, Error> {
+fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result<Response, Error> {
     if !matches!(*method, Method::GET | Method::HEAD) {
         return Err(Error::BadRequest(format!(
             "{method} is not answered here; services are reached by WebSocket"
         )));
     }
+    caller.may_at(app, Action::See, service, None)?;
+    allowed::known_to(app, caller, service)?;
     let revision = app.catalogue.current(service)?;
     let answer = serde_json::json!({
         "service": service,
@@ -140,11 +146,6 @@ impl Asked {
         if let Some(robot) = &robot {
             names::robot(robot).map_err(catalogue::Error::from)?;
         }
-        if link && robot.is_none() {
-            return Err(Error::BadRequest(
-                "a link needs the robot's id: ?robot=ID".to_owned(),
-            ));
-        }
         let node = guard::query(uri.query(), "node").unwrap_or_default();
         check_node(&node).map_err(Error::BadRequest)?;
         let stated = Stated::read(guard::pairs(uri.query()));
@@ -173,10 +174,25 @@ fn check_node(node: &str) -> Result<(), String> {
 }
 
 impl Asked {
+    /// Takes for granted what the caller's token says: who has one of a robot is that robot.
+    fn by(&mut self, caller: &Caller) -> Result<(), Error> {
+        if let Some(own) = &caller.who.principal.scope.robot
+            && (self.robot.is_none() || self.shared)
+        {
+            (self.robot, self.shared) = (Some(own.clone()), false);
+        }
+        match self.link && self.robot.is_none() {
+            true => Err(Error::BadRequest(
+                "a link needs the robot's id: ?robot=ID".to_owned(),
+            )),
+            false => Ok(()),
+        }
+    }
+
     /// The resume token, bound to the caller's bearer token.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
-        Some(tokens::bound_to(caller.token.as_ref(), token))
+        Some(tokens::bound_to(caller.who.token.as_ref(), token))
     }
 }
 
@@ -188,18 +204,22 @@ async fn connect(
 ) -> Result<Response, Error> {
     let accept = handshake::accept(&request)?;
     let link = asks_for_link(request.headers())?;
-    let asked = Asked::read(&app, service, link, request.uri())?;
+    let mut asked = Asked::read(&app, service, link, request.uri())?;
     // A stub shows its token at once; without it nothing is told, not even what there is.
-    if asked.link && !caller.trusted {
+    if asked.link && !caller.is_known() {
         return Err(Error::Unauthorised("a link needs a token"));
     }
+    if caller.is_known() {
+        asked.by(&caller)?;
+        check(&app, &asked, &caller)?;
+    }
     // Who has yet to show a token is not told what there is, nor whether this is: the auth message comes first.
-    if caller.trusted && app.state.service_package(&asked.service)?.is_none() {
+    if caller.is_known() && app.state.service_package(&asked.service)?.is_none() {
         return Err(app.catalogue.unknown(&asked.service)?.into());
     }
     // Who has not shown a token must be let in to show one. Where there is no room, a stub is told by the HTTP status; a robot
     // that speaks rosbridge alone is let in, and told by status messages where it stands, and why it is refused.
-    let lease = if caller.trusted {
+    let lease = if caller.is_known() {
         let lease = lease(&app, &asked, &caller)?;
         if asked.link {
             lease.admitted().await?;
@@ -280,12 +300,35 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     Ok(app.choreographer.ensure(request.stating(stated))?)
 }
 
+/// Whether the caller may be that robot at that service, on those terms.
+fn check(app: &App, asked: &Asked, caller: &Caller) -> Result<(), Error> {
+    caller.may_at(app, Action::Connect, &asked.service, asked.robot.as_deref())?;
+    if let Some(class) = &asked.stated.class {
+        caller.may_use_class(class)?;
+    }
+    // A stub is given everything that its node uses.
+    if asked.link
+        && let Standing::Granted(grants) = app.principals.standing(&caller.who, &asked.service)
+        && !grants.is_everything()
+    {
+        return Err(Error::Forbidden {
+            what: format!(
+                "a stub needs all of {}, and {} is granted {grants}",
+                asked.service, caller.who.principal.name
+            ),
+        });
+    }
+    allowed::known_to(app, caller, &asked.service)
+}
+
 /// Nobody takes over another's robot.
 fn check_owner(app: &App, robot: &str, caller: &Caller) -> Result<(), Error> {
     // Where tokens are configured, a name used before there were any goes to the first who has one.
-    let claim = !app.tokens.is_empty();
-    let owner = app.state.robot_owner(robot, caller.token.as_ref(), claim)?;
-    if owner.is_some() && owner != caller.token {
+    let claim = !app.principals.names_nobody();
+    let owner = app
+        .state
+        .robot_owner(robot, caller.who.owner.as_ref(), claim)?;
+    if owner.is_some() && owner != caller.who.owner {
         return Err(Error::RobotTaken(robot.to_owned()));
     }
     Ok(())
@@ -320,22 +363,22 @@ async fn upgraded_to(
 
 async fn session(
     app: Arc<App>,
-    asked: Asked,
+    mut asked: Asked,
     mut caller: Caller,
     lease: Option<Lease>,
     mut io: Stream,
     mut read_ahead: bytes::Bytes,
 ) {
     if asked.link {
-        return linked(&app, &asked, lease, io, read_ahead).await;
+        return linked(&app, &asked, &caller, lease, io, read_ahead).await;
     }
     if lease.is_none() {
-        let awaited = auth::first_message(&mut io, read_ahead, &app.tokens);
+        let recognise = |message: &AuthMessage, now| app.principals.recognise_auth(message, now);
+        let awaited = auth::first_message(&mut io, read_ahead, recognise);
         match tokio::time::timeout(app.options.handshake, awaited).await {
-            Ok(Ok((token, rest))) => {
+            Ok(Ok((who, rest))) => {
                 read_ahead = rest;
-                caller.token = Some(token);
-                caller.trusted = true;
+                caller.who = who;
             }
             Ok(Err(reason)) => return bridge::refuse(io, POLICY, &reason).await,
             Err(_) => {
@@ -343,13 +386,24 @@ async fn session(
             }
         }
     }
+    let allowed = asked
+        .by(&caller)
+        .and_then(|()| check(&app, &asked, &caller));
+    if let Err(error) = allowed {
+        return bridge::refuse(io, POLICY, &error.in_a_line()).await;
+    }
     let memory = app.choreographer.memory();
     let budget = memory.client(&caller.peer.client(asked.robot.as_deref()));
     let mut waiting =
         Waiting::new(io, &read_ahead, app.choreographer.bridge_options()).within(&budget);
     let (news, told) = mpsc::channel(NEWS);
     let taking = servant(&app, &asked, &caller, lease, &news);
-    let (lease, reach) = match waiting.until_told(taking, told).await {
+    let ended = app.principals.ended(&caller.who, &asked.service, false);
+    let taken = tokio::select! {
+        taken = waiting.until_told(taking, told) => taken,
+        reason = ended => return waiting.refuse(POLICY, &reason).await,
+    };
+    let (lease, reach) = match taken {
         Ok(Ok(taken)) => taken,
         Ok(Err(error)) => return waiting.refuse(code(&error), &error.in_a_line()).await,
         // With its lease its place in the queue is given up, and the servant that only it could have used.
@@ -363,13 +417,19 @@ async fn session(
         (None, Peer::Tcp(address)) => address.to_string(),
         (None, Peer::Unix(uid)) => format!("user {uid}"),
     };
+    let now = app.principals.standing(&caller.who, &asked.service);
+    let (standing, granted) = watch::channel(now);
     let options = SessionOptions {
         budget,
         client,
         resume: asked.bound_resume(&caller),
+        granted: Granted::by(granted),
         ..SessionOptions::default()
     };
-    let end = reach.serve_rosbridge(waiting, options).await;
+    let end = tokio::select! {
+        end = reach.serve_rosbridge(waiting, options) => end,
+        () = app.principals.follow(&caller.who, &asked.service, &standing) => return,
+    };
     let handle = lease.handle();
     match end {
         SessionEnd::Client { code, .. } => {
@@ -438,6 +498,7 @@ async fn admitted(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), chor
 async fn linked(
     app: &App,
     asked: &Asked,
+    caller: &Caller,
     lease: Option<Lease>,
     mut io: Stream,
     read_ahead: bytes::Bytes,
@@ -449,6 +510,9 @@ async fn linked(
     let mut read_ahead = BytesMut::from(read_ahead);
     let ready = tokio::select! {
         ready = lease.ready() => ready,
+        reason = app.principals.ended(&caller.who, &asked.service, true) => {
+            return bridge::refuse(io, POLICY, &reason).await;
+        }
         () = left(&mut io, &mut read_ahead) => {
             tracing::debug!("a stub left before {} was ready", asked.service);
             return;
@@ -465,6 +529,7 @@ async fn linked(
     let lost = tokio::select! {
         lost = reach.serve_link(io, &read_ahead) => lost.to_string(),
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
+        reason = app.principals.ended(&caller.who, &asked.service, true) => reason,
     };
     tracing::info!(
         "the link of {robot} to servant {} ended: {lost}",

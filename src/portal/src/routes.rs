@@ -1,6 +1,8 @@
 //! Every address that the portal answers, in one table: its method, who is answered there, its handler, and what the
 //! OpenAPI document says of it. Router, guard and document are made of it.
 
+use ::access::Action;
+use api::access;
 use axum::extract::{DefaultBodyLimit, OriginalUri};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, any, delete, get, patch, post, put};
@@ -10,16 +12,17 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, push, robots, shadow, stubs,
+    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots, shadow,
+    stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
 
-/// Who is answered where tokens are configured.
+/// Who is answered where there are tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Who has a token.
-    Token,
+    /// Who may do this to that.
+    May(Action, Of),
     /// Anyone who reads.
     Read,
     /// Any robot that connects: its first message must be rosbridge's `auth`.
@@ -28,7 +31,42 @@ pub enum Access {
     ReadOrConnect,
 }
 
-use Access::{Connect, Read, ReadOrConnect, Token};
+/// To what an address leads: the parameter that names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Of {
+    /// The machine, or all services.
+    Machine,
+    /// A service.
+    Service(&'static str),
+    /// The service of a stub's archive.
+    Stub(&'static str),
+    /// The service of a servant.
+    Servant(&'static str),
+    /// A robot.
+    Robot(&'static str),
+    /// What the query or the body names: the handler decides.
+    Handler,
+}
+
+use Access::{Connect, May, Read, ReadOrConnect};
+use Action::{Deploy, Enter, Logs, Look, Operate, See, Try};
+
+/// What each principal is told, as far as it may see it.
+const ENTER: Access = May(Enter, Of::Machine);
+/// The whole machine.
+const LOOK: Access = May(Look, Of::Machine);
+/// Tokens and policy.
+const ADMINISTER: Access = May(Action::Administer, Of::Machine);
+
+/// To the service that `{name}` names.
+const fn service(action: Action) -> Access {
+    May(action, Of::Service("name"))
+}
+
+/// To the servant that `{id}` names.
+const fn servant(action: Action) -> Access {
+    May(action, Of::Servant("id"))
+}
 
 /// One method at one address.
 pub struct Route {
@@ -50,6 +88,10 @@ const fn at(
     access: Access,
     handler: fn() -> MethodRouter<Arc<App>>,
 ) -> Route {
+    assert!(
+        names_its_object(path, access),
+        "a row's address has no parameter of the name that its access says"
+    );
     Route {
         method,
         path,
@@ -57,6 +99,29 @@ const fn at(
         handler,
         operation: None,
     }
+}
+
+/// Whether what is to be looked up is in the address. Where it is not, the program does not compile.
+const fn names_its_object(path: &str, access: Access) -> bool {
+    let May(_, Of::Service(name) | Of::Stub(name) | Of::Servant(name) | Of::Robot(name)) = access
+    else {
+        return true;
+    };
+    let (path, name) = (path.as_bytes(), name.as_bytes());
+    let mut start = 0;
+    while start + name.len() + 2 <= path.len() {
+        let mut same = path[start] == b'{' && path[start + 1 + name.len()] == b'}';
+        let mut at = 0;
+        while same && at < name.len() {
+            same = path[start + 1 + at] == name[at];
+            at += 1;
+        }
+        if same {
+            return true;
+        }
+        start += 1;
+    }
+    false
 }
 
 impl Route {
@@ -81,48 +146,48 @@ impl Route {
 /// Who is answered at a path: whom the first row says that leads there.
 pub fn access(path: &str) -> Access {
     let row = ROUTES.iter().find(|route| route.leads(path));
-    row.map_or(Token, |route| route.access)
+    row.map_or(LOOK, |route| route.access)
 }
 
 /// All routes: a fixed address before those with a name in its place.
 pub const ROUTES: &[Route] = &[
     at("ANY", "/", ReadOrConnect, || any(robots::root)),
     at("GET", "/healthz", Read, || get(api_v1::health)),
-    at("GET", "/metrics", Token, || get(metrics::metrics)),
-    at("ANY", "/assets", Token, || any(nothing)),
+    at("GET", "/metrics", LOOK, || get(metrics::metrics)),
+    at("ANY", "/assets", ENTER, || any(nothing)),
     at("GET", "/assets/{name}", Read, || get(page::asset)),
-    at("ANY", "/api", Token, || any(nothing)),
-    at("GET", "/api/v1/status", Token, || get(api_v1::status))
+    at("ANY", "/api", ENTER, || any(nothing)),
+    at("GET", "/api/v1/status", LOOK, || get(api_v1::status))
         .described(|| operation("status", "The daemon at a glance.").answers::<api::Status>()),
-    at("GET", "/api/v1/doctor", Token, || get(api_v1::doctor)).described(|| {
+    at("GET", "/api/v1/doctor", LOOK, || get(api_v1::doctor)).described(|| {
         operation(
             "doctor",
             "What this machine needs, and whether it is there.",
         )
         .answers::<api::Doctor>()
     }),
-    at("GET", "/api/v1/clock", Token, || get(api_v1::clock)).described(|| {
+    at("GET", "/api/v1/clock", ENTER, || get(api_v1::clock)).described(|| {
         operation(
             "clock",
             "The daemon's clock, for comparing another with it.",
         )
         .answers::<api::Clock>()
     }),
-    at("GET", "/api/v1/events", Token, || get(api_v1::events)).described(|| {
+    at("GET", "/api/v1/events", ENTER, || get(api_v1::events)).described(|| {
         operation("events", "The journal, oldest first.")
             .asks::<api_v1::Which>()
             .lists::<api::Event>()
     }),
-    at("GET", "/api/v1/services", Token, || get(api_v1::services))
+    at("GET", "/api/v1/services", ENTER, || get(api_v1::services))
         .described(|| operation("services", "All services.").lists::<api::ServiceSummary>()),
-    at("GET", "/api/v1/services/{name}", Token, || {
+    at("GET", "/api/v1/services/{name}", service(See), || {
         get(api_v1::service)
     })
     .described(|| {
         operation("service", "One service with its interface and revisions.")
             .answers::<api::ServiceDetail>()
     }),
-    at("DELETE", "/api/v1/services/{name}", Token, || {
+    at("DELETE", "/api/v1/services/{name}", service(Deploy), || {
         delete(api_v1::remove_service)
     })
     .described(|| {
@@ -132,11 +197,11 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/services/{name}/interface", Token, || {
+    at("GET", "/api/v1/services/{name}/interface", service(See), || {
         get(api_v1::interface)
     })
     .described(|| operation("interface", "The interface with all definitions.").answers_object()),
-    at("GET", "/api/v1/services/{name}/fit", Token, || {
+    at("GET", "/api/v1/services/{name}/fit", service(See), || {
         get(api_v1::fit)
     })
     .described(|| {
@@ -147,7 +212,7 @@ pub const ROUTES: &[Route] = &[
         .asks::<api_v1::Statement>()
         .answers::<api::Fit>()
     }),
-    at("POST", "/api/v1/services/{name}/rollback", Token, || {
+    at("POST", "/api/v1/services/{name}/rollback", service(Deploy), || {
         post(api_v1::rollback)
     })
     .described(|| {
@@ -155,14 +220,14 @@ pub const ROUTES: &[Route] = &[
             .takes::<api::Rollback>(Required::False)
             .answers::<api::ServiceDetail>()
     }),
-    at("GET", "/api/v1/services/{name}/rollout", Token, || {
+    at("GET", "/api/v1/services/{name}/rollout", service(See), || {
         get(api_v1::rollout)
     })
     .described(|| {
         operation("rollout", "How a service comes to its next revision.")
             .answers::<api::Rollout>()
     }),
-    at("POST", "/api/v1/services/{name}/rollout", Token, || {
+    at("POST", "/api/v1/services/{name}/rollout", service(Deploy), || {
         post(api_v1::order_rollout)
     })
     .described(|| {
@@ -173,7 +238,7 @@ pub const ROUTES: &[Route] = &[
         .takes::<api::rollout::RolloutOrder>(Required::True)
         .answers::<api::Rollout>()
     }),
-    at("POST", "/api/v1/services/{name}/trial", Token, || {
+    at("POST", "/api/v1/services/{name}/trial", service(Try), || {
         post(api_v1::trial)
     })
     .described(|| {
@@ -189,7 +254,7 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::trial::Trial>()
     }),
-    at("POST", "/api/v1/services/{name}/calibration", Token, || {
+    at("POST", "/api/v1/services/{name}/calibration", service(Try), || {
         post(calibration::calibration).layer(DefaultBodyLimit::disable())
     })
     .described(|| {
@@ -206,7 +271,7 @@ pub const ROUTES: &[Route] = &[
         )
         .streams::<api::CalibrationEvent>()
     }),
-    at("POST", "/api/v1/services/{name}/shadow", Token, || {
+    at("POST", "/api/v1/services/{name}/shadow", service(Try), || {
         post(shadow::shadow)
     })
     .described(|| {
@@ -218,7 +283,7 @@ pub const ROUTES: &[Route] = &[
         .takes::<api::ShadowOptions>(Required::True)
         .streams::<api::ShadowEvent>()
     }),
-    at("GET", "/api/v1/services/{name}/sla", Token, || {
+    at("GET", "/api/v1/services/{name}/sla", service(See), || {
         get(dictionary::rows)
     })
     .described(|| {
@@ -228,7 +293,7 @@ pub const ROUTES: &[Route] = &[
         )
         .lists::<api::dictionary::Row>()
     }),
-    at("PUT", "/api/v1/services/{name}/sla", Token, || {
+    at("PUT", "/api/v1/services/{name}/sla", service(Deploy), || {
         put(dictionary::write)
     })
     .described(|| {
@@ -236,7 +301,7 @@ pub const ROUTES: &[Route] = &[
             .takes::<api::dictionary::NewRows>(Required::True)
             .lists::<api::dictionary::Row>()
     }),
-    at("GET", "/api/v1/services/{name}/sla/explain", Token, || {
+    at("GET", "/api/v1/services/{name}/sla/explain", service(See), || {
         get(dictionary::explain)
     })
     .described(|| {
@@ -247,16 +312,16 @@ pub const ROUTES: &[Route] = &[
         .asks::<dictionary::Stating>()
         .answers::<api::dictionary::Explained>()
     }),
-    at("DELETE", "/api/v1/services/{name}/sla/{id}", Token, || {
+    at("DELETE", "/api/v1/services/{name}/sla/{id}", service(Deploy), || {
         delete(dictionary::remove)
     })
     .described(|| {
         operation("removeFromDictionary", "Removes a row; gives those that are left.")
             .lists::<api::dictionary::Row>()
     }),
-    at("GET", "/api/v1/servants", Token, || get(api_v1::servants))
+    at("GET", "/api/v1/servants", ENTER, || get(api_v1::servants))
         .described(|| operation("servants", "All servants.").lists::<api::Servant>()),
-    at("DELETE", "/api/v1/servants", Token, || {
+    at("DELETE", "/api/v1/servants", May(Operate, Of::Handler), || {
         delete(api_v1::stop_servants)
     })
     .described(|| {
@@ -267,11 +332,11 @@ pub const ROUTES: &[Route] = &[
         .asks::<api_v1::OfService>()
         .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/servants/{id}", Token, || {
+    at("GET", "/api/v1/servants/{id}", servant(See), || {
         get(api_v1::servant)
     })
     .described(|| operation("servant", "One servant.").answers::<api::Servant>()),
-    at("PATCH", "/api/v1/servants/{id}", Token, || {
+    at("PATCH", "/api/v1/servants/{id}", servant(Operate), || {
         patch(api_v1::set_limits)
     })
     .described(|| {
@@ -282,11 +347,11 @@ pub const ROUTES: &[Route] = &[
         .takes::<api::Limits>(Required::True)
         .answers::<api::Servant>()
     }),
-    at("DELETE", "/api/v1/servants/{id}", Token, || {
+    at("DELETE", "/api/v1/servants/{id}", servant(Operate), || {
         delete(api_v1::stop_servant)
     })
     .described(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
-    at("GET", "/api/v1/servants/{id}/logs", Token, || {
+    at("GET", "/api/v1/servants/{id}/logs", servant(Logs), || {
         get(api_v1::logs)
     })
     .described(|| {
@@ -294,14 +359,14 @@ pub const ROUTES: &[Route] = &[
             .asks::<api_v1::Part>()
             .streams::<api::LogLine>()
     }),
-    at("GET", "/api/v1/back-offs", Token, || get(api_v1::back_offs)).described(|| {
+    at("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).described(|| {
         operation(
             "backOffs",
             "Whose servants have failed again and again, and when each is started again at the earliest.",
         )
         .lists::<api::BackOff>()
     }),
-    at("GET", "/api/v1/robots/{name}/explain", Token, || {
+    at("GET", "/api/v1/robots/{name}/explain", May(See, Of::Robot("name")), || {
         get(api_v1::explain)
     })
     .described(|| {
@@ -311,7 +376,36 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::explain::Explanation>()
     }),
-    at("POST", "/api/v1/push", Token, || {
+    at("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
+        .described(|| operation("whoami", "Who asks, as the daemon knows it.").answers::<access::Whoami>()),
+    at("GET", "/api/v1/tokens", ADMINISTER, || get(policy::tokens)).described(|| {
+        operation("tokens", "All tokens there ever were, without their secrets.").lists::<access::Token>()
+    }),
+    at("POST", "/api/v1/tokens", ADMINISTER, || post(policy::create)).described(|| {
+        operation("createToken", "Makes a token. Its secret is told here and never again.")
+            .takes::<access::NewToken>(Required::True)
+            .answers::<access::Secret>()
+    }),
+    at("DELETE", "/api/v1/tokens/{name}", ADMINISTER, || delete(policy::revoke)).described(|| {
+        operation("revokeToken", "Ends a token and what shows it; gives all tokens.").lists::<access::Token>()
+    }),
+    at("POST", "/api/v1/tokens/{name}/rotate", ADMINISTER, || post(policy::rotate)).described(|| {
+        operation("rotateToken", "Gives a token another secret; what shows the old one ends.")
+            .answers::<access::Secret>()
+    }),
+    at("GET", "/api/v1/policy", ADMINISTER, || get(policy::rules)).described(|| {
+        operation("policy", "Rules that say what principals may use of services.").lists::<access::Rule>()
+    }),
+    at("POST", "/api/v1/policy", ADMINISTER, || post(policy::add_rule)).described(|| {
+        operation("addRule", "Writes a rule; it holds at once. Gives all rules.")
+            .takes::<access::NewRule>(Required::True)
+            .lists::<access::Rule>()
+    }),
+    at("DELETE", "/api/v1/policy/{id}", ADMINISTER, || delete(policy::remove_rule)).described(|| {
+        operation("removeRule", "Removes a rule; that holds at once. Gives those that are left.")
+            .lists::<access::Rule>()
+    }),
+    at("POST", "/api/v1/push", May(Deploy, Of::Handler), || {
         post(push::push).layer(DefaultBodyLimit::disable())
     })
     .described(|| {
@@ -327,18 +421,18 @@ pub const ROUTES: &[Route] = &[
         )
         .streams::<api::PushEvent>()
     }),
-    at("GET", "/api/v1/openapi.json", Token, || get(openapi::serve))
+    at("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
         .described(|| operation("openapi", "This document.").answers_object()),
-    at("GET", "/v2", Token, || get(oci::version)),
-    at("GET", "/v2/", Token, || get(oci::version)),
-    at("GET", "/v2/_catalog", Token, || get(oci::catalog)),
-    at("GET", "/v2/{name}/tags/list", Token, || get(oci::tags)),
-    at("GET", "/v2/{name}/manifests/{reference}", Token, || {
+    at("GET", "/v2", ENTER, || get(oci::version)),
+    at("GET", "/v2/", ENTER, || get(oci::version)),
+    at("GET", "/v2/_catalog", ENTER, || get(oci::catalog)),
+    at("GET", "/v2/{name}/tags/list", service(See), || get(oci::tags)),
+    at("GET", "/v2/{name}/manifests/{reference}", service(See), || {
         get(oci::manifest)
     }),
-    at("GET", "/v2/{name}/blobs/{digest}", Token, || get(oci::blob)),
-    at("GET", "/stubs", Token, || get(stubs::list)),
-    at("GET", "/stubs/{file}", Token, || get(stubs::archive)),
+    at("GET", "/v2/{name}/blobs/{digest}", service(See), || get(oci::blob)),
+    at("GET", "/stubs", ENTER, || get(stubs::list)),
+    at("GET", "/stubs/{file}", May(See, Of::Stub("file")), || get(stubs::archive)),
     at("ANY", "/{service}", Connect, || any(robots::service)),
     at("ANY", "/{service}/", Connect, || {
         any(robots::service_with_slash)

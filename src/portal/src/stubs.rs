@@ -21,10 +21,15 @@ use crate::errors::Error;
 const CHUNK: usize = 64 << 10;
 
 /// `/stubs`: services, and for which architectures.
-pub async fn list(State(app): State<Arc<App>>) -> Result<Json<Stubs>, Error> {
+pub async fn list(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+) -> Result<Json<Stubs>, Error> {
+    let mut services = app.state.service_names()?;
+    services.retain(|name| caller.sees(&app, name));
     let programs = Programs::look();
     Ok(Json(Stubs {
-        services: app.state.service_names()?,
+        services,
         architectures: programs.held(),
         lacking: programs.lacking(),
     }))

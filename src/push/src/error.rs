@@ -13,6 +13,9 @@ pub enum Error {
         /// Who wants it.
         newcomer: String,
     },
+    /// Whoever pushes may not publish it.
+    #[error("{0}")]
+    NotAllowed(String),
     /// Something in the options is not what it should be.
     #[error("{0}")]
     Options(String),

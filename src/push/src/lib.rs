@@ -49,7 +49,7 @@ use store::{Journal, NewEvent, Plan, RevisionRecord};
 pub use error::Error;
 pub use options::Options;
 pub use receive::Archive;
-pub use request::Published;
+pub use request::{Deployer, Published};
 
 /// Events that may wait for a slow client before the build waits for it.
 pub const EVENTS_AHEAD: usize = 256;
@@ -145,6 +145,7 @@ impl Pusher {
         &self,
         id: &str,
         options: &PushOptions,
+        by: &Deployer,
         archive: Archive,
         report: &Reporter,
     ) -> Result<Published, Error> {
@@ -159,9 +160,16 @@ impl Pusher {
             .unwrap_or_else(|| built.package.clone());
         names::service(&name).map_err(catalogue::Error::from)?;
         admitted.named(&name, report).await?;
+        // Pushes of one service follow one another: whose it is does not change until this one is done.
+        by.may(&name)?;
+        let is_new = self.catalogue.package(&name)?.is_none();
         let shown = self.shown(id, options, built, name.clone(), report);
+        let layers = left.during(shown).await?;
+        if let Some(owner) = by.owner.as_deref().filter(|_| is_new) {
+            self.catalogue.own(&name, owner)?;
+        }
         Ok(Published {
-            layers: left.during(shown).await?,
+            layers,
             service: name,
             took: began.elapsed(),
         })

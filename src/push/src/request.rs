@@ -35,6 +35,20 @@ impl Reporter {
     }
 }
 
+/// Whoever pushes.
+pub struct Deployer {
+    /// Whose a service is that is published for the first time; none: its operators'.
+    pub owner: Option<String>,
+    /// Whether it may publish a service of that name; else why not.
+    pub may: Box<dyn Fn(&str) -> Result<(), String> + Send + Sync>,
+}
+
+impl Deployer {
+    pub(super) fn may(&self, name: &str) -> Result<(), Error> {
+        (self.may)(name).map_err(Error::NotAllowed)
+    }
+}
+
 /// What a push came to.
 #[derive(Debug)]
 pub struct Published {
@@ -52,6 +66,7 @@ impl Pusher {
     pub fn begin<F>(
         self: &Arc<Self>,
         options: PushOptions,
+        by: Deployer,
         archive: Archive,
         events: mpsc::Sender<PushEvent>,
         finished: impl FnOnce(Result<Published, Error>) -> F + Send + 'static,
@@ -64,7 +79,7 @@ impl Pusher {
         let pusher = Arc::clone(self);
         self.tasks.spawn(async move {
             let outcome = pusher
-                .run(&options, archive, &Reporter(events), cancel)
+                .run(&options, &by, archive, &Reporter(events), cancel)
                 .await;
             let failed = outcome.is_err();
             finished(outcome).await;
@@ -84,12 +99,13 @@ impl Pusher {
     }
 
     /// Refuses what can be refused before anything is received.
-    pub fn check(&self, options: &PushOptions) -> Result<(), Error> {
+    pub fn check(&self, options: &PushOptions, by: &Deployer) -> Result<(), Error> {
         if self.cancel.is_cancelled() {
             return Err(Error::Ending);
         }
         if let Some(name) = &options.name {
             names::service(name).map_err(catalogue::Error::from)?;
+            by.may(name)?;
         }
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
@@ -107,13 +123,14 @@ impl Pusher {
     async fn run(
         &self,
         options: &PushOptions,
+        by: &Deployer,
         archive: Archive,
         report: &Reporter,
         cancel: CancellationToken,
     ) -> Result<Published, Error> {
         let id = format!("push-{}", names::random(8));
         let outcome = tokio::select! {
-            outcome = blocking::cancellable(self.push(&id, options, archive, report)) => outcome,
+            outcome = blocking::cancellable(self.push(&id, options, by, archive, report)) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
         };
         // First what the builder has in there: it goes when its containers have ended.

@@ -13,8 +13,10 @@ mod journal;
 pub mod private;
 mod robots;
 mod rollouts;
+mod rules;
 mod servants;
 mod services;
+mod tokens;
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -30,18 +32,21 @@ use backlog::Backlog;
 pub use backlog::watch;
 pub use events::NewEvent;
 pub use journal::Journal;
-pub use robots::TokenHash;
+pub use robots::{Owner, TokenHash};
+pub use rules::RuleRecord;
 pub use servants::ServantRecord;
 pub use services::{Plan, RevisionLine, RevisionRecord};
+pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 6] = [
+const MIGRATIONS: [&str; 7] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
     include_str!("004-terms.sql"),
     include_str!("005-dictionary.sql"),
     include_str!("006-rollouts.sql"),
+    include_str!("007-access.sql"),
 ];
 
 /// What can go wrong.

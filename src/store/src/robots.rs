@@ -7,6 +7,9 @@ use super::{Error, State, now};
 
 /// SHA-256 of a bearer token, lower-case hex.
 pub type TokenHash = String;
+/// To whom a robot's name belongs: a token of the configuration, by its hash, or a principal, in the words of whoever tells
+/// them apart.
+pub type Owner = String;
 
 impl State {
     /// Binds `robot` to `owner` when it is new, and with `claim` also when nobody owns it yet; then says to whom it
@@ -14,11 +17,11 @@ impl State {
     pub fn robot_owner(
         &self,
         robot: &str,
-        owner: Option<&TokenHash>,
+        owner: Option<&Owner>,
         claim: bool,
-    ) -> Result<Option<TokenHash>, Error> {
+    ) -> Result<Option<Owner>, Error> {
         // Who is known comes in even while nothing can be written.
-        let known: Option<Option<TokenHash>> = self.read(|connection| {
+        let known: Option<Option<Owner>> = self.read(|connection| {
             connection
                 .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
                 .query_row([robot], |row| row.get(0))
@@ -41,9 +44,21 @@ impl State {
         })
     }
 
-    /// Forgets robots bound to tokens that are not in `tokens` any more, so that their names can be used again.
-    pub fn release_robots(&self, tokens: &[TokenHash]) -> Result<usize, Error> {
-        let kept = serde_json::Value::from(tokens).to_string();
+    /// Binds a robot's name to `owner`, whoever had it before.
+    pub fn bind_robot(&self, robot: &str, owner: &Owner) -> Result<(), Error> {
+        self.durably(|connection| {
+            connection.execute(
+                "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
+                 ON CONFLICT (name) DO UPDATE SET owner = ?2",
+                params![robot, owner, now() as i64],
+            )
+        })
+        .map(|_| ())
+    }
+
+    /// Forgets robots bound to owners that are not in `owners` any more, so that their names can be used again.
+    pub fn release_robots(&self, owners: &[Owner]) -> Result<usize, Error> {
+        let kept = serde_json::Value::from(owners).to_string();
         self.run(|connection| {
             connection.execute(
                 "DELETE FROM robots WHERE owner IS NOT NULL AND owner NOT IN (SELECT value FROM json_each(?1))",

@@ -199,6 +199,27 @@ impl State {
         })
     }
 
+    /// The deployer who published a service first: none, where an operator did; outer none, where there is no such service.
+    pub fn service_owner(&self, name: &str) -> Result<Option<Option<String>>, Error> {
+        self.read(|connection| {
+            connection
+                .prepare_cached("SELECT owner FROM services WHERE name = ?1")?
+                .query_row([name], |row| row.get(0))
+                .optional()
+        })
+    }
+
+    /// Records whose a service is that nobody owns yet; on disk when this returns.
+    pub fn own_service(&self, name: &str, owner: &str) -> Result<(), Error> {
+        self.durably(|connection| {
+            connection.execute(
+                "UPDATE services SET owner = ?2 WHERE name = ?1 AND owner IS NULL",
+                [name, owner],
+            )
+        })
+        .map(|_| ())
+    }
+
     /// The current revision of a service.
     pub fn current(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, Error> {
         let current: Option<u64> = self.read(|connection| {

@@ -391,3 +391,105 @@ fn a_known_robot_comes_in_while_nothing_can_be_written() {
     assert!(refused.to_string().contains("locked"), "{refused}");
     assert!(state.unwritable().is_some());
 }
+
+#[test]
+fn tokens_are_kept_by_their_hashes_and_a_name_is_one_live_tokens() {
+    let (directory, state) = state();
+    let new = |name, hash| NewToken {
+        name,
+        hash,
+        role: "robot",
+        scope: "{}",
+        expires: Some(7),
+    };
+    let first = state
+        .add_token(&new("r1", "h1"))
+        .expect("written")
+        .expect("new");
+    assert_eq!(
+        (first.expires, first.revoked, first.last_used),
+        (Some(7), None, None)
+    );
+    assert_eq!(
+        state.add_token(&new("r1", "h2")).expect("written"),
+        None,
+        "the name is taken"
+    );
+    let rotated = state
+        .rotate_token("r1", "h3")
+        .expect("written")
+        .expect("there");
+    assert_eq!((rotated.id, &*rotated.hash), (first.id, "h3"));
+    state.token_used(first.id, 9).expect("written");
+    assert!(state.revoke_token("r1").expect("written").is_some());
+    assert_eq!(state.revoke_token("r1").expect("written"), None, "once");
+    assert_eq!(
+        state.rotate_token("r1", "h4").expect("written"),
+        None,
+        "revoked for good"
+    );
+    let second = state
+        .add_token(&new("r1", "h5"))
+        .expect("written")
+        .expect("the name is free");
+    assert_ne!(second.id, first.id);
+    drop(state);
+    let state = State::open(&directory.path().join("cloudroid.db")).expect("the same database");
+    let kept = state.tokens().expect("readable");
+    let hashes: Vec<_> = kept
+        .iter()
+        .map(|token| (&*token.hash, token.last_used))
+        .collect();
+    assert_eq!(hashes, [("h3", Some(9)), ("h5", None)]);
+    assert!(kept[0].revoked.is_some() && kept[1].revoked.is_none());
+}
+
+#[test]
+fn a_new_database_grants_robots_and_deployers_what_they_had() {
+    let (_directory, state) = state();
+    let rules = state.rules().expect("readable");
+    let texts: Vec<_> = rules
+        .iter()
+        .map(|rule| (&*rule.who, &*rule.services, &*rule.allow))
+        .collect();
+    let all = r#"["*:**"]"#;
+    assert_eq!(
+        texts,
+        [("role:robot", "*", all), ("role:deployer", "*", all)]
+    );
+    assert!(state.remove_rule(rules[0].id).expect("written").is_some());
+    assert_eq!(state.remove_rule(rules[0].id).expect("written"), None);
+    let added = state.add_rule("r1", "det*", "[]").expect("written");
+    assert!(added.id > rules[1].id, "numbers are not given twice");
+    assert_eq!(state.rules().expect("readable").len(), 2);
+}
+
+#[test]
+fn a_service_is_owned_by_whoever_published_it_first() {
+    let (_directory, state) = state();
+    assert_eq!(state.service_owner("a").expect("readable"), None);
+    state
+        .publish(&revision("a", "sha256:1"), &Inventory::default())
+        .expect("published");
+    assert_eq!(state.service_owner("a").expect("readable"), Some(None));
+    state.own_service("a", "alice").expect("written");
+    state.own_service("a", "bob").expect("written");
+    assert_eq!(
+        state.service_owner("a").expect("readable"),
+        Some(Some("alice".into()))
+    );
+}
+
+#[test]
+fn a_robots_name_can_be_bound_again() {
+    let (_directory, state) = state();
+    let owner = |name: &str| name.to_owned();
+    state
+        .robot_owner("r1", Some(&owner("a")), true)
+        .expect("written");
+    state.bind_robot("r1", &owner("robot:r1")).expect("written");
+    let found = state
+        .robot_owner("r1", Some(&owner("a")), true)
+        .expect("read");
+    assert_eq!(found, Some(owner("robot:r1")));
+}

@@ -39,6 +39,24 @@ struct UnderWayGoal {
     recalled: CancellationToken,
 }
 
+impl Actions {
+    /// Removes those of these names that the client serves.
+    pub(super) fn take_served(
+        &mut self,
+        chosen: impl Fn(&str) -> bool,
+    ) -> Vec<(String, Arc<ActionServer>)> {
+        self.served.extract_if(|name, _| chosen(name)).collect()
+    }
+
+    /// Goals under way at actions of these names, with those.
+    pub(super) fn goals_at(&self, chosen: impl Fn(&str) -> bool) -> Vec<(Id<'static>, String)> {
+        let goals = self.goals.iter().filter(|(_, goal)| chosen(&goal.action));
+        goals
+            .map(|(id, goal)| (id.clone(), goal.action.clone()))
+            .collect()
+    }
+}
+
 impl Client {
     fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, String> {
         let name = plain_type(type_name);

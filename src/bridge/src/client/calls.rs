@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::task::{Context, Waker};
 use std::time::{Duration, Instant};
 
+use access::Operation;
 use bytes::Bytes;
 use ros::bus::Digest;
 use ros::codec::{self, CborOptions, JsonOptions};
@@ -112,6 +113,11 @@ impl Client {
         self.serves_itself(&call.service).await;
         let bus = &self.shared.bus;
         let server = bus.graph().borrow().services.get(&call.service).cloned();
+        let told = server.is_none()
+            && rosapi::Service::find(&call.service).is_some_and(rosapi::Service::is_filtered);
+        if !told {
+            self.granted.check(Operation::Call, &call.service)?;
+        }
         if server.is_none()
             && let Some(answer) = self.answer_ourselves(call).await
         {
@@ -210,7 +216,12 @@ impl Client {
             let answer = async {
                 let def = api.definition()?;
                 let args = self.own_args(call, &def)?;
-                self.own_frame(call, &def, &api.answer(&self.shared, &args).await?)
+                self.own_frame(
+                    call,
+                    &def,
+                    &api.answer(&self.shared, &args, &self.granted.grants())
+                        .await?,
+                )
             };
             return Some(answer.await);
         }

@@ -3,6 +3,7 @@
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
+use access::Operation;
 use bytes::Bytes;
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::MessageType;
@@ -33,7 +34,7 @@ pub(super) struct TopicPublishers {
 }
 
 /// A topic that is published on until it has been unadvertised as often as it was advertised.
-struct Advertised {
+pub(super) struct Advertised {
     topic_publisher: Arc<TopicPublisher>,
     /// Those of its advertisements; none where it was only published on.
     ids: HashSet<Option<Id<'static>>>,
@@ -44,6 +45,13 @@ impl TopicPublishers {
     fn count(&self) -> usize {
         let known = self.open.values();
         known.map(|known| known.ids.len().max(1)).sum()
+    }
+
+    /// Removes those of these topics, and what waits for their types.
+    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Advertised)> {
+        self.untyped.retain(|topic, _| !chosen(topic));
+        self.told.retain(|topic| !chosen(topic));
+        self.open.extract_if(|topic, _| chosen(topic)).collect()
     }
 
     /// Names of the topics advertised.
@@ -67,6 +75,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
+        self.granted.check(Operation::Publish, &topic)?;
         let message_type = self
             .publishable_type(&topic, &op.type_name)
             .inspect_err(|_| {
@@ -170,6 +179,8 @@ impl Client {
         let limit = self.shared.options.max_advertisements;
         let id = advertised.then(|| reply.id.clone());
         let mut topic_publishers = self.topic_publishers.lock();
+        // Under the lock: what is taken back meanwhile is taken after this.
+        self.granted.check(Operation::Publish, topic)?;
         let count = topic_publishers.count();
         let known = topic_publishers.open.get_mut(topic);
         if let Some(known) = &known
@@ -239,7 +250,11 @@ impl Client {
             .map(|known| known.topic_publisher.clone());
         let topic_publisher = match known {
             Some(topic_publisher) => topic_publisher,
-            None => match self.type_to_publish(&topic, &op) {
+            None => match self
+                .granted
+                .check(Operation::Publish, &topic)
+                .and_then(|()| self.type_to_publish(&topic, &op))
+            {
                 Ok(Some(message_type)) => {
                     self.open_outlet(&topic, message_type, op.latch, None, reply, false)?
                 }

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
+use access::Operation;
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
@@ -29,6 +30,12 @@ impl Services {
         self.served.len()
     }
 
+    /// Removes those of these names; their unanswered calls fail.
+    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Served)> {
+        self.requests.retain(|_, request| !chosen(&request.service));
+        self.served.extract_if(|name, _| chosen(name)).collect()
+    }
+
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.served.keys().map(String::as_str)
     }
@@ -39,7 +46,7 @@ impl Services {
     }
 }
 
-struct Served {
+pub(super) struct Served {
     number: u64,
     /// Closed without having been true where that failed.
     registered: watch::Receiver<bool>,
@@ -141,6 +148,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let service = resolve(&op.service)?.into_owned();
+        self.granted.check(Operation::Advertise, &service)?;
         let def = self
             .shared
             .registry

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::Instant;
 
+use access::Operation;
 use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 
 use super::{Client, Reply};
@@ -22,6 +23,13 @@ pub(super) struct TopicSubscription {
     subscriptions: Subscriptions,
     listening: Listening,
     listener: Arc<TopicListener>,
+}
+
+impl TopicSubscription {
+    /// Its queue in the outbox.
+    pub(super) fn key(&self) -> TopicKey {
+        self.key
+    }
 }
 
 /// Puts a topic's messages into the client's queue.
@@ -79,6 +87,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let name = resolve(&op.topic)?;
+        self.granted.check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
         let wishes = Wishes {
             throttle_rate: op.throttle_rate,

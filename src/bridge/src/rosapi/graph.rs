@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use access::Grants;
 use futures_util::StreamExt;
 use futures_util::stream;
 use ros::bus::{Graph, TopicNodes};
@@ -63,6 +64,28 @@ pub(super) fn with_own_topics(graph: &Graph) -> Graph {
             nodes.publishers.push(NODE.to_owned());
         }
     }
+    graph
+}
+
+/// What of the graph a client with these grants is shown: the names that it may do something with, and the nodes behind them.
+pub(super) fn shown(mut graph: Graph, grants: &Grants) -> Graph {
+    if grants.is_everything() {
+        return graph;
+    }
+    graph.topics.retain(|topic, _| grants.shows(topic));
+    graph.services.retain(|service, _| grants.shows(service));
+    graph.actions.retain(|action, _| grants.shows(action));
+    let ends = graph
+        .topics
+        .values()
+        .flat_map(|nodes| nodes.publishers.iter().chain(&nodes.subscribers));
+    let servers = graph.actions.values().flat_map(|nodes| &nodes.servers);
+    let behind: BTreeSet<String> = ends
+        .chain(servers)
+        .chain(graph.services.values())
+        .cloned()
+        .collect();
+    graph.nodes.retain(|node, _| behind.contains(node));
     graph
 }
 
@@ -186,7 +209,11 @@ async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
     }
 }
 
-pub(super) async fn service_type(shared: &Arc<Shared>, service: &str) -> Value {
+pub(super) async fn service_type(shared: &Arc<Shared>, service: &str, grants: &Grants) -> Value {
+    // Asked of the node, which need not be in the graph that is shown.
+    if Service::find(service).is_none() && !grants.shows(service) {
+        return json!({ "type": "" });
+    }
     json!({ "type": find_type(shared, service).await })
 }
 

@@ -4,6 +4,8 @@
 mod actions;
 #[path = "bad_input.rs"]
 mod bad_input;
+#[path = "granted.rs"]
+mod granted;
 #[path = "manners.rs"]
 mod manners;
 #[path = "memory.rs"]

@@ -6,6 +6,8 @@ mod actions;
 mod actions_by_topics;
 #[path = "bad_input.rs"]
 mod bad_input;
+#[path = "granted.rs"]
+mod granted;
 #[path = "manners.rs"]
 mod manners;
 #[path = "memory.rs"]

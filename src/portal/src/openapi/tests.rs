@@ -66,7 +66,8 @@ fn the_document_lists_exactly_the_routes_of_the_table() {
 #[test]
 fn what_the_document_describes_needs_a_token() {
     for row in ROUTES.iter().filter(|row| row.operation.is_some()) {
-        assert_eq!(row.access, Access::Token, "{} {}", row.method, row.path);
+        let guarded = matches!(row.access, Access::May(..));
+        assert!(guarded, "{} {}", row.method, row.path);
     }
 }
 

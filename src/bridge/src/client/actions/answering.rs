@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use access::Operation;
 use ros::bus::Outcome;
 use rosbridge::{ActionFeedback, ActionResult, AdvertiseAction, GoalStatus, UnadvertiseAction};
 
@@ -17,6 +18,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let name = resolve(&op.action)?.into_owned();
+        self.granted.check(Operation::Advertise, &name)?;
         let def = self.action_def(&name, &op.type_name)?;
         let limit = self.shared.options.max_advertisements;
         if self.actions.lock().served.len() >= limit {

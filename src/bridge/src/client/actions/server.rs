@@ -16,7 +16,7 @@ use crate::sample::Frame;
 const GONE: &str = "the client that serves this action is gone";
 
 /// One action that a client serves.
-pub(super) struct ActionServer {
+pub(in crate::client) struct ActionServer {
     name: String,
     /// As the client wrote it.
     written: String,

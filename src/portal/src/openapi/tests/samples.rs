@@ -1,5 +1,6 @@
 //! One value or more of every type that the document describes.
 
+use api::access::{NewRule, NewToken, Rule, Secret, Token, Whoami};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
@@ -477,6 +478,40 @@ fn calibration_options() -> CalibrationOptions {
     }
 }
 
+fn token() -> Token {
+    let pattern = || vec!["det*".parse().expect("a pattern")];
+    Token {
+        name: "r1".into(),
+        role: access::Role::Robot,
+        services: pattern(),
+        robot: some("r1"),
+        classes: pattern(),
+        created: 1,
+        expires: Some(1),
+        last_used: Some(1),
+        revoked: Some(1),
+    }
+}
+
+fn new_token() -> NewToken {
+    NewToken {
+        name: "r1".into(),
+        role: access::Role::Robot,
+        services: token().services,
+        robot: some("r1"),
+        classes: token().classes,
+        lifetime: Some(1),
+    }
+}
+
+fn new_rule() -> NewRule {
+    NewRule {
+        who: "role:robot".parse().expect("a role"),
+        services: "*".parse().expect("a pattern"),
+        allow: vec!["subscribe:/camera/**".parse().expect("a grant")],
+    }
+}
+
 /// Values of every type of the document, as serde writes them, with all that is optional and without.
 pub fn samples() -> Vec<(&'static str, Value)> {
     fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
@@ -525,6 +560,53 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("CalibrationOptions", CalibrationOptions::default()),
         sample("Fit", fits),
         sample("Fit", bare),
+        sample("NewRule", new_rule()),
+        sample("NewToken", new_token()),
+        sample(
+            "NewToken",
+            NewToken {
+                services: Vec::new(),
+                robot: None,
+                classes: Vec::new(),
+                lifetime: None,
+                ..new_token()
+            },
+        ),
+        sample(
+            "Rule",
+            Rule {
+                id: 1,
+                who: new_rule().who,
+                services: new_rule().services,
+                allow: new_rule().allow,
+            },
+        ),
+        sample(
+            "Secret",
+            Secret {
+                token: token(),
+                secret: "x".into(),
+            },
+        ),
+        sample(
+            "Token",
+            Token {
+                robot: None,
+                expires: None,
+                last_used: None,
+                revoked: None,
+                ..token()
+            },
+        ),
+        sample(
+            "Whoami",
+            Whoami {
+                name: "r1".into(),
+                roles: vec![access::Role::Robot],
+                services: token().services,
+                robot: some("r1"),
+            },
+        ),
         sample("BackOff", back_off()),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),

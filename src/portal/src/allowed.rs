@@ -1,0 +1,170 @@
+//! Whether who asks may: decided for each request by its row of the table of routes, before its handler.
+
+use std::sync::Arc;
+
+use access::decide::may_use_class;
+use access::{Action, Object, Role, decide};
+use axum::extract::rejection::RawPathParamsRejection;
+use axum::extract::{RawPathParams, Request, State};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use choreographer::Handle;
+
+use crate::app::App;
+use crate::errors::Error;
+use crate::guard::Caller;
+use crate::routes::{Access, Of, Route};
+
+/// The class of robots that name none.
+const DEFAULT: &str = "default";
+
+/// Lets a request through that its caller may make.
+pub async fn allowed(
+    State((app, route)): State<(Arc<App>, &'static Route)>,
+    params: Result<RawPathParams, RawPathParamsRejection>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let Access::May(action, of) = route.access else {
+        return next.run(request).await;
+    };
+    let Some(caller) = request.extensions().get::<Caller>() else {
+        return Error::Internal("telling who asks").into_response();
+    };
+    let named = |parameter: &str| {
+        let params = params.as_ref().ok()?;
+        let (_, value) = params.iter().find(|(name, _)| *name == parameter)?;
+        Some(value)
+    };
+    let decided = match of {
+        Of::Machine => caller.may(action, &Object::MACHINE),
+        // Who may not even at a service of its own need not be heard further.
+        Of::Handler => {
+            let name = &caller.who.principal.name;
+            caller.may(action, &Object::service("", Some(name)))
+        }
+        Of::Service(parameter) => {
+            at_service(&app, caller, action, named(parameter).unwrap_or_default())
+        }
+        Of::Stub(parameter) => {
+            let file = named(parameter).unwrap_or_default();
+            at_service(
+                &app,
+                caller,
+                action,
+                file.strip_suffix(".tar.gz").unwrap_or(file),
+            )
+        }
+        Of::Servant(parameter) => {
+            at_servant(&app, caller, action, named(parameter).unwrap_or_default())
+        }
+        Of::Robot(parameter) => at_robot(caller, action, named(parameter).unwrap_or_default()),
+    };
+    match decided {
+        Ok(()) => next.run(request).await,
+        Err(error) => error.into_response(),
+    }
+}
+
+impl Caller {
+    /// Whether it may; else why not.
+    pub fn may(&self, action: Action, object: &Object<'_>) -> Result<(), Error> {
+        Ok(decide(&self.who.principal, action, object)?)
+    }
+
+    /// Whether it may be told of a service.
+    pub fn sees(&self, app: &App, service: &str) -> bool {
+        self.who.principal.sees_all() || self.may_at(app, Action::See, service, None).is_ok()
+    }
+
+    /// Whether it may be told of a servant: a robot sees its own alone.
+    pub fn sees_servant(&self, app: &App, handle: &Handle) -> bool {
+        self.is_robot_of(&handle.robot) && self.sees(app, handle.service())
+    }
+
+    /// Whether it is no robot, or this one.
+    fn is_robot_of(&self, robot: &str) -> bool {
+        let principal = &self.who.principal;
+        let own = principal.scope.robot.as_deref();
+        !principal.is(Role::Robot) || own.is_none_or(|own| own == robot)
+    }
+
+    /// Whether it may do something at a service, as a robot where one is named.
+    pub fn may_at(
+        &self,
+        app: &App,
+        action: Action,
+        service: &str,
+        robot: Option<&str>,
+    ) -> Result<(), Error> {
+        // What a deployer may depends on whose the service is; the others need not be looked up.
+        let (exists, owner) = match self.who.principal.is(Role::Deployer) {
+            true => match app.state.service_owner(service)? {
+                Some(owner) => (true, owner),
+                None => (false, None),
+            },
+            false => (true, None),
+        };
+        let object = Object {
+            service: Some(service),
+            exists,
+            owner: owner.as_deref(),
+            robot,
+        };
+        self.may(action, &object)
+    }
+
+    /// Whether it may name a class of the configuration.
+    pub fn may_use_class(&self, class: &str) -> Result<(), Error> {
+        match class == DEFAULT || may_use_class(&self.who.principal, class) {
+            true => Ok(()),
+            false => Err(Error::Forbidden {
+                what: format!("{} may not be of class {class}", self.who.principal.name),
+            }),
+        }
+    }
+}
+
+fn at_service(app: &App, caller: &Caller, action: Action, service: &str) -> Result<(), Error> {
+    caller.may_at(app, action, service, None)?;
+    known_to(app, caller, service)
+}
+
+/// Refuses a service that there is not, to those who are not told of all: the refusal names those that they see.
+pub fn known_to(app: &App, caller: &Caller, service: &str) -> Result<(), Error> {
+    if caller.who.principal.sees_all() || app.state.service_package(service)?.is_some() {
+        return Ok(());
+    }
+    let mut refusal = app.catalogue.unknown(service)?;
+    if let catalogue::Error::UnknownService { exists, .. } = &mut refusal {
+        exists.retain(|name| caller.sees(app, name));
+    }
+    Err(refusal.into())
+}
+
+fn at_servant(app: &App, caller: &Caller, action: Action, id: &str) -> Result<(), Error> {
+    let principal = &caller.who.principal;
+    let may = match app.choreographer.servant(id) {
+        Ok(handle) => {
+            caller.is_robot_of(&handle.robot)
+                && caller.may_at(app, action, handle.service(), None).is_ok()
+        }
+        // Whether it is there is told to those alone who are told of all.
+        Err(error) if principal.is_unscoped() => return Err(error.into()),
+        Err(error) if principal.sees_all() && action == Action::See => return Err(error.into()),
+        Err(_) => false,
+    };
+    match may {
+        true => Ok(()),
+        false => Err(access::Refusal::new(principal, action, format_args!("servant {id}")).into()),
+    }
+}
+
+fn at_robot(caller: &Caller, action: Action, robot: &str) -> Result<(), Error> {
+    let principal = &caller.who.principal;
+    let own = principal.is(Role::Robot) && principal.scope.robot.as_deref() == Some(robot);
+    match own || principal.sees_all() {
+        true => Ok(()),
+        false => Err(access::Refusal::new(principal, action, format_args!("robot {robot}")).into()),
+    }
+}

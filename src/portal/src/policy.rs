@@ -1,0 +1,151 @@
+//! `/api/v1/tokens`, `/api/v1/policy`, `/api/v1/whoami`: who may do what, and changing it.
+
+use std::sync::Arc;
+
+use api::access::{NewRule, NewToken, Rule, Secret, Token, Whoami};
+use axum::body::Body;
+use axum::extract::{Path, State};
+use axum::{Extension, Json};
+use serde::de::DeserializeOwned;
+use store::{Journal, NewEvent};
+
+use super::api_v1::{Answer, held};
+use super::guard::Caller;
+use crate::app::App;
+use crate::errors::Error;
+
+/// The longest body.
+const LARGEST: usize = 64 << 10;
+
+async fn read<T: DeserializeOwned>(
+    app: &App,
+    caller: &Caller,
+    body: Body,
+    what: &str,
+) -> Result<T, Error> {
+    let body = held(app, caller, body, LARGEST).await?.bytes;
+    serde_json::from_slice(&body)
+        .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
+}
+
+/// Tells the operator's journal what was changed, and by whom.
+fn record(app: &App, caller: &Caller, kind: &'static str, what: &str) {
+    let by = &caller.who.principal.name;
+    let message = format!("{what}, by {by} from {}", caller.peer);
+    Journal::new(Arc::clone(&app.state)).info(kind, &message, &NewEvent::default());
+}
+
+/// Who asks.
+pub async fn whoami(Extension(caller): Extension<Caller>) -> Json<Whoami> {
+    let principal = &caller.who.principal;
+    Json(Whoami {
+        name: principal.name.clone(),
+        roles: principal.roles.clone(),
+        services: principal.scope.services.clone(),
+        robot: principal.scope.robot.clone(),
+    })
+}
+
+/// All tokens there ever were.
+pub async fn tokens(State(app): State<Arc<App>>) -> Json<Vec<Token>> {
+    Json(app.principals.tokens())
+}
+
+/// Makes a token.
+pub async fn create(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+    body: Body,
+) -> Answer<Secret> {
+    let new: NewToken = read(&app, &caller, body, "token").await?;
+    let first = app.principals.names_nobody();
+    let made = app.principals.create(&new)?;
+    let what = format!("token {} ({}) was made", new.name, new.role);
+    record(&app, &caller, "token-made", &what);
+    if first {
+        tracing::warn!("the first token was made: from now on every request over TCP needs one");
+    }
+    Ok(Json(made))
+}
+
+/// Gives a token another secret.
+pub async fn rotate(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
+) -> Answer<Secret> {
+    let rotated = app.principals.rotate(&name)?;
+    record(
+        &app,
+        &caller,
+        "token-rotated",
+        &format!("token {name} was given another secret"),
+    );
+    Ok(Json(rotated))
+}
+
+/// Ends a token, and the connections that show it; gives all there are.
+pub async fn revoke(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
+) -> Answer<Vec<Token>> {
+    app.principals.revoke(&name)?;
+    record(
+        &app,
+        &caller,
+        "token-revoked",
+        &format!("token {name} was revoked"),
+    );
+    Ok(Json(app.principals.tokens()))
+}
+
+/// All rules.
+pub async fn rules(State(app): State<Arc<App>>) -> Json<Vec<Rule>> {
+    Json(app.principals.rules())
+}
+
+/// Writes a rule; gives all there are.
+pub async fn add_rule(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+    body: Body,
+) -> Answer<Vec<Rule>> {
+    let new: NewRule = read(&app, &caller, body, "rule").await?;
+    app.principals.add_rule(&new)?;
+    let allow: Vec<String> = new.allow.iter().map(ToString::to_string).collect();
+    let what = format!(
+        "{} was granted [{}] at {}",
+        new.who,
+        allow.join(", "),
+        new.services
+    );
+    record(&app, &caller, "policy-changed", &what);
+    Ok(Json(app.principals.rules()))
+}
+
+/// Removes a rule; gives those that are left.
+pub async fn remove_rule(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    Extension(caller): Extension<Caller>,
+) -> Answer<Vec<Rule>> {
+    let removed = match id.parse() {
+        Ok(number) => app.principals.remove_rule(number)?,
+        Err(_) => false,
+    };
+    let rules = app.principals.rules();
+    if !removed {
+        return Err(Error::UnknownRule {
+            id,
+            exists: rules.iter().map(|rule| rule.id.to_string()).collect(),
+        });
+    }
+    record(
+        &app,
+        &caller,
+        "policy-changed",
+        &format!("rule {id} of the policy was removed"),
+    );
+    Ok(Json(rules))
+}
