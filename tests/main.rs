@@ -6,6 +6,8 @@ use std::process::ExitCode;
 use libtest_mimic::{Arguments, Trial};
 use support::Verdict;
 
+#[path = "stories/access.rs"]
+mod access;
 #[path = "stories/answer.rs"]
 mod answer;
 #[path = "stories/bounds.rs"]
@@ -215,6 +217,12 @@ fn main() -> ExitCode {
             a_missing_original_is_said_once_and_the_cloud_goes_on,
             a_local_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
+        ],
+        stories![access:
+            every_route_answers_those_whom_the_table_allows,
+            a_deployer_changes_its_own_services_alone,
+            what_robots_may_changes_while_they_are_connected,
+            this_machines_users_see_and_are_robots_and_change_nothing,
         ],
         stories![tokens:
             no_route_answers_without_a_token,
