@@ -291,8 +291,10 @@ impl Daemon {
         stream.write_all(text.as_bytes())?;
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer)?;
-        let answer = String::from_utf8_lossy(&answer).into_owned();
-        let (head, body) = answer.split_once("\r\n\r\n").context("an HTTP answer")?;
+        // Pieces of a body are cut by bytes, and an archive's are no text.
+        let head = answer.windows(4).position(|end| end == b"\r\n\r\n");
+        let (head, body) = answer.split_at(head.context("an HTTP answer")?);
+        let (head, body) = (String::from_utf8_lossy(head), &body[4..]);
         let status = head.split(' ').nth(1).context("a status line")?.parse()?;
         let body = if head
             .to_ascii_lowercase()
@@ -302,7 +304,7 @@ impl Daemon {
         } else {
             body.to_owned()
         };
-        Ok((status, body))
+        Ok((status, String::from_utf8_lossy(&body).into_owned()))
     }
 
     /// The servants of a service, as the API tells.
@@ -368,17 +370,19 @@ fn address_in(status: &Value) -> anyhow::Result<String> {
     Ok(address.context("status says where it listens")?.to_owned())
 }
 
-fn dechunk(mut body: &str) -> String {
-    let mut whole = String::new();
-    while let Some((size, rest)) = body.split_once("\r\n") {
+fn dechunk(mut body: &[u8]) -> Vec<u8> {
+    let mut whole = Vec::new();
+    while let Some(end) = body.windows(2).position(|end| end == b"\r\n") {
+        let size = std::str::from_utf8(&body[..end]).unwrap_or_default();
+        let rest = &body[end + 2..];
         let Ok(size) = usize::from_str_radix(size.trim(), 16) else {
             break;
         };
         if size == 0 || rest.len() < size {
             break;
         }
-        whole.push_str(&rest[..size]);
-        body = rest[size..].trim_start_matches("\r\n");
+        whole.extend_from_slice(&rest[..size]);
+        body = rest[size..].strip_prefix(b"\r\n").unwrap_or_default();
     }
     whole
 }
