@@ -12,8 +12,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots, shadow,
-    stubs,
+    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots,
+    shadow, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
