@@ -86,7 +86,7 @@ pub enum CalibrationEvent {
     },
     /// Not measured.
     Error {
-        /// Why, and what to do.
+        /// The reason, and what to do.
         problem: Problem,
     },
 }
@@ -146,7 +146,7 @@ pub struct Point {
     pub memory: Size,
 }
 
-/// TimeSpread of a time, in milliseconds (nearest ranks).
+/// Spread of a time, in milliseconds (nearest ranks).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct TimeSpread {
@@ -162,10 +162,7 @@ impl TimeSpread {
     /// Of times in any order (nearest ranks); none of none.
     pub fn of(mut times: Vec<f64>) -> Option<TimeSpread> {
         times.sort_by(f64::total_cmp);
-        let rank = |percent: usize| {
-            let rank = (times.len() * percent).div_ceil(100).max(1);
-            times.get(rank - 1).copied()
-        };
+        let rank = |percent| qos::nearest_rank(&times, percent);
         Some(TimeSpread {
             p50: rank(50)?,
             p95: rank(95)?,

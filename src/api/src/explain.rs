@@ -116,10 +116,10 @@ pub struct Link {
     /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
     #[serde(default)]
     pub unsent: u64,
-    /// Of so many of the last inputs that the node was given and that have a stamp …
+    /// The number of the last inputs that the node was given and that have a stamp.
     #[serde(default)]
     pub given: usize,
-    /// … it has left out so many, since newer ones had come.
+    /// Of these, the inputs that it has left out, since newer ones had come.
     #[serde(default)]
     pub left_out: usize,
     /// Inputs that the node listens to and nobody on the robot publishes.
@@ -146,6 +146,21 @@ pub struct Part {
     pub max: f64,
 }
 
+impl Part {
+    /// Of times in any order (nearest ranks), those left out that are no numbers; none of none.
+    pub fn of(name: &str, mut times: Vec<f64>) -> Option<Part> {
+        times.retain(|time| time.is_finite());
+        times.sort_by(f64::total_cmp);
+        let rank = |percent| qos::nearest_rank(&times, percent);
+        Some(Part {
+            name: name.to_owned(),
+            p50: rank(50)?,
+            p90: rank(90)?,
+            max: rank(100)?,
+        })
+    }
+}
+
 impl Link {
     /// A part by name.
     pub fn part(&self, name: &str) -> Option<&Part> {
@@ -164,4 +179,17 @@ pub fn dominant(parts: &[Part]) -> Option<&Part> {
         .iter()
         .filter(|part| part.name != "total" && part.p50 > 0.0)
         .max_by(|a, b| a.p50.total_cmp(&b.p50))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_leave_out_what_is_no_number() {
+        let times = [f64::NAN, 10.0, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0];
+        let part = Part::of("up", times.to_vec()).expect("times");
+        assert_eq!((part.p50, part.p90, part.max), (5.0, 9.0, 10.0));
+        assert_eq!(Part::of("up", vec![f64::NAN]), None);
+    }
 }

@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::quantile::nearest_rank;
+
 /// Samples kept: enough for a 99th percentile, 12 kB in all.
 const KEPT: usize = 512;
 
@@ -94,10 +96,7 @@ impl PhaseBook {
         let of = |(index, name): (usize, &str)| {
             let mut sorted: Vec<u32> = self.kept.iter().map(|sample| sample[index]).collect();
             sorted.sort_unstable();
-            let rank = |percent: usize| {
-                let rank = (sorted.len() * percent).div_ceil(100).max(1);
-                f64::from(sorted[rank - 1]) / 1000.0
-            };
+            let rank = |percent| nearest_rank(&sorted, percent).map_or(0.0, f64::from) / 1000.0;
             Quantiles {
                 phase: name.to_owned(),
                 p50: rank(50),

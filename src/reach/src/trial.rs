@@ -212,10 +212,7 @@ impl Replay {
 /// Quantiles (nearest rank), and what to begin with.
 fn summed_up(mut times: Vec<Duration>) -> Option<Times> {
     times.sort();
-    let rank = |percent: usize| {
-        let rank = (times.len() * percent).div_ceil(100).max(1);
-        Some(times.get(rank - 1)?.as_secs_f64() * 1000.0)
-    };
+    let rank = |percent| Some(qos::nearest_rank(&times, percent)?.as_secs_f64() * 1000.0);
     let (p50, p90, max) = (rank(50)?, rank(90)?, rank(100)?);
     let desire = p50 * 1.5;
     Some(Times {

@@ -8,7 +8,7 @@ const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(300);
 /// The same where the pause is that of several robots, and what one of them sent may have ended the servant.
 const LONGEST_SHARED: Duration = Duration::from_secs(4);
-/// A servant that was ready for so long before it failed had recovered.
+/// A servant that was ready for so long before it failed had recovered, and so had a node that ran for so long.
 pub const RECOVERED: Duration = Duration::from_secs(60);
 /// So long after its pause a failure is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(600);
@@ -49,8 +49,7 @@ pub fn after_failure(
     };
     let pause = match failures {
         1 => Duration::ZERO,
-        // 2^9 s is longer than the longest.
-        n => longest.min(FIRST_PAUSE * 2u32.pow((n - 2).min(9))),
+        n => doubled(FIRST_PAUSE, n - 2, longest),
     };
     Failing {
         revision,
@@ -58,6 +57,12 @@ pub fn after_failure(
         reason: reason.to_owned(),
         again: now + pause,
     }
+}
+
+/// A pause that was `first` and has doubled so many times.
+pub(super) fn doubled(first: Duration, times: u32, longest: Duration) -> Duration {
+    let pause = first.checked_mul(2u32.saturating_pow(times));
+    pause.map_or(longest, |pause| pause.min(longest))
 }
 
 /// How long a servant of `revision` may not be started, if so.

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
+use super::back_off::{RECOVERED, doubled};
+
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// A node that ran so long has recovered.
-const RECOVERED: Duration = Duration::from_secs(60);
 /// Failures in a row after which it is given up.
 const ATTEMPTS: u32 = 6;
 
@@ -51,7 +51,7 @@ pub struct Event {
 /// What happens next.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
-    /// Nothing.
+    /// Nothing follows.
     Nothing,
     /// The servant works on without the node.
     Without(Event),
@@ -123,7 +123,7 @@ fn back_off(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
         true => 1,
         false => failures + 1,
     };
-    let pause = || LONGEST_PAUSE.min(FIRST_PAUSE * 2u32.pow(failures - 1));
+    let pause = || doubled(FIRST_PAUSE, failures - 1, LONGEST_PAUSE);
     (failures, (failures <= ATTEMPTS).then(pause))
 }
 

@@ -11,6 +11,7 @@ use std::f64::consts::PI;
 use api::Millis;
 use api::rollout::{Arm, RolloutState, RolloutTerms, Share};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
 use super::sketch::Sketch;
 
@@ -22,14 +23,14 @@ const SERVANTS: u64 = 3;
 /// How often something was tried and failed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tries {
-    /// All.
+    /// The number of tries.
     pub all: u64,
     /// Those that failed.
     pub failed: u64,
 }
 
 impl Tries {
-    /// One more.
+    /// Counts one try.
     pub fn note(&mut self, failed: bool) {
         self.all += 1;
         self.failed += u64::from(failed);
@@ -71,7 +72,7 @@ pub struct Rollout {
     pub candidate: u64,
     /// How far it has come.
     pub state: RolloutState,
-    /// Why.
+    /// The reason of the state.
     pub reason: String,
     /// When it began.
     pub started: Millis,
@@ -130,23 +131,23 @@ pub fn given(of: &Rollout, service: &str, robot: &str) -> Given {
     }
 }
 
-/// The same on every machine and in every version: FNV-1a (Fowler, Noll, Vo) and the finaliser of MurmurHash3 (Appleby).
+/// The same on every machine and in every version: the first bytes of a SHA-256 sum.
 fn hash(words: &[&str], number: u64) -> u64 {
-    let bytes = words.iter().flat_map(|word| word.bytes().chain([0xff]));
-    let bytes = bytes.chain(number.to_le_bytes());
-    let mut hash = bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-    });
-    for factor in [0xff51_afd7_ed55_8ccd_u64, 0xc4ce_b9fe_1a85_ec53] {
-        hash = (hash ^ (hash >> 33)).wrapping_mul(factor);
+    let mut sum = Sha256::new();
+    for word in words {
+        sum.update((word.len() as u64).to_le_bytes());
+        sum.update(word);
     }
-    hash ^ (hash >> 33)
+    sum.update(number.to_le_bytes());
+    let mut first = [0; 8];
+    first.copy_from_slice(&sum.finalize()[..8]);
+    u64::from_le_bytes(first)
 }
 
 /// What becomes of a rollout now.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
-    /// Nothing.
+    /// Nothing changes.
     Stays,
     /// The candidate is taken back, for this reason.
     RollsBack(String),

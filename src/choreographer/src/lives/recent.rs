@@ -6,14 +6,15 @@ use std::time::{Duration, Instant};
 
 use api::ResponseTimes;
 use parking_lot::Mutex;
+use qos::nearest_rank;
 
 use crate::decide::controller::Measured;
 
-/// Requests that count: those that became known within this time, …
+/// Requests that count: those that became known within this time.
 const LATELY: Duration = Duration::from_secs(10);
-/// … and no more than so many of them; …
+/// Requests of one servant that are remembered at most.
 const MOST: usize = 256;
-/// … with fewer nothing is said.
+/// Requests that a decision needs at least.
 const LEAST: usize = 3;
 
 /// By servant.
@@ -56,19 +57,22 @@ impl Recent {
     /// What 19 of 20 requests of this servant did not exceed lately; none where too few are known.
     pub(crate) fn of(&self, servant: &str, now: Instant) -> Option<Measured> {
         let (total, cloud) = self.times(servant, now)?;
-        (total.len() >= LEAST).then(|| Measured {
-            total: rank(&total, 19, 20),
-            cloud: rank(&cloud, 19, 20),
+        if total.len() < LEAST {
+            return None;
+        }
+        Some(Measured {
+            total: nearest_rank(&total, 95)?,
+            cloud: nearest_rank(&cloud, 95)?,
         })
     }
 
     /// The same to be shown; none where nothing is known.
     pub(crate) fn shown(&self, servant: &str, now: Instant) -> Option<ResponseTimes> {
         let (total, _) = self.times(servant, now)?;
-        (!total.is_empty()).then(|| ResponseTimes {
+        Some(ResponseTimes {
             requests: total.len(),
-            p50_ms: rank(&total, 1, 2),
-            p95_ms: rank(&total, 19, 20),
+            p50_ms: nearest_rank(&total, 50)?,
+            p95_ms: nearest_rank(&total, 95)?,
         })
     }
 
@@ -89,11 +93,6 @@ impl Recent {
     pub(crate) fn keep(&self, lives: impl Fn(&str) -> bool) {
         self.by_servant.lock().retain(|id, _| lives(id));
     }
-}
-
-/// The one that `part` of `of` do not exceed (nearest rank), of at least one in ascending order.
-fn rank(times: &[f64], part: usize, of: usize) -> f64 {
-    times[(times.len() * part).div_ceil(of) - 1]
 }
 
 #[cfg(test)]

@@ -1,0 +1,335 @@
+//! What follows from what is known of a robot: causes, and what to do about each.
+
+use api::explain::{Cause, Link, Served, Weight};
+use api::{Event, Phase};
+
+/// Shares and differences from which on something is worth saying.
+const THROTTLED: f64 = 0.05;
+const WAITS: f64 = 10.0;
+const CLOCK_APART: f64 = 100.0;
+const LATE: f64 = 0.05;
+const QUEUED: f64 = 0.25;
+/// Milliseconds: less is no queue.
+const QUEUE: f64 = 5.0;
+const LEFT_OUT: f64 = 0.1;
+/// The event of a node that hangs; a cause for so many milliseconds.
+const NODE_HUNG: &str = "node-hung";
+const HANGS_FOR: u64 = 60_000;
+/// The event of a stateful hand-over.
+const STATE_LOST: &str = "state-lost";
+
+/// What follows from all that, the weightiest first.
+pub(super) fn causes(
+    servants: &[Served],
+    events: &[Event],
+    failing: &[api::BackOff],
+) -> Vec<Cause> {
+    let mut causes = Vec::new();
+    let mut say = |weight, what: String, next: String| causes.push(Cause { weight, what, next });
+    for one in failing {
+        let left = one.again.saturating_sub(store::now()).div_ceil(1000);
+        let what = format!(
+            "its servants of {} have failed {} times in a row (the last one {}); the next is started in {left} s at the earliest",
+            one.service, one.failures, one.reason
+        );
+        let next = format!(
+            "cloudroidctl events; push {} again when it is fixed",
+            one.service
+        );
+        say(Weight::Blocks, what, next);
+    }
+    if servants.is_empty() {
+        let last = events.last().map(|event| event.message.as_str());
+        let what = match last {
+            Some(last) => format!("it has no servant; the last that happened: {last}"),
+            None => "it has no servant".to_owned(),
+        };
+        let next = "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned();
+        say(Weight::Blocks, what, next);
+    }
+    for served in servants {
+        of_servant(served, &mut say);
+        for link in &served.links {
+            of_link(served, link, &mut say);
+        }
+    }
+    let hangs = events.iter().rev().find(|event| {
+        let is_there = |served: &Served| Some(&served.servant.id) == event.servant.as_ref();
+        event.kind == NODE_HUNG
+            && store::now().saturating_sub(event.time) < HANGS_FOR
+            && servants.iter().any(is_there)
+    });
+    if let Some(hangs) = hangs {
+        let next =
+            "look at its log, or start it again: rosnode kill, or hung = \"restart\" in [servant]";
+        say(Weight::Blocks, hangs.message.clone(), next.to_owned());
+    }
+    // Only the last one: what was lost before that is of an earlier state.
+    let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);
+    if let Some(lost) = lost {
+        say(
+            Weight::Hint,
+            lost.message.clone(),
+            "where that matters begin anew: start its nodes again, or set local = \"none\" so that the cloud alone answers"
+                .to_owned(),
+        );
+    }
+    causes.sort_by_key(|cause| cause.weight);
+    causes
+}
+
+fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
+    let servant = &served.servant;
+    let id = &servant.id;
+    if servant.phase != Phase::Ready {
+        let reason = servant.reason.as_deref().unwrap_or("no reason is known");
+        let weight = match servant.phase {
+            Phase::Failed | Phase::Stopped => Weight::Blocks,
+            _ => Weight::Slows,
+        };
+        let next = match servant.phase {
+            Phase::Requested => format!("cloudroidctl fit {}", servant.service),
+            _ => format!("cloudroidctl logs {id}"),
+        };
+        say(weight, format!("{id} is {}: {reason}", servant.phase), next);
+    }
+    for down in &servant.down {
+        let left = down.again.saturating_sub(store::now()).div_ceil(1000);
+        say(
+            Weight::Blocks,
+            format!(
+                "{} of {id} failed {} times in a row and is started again in {left} s",
+                down.node, down.failures
+            ),
+            format!("cloudroidctl logs {id}"),
+        );
+    }
+    if servant.connections == 0 {
+        say(
+            Weight::Blocks,
+            format!("nothing of the robot is connected to {id}"),
+            "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned(),
+        );
+    }
+    if served.throttled > THROTTLED {
+        let cpus = servant
+            .enforced
+            .and_then(|limits| limits.cpus)
+            .or(servant.limits.cpus);
+        let limit = cpus.map_or_else(String::new, |cpus| format!(" of {cpus}"));
+        say(
+            Weight::Slows,
+            format!(
+                "{id} is held back by its CPU limit{limit} for {:.0} % of the time",
+                served.throttled * 100.0
+            ),
+            format!("give {} more cores: push it with --cpus N", servant.service),
+        );
+    }
+    let pressure = servant.usage.and_then(|usage| usage.pressure);
+    let waits = pressure.map(|pressure| {
+        [
+            ("a core", pressure.cpu),
+            ("memory", pressure.memory),
+            ("a disk", pressure.io),
+        ]
+    });
+    for (what, share) in waits.into_iter().flatten() {
+        // Being held back by one's own limit counts as waiting for a core, too.
+        let by_itself = what == "a core" && served.throttled > THROTTLED;
+        if share > WAITS && !by_itself {
+            say(
+                Weight::Slows,
+                format!("{id} waits for {what} {share:.0} % of the time"),
+                "see what else runs on the server: cloudroidctl servants".to_owned(),
+            );
+        }
+    }
+    let killed = servant.usage.map_or(0, |usage| usage.oom_kills);
+    if killed > 0 {
+        say(
+            Weight::Slows,
+            format!("{killed} processes of {id} were killed for want of memory"),
+            format!(
+                "give {} more memory: push it with --memory SIZE",
+                servant.service
+            ),
+        );
+    }
+    if servant.dropped > 0 {
+        say(
+            Weight::Hint,
+            format!(
+                "{} messages of {id} were dropped because a reader was slow",
+                servant.dropped
+            ),
+            "lower the rate of what is subscribed to, or compress it".to_owned(),
+        );
+    }
+}
+
+fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+    let node = &link.node;
+    if !link.up {
+        say(
+            Weight::Blocks,
+            match link.fallback_after {
+                Some(after) => format!(
+                    "the link of {node} is down; where the original is installed on the robot, it stands in after {:.1} s",
+                    after / 1000.0
+                ),
+                None => format!("the link of {node} is down"),
+            },
+            "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
+        );
+    }
+    if !link.duplicates.is_empty() {
+        say(
+            Weight::Blocks,
+            format!(
+                "another machine ({}) is connected as this robot, beside that of {node}",
+                link.duplicates.join(", ")
+            ),
+            "give one of them another id: `robot` in stub.toml, or CLOUDROID_ROBOT".to_owned(),
+        );
+    }
+    for topic in &link.unfed {
+        say(
+            Weight::Blocks,
+            format!("{node} listens to {topic}, which nobody on the robot publishes"),
+            format!("remap it to the topic that is meant: {topic}:=/THE/TOPIC"),
+        );
+    }
+    for service in &link.unserved {
+        say(
+            Weight::Hint,
+            format!("{node} looked for the service {service}, which nobody served"),
+            format!("start what serves it on the robot, or remap it: {service}:=/THE/SERVICE"),
+        );
+    }
+    if let Some(clock) = link.clock.filter(|clock| clock.abs() > CLOCK_APART) {
+        let side = if clock > 0.0 { "ahead of" } else { "behind" };
+        say(
+            Weight::Hint,
+            format!(
+                "the robot's clock is {:.0} ms {side} the server's",
+                clock.abs()
+            ),
+            "sudo apt install chrony, on both sides".to_owned(),
+        );
+    }
+    of_queue(served, link, say);
+    for drop in &link.drops {
+        say(
+            Weight::Hint,
+            drop.clone(),
+            "send less (a lower rate, codec = \"jpeg\"), or give the topic's reader a longer queue"
+                .to_owned(),
+        );
+    }
+    if link.requests == 0 {
+        return;
+    }
+    let late = link.late as f64 / link.requests as f64;
+    if late > LATE {
+        let max = link
+            .max
+            .map_or_else(String::new, |max| format!(" ({max:.0} ms)"));
+        let (part, next) = blame(served, link);
+        say(
+            Weight::Slows,
+            format!(
+                "{} of the last {} requests of {node} passed T_max{max}{part}",
+                link.late, link.requests
+            ),
+            next,
+        );
+    }
+    if link.local > 0 {
+        let q = link
+            .satisfaction
+            .map_or_else(String::new, |q| format!(", Q is {q:.1}"));
+        say(
+            Weight::Hint,
+            format!(
+                "the local original answered {} of the last {} requests of {node}{q}",
+                link.local, link.requests
+            ),
+            match link.fallback_after {
+                Some(_) => {
+                    "it stands in while the link is away, and hands back by itself".to_owned()
+                }
+                None => "it stops by itself when the cloud keeps T_max again".to_owned(),
+            },
+        );
+    }
+}
+
+/// Inputs come faster than the node takes them.
+fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+    let node = &link.node;
+    let next = || {
+        format!(
+            "lower the rate of its inputs, or give it more cores: cloudroidctl set {} --cpus N",
+            served.servant.id
+        )
+    };
+    let median = |name: &str| link.part(name).map_or(0.0, |part| part.p50);
+    let (queue, compute, total) = (median("queue"), median("compute"), median("total"));
+    if queue > QUEUE && queue > QUEUED * total {
+        say(
+            Weight::Slows,
+            format!(
+                "requests queue before {node}: {queue:.0} ms of {total:.0} ms, while it needs {compute:.0} ms for one"
+            ),
+            next(),
+        );
+    }
+    if link.unsent > 0 {
+        say(
+            Weight::Slows,
+            format!(
+                "{} inputs of {node} were not sent in the last minute: the link was busy until newer ones came",
+                link.unsent
+            ),
+            "lower their rate, or look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
+        );
+    }
+    if link.left_out as f64 > LEFT_OUT * link.given as f64 {
+        say(
+            Weight::Slows,
+            format!(
+                "{node} has left out {} of its last {} inputs: newer ones came before it was done",
+                link.left_out, link.given
+            ),
+            next(),
+        );
+    }
+}
+
+/// Where the time goes, and what helps there.
+fn blame(served: &Served, link: &Link) -> (String, String) {
+    let Some(part) = &link.late_in else {
+        return (
+            "; of these none was answered".to_owned(),
+            "see the robot's log, and what else is named here".to_owned(),
+        );
+    };
+    let text = format!(
+        "; most of the time goes into {} ({:.0} ms)",
+        part.name, part.p50
+    );
+    let next = match part.name.as_str() {
+        "up" | "down" => "look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
+        "queue" => "requests come faster than they are answered: lower their rate, or give more cores with --cpus".to_owned(),
+        "compute" => format!(
+            "the node itself is slow: push {} with more --cpus, or raise T_max",
+            served.servant.service
+        ),
+        _ => "the robot itself is busy: see top there".to_owned(),
+    };
+    (text, next)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,303 @@
+use api::explain::Part;
+use link::control::Request;
+use reach::links::LinkStatus;
+
+use super::*;
+
+fn served(link: Link) -> Served {
+    Served {
+        servant: api::Servant {
+            id: "s1".into(),
+            service: "people".into(),
+            revision: 1,
+            robot: "rover".into(),
+            phase: Phase::Ready,
+            reason: None,
+            created: 0,
+            connections: 1,
+            idle_until: None,
+            terms: None,
+            limits: api::Limits {
+                cpus: Some(0.5),
+                ..api::Limits::default()
+            },
+            enforced: None,
+            cgroup_version: 2,
+            usage: Some(api::Usage::default()),
+            response: None,
+            pids: Vec::new(),
+            dropped: 0,
+            down: Vec::new(),
+        },
+        throttled: 0.0,
+        cores: 0.0,
+        links: vec![link],
+    }
+}
+
+fn link() -> Link {
+    Link {
+        node: "/detect".into(),
+        up: true,
+        clock: Some(3.0),
+        max: Some(300.0),
+        requests: 100,
+        phases: vec![
+            Part::of("up", vec![20.0; 3]).expect("times"),
+            Part::of("compute", vec![90.0; 3]).expect("times"),
+        ],
+        ..Link::default()
+    }
+}
+
+fn texts(served: Served) -> Vec<(Weight, String)> {
+    causes(&[served], &[], &[])
+        .into_iter()
+        .map(|cause| (cause.weight, format!("{}; {}", cause.what, cause.next)))
+        .collect()
+}
+
+#[test]
+fn when_all_is_well_nothing_is_said() {
+    assert_eq!(texts(served(link())), []);
+}
+
+#[test]
+fn late_requests_are_blamed_on_the_part_that_takes_longest() {
+    let late_in = Part::of("compute", vec![90.0]);
+    let late = Link { late: 20, ..link() };
+    let unanswered = texts(served(late.clone()));
+    assert!(
+        unanswered[0]
+            .1
+            .contains("; of these none was answered; see"),
+        "{unanswered:?}"
+    );
+    let upward = Link {
+        late_in: Part::of("up", vec![400.0]),
+        ..late.clone()
+    };
+    let network = texts(served(upward));
+    assert!(
+        network[0]
+            .1
+            .contains("goes into up (400 ms); look at the robot's network"),
+        "{network:?}"
+    );
+    let causes = texts(served(Link { late_in, ..late }));
+    assert_eq!(causes.len(), 1);
+    assert!(
+        causes[0].1.starts_with(
+            "20 of the last 100 requests of /detect passed T_max (300 ms); most of the time goes into compute (90 ms)"
+        ),
+        "{causes:?}"
+    );
+}
+
+#[test]
+fn each_thing_that_can_be_wrong_is_named() {
+    let mut all = served(Link {
+        up: false,
+        clock: Some(-2000.0),
+        unfed: vec!["/image".into()],
+        unserved: vec!["/static_map".into()],
+        unsent: 12,
+        given: 128,
+        left_out: 40,
+        phases: vec![
+            Part::of("queue", vec![60.0; 3]).expect("times"),
+            Part::of("compute", vec![30.0; 3]).expect("times"),
+            Part::of("total", vec![100.0; 3]).expect("times"),
+        ],
+        duplicates: vec!["rover2".into()],
+        drops: vec!["on the robot 9 messages of /scan were dropped: why".into()],
+        local: 7,
+        satisfaction: Some(2.5),
+        ..link()
+    });
+    all.throttled = 0.4;
+    all.servant.dropped = 3;
+    all.servant.usage = Some(api::Usage {
+        oom_kills: 1,
+        pressure: Some(api::Pressure {
+            cpu: 80.0,
+            memory: 30.0,
+            io: 0.0,
+        }),
+        ..api::Usage::default()
+    });
+    let causes = texts(all);
+    let words = [
+        "the link of /detect is down",
+        "another machine (rover2) is connected as this robot, beside that of /detect; give one",
+        "listens to /image, which nobody on the robot publishes; remap it",
+        "looked for the service /static_map, which nobody served; start",
+        "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
+        "waits for memory 30 %",
+        "1 processes of s1 were killed",
+        "3 messages of s1 were dropped",
+        "2000 ms behind the server's",
+        "requests queue before /detect: 60 ms of 100 ms, while it needs 30 ms for one; lower the rate of its inputs, or give it more cores: cloudroidctl set s1 --cpus N",
+        "12 inputs of /detect were not sent in the last minute",
+        "/detect has left out 40 of its last 128 inputs",
+        "on the robot 9 messages of /scan were dropped: why; send less",
+        "answered 7 of the last 100 requests of /detect, Q is 2.5",
+    ];
+    for words in words {
+        assert!(
+            causes.iter().any(|(_, text)| text.contains(words)),
+            "{words}: {causes:?}"
+        );
+    }
+    assert_eq!(causes.len(), words.len(), "{causes:?}");
+    assert!(causes.is_sorted_by_key(|(weight, _)| *weight));
+}
+
+#[test]
+fn a_robot_without_a_servant_is_told_what_happened_last() {
+    let event = Event {
+        id: 1,
+        time: 0,
+        level: api::Level::Error,
+        kind: "servant-failed".into(),
+        service: None,
+        servant: None,
+        robot: Some("rover".into()),
+        message: "the servant ran out of memory".into(),
+    };
+    let causes = causes(&[], &[event], &[]);
+    assert_eq!(causes[0].weight, Weight::Blocks);
+    assert!(causes[0].what.ends_with("the servant ran out of memory"));
+}
+
+#[test]
+fn what_a_hand_over_has_lost_is_named() {
+    let event = |kind: &str, message: &str| Event {
+        id: 1,
+        time: 0,
+        level: api::Level::Warning,
+        kind: kind.into(),
+        service: None,
+        servant: None,
+        robot: Some("rover".into()),
+        message: message.into(),
+    };
+    let events = [
+        event("state-lost", "the first"),
+        event("state-lost", "the cloud goes on without 3 of /scan"),
+        event("local-hands-back", "the link is up again"),
+    ];
+    let causes = causes(&[], &events, &[]);
+    let lost: Vec<_> = causes
+        .iter()
+        .filter(|cause| cause.weight == Weight::Hint)
+        .collect();
+    assert_eq!(lost.len(), 1);
+    assert_eq!(lost[0].what, "the cloud goes on without 3 of /scan");
+    assert!(
+        lost[0].next.contains("local = \"none\""),
+        "{}",
+        lost[0].next
+    );
+}
+
+#[test]
+fn a_links_requests_are_summed_up() {
+    use link::drops::{Cause, Drop};
+    let request = |total: Option<f64>, local| Request {
+        total,
+        compute: 40.0,
+        local,
+        satisfaction: 6.0,
+        ..Request::default()
+    };
+    let dropped = |cause, count| Drop {
+        topic: "/image".into(),
+        cause,
+        count,
+    };
+    let seen = crate::explain::link(LinkStatus {
+        node: "/detect".into(),
+        up: true,
+        round_trip: Some(2.0),
+        clock: None,
+        throughput: None,
+        drops: vec![dropped(Cause::Slow, 2)],
+        dropped: vec![dropped(Cause::Replaced, 30)],
+        sla: link::control::Sla {
+            desire: Some(0.05),
+            max: Some(0.1),
+            ..Default::default()
+        },
+        requests: vec![
+            request(Some(50.0), false),
+            Request {
+                up: 90.0,
+                ..request(Some(150.0), true)
+            },
+            request(None, true),
+        ],
+        unsent: 0,
+        given: 3,
+        left_out: 1,
+        unfed: vec![],
+        unserved: vec![],
+        duplicates: vec![],
+    });
+    assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
+    assert_eq!(seen.dropped, 32);
+    assert!(seen.drops[0].starts_with("in the cloud 2 messages of /image were dropped: "));
+    assert!(seen.drops[1].starts_with("on the robot 30 messages of /image were dropped: "));
+    assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
+    let total = seen.phases.last().expect("parts");
+    assert_eq!(
+        (total.name.as_str(), total.p50, total.max),
+        ("total", 50.0, 150.0)
+    );
+    let name = |part: Option<&Part>| part.map(|part| part.name.clone());
+    assert_eq!(name(seen.dominant()).as_deref(), Some("compute"));
+    let late_in = name(seen.late_in.as_ref());
+    assert_eq!(late_in.as_deref(), Some("up"), "of those that were late");
+}
+
+#[test]
+fn what_was_never_promised_is_not_late() {
+    let request = |total: Option<f64>| Request {
+        total,
+        local: total.is_none(),
+        satisfaction: 8.0,
+        ..Request::default()
+    };
+    let seen = crate::explain::link(LinkStatus {
+        node: "/detect".into(),
+        up: false,
+        round_trip: None,
+        clock: None,
+        throughput: None,
+        drops: vec![],
+        dropped: vec![],
+        sla: link::control::Sla {
+            fallback_after: Some(3.0),
+            ..Default::default()
+        },
+        requests: vec![request(Some(9000.0)), request(None)],
+        unsent: 0,
+        given: 0,
+        left_out: 0,
+        unfed: vec![],
+        unserved: vec![],
+        duplicates: vec![],
+    });
+    assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
+    let causes = texts(served(seen));
+    for words in [
+        "the link of /detect is down; where the original is installed on the robot, it stands in after 3.0 s",
+        "answered 1 of the last 2 requests of /detect; it stands in while the link is away",
+    ] {
+        assert!(
+            causes.iter().any(|(_, text)| text.contains(words)),
+            "{words}: {causes:?}"
+        );
+    }
+    assert_eq!(causes.len(), 2, "{causes:?}");
+}
