@@ -36,19 +36,72 @@ pub struct Limits {
     pub cpuset: Option<CpuSet>,
 }
 
+/// Limits made of two, field by field: each by a function of two options, that of cores to run on by another if one is given.
+macro_rules! field_by_field {
+    ($one:expr, $other:expr, $of:path) => {
+        field_by_field!($one, $other, $of, $of)
+    };
+    ($one:expr, $other:expr, $of:path, $of_cores:path) => {
+        Limits {
+            cpus: $of($one.cpus, $other.cpus),
+            cpu_weight: $of($one.cpu_weight, $other.cpu_weight),
+            memory: $of($one.memory, $other.memory),
+            memory_high: $of($one.memory_high, $other.memory_high),
+            pids: $of($one.pids, $other.pids),
+            io_read: $of($one.io_read, $other.io_read),
+            io_write: $of($one.io_write, $other.io_write),
+            cpuset: $of_cores($one.cpuset, $other.cpuset),
+        }
+    };
+}
+
 impl Limits {
     /// These limits, with `default` where nothing is said.
     pub fn or(self, default: Limits) -> Limits {
-        Limits {
-            cpus: self.cpus.or(default.cpus),
-            cpu_weight: self.cpu_weight.or(default.cpu_weight),
-            memory: self.memory.or(default.memory),
-            memory_high: self.memory_high.or(default.memory_high),
-            pids: self.pids.or(default.pids),
-            io_read: self.io_read.or(default.io_read),
-            io_write: self.io_write.or(default.io_write),
-            cpuset: self.cpuset.or(default.cpuset),
+        field_by_field!(self, default, Option::or)
+    }
+
+    /// Those of `other` where these say something.
+    pub fn and(self, other: Limits) -> Limits {
+        field_by_field!(self, other, Option::and)
+    }
+
+    /// These limits, without those that `other` has, too.
+    pub fn without(self, other: Limits) -> Limits {
+        fn unlike<T: PartialEq>(one: Option<T>, other: Option<T>) -> Option<T> {
+            one.filter(|one| other.as_ref() != Some(one))
         }
+        field_by_field!(self, other, unlike)
+    }
+
+    /// The smallest limits that are enough for both; the cores that these name, if any, to run on.
+    pub fn most(self, other: Limits) -> Limits {
+        fn more<T: PartialOrd>(one: Option<T>, other: Option<T>) -> Option<T> {
+            match (one, other) {
+                (Some(one), Some(other)) => Some(if other > one { other } else { one }),
+                (one, other) => one.or(other),
+            }
+        }
+        field_by_field!(self, other, more, Option::or)
+    }
+
+    /// What is limited: the name of the flag that sets it, and its value as written there.
+    pub fn named(&self) -> impl Iterator<Item = (&'static str, String)> {
+        fn text(value: Option<impl ToString>) -> Option<String> {
+            value.map(|value| value.to_string())
+        }
+        let all = [
+            ("cpus", text(self.cpus)),
+            ("cpu-weight", text(self.cpu_weight)),
+            ("cpuset", text(self.cpuset)),
+            ("memory", text(self.memory)),
+            ("memory-high", text(self.memory_high)),
+            ("pids", text(self.pids)),
+            ("io-read", text(self.io_read)),
+            ("io-write", text(self.io_write)),
+        ];
+        all.into_iter()
+            .filter_map(|(name, value)| Some((name, value?)))
     }
 }
 

@@ -165,16 +165,19 @@ pub fn clock(time: Millis) -> String {
 
 /// Limits in a cell: what is limited.
 pub fn limits(limits: &Limits) -> String {
-    let cpus = limits.cpus.map(|cpus| format!("{cpus} cpus"));
-    let memory = limits.memory.map(|memory| memory.to_string());
-    let pids = limits.pids.map(|pids| format!("{pids} pids"));
-    let high = limits.memory_high.map(|high| format!("high {high}"));
-    let read = limits.io_read.map(|bytes| format!("read {bytes}/s"));
-    let write = limits.io_write.map(|bytes| format!("write {bytes}/s"));
-    let cores = limits.cpuset.map(|cores| format!("on cores {cores}"));
-    let set: Vec<String> = [cpus, cores, memory, high, pids, read, write]
-        .into_iter()
-        .flatten()
+    let set: Vec<String> = limits
+        .named()
+        .filter_map(|(name, value)| match name {
+            "cpus" | "pids" => Some(format!("{value} {name}")),
+            // It is always enforced, and says little.
+            "cpu-weight" => None,
+            "cpuset" => Some(format!("on cores {value}")),
+            "memory" => Some(value),
+            "memory-high" => Some(format!("high {value}")),
+            "io-read" => Some(format!("read {value}/s")),
+            "io-write" => Some(format!("write {value}/s")),
+            name => Some(format!("{name} {value}")),
+        })
         .collect();
     if set.is_empty() {
         "none".to_owned()

@@ -234,26 +234,6 @@ fn cases<'a>(rows: impl Iterator<Item = &'a Row>, known: &Aux) -> BTreeSet<Aux> 
         .collect()
 }
 
-/// Limits that are enough for both.
-pub fn most(one: Limits, other: Limits) -> Limits {
-    fn more<T: PartialOrd>(one: Option<T>, other: Option<T>) -> Option<T> {
-        match (one, other) {
-            (Some(one), Some(other)) => Some(if other > one { other } else { one }),
-            (one, other) => one.or(other),
-        }
-    }
-    Limits {
-        cpus: more(one.cpus, other.cpus),
-        cpu_weight: more(one.cpu_weight, other.cpu_weight),
-        memory: more(one.memory, other.memory),
-        memory_high: more(one.memory_high, other.memory_high),
-        pids: more(one.pids, other.pids),
-        io_read: more(one.io_read, other.io_read),
-        io_write: more(one.io_write, other.io_write),
-        cpuset: one.cpuset.or(other.cpuset),
-    }
-}
-
 /// Refuses a row that cannot be; says what to write.
 pub fn check(row: &Row) -> Result<(), String> {
     let name = row.measure.name();

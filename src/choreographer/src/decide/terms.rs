@@ -24,7 +24,7 @@ use api::sla::Goal;
 use api::{Caps, Limits, Sla, Stated, Terms};
 
 use super::Amount;
-use super::dictionary::{Aux, Choice, Shelf, most};
+use super::dictionary::{Aux, Choice, Shelf};
 use crate::options::{Class, DEFAULT_CLASS};
 use caps::Bounds;
 pub use caps::{Cap, Capper};
@@ -59,7 +59,7 @@ pub enum Untenable {
     UnknownClass {
         /// Stated.
         name: String,
-        /// Those that there are.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// More than its class or its service allows.
@@ -208,7 +208,7 @@ pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Ter
             } => return Err(unmet(&goal, best, beyond, assumed, offer, &reading)),
         };
         let enough = row.limits.or(own);
-        by_rows = Some(by_rows.map_or(enough, |sum| most(sum, enough)));
+        by_rows = Some(by_rows.map_or(enough, |sum| sum.most(enough)));
         why.push(reason);
         rows.push(row.clone());
     }
@@ -333,19 +333,9 @@ fn class<'a>(
 
 /// Limits for people, by the names of the flags that set them.
 pub(crate) fn in_words(limits: &Limits) -> String {
-    let named = [
-        ("cpus", limits.cpus.map(|cpus| cpus.to_string())),
-        ("cpu-weight", limits.cpu_weight.map(|n| n.to_string())),
-        ("cpuset", limits.cpuset.map(|cores| cores.to_string())),
-        ("memory", limits.memory.map(|bytes| bytes.to_string())),
-        ("memory-high", limits.memory_high.map(|n| n.to_string())),
-        ("pids", limits.pids.map(|pids| pids.to_string())),
-        ("io-read", limits.io_read.map(|bytes| bytes.to_string())),
-        ("io-write", limits.io_write.map(|bytes| bytes.to_string())),
-    ];
-    let set = named
-        .into_iter()
-        .filter_map(|(name, value)| Some(format!("{name} {}", value?)));
+    let set = limits
+        .named()
+        .map(|(name, value)| format!("{name} {value}"));
     set.collect::<Vec<_>>().join(", ")
 }
 

@@ -347,24 +347,17 @@ pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Se
 /// limits, such as a cpuset on cgroup v1, cannot be set again. What `after` says nothing of is none again, all of this
 /// machine's `cores`, and the kernel's weight; a cpuset stays.
 fn changed(before: &Limits, after: &Limits, cores: f64) -> Limits {
-    fn new<T: PartialEq>(before: Option<T>, after: Option<T>, none: Option<T>) -> Option<T> {
-        match after {
-            None => none.filter(|_| before.is_some()),
-            after => after.filter(|after| before.as_ref() != Some(after)),
-        }
-    }
-    let unlimited = Some(UNLIMITED);
-    let size = unlimited.map(Size);
-    Limits {
-        cpus: new(before.cpus, after.cpus, Some(cores)),
-        cpu_weight: new(before.cpu_weight, after.cpu_weight, Some(PLAIN_WEIGHT)),
-        memory: new(before.memory, after.memory, size),
-        memory_high: new(before.memory_high, after.memory_high, size),
-        pids: new(before.pids, after.pids, unlimited),
-        io_read: new(before.io_read, after.io_read, size),
-        io_write: new(before.io_write, after.io_write, size),
-        cpuset: new(before.cpuset, after.cpuset, None),
-    }
+    let unlimited = Limits {
+        cpus: Some(cores),
+        cpu_weight: Some(PLAIN_WEIGHT),
+        memory: Some(Size(UNLIMITED)),
+        memory_high: Some(Size(UNLIMITED)),
+        pids: Some(UNLIMITED),
+        io_read: Some(Size(UNLIMITED)),
+        io_write: Some(Size(UNLIMITED)),
+        cpuset: None,
+    };
+    after.or(before.and(unlimited)).without(*before)
 }
 
 #[cfg(test)]

@@ -5,47 +5,40 @@ use crate::spec::{Limits, UNLIMITED};
 
 /// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
 /// thousandth of one.
-pub fn missing(asked: &Limits, enforced: &Limits) -> Vec<&'static str> {
-    let mut missing = Vec::new();
-    let close = |asked: Option<f64>, got: Option<f64>, tolerance: f64| match (asked, got) {
-        (Some(asked), Some(got)) => (asked - got).abs() <= tolerance,
-        (Some(_), None) => false,
-        (None, _) => true,
-    };
+pub fn missing(asked: &Limits, got: &Limits) -> Vec<&'static str> {
     let number = |value: Option<u64>| value.map(|value| value as f64);
     // Where it is to be none again, none is in force.
-    let enforced = Limits {
-        memory: enforced.memory.or(none(asked.memory)),
-        memory_high: enforced.memory_high.or(none(asked.memory_high)),
-        pids: enforced.pids.or(none(asked.pids)),
-        io_read: enforced.io_read.or(none(asked.io_read)),
-        io_write: enforced.io_write.or(none(asked.io_write)),
-        ..*enforced
+    let lifted = |asked, got: Option<u64>| number(got.or(none(asked)));
+    let numbers = [
+        ("cpus", asked.cpus, got.cpus, 0.001),
+        (
+            "cpu_weight",
+            number(asked.cpu_weight),
+            number(got.cpu_weight),
+            1.0,
+        ),
+    ];
+    let amounts = [
+        // Memory comes in pages.
+        ("memory", asked.memory, got.memory, 65536.0),
+        ("memory_high", asked.memory_high, got.memory_high, 65536.0),
+        ("pids", asked.pids, got.pids, 0.0),
+        ("io_read", asked.io_read, got.io_read, 0.0),
+        ("io_write", asked.io_write, got.io_write, 0.0),
+    ];
+    let amounts = amounts
+        .map(|(name, asked, got, tolerance)| (name, number(asked), lifted(asked, got), tolerance));
+    let is_missing = |asked: Option<f64>, got: Option<f64>, tolerance: f64| match (asked, got) {
+        (Some(asked), Some(got)) => (asked - got).abs() > tolerance,
+        (asked, _) => asked.is_some(),
     };
-    if !close(asked.cpus, enforced.cpus, 0.001) {
-        missing.push("cpus");
-    }
-    if !close(number(asked.cpu_weight), number(enforced.cpu_weight), 1.0) {
-        missing.push("cpu_weight");
-    }
-    if !close(number(asked.memory), number(enforced.memory), 65536.0) {
-        missing.push("memory");
-    }
-    // Memory that is to be given back, like memory, comes in pages.
-    let high = (number(asked.memory_high), number(enforced.memory_high));
-    if !close(high.0, high.1, 65536.0) {
-        missing.push("memory_high");
-    }
-    if !close(number(asked.pids), number(enforced.pids), 0.0) {
-        missing.push("pids");
-    }
-    if !close(number(asked.io_read), number(enforced.io_read), 0.0) {
-        missing.push("io_read");
-    }
-    if !close(number(asked.io_write), number(enforced.io_write), 0.0) {
-        missing.push("io_write");
-    }
-    if asked.cpuset.is_some() && asked.cpuset != enforced.cpuset {
+    let mut missing: Vec<&str> = numbers
+        .into_iter()
+        .chain(amounts)
+        .filter(|(_, asked, got, tolerance)| is_missing(*asked, *got, *tolerance))
+        .map(|(name, ..)| name)
+        .collect();
+    if asked.cpuset.is_some() && asked.cpuset != got.cpuset {
         missing.push("cpuset");
     }
     missing
