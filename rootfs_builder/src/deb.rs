@@ -19,7 +19,7 @@ pub(crate) struct Member {
     pub(crate) mode: u32,
     /// Seconds since 1970.
     pub(crate) mtime: u64,
-    /// What it is.
+    /// File, link or directory.
     pub(crate) content: Content,
 }
 

@@ -13,7 +13,7 @@ pub enum Error {
         name: String,
         /// Where definitions are.
         directory: PathBuf,
-        /// Those that there are.
+        /// Names that exist.
         known: String,
     },
     /// A base definition that cannot be used.
@@ -110,7 +110,7 @@ pub enum Error {
     /// Something of ours that runs inside a container failed.
     #[error("{what} failed: {last_lines}")]
     Inside {
-        /// What it was to do.
+        /// The step that failed.
         what: &'static str,
         /// The last lines it printed.
         last_lines: String,
@@ -136,7 +136,7 @@ pub enum Error {
         what: &'static str,
         /// What was asked for.
         name: String,
-        /// Those that there are.
+        /// Names that exist.
         known: String,
         /// Where it is instead, with the option that adds it.
         elsewhere: String,

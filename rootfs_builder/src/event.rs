@@ -28,7 +28,7 @@ pub enum BuildEvent {
     },
     /// Something to know that is no failure.
     Warning {
-        /// What.
+        /// The text, for people.
         message: String,
     },
 }

@@ -9,7 +9,7 @@ use crate::apt::{Deb, Relations};
 /// Packages that are unpacked together.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Step {
-    /// How many.
+    /// The number of packages.
     pub(crate) unpack: usize,
     /// Names of packages to be configured, with what they need, before the next step.
     pub(crate) configure: BTreeSet<String>,

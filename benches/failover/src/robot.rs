@@ -22,7 +22,7 @@ const SIZE: (u32, u32) = (640, 480);
 /// Stamps of measured requests begin after this one.
 const FIRST: u32 = 1000;
 
-/// What to do.
+/// The inputs that are sent, and when.
 pub struct Plan<'a> {
     /// Requests per second.
     pub rate: f64,

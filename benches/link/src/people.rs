@@ -16,7 +16,7 @@ pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nst
     ================================================================================\n\
     MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
 
-/// One of the two.
+/// One way to send the same messages.
 struct Way {
     pictures: Box<dyn Publisher>,
     found: Subscription,

@@ -14,7 +14,7 @@ use crate::bundle::Bundle;
 /// Runtimes with the command line of runc.
 const KNOWN: [&str; 2] = ["runc", "crun"];
 
-/// One of them.
+/// A program that is measured beside ours.
 pub(crate) struct Peer {
     /// Its program.
     pub(crate) name: &'static str,

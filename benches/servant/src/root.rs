@@ -39,7 +39,7 @@ impl Root {
         Ok(Self { path })
     }
 
-    /// Where it is.
+    /// Its path.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }

@@ -116,7 +116,7 @@ pub struct Considered {
     pub row: Row,
     /// It is taken.
     pub taken: bool,
-    /// Why, or why not.
+    /// The reason why it was taken or not.
     pub why: String,
 }
 

@@ -39,7 +39,7 @@ pub struct Check {
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum CheckStatus {
-    /// It is there.
+    /// What is checked is there.
     Ok,
     /// It works without, but less well.
     Warning,

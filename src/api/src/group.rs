@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub struct Shared {
     /// Servants that there are while a robot uses the service, at least.
     pub min: u32,
-    /// And at most.
+    /// Servants at most.
     pub max: u32,
     /// A request may be carried out twice: one whose servant was lost is asked again.
     pub idempotent: bool,

@@ -120,7 +120,7 @@ pub enum PushEvent {
     },
     /// Not published; an earlier revision keeps serving.
     Error {
-        /// Why, and what to do.
+        /// The reason, and what to do.
         problem: Problem,
     },
 }

@@ -162,7 +162,7 @@ pub struct Rollout {
     pub candidate: u64,
     /// How far it has come.
     pub state: RolloutState,
-    /// Why.
+    /// The reason of its state.
     pub reason: String,
     /// When it began.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
@@ -185,7 +185,7 @@ pub struct Rollout {
 pub enum RolloutOrder {
     /// A published revision begins its way.
     Start {
-        /// Which.
+        /// The revision's number.
         revision: u64,
         /// On which terms.
         #[serde(default)]

@@ -62,14 +62,14 @@ pub enum ShadowEvent {
         /// What is done now.
         title: String,
     },
-    /// It is over.
+    /// The comparison has ended.
     Done {
         /// What was found.
         shadow: Box<Shadow>,
     },
     /// Nothing was compared.
     Error {
-        /// Why, and what to do.
+        /// The reason, and what to do.
         problem: Problem,
     },
 }
@@ -160,7 +160,7 @@ impl fmt::Display for Kind {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Compared {
-    /// What it is.
+    /// Topic, service or action.
     pub kind: Kind,
     /// Its name.
     pub name: String,
@@ -188,7 +188,7 @@ impl Compared {
         self.equal + self.unequal()
     }
 
-    /// Those that were not the same.
+    /// The number of comparisons whose answers differ.
     pub fn unequal(&self) -> u64 {
         self.different + self.missing + self.surplus
     }
@@ -214,7 +214,7 @@ pub struct FieldDifference {
 pub struct NotCompared {
     /// A topic, a service, an action, or part of what happened.
     pub what: String,
-    /// Why.
+    /// The reason.
     pub why: String,
     /// So often; 0 where that does not matter.
     pub count: u64,

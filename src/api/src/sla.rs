@@ -70,7 +70,7 @@ pub struct Stated {
 pub struct Unstatable {
     /// Its key.
     pub key: String,
-    /// Why not, and what to do.
+    /// The reason, and what to do.
     pub reason: String,
 }
 

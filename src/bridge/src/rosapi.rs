@@ -53,7 +53,7 @@ impl Service {
             .map(|(name, srv)| Service { name, srv })
     }
 
-    /// All of them.
+    /// Every service of rosapi.
     pub(crate) fn all() -> impl Iterator<Item = Service> {
         definitions::SERVICES
             .iter()

@@ -171,7 +171,7 @@ impl Budget {
         self.node.above.as_ref().filter(|_| !self.alone)
     }
 
-    /// This one and those above it.
+    /// This budget and those above it, upwards.
     fn chain(&self) -> impl Iterator<Item = &Budget> {
         std::iter::successors(Some(self), |budget| budget.above())
     }

@@ -8,7 +8,7 @@ pub enum Error {
     UnknownService {
         /// Asked for.
         name: String,
-        /// What there is.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// No such revision.
@@ -18,7 +18,7 @@ pub enum Error {
         service: String,
         /// Asked for.
         revision: String,
-        /// What there is.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// No such image or blob.
@@ -32,7 +32,7 @@ pub enum Error {
     NoStub {
         /// The service.
         service: String,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
     /// The robot's program is not held for an architecture.
@@ -40,7 +40,7 @@ pub enum Error {
     UnknownArchitecture {
         /// Asked for.
         asked: String,
-        /// What there is.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// A name that cannot be given.

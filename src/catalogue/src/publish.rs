@@ -16,7 +16,7 @@ use crate::{Catalogue, Error, blocking};
 pub struct RolledBack {
     /// The revision that was the current one.
     pub from: u64,
-    /// The one that is now.
+    /// The revision that is the current one now.
     pub to: u64,
 }
 

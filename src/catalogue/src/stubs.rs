@@ -23,7 +23,7 @@ pub struct Programs {
     found: Vec<Program>,
 }
 
-/// One of them.
+/// A program of a stub.
 pub struct Program {
     /// As in [`ARCHITECTURES`].
     pub architecture: &'static str,
@@ -52,7 +52,7 @@ impl Programs {
         }
     }
 
-    /// For which there is one.
+    /// Architectures for which there is a program.
     pub fn held(&self) -> Vec<String> {
         self.found
             .iter()
@@ -60,7 +60,7 @@ impl Programs {
             .collect()
     }
 
-    /// For which there is none.
+    /// Architectures for which there is no program.
     pub fn lacking(&self) -> Vec<String> {
         let held = self.held();
         ARCHITECTURES

@@ -87,6 +87,6 @@ pub(crate) struct Servant<'a> {
 pub(crate) struct End<'a> {
     /// Its id.
     pub(crate) id: &'a str,
-    /// Why.
+    /// The reason, for people.
     pub(crate) reason: &'static str,
 }

@@ -10,7 +10,7 @@ pub enum Error {
     UnknownServant {
         /// Asked for.
         id: String,
-        /// What there is.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// There is no room.
@@ -28,7 +28,7 @@ pub enum Error {
         service: String,
         /// What was stated.
         stated: String,
-        /// Why not.
+        /// What stood against it.
         reason: Box<Unchanged>,
     },
     /// The servant could not be started, or ended.

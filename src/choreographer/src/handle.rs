@@ -206,12 +206,12 @@ impl Handle {
         }
     }
 
-    /// Where it is now.
+    /// The present state of its life.
     pub fn life(&self) -> Life {
         self.life.borrow().clone()
     }
 
-    /// Where it is now and later.
+    /// The state of its life, and each change.
     pub fn watch(&self) -> watch::Receiver<Life> {
         self.life.subscribe()
     }

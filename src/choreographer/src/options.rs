@@ -9,7 +9,7 @@ use crate::memory::MemoryOptions;
 /// What is done about nodes that are given inputs and answer none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Hung {
-    /// Nothing.
+    /// Nothing is done.
     Ignore,
     /// It is told.
     #[default]

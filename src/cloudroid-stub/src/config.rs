@@ -302,7 +302,7 @@ pub enum Stamps {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Codec {
-    /// Not at all.
+    /// No codec: messages are sent unchanged.
     None,
     /// Where it saves time, without loss.
     #[default]
@@ -430,7 +430,7 @@ fn with(
 #[error("{key} {reason}")]
 struct Wrong {
     key: &'static str,
-    /// Why not, and what to do.
+    /// The reason, and what to do.
     reason: String,
 }
 

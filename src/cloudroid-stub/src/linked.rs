@@ -31,11 +31,11 @@ const CONNECT: Duration = Duration::from_secs(10);
 const SERVANT: Duration = Duration::from_secs(120);
 /// For the welcome of a link that is taken up again, at first: a network may be lost here, too.
 const WELCOME: Duration = Duration::from_secs(5);
-/// Between the beginnings of two attempts, at first …
+/// Between the beginnings of two attempts, at first.
 const PAUSE: Duration = Duration::from_millis(50);
-/// … at last, while no server is reached …
+/// The longest such pause while no server is reached.
 const AWAY: Duration = Duration::from_secs(1);
-/// … and while one says that it has no room.
+/// The longest such pause while the server says that it has no capacity.
 const BUSY: Duration = Duration::from_secs(3);
 /// After a link has fallen silent, until another connection is tried beside it.
 const STANDBY: Duration = Duration::from_secs(1);

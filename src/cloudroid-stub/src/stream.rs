@@ -18,7 +18,7 @@ use crate::address::Address;
 
 /// A TCP connection, with or without TLS.
 pub enum Stream {
-    /// As it is.
+    /// TCP without TLS.
     Plain(TcpStream),
     /// Encrypted, and the portal has shown who it is.
     Tls(Box<TlsStream<TcpStream>>),

@@ -139,7 +139,7 @@ pub struct Servant {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Hung {
-    /// Nothing.
+    /// Nothing is done.
     Ignore,
     /// It is told.
     Report,

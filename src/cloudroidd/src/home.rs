@@ -43,9 +43,9 @@ pub enum HomeError {
     Io {
         /// What was being done.
         action: &'static str,
-        /// Where.
+        /// The directory.
         path: PathBuf,
-        /// Why not.
+        /// What the system said.
         source: std::io::Error,
     },
 }

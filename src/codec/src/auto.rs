@@ -19,9 +19,9 @@ use std::time::Duration;
 
 /// Every so many messages one other codec is tried on a message, in turns.
 const PROBE_EVERY: u64 = 48;
-/// A challenger must win so many comparisons in a row …
+/// A challenger must win so many comparisons in a row.
 const PATIENCE: u32 = 6;
-/// … and take less than this part of the current codec's time.
+/// In each it must take less than this part of the present codec's time.
 const CLEARLY: f64 = 0.85;
 /// How much of the time between messages encoding may take, and the link.
 const SHARE: f64 = 0.8;

@@ -10,7 +10,7 @@ use std::str::FromStr;
 /// `jpeg`.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Codec {
-    /// As it is.
+    /// The serialized message, unchanged.
     Raw,
     /// RFC 1950 at a level of 0 to 9.
     Zlib(u8),

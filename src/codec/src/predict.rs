@@ -8,9 +8,9 @@ use crate::Error;
 pub(crate) enum Kind {
     /// Always zero: the samples are differences already.
     Zero = 0,
-    /// a
+    /// The left neighbour, a.
     West = 1,
-    /// b
+    /// The upper neighbour, b.
     North = 2,
     /// The mean of a and b, corrected by a quarter of the slope above.
     Slope = 3,

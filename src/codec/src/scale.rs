@@ -6,9 +6,9 @@ use crate::Error;
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Scale {
     name: u8,
-    /// The float is `multiple / divisor`, or …
+    /// The float is `multiple / divisor`; zero where `factor` counts.
     divisor: f32,
-    /// … when not zero, `multiple · factor`.
+    /// When it is not zero, the float is `multiple · factor`.
     factor: f32,
 }
 

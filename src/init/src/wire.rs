@@ -106,7 +106,7 @@ pub enum Reply {
         /// Pid inside.
         pid: i32,
     },
-    /// It was not.
+    /// The command was not carried out.
     Failed {
         /// From the request.
         id: u32,

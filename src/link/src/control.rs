@@ -20,11 +20,11 @@ pub struct Hello {
     /// Counts the connections that this life has tried: one that was overtaken on its way does not displace a later
     /// one. 0: they are not counted.
     pub attempt: u64,
-    /// The robot's machine since it was started, so that two robots under one id can be told apart …
+    /// The robot's machine since it was started, so that two robots under one id can be told apart.
     pub machine: String,
-    /// … its host name, for messages …
+    /// The machine's host name, for messages.
     pub host: String,
-    /// … and the id of its ROS Master's life: several machines with one Master are one robot.
+    /// The id of the life of the machine's ROS Master: several machines with one Master are one robot.
     pub roscore: String,
     /// The session to go on with.
     pub resume: Option<Resume>,
@@ -53,9 +53,9 @@ pub struct Hello {
 pub struct Resume {
     /// As the welcome named it.
     pub session: String,
-    /// All numbers up to this one have come …
+    /// All numbers up to this one have come.
     pub received: u64,
-    /// … and these.
+    /// Numbers above that which have come, too.
     pub ahead: Vec<u64>,
 }
 
@@ -77,9 +77,9 @@ pub struct Node {
     pub share: String,
     /// Where it was started: its working directory on the robot.
     pub directory: String,
-    /// The service's revision that the stub was made of …
+    /// The service's revision that the stub was made of.
     pub revision: Option<u64>,
-    /// … and the digest of its image, since another server counts otherwise.
+    /// The digest of the revision's image, since another server counts revisions otherwise.
     pub image: String,
 }
 
@@ -117,7 +117,7 @@ pub enum Welcome {
         resumed: bool,
         /// What the cloud has of the robot's numbers.
         received: u64,
-        /// And those.
+        /// Numbers above that which it has, too.
         ahead: Vec<u64>,
         /// The first number that the cloud will use on this connection.
         next: u64,
@@ -129,7 +129,7 @@ pub enum Welcome {
     },
     /// There will be no session.
     Refused {
-        /// Why, and what to do.
+        /// The reason, and what to do.
         reason: String,
         /// Trying again may help.
         again: bool,
@@ -144,12 +144,12 @@ pub enum FromRobot {
     Open(Input),
     /// That publisher is gone.
     Close {
-        /// Which.
+        /// The channel's number.
         channel: u32,
     },
     /// So many listen to an output now.
     Listeners {
-        /// Which.
+        /// The channel's number.
         channel: u32,
         /// How many nodes of the robot, other nodes of this servant not counted.
         count: usize,
@@ -229,7 +229,7 @@ pub enum FromCloud {
 pub(crate) enum Between {
     /// A frame of a channel was lost that later ones refer to.
     Keyframe {
-        /// Which.
+        /// The channel's number.
         channel: u32,
     },
 }

@@ -73,7 +73,7 @@ pub struct Dropped {
 pub struct Drop {
     /// The topic.
     pub topic: String,
-    /// Why.
+    /// The cause.
     pub cause: Cause,
     /// How many so far.
     pub count: u64,
@@ -163,7 +163,7 @@ pub struct Drops {
 }
 
 impl Drops {
-    /// So many more.
+    /// Counts messages of a topic that were dropped.
     pub fn add(&self, topic: &str, cause: Cause, count: u64) {
         self.counts.lock().add(topic.to_owned(), cause, count);
     }

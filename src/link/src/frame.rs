@@ -51,9 +51,9 @@ pub enum Frame {
         /// Its first bytes.
         bytes: Bytes,
     },
-    /// More of it.
+    /// A continuation.
     More {
-        /// Which.
+        /// The record's stream.
         stream: u32,
         /// Its next bytes.
         bytes: Bytes,

@@ -64,11 +64,11 @@ pub enum Error {
     /// More than can be kept.
     #[error("the other end sends {what} of {bytes} bytes, more than the limit of {limit}")]
     TooMuch {
-        /// What.
+        /// The kind of message.
         what: &'static str,
-        /// How much.
+        /// Its size, bytes.
         bytes: u64,
-        /// How much may be.
+        /// The greatest size, bytes.
         limit: u64,
     },
     /// An unfinished record does not fit into its memory budget.
@@ -79,15 +79,15 @@ pub enum Error {
     Refused {
         /// WebSocket close code.
         code: u16,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// JSON that is not what it should be.
     #[error("the other end sends a {what} that cannot be read: {reason}")]
     Json {
-        /// What.
+        /// The kind of message.
         what: &'static str,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }

@@ -29,9 +29,9 @@ use retransmit::{Retransmit, Sent};
 
 /// Records up to this size go in one piece, and are kept until the peer has them.
 pub(crate) const SMALL: usize = 32 * 1024;
-/// Pieces are made so long that one takes about this on the link as measured …
+/// Pieces are made so long that one takes about this on the link as measured, seconds.
 const PIECE_TIME: f64 = 0.008;
-/// … between these.
+/// The least and the greatest size of a piece, bytes.
 const PIECES: (usize, usize) = (4 * 1024, 64 * 1024);
 /// Before the link was measured.
 const FIRST_PIECE: usize = 32 * 1024;

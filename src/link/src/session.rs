@@ -40,9 +40,9 @@ const LOST: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(
 pub struct SessionOptions {
     /// Between pings while nothing else comes.
     pub ping: Duration,
-    /// Without a sign of the peer for so long the link counts as down …
+    /// Without a sign of the peer for so long the link counts as down.
     pub silent: Duration,
-    /// … and for so long the connection is given up.
+    /// Without a sign of the peer for so long the connection is given up.
     pub lost: Duration,
     /// A message older than this is not sent when a newer one waits.
     pub max_age: Option<Duration>,

@@ -13,7 +13,7 @@ pub enum Error {
         action: &'static str,
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// What the system said.
         source: io::Error,
     },
     /// A file that is larger than such a file can sensibly be.
@@ -75,7 +75,7 @@ pub enum Error {
         name: String,
         /// Where it is, below what was pushed.
         first: PathBuf,
-        /// Where it is again.
+        /// The second directory of that name.
         second: PathBuf,
     },
     /// Packages that need each other to be built.

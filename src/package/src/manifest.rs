@@ -37,7 +37,7 @@ pub struct Manifest {
 pub struct Dependency {
     /// A package or a rosdep key, valid.
     pub name: String,
-    /// For what.
+    /// The kind of dependency.
     pub kind: Kind,
 }
 

@@ -63,7 +63,7 @@ pub struct InstallSpace {
 pub struct External {
     /// A ROS package or rosdep key.
     pub name: String,
-    /// What for.
+    /// The kinds of dependency, such as at build or at run time.
     pub kinds: BTreeSet<Kind>,
     /// The packages that need it.
     pub needed_by: BTreeSet<String>,

@@ -25,7 +25,7 @@ pub enum Error {
         service: String,
         /// Asked for.
         id: String,
-        /// Those that there are.
+        /// Names that exist.
         exists: Vec<String>,
     },
     /// Nothing is served there.
@@ -51,7 +51,7 @@ pub enum Error {
     Foreign {
         /// What was wrong.
         what: String,
-        /// What to do.
+        /// The next step.
         next: String,
     },
     /// The policy does not allow it.

@@ -8,7 +8,7 @@ pub enum Error {
     NameTaken {
         /// The name.
         name: String,
-        /// Whose it is.
+        /// The package.
         package: String,
         /// Who wants it.
         newcomer: String,
@@ -24,7 +24,7 @@ pub enum Error {
     Failed {
         /// What failed.
         message: String,
-        /// What to do.
+        /// The next step.
         next: Option<String>,
         /// What explains it.
         log: Vec<String>,

@@ -46,11 +46,11 @@ pub struct Governor<P> {
     meter: Option<Metered>,
     pairs: Vec<Stream>,
     link: bool,
-    /// It was up before.
+    /// Whether the link was ever up.
     reached: bool,
     /// The link has been down for so long that the local original is to stand in whatever Q is.
     away: bool,
-    /// When it will have been.
+    /// When the cloud will have been away for so long that the local original stands in.
     away_at: Option<Instant>,
     counts: Counts,
     phases: PhaseBook,

@@ -39,7 +39,7 @@ struct Behind {
 pub struct Missed {
     /// The topic, service or action.
     pub name: Arc<str>,
-    /// How many.
+    /// The number of inputs.
     pub count: u64,
     /// How long ago the first of them was.
     pub since: Duration,

@@ -25,13 +25,13 @@ pub enum Refused {
         "egress {name} is not allowed here; its operator may add it to egress of [allow] in the configuration"
     )]
     NotAllowed {
-        /// Which.
+        /// The destination, as written.
         name: String,
     },
     /// It cannot be understood.
     #[error("{name:?} is not {form}")]
     Malformed {
-        /// Which.
+        /// The destination, as written.
         name: String,
         /// What it should be.
         form: &'static str,

@@ -45,7 +45,7 @@ pub use seat::seat;
 
 /// A servant that did not take a request is asked again when its graph has changed, and not sooner than after this.
 const PAUSE: Duration = Duration::from_millis(100);
-/// And not later.
+/// The longest such pause.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
 /// A mean of less tells of single requests.

@@ -34,9 +34,9 @@ pub(crate) struct InProcess {
 pub(crate) struct Behind {
     /// The id of the servant, or of the robot's place.
     pub(crate) id: String,
-    /// What rosbridge clients see …
+    /// The bus that rosbridge clients see.
     pub(crate) bus: Arc<dyn Bus>,
-    /// … and what stubs see, with the nodes that they start and end.
+    /// The bus that stubs see, with the nodes that they start and end.
     pub(crate) linked: (Arc<dyn Bus>, Arc<dyn Nodes>),
     pub(crate) registry: Arc<Registry>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,

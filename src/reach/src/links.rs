@@ -163,9 +163,9 @@ pub struct LinkStatus {
     pub clock: Option<f64>,
     /// Bytes per second downwards, when it had to hurry.
     pub throughput: Option<f64>,
-    /// Messages that were dropped in the cloud …
+    /// Messages that were dropped in the cloud.
     pub drops: Vec<Drop>,
-    /// … and on the robot, as it told.
+    /// Messages dropped on the robot, as its stub reported.
     pub dropped: Vec<Drop>,
     /// What the robot asked for.
     pub sla: Sla,
@@ -173,9 +173,9 @@ pub struct LinkStatus {
     pub requests: Vec<Request>,
     /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
     pub unsent: u64,
-    /// Of so many of the last inputs that the node was given and that have a stamp …
+    /// The number of the last inputs that the node was given and that have a stamp.
     pub given: usize,
-    /// … it answered so many later ones first: it has left them out.
+    /// Of these, the inputs that it has left out: it answered later ones first.
     pub left_out: usize,
     /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
     pub unfed: Vec<String>,

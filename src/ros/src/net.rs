@@ -24,11 +24,11 @@ pub trait Sockets: Send + Sync + 'static {
     }
 }
 
-/// A peer that has said nothing for so long is asked whether it is there …
+/// A peer that has said nothing for so long is asked whether it is there.
 const ASK: Duration = Duration::from_secs(20);
-/// … and again until it answers …
+/// The pause until it is asked again while it does not answer.
 const ASK_AGAIN: Duration = Duration::from_secs(10);
-/// … and after so long without an answer it is gone. That is also how long it may leave what was sent to it untaken:
+/// After so long without an answer it is gone. That is also how long it may leave what was sent to it untaken:
 /// a peer that does not read for so long loses its connection.
 const GONE: Duration = Duration::from_secs(60);
 

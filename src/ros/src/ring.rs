@@ -53,7 +53,7 @@ impl Bounds {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[must_use = "whoever drops messages counts them"]
 pub struct Lost {
-    /// How many.
+    /// The number of messages.
     pub messages: u64,
     /// Their bytes.
     pub bytes: u64,

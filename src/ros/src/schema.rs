@@ -61,7 +61,7 @@ pub enum SchemaError {
         name: String,
         /// How many there must be.
         expected: usize,
-        /// How many there are.
+        /// The number found.
         found: usize,
     },
     /// Larger than any honest definition.

@@ -17,7 +17,7 @@ pub struct Fragment<'a> {
     pub data: Cow<'a, str>,
     /// Which piece, from 0.
     pub num: u64,
-    /// How many there are.
+    /// The number of fragments.
     pub total: u64,
 }
 

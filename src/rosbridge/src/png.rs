@@ -100,9 +100,9 @@ pub enum PngError {
     /// It unpacks to too much.
     #[error("the picture unpacks to {found} bytes, at most {limit} are allowed")]
     TooLarge {
-        /// What it would be.
+        /// Bytes that it would take.
         found: u64,
-        /// What it may be.
+        /// Bytes that it may take.
         limit: usize,
     },
     /// The pixels are not UTF-8.

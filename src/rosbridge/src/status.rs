@@ -9,7 +9,7 @@ use crate::{Id, Problem, Writer};
 /// How grave a status is, and, in `set_level`, down to which gravity the client wants to hear.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub enum Level {
-    /// Nothing at all.
+    /// No status message is sent.
     None,
     /// What did not work.
     #[default]

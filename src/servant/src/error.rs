@@ -12,7 +12,7 @@ pub enum Error {
     File {
         /// What was tried, as a verb.
         action: &'static str,
-        /// With what.
+        /// The file or directory.
         path: PathBuf,
         /// Error of the system call.
         source: io::Error,
@@ -126,7 +126,7 @@ pub enum Error {
     Image {
         /// Its digest.
         image: String,
-        /// Why not.
+        /// What the image store said.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// Something that was written by another process is not what it should be.

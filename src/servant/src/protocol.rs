@@ -66,7 +66,7 @@ pub enum FromShim {
     },
     /// The container's state has changed.
     State {
-        /// To this.
+        /// The state that it is in now.
         state: State,
     },
     /// Something happened to a node.
@@ -78,7 +78,7 @@ pub enum FromShim {
     },
     /// The limits in force have changed.
     Enforced {
-        /// To these.
+        /// The limits in force now.
         enforced: Enforced,
     },
     /// An answer to a [`Request`].
@@ -107,11 +107,11 @@ impl NodeEvent {
 pub struct Request {
     /// Returned in the answer.
     pub id: u64,
-    /// What to do.
+    /// The command.
     pub command: Command,
 }
 
-/// What to do.
+/// The command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Command {

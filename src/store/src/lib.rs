@@ -57,7 +57,7 @@ pub enum Error {
     Database {
         /// Its file.
         path: String,
-        /// Why.
+        /// What the database said.
         source: rusqlite::Error,
     },
     /// Written by a later version.
@@ -75,9 +75,9 @@ pub enum Error {
     /// A record cannot be read back.
     #[error("the record of {what} in the state database cannot be read: {source}")]
     Record {
-        /// Of what.
+        /// The table or row.
         what: String,
-        /// Why.
+        /// What the database said.
         source: serde_json::Error,
     },
 }

@@ -23,7 +23,7 @@ pub const MAX_CONTROL: usize = 125;
 pub struct Header {
     /// The message ends with this frame.
     pub last: bool,
-    /// What it is.
+    /// The opcode (RFC 6455, 5.2).
     pub opcode: u8,
     /// From clients only.
     pub mask: Option<[u8; 4]>,

@@ -22,7 +22,7 @@ pub enum Measure {
 }
 
 impl Measure {
-    /// All of them.
+    /// Every measure.
     pub const ALL: [Measure; 3] = [Measure::Rrt, Measure::Fps, Measure::Age];
 
     /// Its key.

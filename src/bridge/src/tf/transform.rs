@@ -13,7 +13,7 @@ impl Transform {
         rotation: [0.0, 0.0, 0.0, 1.0],
     };
 
-    /// What `other` does, then what this one does.
+    /// The composition: first `other`, then this transform.
     pub(super) fn after(&self, other: &Transform) -> Transform {
         let moved = rotate(self.rotation, other.translation);
         Transform {

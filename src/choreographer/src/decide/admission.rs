@@ -25,7 +25,7 @@ pub enum Refused {
     TooBig {
         /// Asked for.
         wanted: Amount,
-        /// What there is.
+        /// The capacity.
         capacity: Amount,
     },
     /// A servant that runs cannot be promised more.
@@ -42,7 +42,7 @@ pub enum Refused {
     /// Too many wait already.
     #[error("this machine is full and {waiting} robots wait for room already")]
     QueueFull {
-        /// So many.
+        /// Robots that wait.
         waiting: usize,
     },
     /// No capacity came free until the deadline.
@@ -107,9 +107,9 @@ pub enum Origin {
 /// What is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Ask {
-    /// So much.
+    /// What is to be promised.
     pub wanted: Amount,
-    /// For whom.
+    /// The robot or push that asks.
     pub origin: Origin,
     /// Robots of a higher one go first; 0 where nothing else is said. Pushes have none.
     pub priority: i32,
@@ -142,16 +142,16 @@ pub enum Verdict {
     Admitted,
     /// It is in the queue.
     Waits,
-    /// It is neither.
+    /// It is refused.
     Refused(Refused),
 }
 
 /// One in the queue that is promised what it asked for now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Admitted {
-    /// Who.
+    /// The ticket of who is admitted.
     pub ticket: Ticket,
-    /// What.
+    /// What it is promised.
     pub amount: Amount,
 }
 
@@ -201,7 +201,7 @@ impl Book {
         }
     }
 
-    /// What there is.
+    /// The capacity.
     pub fn capacity(&self) -> Amount {
         self.capacity
     }

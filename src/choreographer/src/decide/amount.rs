@@ -10,7 +10,7 @@ pub struct Amount {
 }
 
 impl Amount {
-    /// Nothing.
+    /// No memory and no cores.
     pub const NONE: Amount = Amount {
         millicpus: 0,
         memory: 0,

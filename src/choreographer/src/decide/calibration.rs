@@ -41,7 +41,7 @@ pub(crate) fn ladder(most: u64) -> Vec<f64> {
 pub(crate) enum Next {
     /// At this limit, in cores.
     Measure(f64),
-    /// Nothing, and why.
+    /// Nothing more is measured, for this reason.
     Enough(String),
 }
 

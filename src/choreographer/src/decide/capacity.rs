@@ -15,7 +15,7 @@ pub struct Lacking {
 /// A push that was admitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Push {
-    /// Which.
+    /// Its ticket.
     pub ticket: Ticket,
     /// What it is promised.
     pub has: Amount,

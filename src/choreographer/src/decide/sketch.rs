@@ -23,12 +23,12 @@ fn bucket(value: f64) -> i32 {
 }
 
 impl Sketch {
-    /// One more.
+    /// Counts a value.
     pub fn note(&mut self, value: f64) {
         *self.buckets.entry(bucket(value)).or_default() += 1;
     }
 
-    /// How many.
+    /// The number of values.
     pub fn count(&self) -> u64 {
         self.buckets.values().sum()
     }

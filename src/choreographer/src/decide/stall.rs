@@ -7,15 +7,15 @@
 
 use std::time::{Duration, Instant};
 
-/// Percent of the last ten seconds in which all waited for memory: from so much on the machine stalls, …
+/// Percent of the last ten seconds in which all waited for memory: from so much on the machine stalls.
 const STALLS: f64 = 10.0;
-/// … and from so little on no longer.
+/// Percent below which it does not stall any more.
 const FLOWS: f64 = 5.0;
 /// Percent of its memory that can still be given: with so much it is not the machine that stalls.
 const PLENTY: f64 = 25.0;
-/// Bytes a second read from swap: from so many on it swaps, …
+/// Bytes a second read from swap: from so many on it swaps.
 const SWAPS: f64 = (1 << 20) as f64;
-/// … and from so few on no longer.
+/// Bytes a second below which it does not swap any more.
 const SETTLED: f64 = SWAPS / 4.0;
 /// It has ended when it has not been there for so long.
 const QUIET: Duration = Duration::from_secs(5);

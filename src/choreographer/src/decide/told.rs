@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-/// In each such time …
+/// The length of a window.
 const WINDOW: Duration = Duration::from_secs(60);
-/// … each robot of a service is told of once, and so many of them.
+/// Robots of a service that are told of in one window at most, each once.
 const ROBOTS: usize = 20;
 /// Services of which it is remembered.
 const SERVICES: usize = 1000;

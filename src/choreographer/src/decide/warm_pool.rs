@@ -174,7 +174,7 @@ pub struct Wanted<'a> {
     pub revision: u64,
     /// Its image.
     pub image: &'a str,
-    /// How many.
+    /// The number of containers.
     pub size: Size,
 }
 
@@ -231,7 +231,7 @@ pub enum Missing<'a> {
     Containers(usize),
     /// The nodes are started in this one.
     Nodes(&'a str),
-    /// Nothing.
+    /// Nothing is to be done.
     Nothing,
 }
 

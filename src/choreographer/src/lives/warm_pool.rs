@@ -56,7 +56,7 @@ pub(crate) struct Warm {
     revision: Arc<RevisionRecord>,
 }
 
-/// All of them.
+/// The containers of all services that were made ahead.
 #[derive(Default)]
 pub(crate) struct WarmPool {
     kept: Mutex<Kept>,

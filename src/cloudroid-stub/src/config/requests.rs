@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub enum Requests {
     /// Without times.
     Line(String),
-    /// One after the other.
+    /// A list of requests.
     List(Vec<Request>),
 }
 

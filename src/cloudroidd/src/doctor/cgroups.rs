@@ -11,7 +11,7 @@ pub struct Found {
     pub version: u8,
     /// Limits that cannot be set.
     pub missing: Vec<String>,
-    /// Why not.
+    /// The reason, for people.
     pub why: String,
 }
 

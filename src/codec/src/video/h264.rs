@@ -19,7 +19,7 @@ use std::fmt;
 /// What the library can do at most.
 const LONG_SIDE: usize = 3840;
 const SHORT_SIDE: usize = 2160;
-/// And at least.
+/// Least width and height that the library takes, pixels.
 const SMALLEST: usize = 16;
 
 /// The layout, if it is a colour picture the library can take.

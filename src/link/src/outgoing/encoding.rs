@@ -28,7 +28,7 @@ impl Encoding {
         self.channels.insert(channel);
     }
 
-    /// They may not any more.
+    /// A channel whose messages may not be encoded ahead any more.
     pub(super) fn remove(&mut self, channel: u32) {
         self.channels.remove(&channel);
     }

@@ -23,7 +23,7 @@ pub(super) struct Counters {
     pub(super) bytes: u64,
     /// How much had been sent.
     pub(super) sent: u64,
-    /// That was all there was.
+    /// Nothing more waited to be sent.
     pub(super) idle: bool,
 }
 

@@ -37,12 +37,12 @@ pub(super) struct ShownAction {
 
 /// A node of the group under the name that a robot's stub has for it.
 pub(super) struct Alias<'a> {
-    /// Its name in the group …
+    /// Its name in the group.
     pub(super) node: &'a str,
-    /// … whether it is the only one, so that what the interface ascribes to nobody is its own …
+    /// Whether it is the only node, so that what the interface ascribes to no node is its own.
     pub(super) only: bool,
     pub(super) deployed: Names,
-    /// … and on the robot.
+    /// Its name on the robot.
     pub(super) name: &'a str,
     pub(super) robot: Names,
 }

@@ -27,11 +27,11 @@ pub(super) struct Given {
     flow: (u64, u64),
     /// Whether they were answered: the last ones of which that is known.
     fates: VecDeque<bool>,
-    /// The `born` of the input that the node has answered last, by the same stamp, …
+    /// The `born` of the input that the node has answered last, by the same stamp.
     answered: Option<i64>,
-    /// … when it has, …
+    /// When it answered that one.
     until: i64,
-    /// … and when it had answered the one before that.
+    /// When it answered the one before that.
     before: i64,
 }
 

@@ -21,7 +21,7 @@ pub struct ServiceProvider {
 /// A service of another ROS system.
 #[derive(Clone)]
 pub struct Lent {
-    /// As it is there.
+    /// The type of the service.
     pub service_type: ServiceType,
     /// Passes calls on.
     pub handler: Arc<dyn ServiceHandler>,

@@ -41,7 +41,7 @@ impl fmt::Display for PeerId {
 /// A publisher as seen by a subscription, or the other way round.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Peer {
-    /// Who it is.
+    /// The peer's id.
     pub id: PeerId,
     /// Whether messages can pass now; else it was connected, and has not left as far as is known.
     pub connected: bool,

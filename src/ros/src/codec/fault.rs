@@ -44,7 +44,7 @@ pub enum CodecErrorKind {
     /// The serialized message ends inside a value.
     #[error("the serialized message ends here, {missing} bytes too early")]
     Truncated {
-        /// How many more there would have to be.
+        /// Bytes that are missing.
         missing: usize,
     },
     /// The serialized message goes on after its last field.
@@ -69,7 +69,7 @@ pub enum CodecErrorKind {
     Mismatch {
         /// What the field takes.
         expected: &'static str,
-        /// What was there.
+        /// The kind of value that was found.
         found: &'static str,
     },
     /// A number that the field cannot hold.

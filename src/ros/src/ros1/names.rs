@@ -53,7 +53,7 @@ pub struct PeerUri {
     pub host: String,
     /// The TCP port.
     pub port: u16,
-    /// At least `/`.
+    /// The path, at least `/`.
     pub path: String,
 }
 

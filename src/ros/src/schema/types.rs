@@ -123,7 +123,7 @@ pub struct Field {
     pub name: String,
     /// Without brackets, references resolved: `byte`, `std_msgs/Header`.
     pub type_name: String,
-    /// What that is.
+    /// The type of the field, or of each element.
     pub base: Base,
     /// Single value or array.
     pub arity: Arity,

@@ -38,7 +38,7 @@ pub enum GrantError {
     NotAllowed {
         /// `device` or `volume`.
         kind: &'static str,
-        /// Which.
+        /// Its name.
         name: String,
     },
     /// A way out.
@@ -49,7 +49,7 @@ pub enum GrantError {
     Volume {
         /// Its path on the machine.
         path: String,
-        /// Why not.
+        /// What the system said.
         source: std::io::Error,
     },
     /// No CDI specification names the device.
@@ -59,7 +59,7 @@ pub enum GrantError {
         name: String,
         /// Where was looked.
         directories: String,
-        /// What there is.
+        /// Names that are known, for people.
         known: String,
     },
     /// A CDI specification cannot be used.

@@ -31,7 +31,7 @@ pub(super) struct Begun {
     pub(super) launch: Launch,
     pub(super) identity: Identity,
     pub(super) cgroup: Cgroup,
-    /// Our own.
+    /// The cgroup of the shim itself.
     pub(super) shim_cgroup: Cgroup,
     pub(super) enforced: Enforced,
     /// The daemon that started us.

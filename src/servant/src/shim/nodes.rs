@@ -28,7 +28,7 @@ pub(super) struct Nodes {
 /// What follows from the end of a node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Consequence {
-    /// Nothing.
+    /// Nothing follows.
     None,
     /// It is to be started again, after so many seconds.
     Respawn(f64),
@@ -200,7 +200,7 @@ impl Nodes {
             .ok_or_else(|| format!("node {name} does not run"))
     }
 
-    /// How one is.
+    /// The status of one node.
     pub(super) fn status(&self, name: &str) -> NodeStatus {
         self.known
             .get(name)
@@ -208,7 +208,7 @@ impl Nodes {
             .unwrap_or_default()
     }
 
-    /// How all are.
+    /// The status of every node.
     pub(super) fn statuses(&self) -> BTreeMap<String, NodeStatus> {
         self.known
             .iter()

@@ -25,7 +25,7 @@ pub struct MemoryEngine {
     world: Arc<World>,
 }
 
-/// All that there is.
+/// The servants, images and limits of the engine.
 pub(crate) struct World {
     /// Where nodes run, wherever their servants are asked for.
     pub(crate) runtime: Handle,

@@ -7,7 +7,7 @@ pub(crate) const WINDOW: usize = 8;
 /// So many messages at the end of one sequence, without a counterpart, may be on their way on the other side.
 const EDGE: usize = 2;
 
-/// Whose.
+/// The servant that an answer is of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     /// The robot's servant.

@@ -27,7 +27,7 @@ pub struct Cap {
     pub resource: &'static str,
     /// The most, as it is written.
     pub most: String,
-    /// Whose it is.
+    /// Who has set it.
     pub by: Capper,
 }
 

@@ -110,7 +110,7 @@ pub fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
     (0..count).map(|_| reader.goal_state()).collect()
 }
 
-/// A `…ActionGoal`.
+/// Serializes a `…ActionGoal`.
 pub fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
     let mut out = Vec::with_capacity(64 + body.len());
     write_header(&mut out, now);
@@ -119,7 +119,7 @@ pub fn write_goal(now: Time, goal: &GoalId, body: &[u8]) -> Bytes {
     out.into()
 }
 
-/// A `…ActionResult` or `…ActionFeedback`.
+/// Serializes a `…ActionResult` or `…ActionFeedback`.
 pub fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
     let mut out = Vec::with_capacity(96 + body.len());
     write_header(&mut out, now);
