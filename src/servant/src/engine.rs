@@ -177,8 +177,8 @@ pub trait Servant: Send + Sync + 'static {
     async fn set_limits(&self, limits: Limits) -> Result<Enforced, crate::Error>;
     /// Usage now.
     async fn usage(&self) -> Result<Usage, crate::Error>;
-    /// How long threads of its nodes could have run so far and others had the cores, summed up; nothing where that is not
-    /// counted.
+    /// How long threads of its nodes, and of the processes that serve these, could have run so far and others had the cores,
+    /// summed up; nothing where that is not counted.
     async fn waited(&self) -> Duration {
         Duration::ZERO
     }

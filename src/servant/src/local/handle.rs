@@ -401,7 +401,12 @@ impl Servant for LocalServant {
     }
 
     async fn waited(&self) -> Duration {
-        let processes = self.processes().unwrap_or_default();
+        if self.init().is_err() {
+            return Duration::ZERO;
+        }
+        let mut processes = self.cgroup.processes();
+        // Nodes go on only when their Master and whoever is connected to them do.
+        processes.extend(i32::try_from(std::process::id()));
         let waited = tokio::task::spawn_blocking(move || processes.into_iter().map(waited).sum());
         waited.await.unwrap_or_default()
     }
