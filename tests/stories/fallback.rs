@@ -286,14 +286,10 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
         let x = pose.bytes.len() - 56;
         ensure!(pose.bytes[x..x + 8] == 0.75_f64.to_le_bytes(), "{pose:?}");
     }
-    let events = daemon.deployer().asks(&["events", "-n", "10000"])?;
-    let mine = events.as_array().context("a list")?.iter();
-    let mine = mine.filter(|event| event["robot"] == "fallback-cut");
-    let kinds: Vec<&str> = mine
-        .filter_map(|event| event["kind"].as_str())
-        .filter(|kind| kind.starts_with("local-"))
-        .collect();
-    ensure!(kinds.contains(&"local-takes-over"), "{kinds:?}");
+    // Told when the link is back.
+    daemon.awaits_event("that its original took over", |event| {
+        event["robot"] == "fallback-cut" && event["kind"] == "local-takes-over"
+    })?;
     Ok(())
 }
 

@@ -154,7 +154,13 @@ impl<'a> Mirror<'a> {
             }
             let end = tokio::select! {
                 told = self.tapping.told.recv() => self.told(told, false).await,
-                Some(heard) = self.topics.heard.recv() => { self.heard(heard, false).await; None }
+                Some(heard) = self.topics.heard.recv() => {
+                    // Calls are told before they are carried out: what is heard of them comes after them here, too.
+                    let end = self.catch_up().await;
+                    let enough = self.has_enough();
+                    self.heard(heard, enough).await;
+                    end
+                }
                 Some(answer) = self.exchanges.answers.join_next() => { self.candidate_answers(answer); None }
                 Ok(()) = self.graph.changed() => { self.follow().await; None }
                 () = left(&mut present) => Some(End::Soon("the robot's servant has ended".to_owned())),
@@ -175,6 +181,20 @@ impl<'a> Mirror<'a> {
         // One that was ended has given no answer to what was on its way.
         let cut = failed.is_none() && self.candidate.lease.handle().life().is_over();
         self.found(seconds, ended, failed, cut)
+    }
+
+    /// Takes up the calls and goals that were told until now.
+    async fn catch_up(&mut self) -> Option<End> {
+        while !self.has_enough() {
+            let Ok(told) = self.tapping.told.try_recv() else {
+                break;
+            };
+            let end = self.told(Some(told), false).await;
+            if end.is_some() {
+                return end;
+            }
+        }
+        None
     }
 
     /// Waits for what is on its way, and takes up nothing new.

@@ -28,6 +28,8 @@ const AHEAD: usize = 256;
 const WAITING: usize = 16 * WINDOW;
 /// For the candidate's nodes to be connected.
 const PATIENCE: Duration = Duration::from_secs(5);
+/// An output may be heard before the message that it answers: by so much, at most, and as many of each topic.
+const EARLY: (Duration, usize) = (Duration::from_secs(1), 2);
 /// Of which an output may be the answer to any.
 const REQUESTS: usize = 256;
 
@@ -67,6 +69,8 @@ struct Listened {
     /// Where nodes of the service publish it and the robot listens.
     candidate: Option<AbortOnDropHandle<()>>,
     pairing: Pairing<Item>,
+    /// Outputs of the present servant from before the first request.
+    early: VecDeque<(Instant, Item)>,
     tally: Tally,
     /// Requests when the last output came: of the present servant, and of the candidate.
     answered: (u64, u64),
@@ -75,6 +79,8 @@ struct Listened {
 /// A message that waits for its counterpart.
 struct Item {
     message: bytes::Bytes,
+    /// It may be of before.
+    early: bool,
     read: OnceLock<Read>,
 }
 
@@ -239,6 +245,7 @@ impl Topics {
                     _present: present,
                     candidate,
                     pairing: Pairing::default(),
+                    early: VecDeque::new(),
                     tally: Tally::of(Kind::Topic, name),
                     answered: (0, 0),
                 };
@@ -272,8 +279,23 @@ impl Topics {
 
     /// A call or a goal was given to both: outputs may answer it.
     pub(super) fn asked(&mut self, at: Instant) {
+        self.begins(at);
         self.present.asked(None, at);
         self.candidate.asked(None, Instant::now());
+    }
+
+    /// Before the first request: what was heard just before it may answer it.
+    fn begins(&mut self, at: Instant) {
+        if self.present.count > 0 {
+            return;
+        }
+        for listened in self.listened.values_mut() {
+            for (heard, item) in listened.early.drain(..) {
+                if heard + EARLY.0 >= at {
+                    listened.pairing.push(Side::Present, item);
+                }
+            }
+        }
     }
 
     /// Whether it is the robot's.
@@ -310,6 +332,7 @@ impl Topics {
                 Err(error) => return notes.add(&topic, &error.to_string()),
             }
         }
+        self.begins(at);
         self.present.asked(stamp, at);
         self.candidate.asked(stamp, Instant::now());
         self.publishers[&key].publish(message.bytes);
@@ -330,9 +353,9 @@ impl Topics {
         if listened.of.is_none() {
             listened.of = message.wire_type.schema().ok();
         }
-        // A topic that nobody compared yet, or an output of before.
-        let before = self.present.count == 0 && !message.latching;
-        if listened.candidate.is_none() || before {
+        let early = self.present.count == 0 && !message.latching;
+        // A topic that nobody compared yet, or what the candidate says unasked.
+        if listened.candidate.is_none() || (early && side == Side::Candidate) {
             return;
         }
         let of = listened.of.as_deref();
@@ -352,8 +375,16 @@ impl Topics {
         };
         let item = Item {
             message: permit.around(message.bytes),
+            early,
             read: OnceLock::new(),
         };
+        if early {
+            if listened.early.len() >= EARLY.1 {
+                listened.early.pop_front();
+            }
+            listened.early.push_back((at, item));
+            return;
+        }
         listened.pairing.push(side, item);
         let full = listened.pairing.waiting() > WAITING;
         listened.settle((full, false), tolerance, notes, &topic);
@@ -396,6 +427,7 @@ impl Listened {
                 Paired::Both(one, other, false) => {
                     self.tally.pair(one.differing(&other, of, tolerance));
                 }
+                Paired::Missing(one) if one.early => {}
                 Paired::Missing(_) if cut => notes.add(topic, CUT),
                 Paired::Missing(_) => self.tally.missing(),
                 Paired::Surplus(_) => self.tally.surplus(),
