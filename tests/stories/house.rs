@@ -15,8 +15,9 @@ use support::world::{PEOPLE, world};
 use support::{Verdict, binaries, leftovers};
 
 pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
-    let daemon = world().own("one").start()?;
-    let said = world().own("one").refuses_to_start()?;
+    let setup = world().own("one");
+    let daemon = setup.start()?;
+    let said = setup.refuses_to_start()?;
     ensure!(
         said.contains(&daemon.pid().to_string()),
         "the first is named: {said}"
@@ -77,7 +78,8 @@ fn open_up(path: &Path) -> Verdict {
 }
 
 pub fn the_state_is_closed_to_others() -> Verdict {
-    let daemon = world().own("closed").start()?;
+    let setup = world().own("closed");
+    let daemon = setup.start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
@@ -108,7 +110,7 @@ pub fn the_state_is_closed_to_others() -> Verdict {
     let home = daemon.home.clone();
     daemon.ends()?;
     open_up(&home)?;
-    let daemon = world().own("closed").start()?;
+    let daemon = setup.start()?;
     is_closed(&home)?;
     adds(&daemon)
 }
@@ -178,7 +180,7 @@ pub fn doctor_names_each_need() -> Verdict {
 
 pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Verdict {
     let daemon = world()
-        .own("impatient")
+        .own("grace")
         .config("[servant]\ngrace = \"1s\"\n")
         .start()?;
     daemon

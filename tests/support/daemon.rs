@@ -6,6 +6,7 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
@@ -25,11 +26,25 @@ pub struct Daemon {
     pub address: String,
     /// None where another has started it, such as systemd.
     child: Option<Child>,
+    _space: Option<Arc<Space>>,
 }
 
-/// How to start one.
+/// What a home takes on the disk. Some hundred megabytes each: all of a run together are more than many machines have free.
+#[derive(Debug)]
+struct Space(PathBuf);
+
+impl Drop for Space {
+    fn drop(&mut self) {
+        for heavy in ["layers", "images"] {
+            let _ = std::fs::remove_dir_all(self.0.join(heavy));
+        }
+    }
+}
+
+/// How to start one. Images are kept for as long as this, or a daemon that it has started, is there.
 #[derive(Debug, Clone)]
 pub struct Setup {
+    space: Arc<Space>,
     home: PathBuf,
     config: String,
     listen: String,
@@ -40,6 +55,7 @@ impl Setup {
     /// A daemon with its state in `home`, on a free port of loopback.
     pub fn new(home: &Path) -> Setup {
         Setup {
+            space: Arc::new(Space(home.to_owned())),
             home: home.to_owned(),
             config: String::new(),
             listen: "127.0.0.1:0".to_owned(),
@@ -105,6 +121,7 @@ impl Setup {
             home: self.home.clone(),
             address: "localhost".to_owned(),
             child: Some(child),
+            _space: Some(Arc::clone(&self.space)),
         };
         let answers = crate::until("a daemon that answers", || {
             if let Some(child) = &mut daemon.child
@@ -184,6 +201,7 @@ impl Daemon {
             home: home.to_owned(),
             address: "localhost".to_owned(),
             child: None,
+            _space: None,
         };
         daemon.address = crate::until("a daemon that answers", || {
             let listens = daemon.status().and_then(|status| {

@@ -1,7 +1,7 @@
 //! What stories share: a place for homes, and one daemon with services that are pushed when the first story
 //! needs them. A robot's servant is its own, so stories that only use services do not meet.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock};
 
@@ -20,6 +20,8 @@ pub struct World {
     place: TempDir,
     shared: Mutex<Option<Arc<Daemon>>>,
     services: Mutex<HashMap<&'static str, Pushed>>,
+    /// Names of homes that were given.
+    homes: Mutex<HashSet<String>>,
 }
 
 /// A service of the shared daemon.
@@ -122,6 +124,7 @@ pub fn world() -> &'static World {
                 .expect("a temporary directory"),
             shared: Mutex::new(None),
             services: Mutex::default(),
+            homes: Mutex::default(),
         }
     })
 }
@@ -139,8 +142,13 @@ impl World {
             .tempdir_in(self.place.path())?)
     }
 
-    /// A daemon of one's own.
+    /// A daemon of one's own, in a home that no other story has.
     pub fn own(&self, name: &str) -> Setup {
+        let mut homes = self
+            .homes
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        assert!(homes.insert(name.to_owned()), "two stories have {name}");
         Setup::new(&self.home(name))
     }
 
