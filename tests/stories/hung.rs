@@ -10,13 +10,19 @@ use support::world::world;
 pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
     let setup = world()
         .own("hung")
-        .config("[servant]\nhung = \"restart\"\nhung_after = 2\n");
+        .config("[servant]\nhung = \"restart\"\nhung_after = 2\nwarm_nodes = 1\n");
     let daemon = setup.start()?;
     daemon
         .deployer()
         .pushes("adder_py", &["--node", "adder.py"])?
         .succeeded()?;
-    let mut robot = daemon.robot("adder_py?robot=one&max_rrt=500ms")?;
+    support::until("a container whose node runs", || {
+        let status = daemon.api("/api/v1/status")?;
+        Ok((status["warm_nodes"] == 1)
+            .then_some(())
+            .ok_or_else(|| status.to_string()))
+    })?;
+    let mut robot = daemon.robot("adder_py?robot=one&rrt=500ms")?;
     let sum = json!({"a": 1, "b": 1});
     robot.calls("/add_two", sum.clone())?;
     let servant = daemon.servant_of("adder_py", "one")?;
@@ -38,6 +44,7 @@ pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
         Ok(message.ok_or_else(|| events.to_string()))
     })?;
     ensure!(message.contains("/adder answered none of"), "{message}");
+    robot.hears_status("/adder answered none of")?;
     daemon.awaits_event("its new start", |event| event["kind"] == "node-failed")?;
     support::until("an answer", || {
         let answer = robot.calls("/add_two", sum.clone())?;

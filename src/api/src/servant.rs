@@ -104,6 +104,10 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub down: Vec<NodeDown>,
+    /// Of its nodes that hang: which, and what they leave unanswered, in words.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub hung: Vec<String>,
 }
 
 /// How long requests took that were answered within the last ten seconds: calls of services, goals, and messages on topics where

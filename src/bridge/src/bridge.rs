@@ -113,6 +113,13 @@ impl Bridge {
         }
     }
 
+    /// Tells every session, connected or away, of something that is wrong: a status message at level error.
+    pub fn report(&self, what: &str) {
+        for client in self.shared.clients() {
+            client.status(Level::Error, None, Format::Json, what);
+        }
+    }
+
     /// How many sessions there are, now and later.
     pub fn sessions(&self) -> watch::Receiver<SessionCount> {
         self.shared.sessions.subscribe()

@@ -103,6 +103,11 @@ impl Shared {
             .collect()
     }
 
+    pub(crate) fn clients(&self) -> Vec<Arc<Client>> {
+        let clients = self.clients.lock();
+        clients.all.iter().filter_map(Weak::upgrade).collect()
+    }
+
     /// The client that a connection belongs to: the one it was before, or a new one.
     pub(crate) fn client_for(
         self: &Arc<Self>,

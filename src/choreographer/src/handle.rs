@@ -1,6 +1,6 @@
 //! A servant as everybody but its driver sees it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -93,6 +93,8 @@ pub struct Handle {
     /// Its nodes are started and ended by a robot's stubs.
     linked: AtomicBool,
     down: Mutex<Vec<api::NodeDown>>,
+    /// What of its nodes hangs, in words, by who uses them.
+    hung: Mutex<BTreeMap<String, String>>,
     /// How often its nodes were started, as far as that was seen.
     starts: Mutex<HashMap<String, u64>>,
     end: CancellationToken,
@@ -131,6 +133,7 @@ impl Handle {
             idle_until: AtomicU64::new(0),
             linked: AtomicBool::new(false),
             down: Mutex::default(),
+            hung: Mutex::default(),
             starts: Mutex::default(),
             end: CancellationToken::new(),
             end_reason: OnceLock::new(),
@@ -260,6 +263,16 @@ impl Handle {
             failures,
             again: store::now() + after.as_millis() as u64,
         }));
+    }
+
+    /// Its nodes that hang: which, and what they leave unanswered.
+    pub fn hung(&self) -> Vec<String> {
+        self.hung.lock().values().cloned().collect()
+    }
+
+    /// That is all of them, by who uses them.
+    pub(crate) fn set_hung(&self, hung: BTreeMap<String, String>) {
+        *self.hung.lock() = hung;
     }
 
     /// How often the node was started, as far as that was seen; without a name: all of them.

@@ -455,6 +455,7 @@ impl Choreographer {
             pids: pids.unwrap_or_default(),
             dropped: reach.map_or(0, |reach| reach.dropped()),
             down: handle.down(),
+            hung: handle.hung(),
         }
     }
 

@@ -119,6 +119,7 @@ fn state(servant: &Servant) -> String {
             )
         })
         .collect();
+    let down: Vec<String> = down.into_iter().chain(servant.hung.clone()).collect();
     match &servant.reason {
         Some(reason) => format!("{}: {reason}", servant.phase),
         None if !down.is_empty() => format!("{}: {}", servant.phase, down.join(", ")),

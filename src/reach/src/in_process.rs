@@ -141,6 +141,13 @@ impl Reach for InProcess {
         flows
     }
 
+    fn report(&self, flow: &str, what: &str) {
+        match flow {
+            "" => self.bridge.report(what),
+            node => self.hub.warn(node, what),
+        }
+    }
+
     fn inputs(&self) -> Vec<(String, Seen)> {
         let mut inputs = self.hub.inputs();
         inputs.extend(self.bridge.inputs());

@@ -177,6 +177,8 @@ pub trait Reach: Send + Sync + 'static {
     fn flows(&self) -> Vec<Flow> {
         Vec::new()
     }
+    /// Tells whoever uses this [`Flow`] of something that is wrong with it.
+    fn report(&self, _flow: &str, _what: &str) {}
     /// How large the messages and requests are that its robot sends to nodes, by topic or service.
     fn inputs(&self) -> Vec<(String, Seen)> {
         Vec::new()

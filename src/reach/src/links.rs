@@ -225,6 +225,17 @@ impl Hub {
         links.values().map(|link| link.flow()).collect()
     }
 
+    /// Warns the stub of a node, if there is one.
+    pub fn warn(&self, node: &str, what: &str) {
+        let link = self.links.lock().get(node).cloned();
+        if let Some(link) = link {
+            link.session.report(&FromCloud::Notice {
+                warning: true,
+                text: what.to_owned(),
+            });
+        }
+    }
+
     /// How large the messages and requests of each topic and service are that robots send to nodes.
     pub fn inputs(&self) -> Vec<(String, Seen)> {
         self.inputs.seen()

@@ -40,6 +40,13 @@ pub struct Hung {
     pub since: Duration,
 }
 
+impl Watched {
+    /// Whether it was told that they hang, and there was no output since.
+    pub fn hangs(&self) -> bool {
+        self.told
+    }
+}
+
 /// Looks at a flow again: what is to be remembered, and whether it is to be told that the nodes hang, which it is once until
 /// there is an output again. Nodes that never had an output may have none; nor do those that were started again and still load
 /// what they need.

@@ -1,16 +1,16 @@
 //! Looks for nodes that hang, tells of them, and starts them again where the operator wants that.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use api::Phase;
+use api::{Phase, Sla, Stated, Terms};
 use tokio::time::Instant;
 
 use super::Inner;
 use crate::decide::hung::{Flow, Hung, Watched, look};
 use crate::handle::Handle;
-use crate::options;
+use crate::options::{self, Class};
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);
@@ -20,7 +20,7 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
     if inner.options.hung == options::Hung::Ignore {
         return;
     }
-    let mut watched: HashMap<(String, String), Watched> = HashMap::new();
+    let mut watched: HashMap<(String, String), (Watched, String)> = HashMap::new();
     loop {
         tokio::time::sleep(LOOK).await;
         let servants: Vec<Arc<Handle>> = {
@@ -32,15 +32,18 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
             if handle.life().phase != Phase::Ready {
                 continue;
             }
-            // Without a time there is nothing to measure by.
             let terms = handle.terms();
-            let stated = |who: &str| {
-                let sla = terms.stated.get(who)?.sla;
+            let by_class = by_class(&terms, &inner.options.classes);
+            // Without a time there is nothing to measure by.
+            let accepted = |who: &str| {
+                let own = terms.stated.get(who).map(|stated| stated.sla);
+                let sla = own.filter(|sla| !sla.is_empty()).or(by_class)?;
                 sla.max_rrt.or(sla.rrt)
             };
+            let mut hanging = BTreeMap::new();
             let flows = handle.reach().map(|reach| reach.flows());
             for flow in flows.unwrap_or_default() {
-                let Some(max) = stated(&flow.node) else {
+                let Some(max) = accepted(&flow.node) else {
                     continue;
                 };
                 let patience = max.duration().mul_f64(inner.options.hung_after);
@@ -50,44 +53,68 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                     outputs: flow.outputs,
                     starts: handle.starts(&key.1),
                 };
-                let before = watched.remove(&key);
+                let (before, mut words) = watched.remove(&key).unzip();
                 let (after, hung) = look(before, seen, patience, Instant::now().into_std());
                 if let Some(hung) = hung {
-                    act(&inner, &handle, &key.1, hung).await;
+                    words = Some(act(&inner, &handle, &key.1, hung).await);
                 }
-                next.insert(key, after);
+                let words = words.unwrap_or_default();
+                if after.hangs() {
+                    hanging.insert(key.1.clone(), words.clone());
+                }
+                next.insert(key, (after, words));
             }
+            handle.set_hung(hanging);
         }
         watched = next;
     }
 }
 
-/// `node`: that of a stub; nothing: those that rosbridge clients use.
-async fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) {
+/// The SLA of a robot that states neither one nor resources.
+fn by_class(terms: &Terms, classes: &BTreeMap<String, Class>) -> Option<Sla> {
+    let says = |one: &Stated| !one.sla.is_empty() || one.cpus.is_some() || one.memory.is_some();
+    let class = classes.get(terms.class.as_ref()?)?;
+    (!terms.stated.values().any(says)).then_some(class.sla)
+}
+
+/// What hangs, in words. `node`: that of a stub; nothing: those that rosbridge clients use.
+async fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> String {
     let own = &handle.revision.plan.nodes;
     let nodes: Vec<&str> = match node {
         "" => own.iter().map(|node| &*node.name).collect(),
         node => vec![node],
     };
     let restarts = inner.options.hung == options::Hung::Restart;
+    // A stub's node is its robot's, which starts it again or not.
+    let again = |name: &str| {
+        let known = own.iter().find(|node| node.name == name);
+        !node.is_empty() || handle.revision.plan.restart || known.is_some_and(|it| it.respawn)
+    };
+    let kills = restarts && matches!(&*nodes, [one] if again(one));
     let next = match &*nodes {
         _ if !restarts => {
             "look at its log, or let such nodes be started again: hung = \"restart\" in [servant]"
         }
-        [_] => "it is killed, and started again as after any failure",
+        [_] if kills => "it is killed, and started again as after any failure",
+        [_] => {
+            "it is not killed, since its launch file says nothing of respawn and it would stay away"
+        }
         _ => "which of them hangs is not known, and none is started again",
     };
-    let message = format!(
-        "servant {}: {} answered none of {} inputs in {:.1} s; {next}",
-        handle.id,
+    let what = format!(
+        "{} answered none of {} inputs in {:.1} s",
         nodes.join(", "),
         hung.inputs,
         hung.since.as_secs_f64()
     );
+    let message = format!("servant {}: {what}; {next}", handle.id);
     inner
         .journal
         .warning("node-hung", &message, &handle.about());
-    if let ([node], true, Some(container)) = (&*nodes, restarts, handle.container())
+    if let Some(reach) = handle.reach() {
+        reach.report(node, &format!("servant {}: {what}", handle.id));
+    }
+    if let ([node], true, Some(container)) = (&*nodes, kills, handle.container())
         && let Err(error) = container.signal_node(node, libc::SIGKILL).await
     {
         tracing::warn!(
@@ -95,4 +122,5 @@ async fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) {
             handle.id
         );
     }
+    what
 }

@@ -8,6 +8,7 @@ use servant::spec::NodeSpec;
 use super::*;
 
 mod ahead;
+mod hung;
 mod rollouts;
 
 /// A machine, and what outlives a daemon on it.

@@ -12,9 +12,6 @@ const QUEUED: f64 = 0.25;
 /// Milliseconds: less is no queue.
 const QUEUE: f64 = 5.0;
 const LEFT_OUT: f64 = 0.1;
-/// The event of a node that hangs; a cause for so many milliseconds.
-const NODE_HUNG: &str = "node-hung";
-const HANGS_FOR: u64 = 60_000;
 /// The event of a stateful hand-over.
 const STATE_LOST: &str = "state-lost";
 
@@ -52,17 +49,6 @@ pub(super) fn causes(
         for link in &served.links {
             of_link(served, link, &mut say);
         }
-    }
-    let hangs = events.iter().rev().find(|event| {
-        let is_there = |served: &Served| Some(&served.servant.id) == event.servant.as_ref();
-        event.kind == NODE_HUNG
-            && store::now().saturating_sub(event.time) < HANGS_FOR
-            && servants.iter().any(is_there)
-    });
-    if let Some(hangs) = hangs {
-        let next =
-            "look at its log, or start it again: rosnode kill, or hung = \"restart\" in [servant]";
-        say(Weight::Blocks, hangs.message.clone(), next.to_owned());
     }
     // Only the last one: what was lost before that is of an earlier state.
     let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);
@@ -102,6 +88,15 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
                 down.node, down.failures
             ),
             format!("cloudroidctl logs {id}"),
+        );
+    }
+    for hangs in &servant.hung {
+        say(
+            Weight::Blocks,
+            format!("{id} hangs: {hangs}"),
+            format!(
+                "cloudroidctl logs {id}; where such nodes are to be started again: hung = \"restart\" in [servant]"
+            ),
         );
     }
     if servant.connections == 0 {

@@ -10,8 +10,8 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
 use reach::{
-    Error, Look, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded, Replay, Stream,
-    Tenant,
+    Error, Flow, Look, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded, Replay,
+    Stream, Tenant,
 };
 use ros::bus::{Bus, Graph, RosVersion};
 use ros::sizes::Seen;
@@ -101,6 +101,20 @@ impl Reach for MemoryReach {
 
     fn links(&self) -> Vec<LinkStatus> {
         Vec::new()
+    }
+
+    fn flows(&self) -> Vec<Flow> {
+        let (inputs, outputs) = *self.servant.flow.lock();
+        let node = String::new();
+        vec![Flow {
+            node,
+            inputs,
+            outputs,
+        }]
+    }
+
+    fn report(&self, _flow: &str, what: &str) {
+        self.servant.reported.lock().push(what.to_owned());
     }
 
     fn inputs(&self) -> Vec<(String, Seen)> {

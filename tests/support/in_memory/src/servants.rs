@@ -37,6 +37,10 @@ pub struct MemoryServant {
     pub(crate) graph: watch::Sender<Arc<Graph>>,
     /// How large what its robot sends is.
     pub inputs: Inputs,
+    /// What rosbridge clients gave its nodes and had of them so far: inputs and outputs.
+    pub flow: Mutex<(u64, u64)>,
+    /// What these clients were told of it.
+    pub reported: Mutex<Vec<String>>,
     /// Where services of its nodes are called.
     pub(crate) system: Arc<MemorySystem>,
 }
@@ -92,6 +96,8 @@ impl MemoryServant {
             tasks: watch::Sender::default(),
             graph: watch::Sender::default(),
             inputs: Inputs::default(),
+            flow: Mutex::default(),
+            reported: Mutex::default(),
             system: Arc::default(),
         })
     }

@@ -28,6 +28,7 @@ fn served(link: Link) -> Served {
             pids: Vec::new(),
             dropped: 0,
             down: Vec::new(),
+            hung: Vec::new(),
         },
         throttled: 0.0,
         cores: 0.0,
@@ -117,6 +118,7 @@ fn each_thing_that_can_be_wrong_is_named() {
     });
     all.throttled = 0.4;
     all.servant.dropped = 3;
+    all.servant.hung = vec!["/detect answered none of 9 inputs in 3.0 s".into()];
     all.servant.usage = Some(api::Usage {
         oom_kills: 1,
         pressure: Some(api::Pressure {
@@ -133,6 +135,7 @@ fn each_thing_that_can_be_wrong_is_named() {
         "listens to /image, which nobody on the robot publishes; remap it",
         "looked for the service /static_map, which nobody served; start",
         "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
+        "s1 hangs: /detect answered none of 9 inputs in 3.0 s; cloudroidctl logs s1",
         "waits for memory 30 %",
         "1 processes of s1 were killed",
         "3 messages of s1 were dropped",

@@ -82,6 +82,7 @@ fn servant() -> Servant {
         }),
         pids: vec![1],
         dropped: 0,
+        hung: vec!["/x answered none of 3 inputs in 1.0 s".into()],
         down: vec![NodeDown {
             node: "/x".into(),
             failures: 2,
