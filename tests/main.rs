@@ -119,6 +119,7 @@ fn main() -> ExitCode {
             what_cannot_be_calibrated_is_said,
             a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers,
             a_calibration_that_nobody_waits_for_leaves_nothing,
+            a_calibration_gives_way_to_a_robot,
         ],
         stories![calls:
             a_python_node_calls_the_robot,

@@ -1,7 +1,7 @@
 //! What response times cost is measured, and a robot whose requests are taken for it notices nothing.
 
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, ensure};
@@ -311,8 +311,8 @@ pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
         ])
         .arg("--frames")
         .arg(place.path())
-        .stdout(std::process::Stdio::null())
-        .stderr(std::process::Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
         .spawn()?;
     let seen = support::until("a servant that is measured", || {
         let found = measured(&daemon, "opencv_apps")?;
@@ -325,5 +325,46 @@ pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
     going.kill()?;
     going.wait()?;
     seen?;
+    none_is_left(&daemon, "opencv_apps")
+}
+
+pub fn a_calibration_gives_way_to_a_robot() -> Verdict {
+    // Room for what is measured, or for a robot.
+    let setup = world()
+        .own("gives-way")
+        .config("[capacity]\ncpus = 1.0\n[servant]\nwarm_pool = 0\nreserve_cpus = 0.1\n");
+    let daemon = setup.start()?;
+    daemon
+        .deployer()
+        .types(&[&["push"], PEOPLE.arguments].concat())?
+        .succeeded()?;
+    let place = world().directory("given-up")?;
+    frames(place.path())?;
+    // Would take minutes.
+    let going = Command::new(support::binaries::path("cloudroidctl"))
+        .env("CLOUDROID_HOME", &daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .args(["calibrate", "opencv_apps", "--cpus", "1"])
+        .args(["--requests", "100000", "--frames"])
+        .arg(place.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    support::until("a servant that is promised all", || {
+        let status = daemon.api("/api/v1/status")?;
+        Ok((status["capacity"]["cpus_reserved"] == 1.0)
+            .then_some(())
+            .ok_or_else(|| status.to_string()))
+    })?;
+    let _robot = daemon.robot("opencv_apps?robot=needs&cpus=0.5")?;
+    daemon.awaits_event("the robot's servant", |event| {
+        event["kind"] == "servant-ready" && event["robot"] == "needs"
+    })?;
+    let outcome = going.wait_with_output()?;
+    let said = String::from_utf8_lossy(&outcome.stderr);
+    ensure!(
+        !outcome.status.success() && said.contains("a robot needs its room"),
+        "{said}"
+    );
     none_is_left(&daemon, "opencv_apps")
 }

@@ -69,6 +69,13 @@ impl Life {
     }
 }
 
+/// One of the clients of a robot, or several that are not told apart.
+struct User {
+    connections: usize,
+    /// Since when there are so many.
+    since: Instant,
+}
+
 /// A servant.
 pub struct Handle {
     /// Its id.
@@ -88,6 +95,10 @@ pub struct Handle {
     promise: OnceLock<Promise>,
     ready_since: OnceLock<Instant>,
     connections: watch::Sender<usize>,
+    /// Whose they are: of a stub its node, of rosbridge clients nothing.
+    users: Mutex<HashMap<String, User>>,
+    /// Who has stated something and was not connected since then has left.
+    began: Instant,
     /// 0: not idle.
     idle_until: AtomicU64,
     /// Its nodes are started and ended by a robot's stubs.
@@ -130,6 +141,8 @@ impl Handle {
             promise: OnceLock::new(),
             ready_since: OnceLock::new(),
             connections: watch::Sender::new(0),
+            users: Mutex::default(),
+            began: Instant::now(),
             idle_until: AtomicU64::new(0),
             linked: AtomicBool::new(false),
             down: Mutex::default(),
@@ -352,6 +365,41 @@ impl Handle {
         self.idle_until.store(until.unwrap_or(0), Ordering::Relaxed);
     }
 
+    fn enters(&self, who: &str) {
+        let mut users = self.users.lock();
+        let user = users.entry(who.to_owned()).or_insert(User {
+            connections: 0,
+            since: Instant::now(),
+        });
+        user.connections += 1;
+        self.connections.send_modify(|count| *count += 1);
+    }
+
+    fn leaves(&self, who: &str) {
+        let mut users = self.users.lock();
+        if let Some(user) = users.get_mut(who) {
+            user.connections -= 1;
+            user.since = Instant::now();
+        }
+        let asked = self.asked.lock();
+        // How long the others are away says nothing.
+        users.retain(|who, user| user.connections > 0 || asked.terms.stated.contains_key(who));
+        drop(asked);
+        self.connections.send_modify(|count| *count -= 1);
+    }
+
+    /// Who has stated something and has been away for so long.
+    pub(crate) fn away_for(&self, time: Duration) -> Vec<String> {
+        let users = self.users.lock();
+        let asked = self.asked.lock();
+        let is_away = |who: &&String| match users.get(*who) {
+            Some(user) => user.connections == 0 && user.since.elapsed() >= time,
+            None => self.began.elapsed() >= time,
+        };
+        let stated = asked.terms.stated.keys();
+        stated.filter(is_away).cloned().collect()
+    }
+
     /// The number of connections now and later.
     pub(crate) fn watch_connections(&self) -> watch::Receiver<usize> {
         self.connections.subscribe()
@@ -396,6 +444,7 @@ impl Tenant for Handle {
 /// The right to use a servant; while one lives the servant is not idle.
 pub struct Lease {
     handle: Arc<Handle>,
+    who: String,
     /// Terms that are to be agreed upon before it is used: those of a servant that was there.
     anew: Option<Anew>,
 }
@@ -403,15 +452,15 @@ pub struct Lease {
 /// What a client states to a servant that was there.
 pub(crate) struct Anew {
     pub(crate) inner: Arc<Inner>,
-    pub(crate) who: String,
     pub(crate) stated: Stated,
 }
 
 impl Lease {
-    /// Counts one more connection in. Only under the choreographer's lock.
-    pub(crate) fn new(handle: Arc<Handle>) -> Lease {
-        handle.connections.send_modify(|count| *count += 1);
-        Lease { handle, anew: None }
+    /// Counts one more connection in, of this one of the robot's clients. Only under the choreographer's lock.
+    pub(crate) fn new(handle: Arc<Handle>, who: &str) -> Lease {
+        handle.enters(who);
+        let (who, anew) = (who.to_owned(), None);
+        Lease { handle, who, anew }
     }
 
     /// With what its client states to a servant that was there.
@@ -429,16 +478,13 @@ impl Lease {
     /// it is resized in place; an error says what would fit, and the servant keeps what it had.
     pub async fn admitted(&self) -> Result<(), Error> {
         self.reached(Phase::Admitted).await?;
-        let Some(Anew { inner, who, stated }) = &self.anew else {
+        let Some(Anew { inner, stated }) = &self.anew else {
             return Ok(());
         };
-        if self.handle.terms().stated.get(who) == Some(stated) {
-            return Ok(());
-        }
         // Until then its limits are those that it begins with.
         self.reached(Phase::Created).await?;
         let (inner, handle) = (Arc::clone(inner), Arc::clone(&self.handle));
-        let (who, stated) = (who.clone(), stated.clone());
+        let (who, stated) = (self.who.clone(), stated.clone());
         // Its client may go away meanwhile; what is begun is done.
         let agreed = tokio::spawn(async move { inner.agree(&handle, &who, &stated).await });
         agreed
@@ -482,6 +528,6 @@ impl Lease {
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        self.handle.connections.send_modify(|count| *count -= 1);
+        self.handle.leaves(&self.who);
     }
 }

@@ -153,7 +153,6 @@ impl Choreographer {
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
             }
-            let terms = inner.terms(&request.statement(), &revision);
             let has = servants.given.get(&key).map(|handle| inner.facts(handle));
             if has.as_ref().is_none_or(|has| has.ending) {
                 inner.check_back_off(&revision, &request.robot, request.anonymous)?;
@@ -170,10 +169,9 @@ impl Choreographer {
             };
             let ends = match placement {
                 Placement::Keep(id) => {
-                    let lease = Lease::new(Arc::clone(&servants.all[id]));
+                    let lease = Lease::new(Arc::clone(&servants.all[id]), request.who());
                     return Ok(lease.stating(Anew {
                         inner: Arc::clone(inner),
-                        who: request.who().to_owned(),
                         stated: request.stated,
                     }));
                 }
@@ -194,6 +192,7 @@ impl Choreographer {
                 rollouts.takes_canary(&request.service, &request.robot);
             }
             let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
+            let who = request.who().to_owned();
             let handle = Arc::new(Handle::new(
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
                 request.robot,
@@ -207,7 +206,7 @@ impl Choreographer {
             }
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
-            let lease = Lease::new(Arc::clone(&handle));
+            let lease = Lease::new(Arc::clone(&handle), &who);
             (handle, lease, warm, takes_canary)
         };
         if takes_canary {
@@ -296,10 +295,11 @@ impl Choreographer {
     }
 
     /// Looks after the machine from now on, moves cores where that is wanted, and resizes servants by how large what their
-    /// robots send is; comes back at once.
+    /// robots send is, and by who of their clients has left; comes back at once.
     pub fn keep_watch(&self) {
         tokio::spawn(lives::controller::watch(Arc::clone(&self.inner)));
         tokio::spawn(lives::measuring::watch(Arc::clone(&self.inner)));
+        tokio::spawn(lives::leaving::watch(Arc::clone(&self.inner)));
     }
 
     /// So often cores were moved.

@@ -10,6 +10,7 @@ pub(crate) mod driver;
 mod fit;
 pub(crate) mod group;
 pub(crate) mod hung;
+pub(crate) mod leaving;
 mod lifetime;
 pub(crate) mod limits;
 pub(crate) mod measuring;

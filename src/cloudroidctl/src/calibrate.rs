@@ -20,7 +20,7 @@ use crate::stated::aux;
 
 /// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
 ///
-/// A servant of its own is started, asks for room as any other, and is ended afterwards. Rows are written when you say yes.
+/// A servant of its own is started, gives way to robots, and is ended afterwards. Rows are written when you say yes.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "frames", "live"])))]
 pub struct Calibrate {

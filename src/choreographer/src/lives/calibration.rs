@@ -12,6 +12,8 @@ use tokio::sync::mpsc;
 
 use crate::decide::Amount;
 use crate::decide::calibration::{self as decide, Next};
+use crate::handle::Handle;
+use crate::lives::driver::GAVE_WAY;
 use crate::{Choreographer, Error, Measured};
 
 /// Requests at each limit where nobody says how many.
@@ -25,6 +27,23 @@ const IN_VAIN: usize = 3;
 const LEAST: u64 = 10;
 /// How often its memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
+
+/// What its servant is named after, where a robot's name stands.
+const PURPOSE: &str = "calibrate";
+
+impl Handle {
+    /// Whether what it is promised is given back where a robot needs it, as that of a push is.
+    pub(crate) fn gives_way(&self) -> bool {
+        let measured = self.robot.strip_prefix('~');
+        let is_measured = measured.is_some_and(|name| name.starts_with(PURPOSE));
+        self.is_candidate() || (self.anonymous && is_measured)
+    }
+
+    /// A robot needed what it was promised.
+    fn gave_way(&self) -> bool {
+        self.life().ended.as_deref() == Some(GAVE_WAY)
+    }
+}
 
 /// What a service is measured with.
 pub struct Requests {
@@ -55,10 +74,17 @@ impl Choreographer {
             &requests.material,
             options.input.as_deref(),
         )?;
-        let measured = self.measured(service, "calibrate")?;
+        let measured = self.measured(service, PURPOSE)?;
+        let gave_way = |error| match measured.lease.handle().gave_way() {
+            true => Error::Calibration(format!(
+                "measuring {service} was given up before it came to anything: {GAVE_WAY}; calibrate on a machine with more room, \
+                 or name smaller limits with --cpus"
+            )),
+            false => error,
+        };
         step(format!("starting a servant of {service} to measure")).await;
-        measured.lease.admitted().await?;
-        let reach = measured.lease.ready().await?;
+        measured.lease.admitted().await.map_err(gave_way)?;
+        let reach = measured.lease.ready().await.map_err(gave_way)?;
         let ladder = self.limits_for(&measured, options)?;
         let mut measuring = Measuring {
             choreographer: self,
@@ -88,8 +114,13 @@ impl Choreographer {
                 Ok(point) => {
                     let _ = events.send(CalibrationEvent::Measured { point }).await;
                 }
+                Err(error) if measuring.sum.points.is_empty() => return Err(gave_way(error)),
+                Err(_) if measured.lease.handle().gave_way() => {
+                    measuring.sum.ended = format!("{GAVE_WAY}; calibrate again for more");
+                    break;
+                }
                 // Room that others have taken meanwhile.
-                Err(Error::Full(refused)) if !measuring.sum.points.is_empty() => {
+                Err(Error::Full(refused)) => {
                     measuring.sum.ended = refused.to_string();
                     break;
                 }

@@ -22,6 +22,9 @@ use crate::with_last_words;
 /// Lines of the log that explain a failure.
 const LOG_LINES: usize = 20;
 
+/// Why a servant that gives way to robots was ended for one.
+pub(crate) const GAVE_WAY: &str = "a robot needs its room";
+
 /// How a servant begins.
 pub(crate) enum Beginning {
     /// A robot asked for it; it may have been made but for its nodes.
@@ -162,7 +165,7 @@ async fn live(
         reason = handle.end_asked() => Ok(reason),
         failure = container_over(&container) => Err(failure),
         reason = unneeded(inner, handle, fresh) => Ok(reason),
-        () = is_needed(permit) => Ok("a robot needs its room".to_owned()),
+        () = is_needed(permit) => Ok(GAVE_WAY.to_owned()),
     }
 }
 
@@ -239,12 +242,13 @@ async fn admit(
 ) -> Result<Permit, Failure> {
     let deadline = inner.options.deadline;
     let wanted = inner.promised(&handle.asked());
-    if let Some(permit) = ahead
+    // One that gives way has to be known as such.
+    if let Some(permit) = ahead.filter(|_| !handle.gives_way())
         && permit.promise().change(wanted).is_ok()
     {
         return Ok(permit);
     }
-    let ask = match handle.is_candidate() {
+    let ask = match handle.gives_way() {
         true => Ask::push(wanted),
         false => Ask::robot(wanted, handle.priority()),
     };

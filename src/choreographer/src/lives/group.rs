@@ -530,7 +530,7 @@ fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) ->
         .get(&key)
         .filter(|handle| !handle.is_ending());
     if let Some(handle) = has {
-        return Some(Lease::new(Arc::clone(handle)));
+        return Some(Lease::new(Arc::clone(handle), ""));
     }
     let (placement, warm) = inner.warm_pool.place(None, revision, (&robot, false));
     debug_assert!(matches!(placement, Placement::Start { ends: None, .. }));
@@ -544,7 +544,7 @@ fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) ->
         store::now(),
     ));
     servants.add(key, &handle);
-    let lease = Lease::new(Arc::clone(&handle));
+    let lease = Lease::new(Arc::clone(&handle), "");
     drop(servants);
     let beginning = Beginning::Asked(warm);
     tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));

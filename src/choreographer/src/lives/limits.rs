@@ -158,6 +158,38 @@ impl Inner {
         Ok(())
     }
 
+    /// Has a servant that runs forget what those of its robot's clients stated that have been away for the grace time. Where it
+    /// cannot be made smaller, it keeps what it has.
+    pub(crate) async fn forget_stated(
+        &self,
+        handle: &Handle,
+        grace: Duration,
+    ) -> Result<(), Error> {
+        // Whoever is back by now waits for this turn, and states it again.
+        let _turn = handle.limits_turn().await;
+        let away = handle.away_for(grace);
+        let before = handle.all_asked();
+        let mut left = before.terms.stated.clone();
+        left.retain(|who, _| !away.contains(who));
+        if left.len() == before.terms.stated.len() {
+            return Ok(());
+        }
+        let measured = before.terms.measured.clone();
+        let terms = self.offering(&handle.revision, |_| measured, |offer| terms(&left, offer))?;
+        let away: Vec<&str> = away.iter().map(|who| client(who)).collect();
+        let why = format!("its robot's clients without {}", away.join(", "));
+        let changed = self.renew(handle, before, terms, &why).await?;
+        if !handle.is_place() {
+            let why = format!(
+                "what {} stated ended {} s after that had left",
+                away.join(", "),
+                grace.as_secs_f64()
+            );
+            self.report_changed(handle, changed, &why);
+        }
+        Ok(())
+    }
+
     /// Gives a servant that runs what the dictionary says of messages as large as those that its robot sends. Where that
     /// cannot be, it keeps what it has.
     pub(crate) async fn measured(&self, handle: &Handle, inputs: &[Input]) -> Result<(), Error> {
@@ -275,6 +307,14 @@ impl Inner {
         handle.set_asked(after);
         promise.change(wanted)?;
         Ok(in_words(&limits_of(&container.enforced().limits)))
+    }
+}
+
+/// Who states something, for people: a stub by its node.
+fn client(who: &str) -> &str {
+    match who {
+        "" => "a rosbridge client",
+        node => node,
     }
 }
 

@@ -25,7 +25,44 @@ struct Watched {
     first: HashMap<String, Instant>,
     /// As its terms were made of it.
     known: Vec<Input>,
-    refused: Option<(Instant, String)>,
+    refused: Option<Refusal>,
+}
+
+/// A servant could not be given what is right for it.
+pub(super) struct Refusal {
+    at: Instant,
+    why: String,
+}
+
+impl Refusal {
+    /// It is to be tried again.
+    pub(super) fn is_due(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.at) >= AGAIN
+    }
+
+    /// What is remembered after one more try; a refusal is told unless it says what the one before has said.
+    pub(super) fn after(
+        before: Option<Refusal>,
+        outcome: Result<(), Error>,
+        inner: &Inner,
+        handle: &Handle,
+    ) -> Option<Refusal> {
+        match outcome {
+            Ok(()) => None,
+            Err(error @ Error::NotResized { .. }) => {
+                let (at, why) = (Instant::now(), error.to_string());
+                if before.is_none_or(|before| before.why != why) {
+                    inner.report_not_resized(handle, &error);
+                }
+                Some(Refusal { at, why })
+            }
+            // One that ends just now is told of elsewhere.
+            Err(error) => {
+                tracing::debug!("servant {} stays as it is: {error}", handle.id);
+                None
+            }
+        }
+    }
 }
 
 /// Looks, for ever.
@@ -60,26 +97,14 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
 async fn look(inner: &Inner, handle: &Handle, watched: &mut Watched, seen: Vec<(String, Seen)>) {
     let now = Instant::now();
     let inputs = watched.inputs(seen, now);
-    let again = watched.refused.as_ref();
-    let again = again.is_some_and(|(then, _)| now.saturating_duration_since(*then) >= AGAIN);
+    let refused = watched.refused.as_ref();
+    let again = refused.is_some_and(|refused| refused.is_due(now));
     if watched.known == inputs && !again {
         return;
     }
     let outcome = inner.measured(handle, &inputs).await;
     watched.known = inputs;
-    let before = watched.refused.take();
-    match outcome {
-        Ok(()) => {}
-        Err(error @ Error::NotResized { .. }) => {
-            let why = error.to_string();
-            if before.is_none_or(|(_, told)| told != why) {
-                inner.report_not_resized(handle, &error);
-            }
-            watched.refused = Some((now, why));
-        }
-        // One that ends just now is told of elsewhere.
-        Err(error) => tracing::debug!("servant {} stays as it is: {error}", handle.id),
-    }
+    watched.refused = Refusal::after(watched.refused.take(), outcome, inner, handle);
 }
 
 impl Watched {

@@ -38,7 +38,7 @@ const NAMED: &str = "~shadow-";
 const LOOK: Duration = Duration::from_millis(200);
 
 impl Handle {
-    /// Whether it is a candidate beside a robot's servant. It gives way to robots, as a push does.
+    /// Whether it is a candidate beside a robot's servant.
     pub(crate) fn is_candidate(&self) -> bool {
         self.robot.starts_with(NAMED)
     }
@@ -209,7 +209,7 @@ impl Choreographer {
                 return Err(Error::Ending);
             }
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
-            Lease::new(Arc::clone(&handle))
+            Lease::new(Arc::clone(&handle), "")
         };
         tokio::spawn(driver::drive(
             Arc::clone(inner),

@@ -51,7 +51,8 @@ struct Door {
 }
 
 struct Working {
-    has: Amount,
+    /// Its promise, which may have been changed.
+    has: Arc<Mutex<Option<Amount>>>,
     gives_way: CancellationToken,
 }
 
@@ -185,19 +186,17 @@ impl Admission {
     }
 
     fn permit(&self, desk: &mut Desk, ticket: Ticket, origin: Origin, has: Amount) -> Permit {
+        let promise = self.promise(has);
         let work = (origin == Origin::Push).then(|| {
             let gives_way = CancellationToken::new();
             let working = Working {
-                has,
+                has: Arc::clone(&promise.amount),
                 gives_way: gives_way.clone(),
             };
             desk.pushes.insert(ticket, working);
             (ticket, gives_way)
         });
-        Permit {
-            promise: self.promise(has),
-            work,
-        }
+        Permit { promise, work }
     }
 
     fn promise(&self, amount: Amount) -> Promise {
@@ -237,7 +236,7 @@ impl Admission {
         let desk = self.desk.lock();
         let pushes = desk.pushes.iter().map(|(ticket, working)| Push {
             ticket: *ticket,
-            has: working.has,
+            has: working.has.lock().unwrap_or_default(),
             gives_way: working.gives_way.is_cancelled(),
         });
         (desk.book.lacking(), pushes.collect())
@@ -636,6 +635,22 @@ mod tests {
         let (robot, ()) = tokio::join!(waits, gives);
         let _robot = robot.expect("the push gave way");
         assert!(room.lacking().1.is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_a_push_has_is_what_it_is_promised_now() {
+        let room = machine();
+        let push = Ask::push(Amount::new(0.1, 100));
+        let push = room.admit(push, SECOND, watch::Sender::new(None), || {});
+        let push = push.await.expect("it is free");
+        let has = || room.lacking().1[0].has;
+        for now in [Amount::new(1.9, 100), Amount::new(0.5, 200)] {
+            push.promise().change(now).expect("it is free");
+            assert_eq!(has(), now);
+        }
+        let more = push.promise().change(Amount::new(2.5, 200));
+        more.expect_err("there is not so much");
+        assert_eq!(has(), Amount::new(0.5, 200));
     }
 
     #[tokio::test]

@@ -107,6 +107,78 @@ async fn stubs_of_one_robot_state_each_for_itself() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_a_stub_stated_ends_with_it() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    daemon.keep_watch();
+    let grace = daemon.inner.options.grace;
+    let by = |node: &str, cpus| stating("r1", &[("cpus", cpus)]).by_stub(node);
+    let one = ready(&daemon, by("/one", "0.5")).await;
+    let two = ready(&daemon, by("/two", "1.5")).await;
+    let promised = || daemon.admission().look().1.cpus();
+    // Back within the grace time, and by another of its connections.
+    drop(two);
+    tokio::time::sleep(grace / 2).await;
+    assert_eq!(promised(), 1.5);
+    let two = ready(&daemon, by("/two", "1.5")).await;
+    let other = ready(&daemon, by("/two", "1.5")).await;
+    drop(two);
+    tokio::time::sleep(grace * 2).await;
+    assert_eq!(promised(), 1.5);
+    // And then not.
+    drop(other);
+    tokio::time::sleep(grace / 2).await;
+    assert_eq!(promised(), 1.5);
+    tokio::time::sleep(grace).await;
+    assert_eq!(promised(), 0.5);
+    assert_eq!(enforced(&daemon, &one).await.0, Some(0.5));
+    assert_eq!(one.handle().terms().stated_in_words(), "/one: cpus=0.5");
+    let told = world.told("terms-changed");
+    let last = told.last().expect("it is told");
+    assert!(last.contains("what /two stated ended 60 s after"), "{last}");
+    // Each place of those who may state something is free again.
+    for node in 0..100 {
+        ready(&daemon, by(&format!("/node{node}"), "0.25")).await;
+        tokio::time::sleep(grace / 10).await;
+    }
+    tokio::time::sleep(grace * 2).await;
+    assert_eq!(one.handle().terms().stated.len(), 1);
+    // It comes back with what it stated before.
+    ready(&daemon, by("/two", "1.5")).await;
+    assert_eq!(promised(), 1.5);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_stub_stated_is_kept_while_it_is_in_use() {
+    let world = World::new();
+    world.engine.program("/eats", |process| async move {
+        process.allocate(100 << 20).await;
+        process.advertise("/greeting", "std_msgs/String");
+        std::future::pending().await
+    });
+    world.publish("greet", "/eats", |_| {});
+    let daemon = world.daemon();
+    daemon.keep_watch();
+    let by = |memory| stating("r1", &[("memory", memory)]);
+    let big = ready(&daemon, by("200M")).await;
+    let grown = world.engine.servant(&big.handle().id).expect("it runs");
+    let small = daemon.ensure(by("50M").by_stub("/small"));
+    let small = small.expect("a lease");
+    small.ready().await.expect("the greater counts");
+    drop(big);
+    tokio::time::sleep(daemon.inner.options.grace * 3).await;
+    let memory = || servant::engine::Servant::enforced(&*grown).limits.memory;
+    assert_eq!(memory(), Some(200 << 20), "it uses more than 50M");
+    let told = world.told("terms-refused");
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert!(
+        told[0].contains("clients without a rosbridge client"),
+        "{told:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
 async fn what_the_operator_sets_stays_whatever_the_robot_states() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
