@@ -145,6 +145,9 @@ impl Choreographer {
     pub fn ensure(&self, request: ServantRequest) -> Result<Lease, Error> {
         let inner = &self.inner;
         let key = (request.service.clone(), request.robot.clone());
+        // Not under the lock, since all other robots wait for that: the dictionary is read, and may be long.
+        let is_new = !inner.servants.lock().given.contains_key(&key);
+        let ahead = is_new.then(|| inner.terms_ahead(&request)).transpose()?;
         let (handle, lease, warm, takes_canary) = {
             let mut servants = inner.servants.lock();
             // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
@@ -176,6 +179,12 @@ impl Choreographer {
                     }));
                 }
                 Placement::Start { ends, .. } => ends,
+            };
+            let ahead = ahead.filter(|(of, _)| of.number == revision.number);
+            let terms = match ahead {
+                Some((_, terms)) => terms,
+                // Another revision was published meanwhile.
+                None => inner.terms(&request.statement(), &revision),
             };
             let terms = match terms {
                 Ok(terms) => terms,

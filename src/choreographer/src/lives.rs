@@ -34,7 +34,6 @@ use reach::{Opener, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, RevisionRecord, State};
 
-use crate::Error;
 use crate::decide::capacity::Room;
 use crate::decide::demand::{self, Asked};
 use crate::decide::dictionary::Aux;
@@ -44,6 +43,7 @@ use crate::decide::{Amount, End, Servant, capacity};
 use crate::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
+use crate::{Error, ServantRequest};
 use back_off::BackOffs;
 use group::Groups;
 use recent::Recent;
@@ -114,6 +114,17 @@ impl Inner {
         revision: &RevisionRecord,
     ) -> Result<api::Terms, Error> {
         self.offering(revision, |_| Aux::new(), |offer| Ok(terms(stated, offer)?))?
+    }
+
+    /// The terms of a servant of the revision that a robot would be given now.
+    #[allow(clippy::type_complexity)]
+    pub(crate) fn terms_ahead(
+        &self,
+        request: &ServantRequest,
+    ) -> Result<(Arc<RevisionRecord>, Result<api::Terms, Error>), Error> {
+        let (revision, _) = self.revision_for(request)?;
+        let terms = self.terms(&request.statement(), &revision);
+        Ok((revision, terms))
     }
 
     /// What terms for a servant of this revision are made from; `measured` says, of the dictionary's rows, which auxiliary

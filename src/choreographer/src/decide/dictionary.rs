@@ -100,80 +100,63 @@ impl<'a> Shelf<'a> {
         if of_measure().next().is_none() {
             return Choice::Silent;
         }
-        let mut dearest: Option<(Cost, Choice<'a>)> = None;
-        for assumed in cases(of_measure(), self.aux) {
-            let known = |key: &str| assumed.get(key).or_else(|| self.aux.get(key));
-            let applying = of_measure().filter(|row| applies(row, known));
-            let applying: Vec<&Row> = applying.collect();
-            match self.best_of(goal, &applying, &affordable) {
+        let holding =
+            of_measure().filter(|row| applies(row, |key| self.aux.get(key).or(row.aux.get(key))));
+        let mut holding: Vec<Holding<'a>> = holding
+            .map(|row| Holding {
+                row,
+                cost: self.cost(row),
+                open: affordable(row),
+                unknown: (row.aux.iter())
+                    .filter(|(key, _)| !self.aux.contains_key(*key))
+                    .map(|(key, value)| (&**key, &**value, number(value)))
+                    .collect(),
+            })
+            .collect();
+        holding.sort_unstable_by(|one, other| less(one.cost, other.cost));
+        let cases: BTreeSet<Case<'a>> = holding.iter().map(Holding::case).collect();
+        let mut dearest: Option<(&Holding<'a>, bool, Case<'a>)> = None;
+        for case in cases {
+            let numbers: Vec<Option<f64>> = case.iter().map(|(_, value)| number(value)).collect();
+            let applying = || holding.iter().filter(|row| row.covers(&case, &numbers));
+            match best_of(goal, applying) {
                 Ok((row, desired)) => {
-                    let cost = self.cost(row);
-                    if dearest
-                        .as_ref()
-                        .is_none_or(|(dear, _)| less(cost, *dear).is_gt())
-                    {
-                        let taken = Choice::Taken {
-                            row,
-                            desired,
-                            assumed,
-                        };
-                        dearest = Some((cost, taken));
+                    let dear = dearest.as_ref().map(|(dear, ..)| dear.cost);
+                    if dear.is_none_or(|dear| less(row.cost, dear).is_gt()) {
+                        dearest = Some((row, desired, case));
                     }
                 }
                 Err((best, beyond)) => {
                     return Choice::Unmet {
                         best,
                         beyond,
-                        assumed,
+                        assumed: owned(&case),
                     };
                 }
             }
         }
-        // Without any case no row is for what is known.
-        let unmet = || Choice::Unmet {
-            best: None,
-            beyond: None,
-            assumed: Aux::new(),
-        };
-        dearest.map_or_else(unmet, |(_, choice)| choice)
-    }
-
-    /// Of rows that apply, the one to take and whether it reaches the desire; else the best, and the cheapest that would
-    /// do but for the caps.
-    #[allow(clippy::type_complexity)]
-    fn best_of(
-        &self,
-        goal: &Goal,
-        rows: &[&'a Row],
-        affordable: impl Fn(&Row) -> bool,
-    ) -> Result<(&'a Row, bool), (Option<&'a Row>, Option<&'a Row>)> {
-        let cheaper = |one: &&&'a Row, other: &&&'a Row| less(self.cost(one), self.cost(other));
-        let reaches = |row: &Row, than| goal.measure.reaches(row.value, than);
-        let open = || rows.iter().filter(|row| affordable(row));
-        let desired = open().filter(|row| reaches(row, goal.desire));
-        if let Some(row) = desired.min_by(cheaper) {
-            return Ok((row, true));
-        }
-        let best = open().min_by(|one, other| {
-            better(goal.measure, one.value, other.value).then_with(|| cheaper(one, other))
-        });
-        match best {
-            Some(row) if reaches(row, goal.bound) => Ok((row, false)),
-            best => {
-                let beyond = rows
-                    .iter()
-                    .filter(|row| !affordable(row) && reaches(row, goal.bound));
-                Err((best.copied(), beyond.min_by(cheaper).copied()))
-            }
+        match dearest {
+            Some((Holding { row, .. }, desired, case)) => Choice::Taken {
+                row,
+                desired,
+                assumed: owned(&case),
+            },
+            // Without any case no row is for what is known.
+            None => Choice::Unmet {
+                best: None,
+                beyond: None,
+                assumed: Aux::new(),
+            },
         }
     }
 
-    /// The cheapest row with a better value than this one's, and the best of the cheaper ones, for the same auxiliary
-    /// parameters: what comes next in either direction.
+    /// The cheapest row with a better value than this one's, and the best of the cheaper ones, of those that hold for the same
+    /// robot: what comes next in either direction. What is not known of the robot is as this row has it.
     pub fn next_to(&self, taken: &Row) -> (Option<&'a Row>, Option<&'a Row>) {
         let beside = || {
             let rows = self.rows.iter();
-            rows.filter(|row| row.measure == taken.measure && row.aux == taken.aux)
+            let known = |key: &str| self.aux.get(key).or(taken.aux.get(key));
+            rows.filter(move |row| row.measure == taken.measure && applies(row, known))
         };
         let cheaper = |one: &&'a Row, other: &&'a Row| less(self.cost(one), self.cost(other));
         let dearer = beside().filter(|row| better(row.measure, row.value, taken.value).is_lt());
@@ -205,6 +188,71 @@ fn better(measure: Measure, one: f64, other: f64) -> std::cmp::Ordering {
     }
 }
 
+/// What the parameters that are not known may be, as rows name them that hold for what is known; in the order of their names.
+type Case<'a> = Vec<(&'a str, &'a str)>;
+
+fn owned(case: &Case<'_>) -> Aux {
+    let pairs = case.iter();
+    pairs
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect()
+}
+
+/// A row that holds for what is known of the robot, with what choosing among many asks of it again and again.
+struct Holding<'a> {
+    row: &'a Row,
+    cost: Cost,
+    /// It is affordable.
+    open: bool,
+    /// Its parameters that are not known, in the order of their names: value, and as a number.
+    unknown: Vec<(&'a str, &'a str, Option<f64>)>,
+}
+
+impl<'a> Holding<'a> {
+    fn case(&self) -> Case<'a> {
+        let unknown = self.unknown.iter();
+        unknown.map(|(key, value, _)| (*key, *value)).collect()
+    }
+
+    /// Whether it applies in this case, whose values are these numbers.
+    fn covers(&self, case: &Case<'a>, numbers: &[Option<f64>]) -> bool {
+        let mut has = case.iter().zip(numbers);
+        self.unknown.iter().all(|(key, most, upto)| {
+            has.find(|((name, _), _)| name == key)
+                .is_some_and(|((_, value), number)| match (number, upto) {
+                    (Some(number), Some(upto)) => number <= upto,
+                    _ => value == most,
+                })
+        })
+    }
+}
+
+/// Of rows that apply, the cheapest first: the one to take and whether it reaches the desire; else the best, and the cheapest
+/// that would do but for the caps.
+#[allow(clippy::type_complexity)]
+fn best_of<'a, 'h, I: Iterator<Item = &'h Holding<'a>>>(
+    goal: &Goal,
+    rows: impl Fn() -> I,
+) -> Result<(&'h Holding<'a>, bool), (Option<&'a Row>, Option<&'a Row>)>
+where
+    'a: 'h,
+{
+    let reaches = |one: &Holding<'_>, than| goal.measure.reaches(one.row.value, than);
+    let open = || rows().filter(|one| one.open);
+    if let Some(one) = open().find(|one| reaches(one, goal.desire)) {
+        return Ok((one, true));
+    }
+    // The first of those that are equally good is the cheapest.
+    let best = open().min_by(|one, other| better(goal.measure, one.row.value, other.row.value));
+    match best {
+        Some(one) if reaches(one, goal.bound) => Ok((one, false)),
+        best => {
+            let beyond = rows().find(|one| !one.open && reaches(one, goal.bound));
+            Err((best.map(|one| one.row), beyond.map(|one| one.row)))
+        }
+    }
+}
+
 /// Whether a row holds for a robot of which `known` says what is known.
 pub fn applies<'a>(row: &Row, known: impl Fn(&str) -> Option<&'a String>) -> bool {
     row.aux.iter().all(|(key, most)| {
@@ -217,21 +265,6 @@ pub fn applies<'a>(row: &Row, known: impl Fn(&str) -> Option<&'a String>) -> boo
 
 fn number(text: &str) -> Option<f64> {
     text.parse().ok().filter(|number: &f64| number.is_finite())
-}
-
-/// What the parameters that are not known may be: as rows name them that hold for what is known. One case of nothing where
-/// all are known.
-fn cases<'a>(rows: impl Iterator<Item = &'a Row>, known: &Aux) -> BTreeSet<Aux> {
-    let holding =
-        rows.filter(|row| applies(row, |key| known.get(key).or_else(|| row.aux.get(key))));
-    holding
-        .map(|row| {
-            let unknown = row.aux.iter().filter(|(key, _)| !known.contains_key(*key));
-            unknown
-                .map(|(key, value)| (key.clone(), value.clone()))
-                .collect()
-        })
-        .collect()
 }
 
 /// Refuses a row that cannot be; says what to write.

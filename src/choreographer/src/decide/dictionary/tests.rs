@@ -387,4 +387,83 @@ proptest! {
             prop_assert!(less(shelf.cost(told), shelf.cost(row)).is_le());
         }
     }
+
+    #[test]
+    fn what_is_not_stated_is_looked_at_value_by_value(
+        mut rows in rows(), models in proptest::collection::vec(proptest::option::of(0..3usize), 12),
+        goal in goals(), most in value(),
+    ) {
+        for (row, model) in rows.iter_mut().zip(models) {
+            row.aux.extend(model.map(|model| ("model".to_owned(), ["big", "7", "30"][model].to_owned())));
+        }
+        let nothing = Aux::new();
+        let all = shelf(&rows, &nothing);
+        let chosen = all.choose(&goal, within(most * 3.0));
+        // Each combination that a row names, stated by a robot of its own; what a row beside it does not name has no value.
+        let of_measure = rows.iter().filter(|row| row.measure == goal.measure);
+        let cases: BTreeSet<&Aux> = of_measure.map(|row| &row.aux).collect();
+        let mut dearest: Option<Cost> = None;
+        let mut unmet = false;
+        for case in cases {
+            let of_case: Vec<Row> = rows.iter().filter(|row| applies(row, |key| case.get(key))).cloned().collect();
+            match shelf(&of_case, case).choose(&goal, within(most * 3.0)) {
+                Choice::Taken { row, .. } => {
+                    let cost = all.cost(row);
+                    dearest = Some(dearest.map_or(cost, |dear| if less(cost, dear).is_gt() { cost } else { dear }));
+                }
+                _ => unmet = true,
+            }
+        }
+        match chosen {
+            Choice::Silent => prop_assert!(dearest.is_none() && !unmet),
+            Choice::Taken { row, .. } => prop_assert_eq!((Some(all.cost(row)), unmet), (dearest, false)),
+            Choice::Unmet { .. } => prop_assert!(unmet),
+        }
+    }
+}
+
+#[test]
+fn what_comes_next_holds_for_the_same_robot() {
+    let of = |id, value, cpus, aux: &[(&str, &str)]| row(id, Measure::Rrt, value, cpus, aux);
+    let rows = [
+        of(1, 0.2, 0.5, &[("width", "640")]),
+        of(2, 0.1, 1.0, &[("width", "1280")]),
+        of(3, 0.05, 2.0, &[("width", "320")]),
+        of(4, 0.04, 3.0, &[]),
+        of(5, 0.02, 3.5, &[("model", "big")]),
+    ];
+    let next = |aux: &[(&str, &str)], taken: usize| {
+        let aux = known(aux);
+        let (better, weaker) = shelf(&rows, &aux).next_to(&rows[taken - 1]);
+        (better.map(|row| row.id), weaker.map(|row| row.id))
+    };
+    assert_eq!(
+        next(&[("width", "640")], 1),
+        (Some(2), None),
+        "wider will do"
+    );
+    assert_eq!(next(&[("width", "640")], 2), (Some(4), Some(1)));
+    assert_eq!(next(&[("width", "320")], 2), (Some(3), Some(1)));
+    // It was assumed to be as wide as the row.
+    assert_eq!(next(&[], 2), (Some(4), None));
+    assert_eq!(next(&[("model", "big")], 4), (Some(5), None));
+}
+
+/// Rows and cases at their bound, each with a value of its own.
+#[test]
+fn as_many_rows_as_there_may_be_are_chosen_from() {
+    let rows: Vec<Row> = (1..=MOST_ROWS as i64)
+        .map(|id| {
+            let (width, model) = (id.to_string(), (id % 7).to_string());
+            let aux = [("width", &*width), ("model", &*model)];
+            row(id, Measure::Rrt, 0.1, id as f64 / 1e4, &aux)
+        })
+        .collect();
+    let nothing = Aux::new();
+    let Choice::Taken { row, desired, .. } =
+        shelf(&rows, &nothing).choose(&goal(0.01, 0.1), |_| true)
+    else {
+        panic!("it is acceptable");
+    };
+    assert_eq!((row.id, desired), (MOST_ROWS as i64, false));
 }
