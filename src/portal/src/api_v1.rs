@@ -14,6 +14,7 @@ use futures_util::StreamExt;
 use reach::{Material, Picture};
 use serde::Deserialize;
 use servant::engine::LogStart;
+use store::EventFilter;
 use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
@@ -64,6 +65,14 @@ pub struct Which {
     since: i64,
     /// So many of the newest; 100 by default.
     limit: Option<u32>,
+    /// Only events of this kind, such as `node-hung`.
+    kind: Option<String>,
+    /// Only events of this service.
+    service: Option<String>,
+    /// Only events of this servant.
+    servant: Option<String>,
+    /// Only events of this robot.
+    robot: Option<String>,
 }
 
 /// The journal.
@@ -73,7 +82,13 @@ pub async fn events(
     Extension(caller): Extension<Caller>,
 ) -> Answer<Vec<api::Event>> {
     let limit = which.limit.unwrap_or(EVENTS);
-    let mut events = app.state.events(which.since, limit)?;
+    let filter = EventFilter {
+        kind: which.kind.as_deref(),
+        service: which.service.as_deref(),
+        servant: which.servant.as_deref(),
+        robot: which.robot.as_deref(),
+    };
+    let mut events = app.state.events_of(filter, which.since, limit)?;
     let principal = &caller.who.principal;
     if !principal.sees_all() {
         // A robot is told of itself, and everybody of services that they see; the machine's own are for those who see it.

@@ -12,14 +12,12 @@ use reach::links::LinkStatus;
 
 use crate::errors::Error;
 use choreographer::{Choreographer, Handle};
-use store::State;
+use store::{EventFilter, State};
 
 /// Between two looks at what a servant uses.
 const MOMENT: Duration = Duration::from_millis(400);
 /// Events that are told.
-const EVENTS: usize = 8;
-/// Of these many the robot's are looked for.
-const EVENTS_SEARCHED: u32 = 2000;
+const EVENTS: u32 = 8;
 
 /// Explains one robot.
 pub async fn robot(
@@ -51,10 +49,11 @@ pub async fn robot(
 }
 
 fn events(state: &State, robot: &str) -> Result<Vec<Event>, Error> {
-    let mut events = state.events(0, EVENTS_SEARCHED)?;
-    events.retain(|event| event.robot.as_deref() == Some(robot));
-    let skipped = events.len().saturating_sub(EVENTS);
-    Ok(events.split_off(skipped))
+    let of_it = EventFilter {
+        robot: Some(robot),
+        ..EventFilter::default()
+    };
+    Ok(state.events_of(of_it, 0, EVENTS)?)
 }
 
 async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {

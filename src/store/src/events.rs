@@ -20,6 +20,29 @@ pub struct NewEvent<'a> {
     pub robot: Option<&'a str>,
 }
 
+/// Which events are meant; where nothing is said, all.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EventFilter<'a> {
+    /// Of this kind.
+    pub kind: Option<&'a str>,
+    /// Of this service.
+    pub service: Option<&'a str>,
+    /// Of this servant.
+    pub servant: Option<&'a str>,
+    /// Of this robot.
+    pub robot: Option<&'a str>,
+}
+
+impl EventFilter<'_> {
+    fn takes(&self, event: &Event) -> bool {
+        let is = |wanted: Option<&str>, has: Option<&str>| wanted.is_none() || wanted == has;
+        is(self.kind, Some(&event.kind))
+            && is(self.service, event.service.as_deref())
+            && is(self.servant, event.servant.as_deref())
+            && is(self.robot, event.robot.as_deref())
+    }
+}
+
 /// The number of the last event ever written; 0 before the first.
 pub(super) fn last(connection: &Connection) -> rusqlite::Result<i64> {
     connection.query_row(
@@ -73,34 +96,62 @@ impl State {
 
     /// The newest `limit` events after number `since`, oldest first.
     pub fn events(&self, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
+        self.events_of(EventFilter::default(), since, limit)
+    }
+
+    /// Of certain events, the newest `limit` after number `since`, oldest first.
+    pub fn events_of(
+        &self,
+        filter: EventFilter<'_>,
+        since: i64,
+        limit: u32,
+    ) -> Result<Vec<Event>, Error> {
         // First, so that none is missed that is being written meanwhile.
-        let kept = self.backlog.events(since);
-        let mut events = self.written_events(since, limit)?;
+        let mut kept = self.backlog.events(since);
+        kept.retain(|event| filter.takes(event));
+        let mut events = self.written_events(filter, since, limit)?;
         let last = events.last().map_or(since, |event| event.id);
         events.extend(kept.into_iter().filter(|event| event.id > last));
         let beyond = events.len().saturating_sub(limit as usize);
         Ok(events.split_off(beyond))
     }
 
-    fn written_events(&self, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
+    fn written_events(
+        &self,
+        filter: EventFilter<'_>,
+        since: i64,
+        limit: u32,
+    ) -> Result<Vec<Event>, Error> {
+        let EventFilter {
+            kind,
+            service,
+            servant,
+            robot,
+        } = filter;
         self.read(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, time, level, kind, service, servant, robot, message FROM
-                     (SELECT * FROM events WHERE id > ?1 ORDER BY id DESC LIMIT ?2) ORDER BY id",
+                     (SELECT * FROM events WHERE id > ?1
+                      AND (?3 IS NULL OR kind = ?3) AND (?4 IS NULL OR service = ?4)
+                      AND (?5 IS NULL OR servant = ?5) AND (?6 IS NULL OR robot = ?6)
+                      ORDER BY id DESC LIMIT ?2) ORDER BY id",
                 )?
-                .query_map(params![since, limit], |row| {
-                    Ok(Event {
-                        id: row.get(0)?,
-                        time: row.get::<_, i64>(1)? as Millis,
-                        level: level_of(&row.get::<_, String>(2)?),
-                        kind: row.get(3)?,
-                        service: row.get(4)?,
-                        servant: row.get(5)?,
-                        robot: row.get(6)?,
-                        message: row.get(7)?,
-                    })
-                })?
+                .query_map(
+                    params![since, limit, kind, service, servant, robot],
+                    |row| {
+                        Ok(Event {
+                            id: row.get(0)?,
+                            time: row.get::<_, i64>(1)? as Millis,
+                            level: level_of(&row.get::<_, String>(2)?),
+                            kind: row.get(3)?,
+                            service: row.get(4)?,
+                            servant: row.get(5)?,
+                            robot: row.get(6)?,
+                            message: row.get(7)?,
+                        })
+                    },
+                )?
                 .collect()
         })
     }

@@ -30,7 +30,7 @@ use serde::Serialize;
 
 use backlog::Backlog;
 pub use backlog::watch;
-pub use events::NewEvent;
+pub use events::{EventFilter, NewEvent};
 pub use journal::Journal;
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;

@@ -267,6 +267,51 @@ fn the_newest_events_come_oldest_first() {
 }
 
 #[test]
+fn events_are_told_apart_by_kind_and_by_whom_they_are_about() {
+    let (_directory, state) = state();
+    for (number, (kind, service, servant, robot)) in [
+        ("node-hung", Some("a"), Some("a-1"), Some("r1")),
+        ("node-hung", Some("b"), Some("b-1"), Some("r1")),
+        ("terms", Some("a"), Some("a-1"), Some("r1")),
+        ("terms", Some("a"), Some("a-2"), Some("r2")),
+        ("machine-stalled", None, None, None),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let about = NewEvent {
+            service,
+            servant,
+            robot,
+        };
+        state.add_event(Level::Info, kind, &number.to_string(), &about);
+    }
+    let numbers = |filter, limit| -> Vec<String> {
+        let events = state.events_of(filter, 0, limit).expect("readable");
+        events.into_iter().map(|event| event.message).collect()
+    };
+    let all = EventFilter::default();
+    let of = |kind, service, servant, robot| EventFilter {
+        kind,
+        service,
+        servant,
+        robot,
+    };
+    for (filter, expected) in [
+        (all, &["0", "1", "2", "3", "4"][..]),
+        (of(Some("node-hung"), None, None, None), &["0", "1"]),
+        (of(None, Some("a"), None, None), &["0", "2", "3"]),
+        (of(None, None, Some("a-1"), None), &["0", "2"]),
+        (of(None, None, None, Some("r2")), &["3"]),
+        (of(Some("terms"), Some("a"), None, Some("r1")), &["2"]),
+        (of(Some("no-such-kind"), None, None, None), &[]),
+    ] {
+        assert_eq!(numbers(filter, 10), expected, "{filter:?}");
+    }
+    assert_eq!(numbers(of(None, Some("a"), None, None), 2), ["2", "3"]);
+}
+
+#[test]
 fn revisions_of_an_earlier_version_are_kept_and_completed() {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("cloudroid.db");
