@@ -33,6 +33,10 @@ pub struct Fed {
     pub type_name: String,
     /// Messages published.
     pub sent: usize,
+    /// Topics of other names in the recording that went to it, since it is the only input of their type.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub from: Vec<String>,
 }
 
 /// An output.

@@ -31,6 +31,18 @@ pub enum Error {
         /// What stood against it.
         reason: Box<Unchanged>,
     },
+    /// It has no container of its own.
+    #[error(
+        "{id} is the place of robot {robot} at {service}, which robots share: it has no container, and what it uses is its servants'"
+    )]
+    Place {
+        /// Its id.
+        id: String,
+        /// The service.
+        service: String,
+        /// The robot.
+        robot: String,
+    },
     /// The servant could not be started, or ended.
     #[error("the servant of {service} for robot {robot} {reason}")]
     Servant {

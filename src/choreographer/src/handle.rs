@@ -252,6 +252,18 @@ impl Handle {
         self.container.get().cloned()
     }
 
+    /// Refuses a robot's place in a group, which never has a container.
+    pub fn check_container(&self) -> Result<(), Error> {
+        if !self.is_place() {
+            return Ok(());
+        }
+        Err(Error::Place {
+            id: self.id.clone(),
+            service: self.service().to_owned(),
+            robot: self.robot.clone(),
+        })
+    }
+
     /// Its ROS and its bridge, once reached.
     pub fn reach(&self) -> Option<Arc<dyn Reach>> {
         self.reach.lock().clone()

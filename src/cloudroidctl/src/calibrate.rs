@@ -17,6 +17,7 @@ use hyper::Method;
 use crate::client::{self, Client, escaped};
 use crate::output::{self, Format, Table};
 use crate::stated::aux;
+use crate::trial::renamed;
 
 /// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
 ///
@@ -239,6 +240,9 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     output::line("")?;
     table.print()?;
     output::line(&format!("ended: {}", calibration.ended))?;
+    for words in renamed(&calibration.inputs) {
+        output::line(&words)?;
+    }
     if !calibration.unused.is_empty() {
         output::line(&format!("not used: {}", calibration.unused.join(", ")))?;
     }

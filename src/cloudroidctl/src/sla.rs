@@ -199,8 +199,8 @@ fn cells(row: &Row) -> [String; 6] {
     let spread = row.spread.map(|spread| {
         format!(
             "p50 {}, p95 {} of {}",
-            print(spread.p50),
-            print(spread.p95),
+            print(rounded(spread.p50)),
+            print(rounded(spread.p95)),
             spread.requests
         )
     });
@@ -212,6 +212,11 @@ fn cells(row: &Row) -> [String; 6] {
         spread.unwrap_or_default(),
         row.revision.map_or_else(String::new, |n| n.to_string()),
     ]
+}
+
+/// To three digits that count: more is noise of the measurement.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.2e}").parse().unwrap_or(value)
 }
 
 const HEADINGS: [&str; 6] = ["ROW", "REACHES", "FOR", "WITH", "MEASURED", "REVISION"];
@@ -232,20 +237,28 @@ fn list(service: &str, rows: &[Row], format: Format) -> anyhow::Result<()> {
     table.print()
 }
 
-fn explain(explained: &Explained) -> anyhow::Result<()> {
+/// What the robot gets.
+fn outcome(explained: &Explained) -> String {
     let Explained {
         service, stated, ..
     } = explained;
+    let robot = match stated.is_empty() {
+        true => format!("a robot that states nothing to {service}"),
+        false => format!("a robot that states {stated} to {service}"),
+    };
     match (&explained.limits, &explained.refused) {
-        (Some(limits), _) => output::line(&format!(
-            "a robot that states {stated} to {service} is promised {}",
-            output::limits(limits)
-        ))?,
-        (None, Some(refused)) => output::line(&format!(
-            "a robot that states {stated} to {service} is refused: {refused}"
-        ))?,
-        (None, None) => {}
+        (_, Some(refused)) => format!("{robot} is refused: {refused}"),
+        (Some(limits), None) if *limits != Limits::default() => {
+            format!("{robot} is promised {}", output::limits(limits))
+        }
+        _ => format!(
+            "{robot} is promised nothing; its servant gets the limits that the server gives to all ([limits] of its configuration)"
+        ),
     }
+}
+
+fn explain(explained: &Explained) -> anyhow::Result<()> {
+    output::line(&outcome(explained))?;
     if let Some(class) = &explained.class {
         output::line(&format!("  class {class}, priority {}", explained.priority))?;
     }
@@ -307,6 +320,47 @@ mod tests {
             (spread.p50, spread.p95, spread.requests),
             (0.08, 0.095, 200)
         );
+    }
+
+    #[test]
+    fn what_a_robot_gets_is_said_whatever_it_states() {
+        let stated = api::Stated::read([("rrt", "100ms")]).expect("valid");
+        let limits = |cpus| Limits {
+            cpus,
+            ..Limits::default()
+        };
+        let said = |stated, cpus: Option<f64>, refused: Option<&str>| {
+            outcome(&Explained {
+                service: "s".into(),
+                stated,
+                limits: refused.is_none().then(|| limits(cpus)),
+                refused: refused.map(str::to_owned),
+                ..Explained::default()
+            })
+        };
+        let nothing = api::Stated::default();
+        for (said, expected) in [
+            (
+                said(stated.clone(), Some(1.5), None),
+                "a robot that states rrt=100ms to s is promised 1.5 cpus",
+            ),
+            (
+                said(stated.clone(), None, Some("no row")),
+                "a robot that states rrt=100ms to s is refused: no row",
+            ),
+            (
+                said(nothing, None, None),
+                "a robot that states nothing to s is promised nothing; its servant gets",
+            ),
+        ] {
+            assert!(said.starts_with(expected), "{said}");
+        }
+    }
+
+    #[test]
+    fn what_was_measured_is_rounded() {
+        let rounded = [0.17320284, 0.236046755, 12.349, 0.08, 0.0].map(rounded);
+        assert_eq!(rounded, [0.173, 0.236, 12.3, 0.08, 0.0]);
     }
 
     #[test]

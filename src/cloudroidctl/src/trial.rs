@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use api::Stopped;
-use api::trial::Trial;
+use api::trial::{Fed, Trial};
 use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
@@ -90,6 +90,9 @@ fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
     }
     output::line("")?;
     table.print()?;
+    for words in renamed(&trial.inputs) {
+        output::line(&words)?;
+    }
     if !trial.unused.is_empty() {
         let unused = trial.unused.join(", ");
         output::line(&format!("not used of {}: {unused}", path.display()))?;
@@ -109,4 +112,17 @@ fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
         rrt.desire / 1000.0,
         rrt.acceptable / 1000.0
     ))
+}
+
+/// Which topics of the recording went to inputs of other names.
+pub fn renamed(inputs: &[Fed]) -> impl Iterator<Item = String> {
+    let renamed = inputs.iter().filter(|input| !input.from.is_empty());
+    renamed.map(|input| {
+        format!(
+            "{} of the recording went to {}, the only input of type {}",
+            input.from.join(", "),
+            input.topic,
+            input.type_name
+        )
+    })
 }

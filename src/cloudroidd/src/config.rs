@@ -2,15 +2,17 @@
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
 mod class;
+mod doubts;
 mod options;
 mod time;
+mod words;
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use api::{Limits, Size};
 use choreographer::limits::check as check_limits;
 use portal::Tokens;
@@ -18,6 +20,7 @@ use serde::Deserialize;
 use servant::local::grants::Allow;
 
 pub use class::Class;
+pub use doubts::Has;
 pub use time::Time;
 
 /// Everything that can be configured.
@@ -394,7 +397,8 @@ impl Config {
 
     fn parse(text: &str) -> anyhow::Result<Config> {
         let defaults = Config::default();
-        let mut config: Config = toml::from_str(text)?;
+        let read = toml::from_str(text).map_err(|error| anyhow!(words::plain(&error.to_string())));
+        let mut config: Config = read?;
         config.limits = config.limits.or(defaults.limits);
         Ok(config)
     }

@@ -15,8 +15,9 @@ const OLDEST_KERNEL: (u32, u32) = (5, 19);
 const ROOM_NEEDED: u64 = 2 << 30;
 const SPACE_WANTED: u64 = 10 << 30;
 
-/// Every check. `listening`: the portal that runs already and holds its port.
-pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {
+/// Every check. `listening`: the portal that runs already and holds its port. `doubts`: what of the configuration is beyond this
+/// machine.
+pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) -> Doctor {
     let mut checks = vec![
         root(),
         kernel(),
@@ -33,6 +34,7 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>) -> Doctor {
     checks.push(disk_space(home));
     checks.push(init());
     checks.push(port(listening));
+    checks.push(configuration(doubts));
     Doctor { checks }
 }
 
@@ -309,6 +311,17 @@ fn init() -> Check {
     }
 }
 
+fn configuration(doubts: &[String]) -> Check {
+    match doubts {
+        [] => ok("configuration", "fits this machine"),
+        doubts => warning(
+            "configuration",
+            doubts.join("; "),
+            "change it, and start the daemon again",
+        ),
+    }
+}
+
 fn port(listening: Option<SocketAddr>) -> Check {
     const NAME: &str = "port";
     if let Some(address) = listening {
@@ -342,7 +355,7 @@ mod tests {
 
     #[test]
     fn every_need_that_is_not_met_says_how_to_mend_it() {
-        let doctor = examine(Path::new("/nonexistent/home"), None);
+        let doctor = examine(Path::new("/nonexistent/home"), None, &[]);
         for check in doctor.checks {
             assert!(
                 check.status == CheckStatus::Ok || check.fix.is_some(),

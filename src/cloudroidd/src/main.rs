@@ -110,7 +110,9 @@ fn home_of(arguments: &Arguments) -> anyhow::Result<PathBuf> {
 }
 
 fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
-    let doctor = doctor::examine(&home_of(arguments)?, None);
+    let config = Config::read(arguments.config.as_deref())?;
+    let doubts = config.doubts(supervision::machine());
+    let doctor = doctor::examine(&home_of(arguments)?, None, &doubts);
     if json {
         println!("{}", serde_json::to_string_pretty(&doctor)?);
         return Ok(());
@@ -141,7 +143,10 @@ fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
     let path = home_of(&arguments)?;
     require_root(nix::unistd::geteuid())?;
     let home = Home::open(&path)?;
-    let (machine, missing) = doctor::look(home.path());
+    let (mut machine, missing) = doctor::look(home.path());
+    machine
+        .warnings
+        .extend(config.doubts(supervision::machine()));
     if !missing.is_empty() {
         bail!(
             "this machine lacks what servants need:\n{}",

@@ -76,6 +76,7 @@ pub fn build(
     };
     let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
+    let doubts = config.doubts(supervision::machine());
     Ok(Arc::new(App {
         principals,
         listen,
@@ -89,7 +90,7 @@ pub fn build(
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),
         options: config.portal(),
-        examine: Box::new(move || doctor::examine(&examined, Some(listen))),
+        examine: Box::new(move || doctor::examine(&examined, Some(listen), &doubts)),
     }))
 }
 

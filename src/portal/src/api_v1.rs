@@ -429,6 +429,7 @@ pub async fn logs(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let handle = app.choreographer.servant(&id)?;
+    handle.check_container()?;
     let Some(container) = handle.container() else {
         return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
     };

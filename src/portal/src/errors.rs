@@ -380,6 +380,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
             Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
             Unchanged::Many => (S::CONFLICT, "too-many", "too many state something"),
         },
+        C::Place { .. } => (S::CONFLICT, "place", "no container"),
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
         C::NoRollout(_) => (S::NOT_FOUND, "no-rollout", "no rollout"),
         C::Rollout(_) => (S::CONFLICT, "rollout", "no such rollout"),
@@ -423,6 +424,9 @@ fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
             }
         },
         C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),
+        C::Place { service, .. } => format!(
+            "name one of the servants of {service}, which are named ~group- where a robot's name stands: cloudroidctl servants"
+        ),
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
         }

@@ -133,13 +133,14 @@ pub(crate) async fn replay(
             done.note(asked, took);
         }
     }
-    let fed = plan.inputs.iter().zip(&mouths);
+    let fed = plan.inputs.iter().zip(&mouths).enumerate();
     Ok(Replay {
         inputs: fed
-            .map(|((topic, wire_type), mouth)| Fed {
+            .map(|(number, ((topic, wire_type), mouth))| Fed {
                 topic: topic.clone(),
                 type_name: wire_type.name.clone(),
                 sent: mouth.sent,
+                from: plan.recorded_for(number),
             })
             .collect(),
         outputs: ears.heard(&registry),

@@ -61,6 +61,7 @@ impl Choreographer {
 
     async fn set(&self, id: &str, change: Limits) -> Result<(), Error> {
         let handle = self.servant(id)?;
+        handle.check_container()?;
         // One change after the other: what is promised, in force and remembered must be of the same.
         let _turn = handle.limits_turn().await;
         let before = handle.all_asked();

@@ -133,12 +133,15 @@ pub(super) fn report_terms(inner: &Inner, handle: &Handle) {
     if terms.stated.is_empty() {
         return;
     }
+    let promised = match in_words(&handle.asked()) {
+        none if none.is_empty() => "no more than others".to_owned(),
+        limits => limits,
+    };
     let message = format!(
-        "servant {} of {}: its robot states {}; it is promised {} ({})",
+        "servant {} of {}: its robot states {}; it is promised {promised} ({})",
         handle.id,
         handle.service(),
         terms.stated_in_words(),
-        in_words(&handle.asked()),
         terms.why.join("; "),
     );
     inner.journal.info("terms", &message, &handle.about());

@@ -186,6 +186,23 @@ async fn one_more_robot_of_a_group_that_runs_needs_no_room() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_place_has_no_limits_of_its_own() {
+    let shop = Shop::new(api::Shared::default());
+    let daemon = shop.world.daemon();
+    let (lease, _bus) = robot(&daemon, "r1").await;
+    let change = api::Limits {
+        cpus: Some(0.5),
+        ..api::Limits::default()
+    };
+    let refused = daemon.set_limits(&lease.handle().id, change).await;
+    let refused = refused.expect_err("it has no container").to_string();
+    assert!(
+        refused.contains("the place of robot r1 at echo"),
+        "{refused}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
 async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() {
     let shop = Shop::new(api::Shared {
         min: 2,

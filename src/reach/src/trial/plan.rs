@@ -1,5 +1,6 @@
 //! What is published where: the messages of a recording, or pictures, and the inputs that they go to.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -24,6 +25,8 @@ pub(super) struct Plan<'a> {
     /// From the first message to the first of the next round, at the recording's own pace; pictures come once a second.
     pub(super) length: Duration,
     pub(super) unused: Vec<String>,
+    /// Recorded topics of other names than the input of this number that they go to.
+    pub(super) renamed: BTreeSet<(usize, String)>,
 }
 
 /// One message.
@@ -84,6 +87,7 @@ impl<'a> Plan<'a> {
             items: Vec::new(),
             length: Duration::ZERO,
             unused: Vec::new(),
+            renamed: BTreeSet::new(),
         };
         match material {
             Material::Pictures(pictures) => {
@@ -117,6 +121,9 @@ impl<'a> Plan<'a> {
                 for message in recorded {
                     match plan.place(&inputs, registry, message)? {
                         Some(input) => {
+                            if plan.inputs[input].0 != *message.topic {
+                                plan.renamed.insert((input, message.topic.to_string()));
+                            }
                             let pause = message.time.saturating_sub(before.unwrap_or(message.time));
                             plan.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
                             before = Some(message.time.max(before.unwrap_or(0)));
@@ -159,6 +166,12 @@ impl<'a> Plan<'a> {
     pub(super) fn requests(&self) -> usize {
         let requests = self.items.iter().filter(|item| item.input == self.request);
         requests.count()
+    }
+
+    /// Recorded topics of other names that go to an input.
+    pub(super) fn recorded_for(&self, input: usize) -> Vec<String> {
+        let renamed = self.renamed.iter().filter(|(to, _)| *to == input);
+        renamed.map(|(_, topic)| topic.clone()).collect()
     }
 
     /// The stamp of a message of an input.
@@ -289,6 +302,7 @@ mod tests {
         assert_eq!(plan.inputs.len(), 1);
         assert_eq!((plan.inputs[0].0.as_str(), plan.items.len()), ("/name", 2));
         assert_eq!(plan.unused, ["/tf"]);
+        assert_eq!(plan.recorded_for(0), ["/chatter"]);
     }
 
     #[test]

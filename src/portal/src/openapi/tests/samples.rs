@@ -401,6 +401,7 @@ fn tried() -> Trial {
     Trial {
         service: "x".into(),
         inputs: vec![Fed {
+            from: vec!["/recorded".into()],
             topic: "/x".into(),
             type_name: "p/T".into(),
             sent: 1,
