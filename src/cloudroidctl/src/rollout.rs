@@ -44,7 +44,7 @@ pub struct TermFlags {
     /// response times the part by which they are longer.
     #[arg(long, value_name = "PART", requires = "canary")]
     bound: Option<f64>,
-    /// Requests of each revision before they are compared.
+    /// Requests of each revision before they are compared; 20 by default.
     #[arg(long, value_name = "N", requires = "canary")]
     samples: Option<u32>,
     /// Time after which a canary that was not worse becomes the current revision, such as 30m; when you say so by default.
