@@ -79,18 +79,6 @@ impl Resources for NoResources {
     }
 }
 
-/// Below which cgroup servants live.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub enum CgroupParent {
-    /// On v2 `cloudroid-servants.service` if it is there, otherwise what can be delegated; on v1 below our own in each
-    /// hierarchy.
-    #[default]
-    Auto,
-    /// This one, as seen from the root of the hierarchy (each hierarchy on v1), such as
-    /// `/system.slice/cloudroid-servants.service`.
-    Path(PathBuf),
-}
-
 /// How long the nodes have to end by themselves.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Grace {
@@ -124,8 +112,6 @@ pub struct LocalEngineConfig {
     pub shim_limits: Limits,
     /// First uid of the first range; see [`DEFAULT_UID_BASE`].
     pub uid_base: u32,
-    /// Below which cgroup.
-    pub cgroup_parent: CgroupParent,
     /// Whether less isolation than asked for is accepted.
     pub isolation: Isolation,
     /// How long nodes have to end when the servant is stopped.
@@ -153,7 +139,6 @@ impl LocalEngineConfig {
                 ..Limits::default()
             },
             uid_base: DEFAULT_UID_BASE,
-            cgroup_parent: CgroupParent::Auto,
             isolation: Isolation::Require,
             grace: Grace::default(),
             allow: grants::Allow::default(),
@@ -204,7 +189,7 @@ impl LocalEngine {
         {
             std::fs::metadata(program).map_err(Error::file("find the program", program))?;
         }
-        let parent = Parent::find(&config.cgroup_parent)?;
+        let parent = Parent::find()?;
         let networks = pool::Networks::default();
         Ok(Self {
             shared: Arc::new(Shared {

@@ -61,21 +61,6 @@ pub trait Resident {
     fn process_exited(&mut self, pid: i32);
 }
 
-/// No resident: for builds.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct NoResident;
-
-impl Resident for NoResident {
-    fn start<'a>(
-        &'a mut self,
-        _context: &'a ResidentContext,
-    ) -> Pin<Box<dyn Future<Output = Result<(), ResidentError>> + 'a>> {
-        Box::pin(async { Ok(()) })
-    }
-
-    fn process_exited(&mut self, _pid: i32) {}
-}
-
 /// Is the shim of the servant whose state directory this is. To be called by the command that
 /// [`crate::local::LocalEngineConfig::shim_command`] names, with its last argument, before that process has a second
 /// thread; the caller returns what it gets from `main`.

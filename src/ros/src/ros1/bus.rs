@@ -215,11 +215,6 @@ impl Ros1Bus {
         Ok(bus)
     }
 
-    /// This node's name.
-    pub fn node_name(&self) -> &str {
-        &self.inner.node
-    }
-
     /// The address of this node's slave API, as the Master knows it.
     pub fn uri(&self) -> &str {
         self.inner.registrar.slave_uri()

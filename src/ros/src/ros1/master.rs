@@ -2,7 +2,7 @@
 //!
 //! In: XML-RPC calls of nodes on a listener, and word that a process exited. Out: answers, `publisherUpdate` and
 //! `paramUpdate` calls to nodes, and the [`Graph`] for whoever waits for it. It runs on one thread and keeps
-//! everything in memory; [`Master::snapshot`] and [`Master::restore`] carry it over.
+//! everything in memory.
 
 mod api;
 pub(crate) mod graph;
@@ -18,7 +18,6 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use parking_lot::Mutex;
-use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 
@@ -67,15 +66,6 @@ impl Default for MasterOptions {
 #[derive(Clone)]
 pub struct Master {
     inner: Arc<Inner>,
-}
-
-/// Everything a Master knows.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Snapshot {
-    run_id: String,
-    registry: Registry,
-    params: Params,
-    uses: Vec<(String, Vec<String>, Vec<String>)>,
 }
 
 struct Inner {
@@ -132,56 +122,17 @@ impl Master {
             params,
             ..State::default()
         };
-        Self::with(options.uri, options.limits, run_id, state, 0)
-    }
-
-    /// The Master that `snapshot` was taken of. The options' parameters are not looked at.
-    pub fn restore(options: MasterOptions, snapshot: Snapshot) -> Self {
-        let uses = snapshot.uses.into_iter();
-        let state = State {
-            registry: snapshot.registry,
-            params: snapshot.params,
-            uses: uses
-                .map(|(key, read_by, written_by)| {
-                    let used = ParameterUse {
-                        read_by,
-                        written_by,
-                    };
-                    (key, used)
-                })
-                .collect(),
-            uses_changed: false,
-            sought: BTreeMap::new(),
-        };
-        Self::with(options.uri, options.limits, snapshot.run_id, state, 1)
-    }
-
-    fn with(uri: String, limits: Limits, run_id: String, state: State, generation: u64) -> Self {
         Self {
             inner: Arc::new(Inner {
-                uri,
+                uri: options.uri,
                 run_id,
-                limits,
+                limits: options.limits,
                 state: Mutex::new(state),
-                generation: watch::Sender::new(generation),
+                generation: watch::Sender::new(0),
                 notifier: Notifier::default(),
                 lending: Lending::default(),
                 sockets: OnceLock::new(),
             }),
-        }
-    }
-
-    /// Everything it knows, for [`Master::restore`].
-    pub fn snapshot(&self) -> Snapshot {
-        let state = self.inner.state.lock();
-        let uses = state.uses.iter();
-        Snapshot {
-            run_id: self.inner.run_id.clone(),
-            registry: state.registry.clone(),
-            params: state.params.clone(),
-            uses: uses
-                .map(|(key, used)| (key.clone(), used.read_by.clone(), used.written_by.clone()))
-                .collect(),
         }
     }
 

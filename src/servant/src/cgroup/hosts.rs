@@ -8,7 +8,6 @@ use std::process::Command;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
-use crate::local::CgroupParent;
 
 /// Servants' cgroups are below a directory of this name where we choose it ourselves.
 const NAME: &str = "cloudroid";
@@ -53,15 +52,15 @@ struct Mounted {
 
 impl Parent {
     /// Finds and, where needed, makes the place.
-    pub fn find(choice: &CgroupParent) -> Result<Self, Error> {
+    pub fn find() -> Result<Self, Error> {
         let read = |path: &str| fs::read_to_string(path).map_err(Error::file("read", path));
         let mounted = parse(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
         let uses_v1 = mounted
             .iter()
             .any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has(name)));
         match mounted.iter().find(|hierarchy| hierarchy.unified) {
-            _ if uses_v1 => Self::v1(&mounted, choice),
-            Some(unified) => Self::v2(unified, choice),
+            _ if uses_v1 => Ok(Self::v1(&mounted)),
+            Some(unified) => Self::v2(unified),
             None => Ok(Self {
                 version: 0,
                 hierarchies: vec![],
@@ -91,7 +90,7 @@ impl Parent {
         }
     }
 
-    fn v1(mounted: &[Mounted], choice: &CgroupParent) -> Result<Self, Error> {
+    fn v1(mounted: &[Mounted]) -> Self {
         let lacks_v2 = !has_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
         let wanted = |hierarchy: &&Mounted| {
             let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has(name));
@@ -102,12 +101,7 @@ impl Parent {
         };
         let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
             controllers: hierarchy.controllers.clone(),
-            directory: match choice {
-                CgroupParent::Auto => hierarchy.own.join(NAME),
-                CgroupParent::Path(path) => {
-                    hierarchy.mount.join(path.strip_prefix("/").unwrap_or(path))
-                }
-            },
+            directory: hierarchy.own.join(NAME),
             unified: hierarchy.unified,
         });
         let parent = Self {
@@ -125,14 +119,11 @@ impl Parent {
         } else {
             format!("cgroup v1 without {}", absent.join(", "))
         };
-        Ok(Self { reason, ..parent })
+        Self { reason, ..parent }
     }
 
-    fn v2(unified: &Mounted, choice: &CgroupParent) -> Result<Self, Error> {
-        let directory = match choice {
-            CgroupParent::Path(path) => unified.mount.join(path.strip_prefix("/").unwrap_or(path)),
-            CgroupParent::Auto => choose_v2(unified),
-        };
+    fn v2(unified: &Mounted) -> Result<Self, Error> {
+        let directory = choose_v2(unified);
         fs::create_dir_all(&directory).map_err(Error::file("make the cgroup", &directory))?;
         // From the place just above down: each directory hands to the next what it was handed itself.
         let mut reason = String::new();
@@ -344,7 +335,7 @@ mod tests {
                 ("/sys/fs/cgroup/unified", true)
             ]
         );
-        let parent = Parent::v1(&found, &CgroupParent::Auto).unwrap();
+        let parent = Parent::v1(&found);
         assert_eq!(
             parent.hierarchies[1].directory,
             Path::new("/sys/fs/cgroup/memory/private/x/cloudroid")

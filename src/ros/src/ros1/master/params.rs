@@ -2,8 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
 use crate::ros1::names;
 use crate::ros1::xmlrpc::{MAX_DEPTH, Value};
 
@@ -12,7 +10,7 @@ use crate::ros1::xmlrpc::{MAX_DEPTH, Value};
 const MAX_BYTES: usize = 24 << 20;
 
 /// Nested structs, as ROS has it: `/a/b` is member `b` of member `a`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Params {
     root: Value,
     /// Roughly what the tree takes; never less than its values.

@@ -3,8 +3,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use serde::{Deserialize, Serialize};
-
 use super::notify::Notice;
 use crate::bus::TopicNodes;
 
@@ -24,7 +22,7 @@ pub(super) enum Kind {
     Parameter,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 struct Node {
     api: String,
     publishes: BTreeSet<String>,
@@ -32,7 +30,6 @@ struct Node {
     serves: BTreeSet<String>,
     watches: BTreeSet<String>,
     /// Addresses of the nodes that had this name before and were told to end.
-    #[serde(default)]
     replaced: Vec<String>,
 }
 
@@ -65,14 +62,14 @@ impl Node {
     }
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 struct Service {
     node: String,
     api: String,
 }
 
 /// All registrations.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Registry {
     nodes: BTreeMap<String, Node>,
     /// Topics with their ends in the order registered. Kept without ends too: ROS remembers types.
@@ -80,11 +77,10 @@ pub(super) struct Registry {
     services: BTreeMap<String, Service>,
     count: usize,
     /// Grows with everything that really changed.
-    #[serde(skip)]
     version: u64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 struct Topic {
     type_name: String,
     publishers: Vec<String>,

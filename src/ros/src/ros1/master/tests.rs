@@ -397,38 +397,6 @@ async fn the_graph_is_waited_for() {
 }
 
 #[tokio::test]
-async fn a_restored_master_knows_what_the_first_knew() {
-    let options = || MasterOptions {
-        parameters: BTreeMap::from([("/mine".to_owned(), ParamValue::Int(5))]),
-        ..MasterOptions::default()
-    };
-    let master = TestMaster::with(Master::new(options()), None).await;
-    let mut node = TestNode::start().await;
-    master
-        .call("registerSubscriber", &args(["/s", "/t", "*", &node.uri]))
-        .await;
-    master.call("getParam", &args(["/s", "/mine"])).await;
-    let text = serde_json::to_string(&master.master.snapshot()).unwrap();
-    let (graph, run_id) = (master.master.graph(), master.master.run_id().to_owned());
-    let address = master.stop().await;
-    let restored = Master::restore(options(), serde_json::from_str(&text).unwrap());
-    let master = TestMaster::with(restored, Some(address)).await;
-    let now = master.master.graph();
-    assert_eq!((now.topics, now.nodes), (graph.topics, graph.nodes));
-    assert_eq!(now.parameters, graph.parameters);
-    assert_eq!(master.master.run_id(), run_id);
-    assert_eq!(
-        master.call("getParam", &args(["/s", "mine"])).await.2,
-        5.into()
-    );
-    // And it goes on with the old one's duties.
-    master
-        .call("registerPublisher", &args(["/p", "/t", "a/B", NOWHERE]))
-        .await;
-    assert_eq!(node.next().await.0, "publisherUpdate");
-}
-
-#[tokio::test]
 async fn a_node_gone_wild_finds_the_end_of_our_patience() {
     let mut registry = Registry::default();
     let mut notices = Vec::new();
