@@ -9,9 +9,9 @@ use rosbridge::{Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
+use crate::connection::Connection;
 use crate::lease::Lease;
 use crate::outbox::Goodbye;
-use crate::session::Session;
 use crate::shared::Shared;
 use crate::waiting::Waiting;
 use crate::{BridgeOptions, Metrics, SessionOptions};
@@ -91,7 +91,7 @@ impl Bridge {
         let lease = Lease::take(shared.clone(), client.clone(), options.resume);
         tracing::debug!(client = %client.name, "session begins");
         let (socket, kept) = waiting.into_parts();
-        let end = Session::new(socket, kept, client.clone(), lease.socket, &options.budget)
+        let end = Connection::new(socket, kept, client.clone(), lease.socket, &options.budget)
             .run()
             .await;
         tracing::debug!(client = %client.name, ?end, "session ends");

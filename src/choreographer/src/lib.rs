@@ -58,7 +58,7 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 pub use decide::Amount;
-pub use decide::admission::{Place, Refused};
+pub use decide::admission::{Position, Refused};
 pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};

@@ -76,15 +76,15 @@ impl Check {
 
 /// Examines and prints; fails when something is bad.
 pub fn examine(asked: &Doctor) -> anyhow::Result<ExitCode> {
-    let place = overlay::Place::of(asked)?;
-    let config = crate::config::read(&place.share, std::env::vars())?;
+    let stub = overlay::ExaminedStub::of(asked)?;
+    let config = crate::config::read(&stub.share, std::env::vars())?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
-    let mut checks = runtime.block_on(server::checks(&config, &place));
+    let mut checks = runtime.block_on(server::checks(&config, &stub));
     if asked.only != Some(Part::Server) {
         let variable = |name: &str| std::env::var(name).ok();
-        checks.extend(overlay::checks(&place, &config, &variable));
+        checks.extend(overlay::checks(&stub, &config, &variable));
     }
     for check in &checks {
         println!("{}", check.lines());

@@ -13,7 +13,7 @@ mod keeper;
 mod latched;
 mod lender;
 mod original;
-mod place;
+mod private_master;
 mod process;
 mod stamp;
 #[cfg(test)]
@@ -22,6 +22,6 @@ pub mod tests;
 pub use keeper::{Application, Cloud, Keeper};
 pub use lender::took_too_long;
 pub use original::{Interface, Original, Setting};
-pub use place::Registered;
+pub use private_master::Registered;
 pub use process::Program;
 pub use stamp::is_stamped;

@@ -37,7 +37,7 @@ use tokio::sync::{mpsc, watch};
 
 use calls::Calls;
 use inputs::Inputs;
-use lent::Lent;
+use lent::LentServices;
 use outputs::Outputs;
 use parameters::Parameters;
 use promise::Promise;
@@ -56,7 +56,7 @@ pub struct Mirror {
     inputs: Inputs,
     outputs: Outputs,
     calls: Calls,
-    lent: Lent,
+    lent: LentServices,
     parameters: Parameters,
     /// Messages dropped on this side, but for the session's own.
     drops: Drops,
@@ -90,7 +90,7 @@ impl Mirror {
             inputs: Inputs::default(),
             outputs: Outputs::default(),
             calls: Calls::default(),
-            lent: Lent::default(),
+            lent: LentServices::default(),
             parameters: Parameters::default(),
             drops: Drops::default(),
             promise: OnceLock::new(),

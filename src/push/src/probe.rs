@@ -102,12 +102,12 @@ pub(super) async fn start(
     pusher: &Pusher,
     spec: Spec,
     alive: &Alive,
-) -> Result<(Arc<dyn Servant>, Trial), Error> {
+) -> Result<(Arc<dyn Servant>, ProbeServant), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
     let alive = alive.clone();
     let starting = pusher.tasks.spawn(async move {
         let servant = engine.start(spec).await?;
-        let trial = Trial {
+        let trial = ProbeServant {
             servant: Some(Arc::clone(&servant)),
             tasks,
             alive,
@@ -301,13 +301,13 @@ pub(super) fn spec(
 }
 
 /// A servant that ends with this value.
-pub(super) struct Trial {
+pub(super) struct ProbeServant {
     servant: Option<Arc<dyn Servant>>,
     tasks: TaskTracker,
     alive: Alive,
 }
 
-impl Trial {
+impl ProbeServant {
     pub(super) async fn end(mut self) -> Result<(), Error> {
         match self.servant.take() {
             Some(servant) => Ok(servant.stop().await?),
@@ -316,7 +316,7 @@ impl Trial {
     }
 }
 
-impl Drop for Trial {
+impl Drop for ProbeServant {
     fn drop(&mut self) {
         let Some(servant) = self.servant.take() else {
             return;

@@ -10,11 +10,11 @@ pub struct Turns<K> {
     /// Those whose time has not come, and when it does.
     later: BTreeSet<(Instant, K)>,
     /// Of all queues that are not forgotten: a queue that joins and is served again and again changes nothing here but its place.
-    places: BTreeMap<K, Place>,
+    places: BTreeMap<K, QueueState>,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
-enum Place {
+enum QueueState {
     #[default]
     None,
     Ready,
@@ -36,9 +36,9 @@ impl<K> Default for Turns<K> {
 impl<K: Copy + Ord> Turns<K> {
     /// This queue has something: it gets a turn after all that wait for theirs, unless it waits already or is held.
     pub fn join(&mut self, key: K) {
-        let place = self.places.entry(key).or_default();
-        if let Place::None = place {
-            *place = Place::Ready;
+        let state = self.places.entry(key).or_default();
+        if let QueueState::None = state {
+            *state = QueueState::Ready;
             self.ready.push_back(key);
         }
     }
@@ -48,9 +48,9 @@ impl<K: Copy + Ord> Turns<K> {
         if due <= now {
             return self.join(key);
         }
-        let place = self.places.entry(key).or_default();
-        if let Place::None = place {
-            *place = Place::Later(due);
+        let state = self.places.entry(key).or_default();
+        if let QueueState::None = state {
+            *state = QueueState::Later(due);
             self.later.insert((due, key));
         }
     }
@@ -59,7 +59,7 @@ impl<K: Copy + Ord> Turns<K> {
     pub fn wake(&mut self, now: Instant) {
         while let Some((due, key)) = self.later.first().copied().filter(|(due, _)| *due <= now) {
             self.later.remove(&(due, key));
-            self.places.insert(key, Place::Ready);
+            self.places.insert(key, QueueState::Ready);
             self.ready.push_back(key);
         }
     }
@@ -73,8 +73,8 @@ impl<K: Copy + Ord> Turns<K> {
                 self.ready.remove(at)?
             }
         };
-        if let Some(place) = self.places.get_mut(&key) {
-            *place = Place::None;
+        if let Some(state) = self.places.get_mut(&key) {
+            *state = QueueState::None;
         }
         Some(key)
     }
@@ -82,29 +82,29 @@ impl<K: Copy + Ord> Turns<K> {
     /// This queue gets no turn until it is [released](Self::release).
     pub fn hold(&mut self, key: K) {
         self.withdraw(key);
-        self.places.insert(key, Place::Held);
+        self.places.insert(key, QueueState::Held);
     }
 
     /// It may join again.
     pub fn release(&mut self, key: K) {
-        if let Some(place @ Place::Held) = self.places.get_mut(&key) {
-            *place = Place::None;
+        if let Some(state @ QueueState::Held) = self.places.get_mut(&key) {
+            *state = QueueState::None;
         }
     }
 
     /// There is nothing in this queue any more. If it is held it stays so.
     pub fn withdraw(&mut self, key: K) {
-        let Some(place) = self.places.get_mut(&key) else {
+        let Some(state) = self.places.get_mut(&key) else {
             return;
         };
-        match place {
-            Place::Ready => self.ready.retain(|other| *other != key),
-            Place::Later(due) => {
+        match state {
+            QueueState::Ready => self.ready.retain(|other| *other != key),
+            QueueState::Later(due) => {
                 self.later.remove(&(*due, key));
             }
-            Place::Held | Place::None => return,
+            QueueState::Held | QueueState::None => return,
         }
-        *place = Place::None;
+        *state = QueueState::None;
     }
 
     /// This queue is gone.

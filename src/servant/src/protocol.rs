@@ -30,7 +30,7 @@ impl NodeStatus {
 
 /// The container as its shim knows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct State {
+pub struct Snapshot {
     /// Where it is in its life.
     #[serde(flatten)]
     pub state: ContainerState,
@@ -39,7 +39,7 @@ pub struct State {
     pub init_pid: Option<i32>,
 }
 
-impl From<ContainerState> for State {
+impl From<ContainerState> for Snapshot {
     /// Of one without an init.
     fn from(state: ContainerState) -> Self {
         Self {
@@ -58,7 +58,7 @@ pub enum FromShim {
         /// Who speaks.
         shim: Identity,
         /// The container.
-        state: State,
+        state: Snapshot,
         /// Its nodes by name.
         nodes: BTreeMap<String, NodeStatus>,
         /// Limits in force.
@@ -67,7 +67,7 @@ pub enum FromShim {
     /// The container's state has changed.
     State {
         /// The state that it is in now.
-        state: State,
+        state: Snapshot,
     },
     /// Something happened to a node.
     Node {
@@ -155,7 +155,7 @@ mod tests {
         };
         let messages = [
             FromShim::State {
-                state: State {
+                state: Snapshot {
                     state: ContainerState::Running,
                     init_pid: Some(7),
                 },

@@ -51,7 +51,7 @@ pub enum Refused {
         /// So long was waited.
         waited: Duration,
         /// Where it stood in the end; none of what is no robot's.
-        place: Option<Place>,
+        place: Option<Position>,
     },
     /// The machine stalls; until the deadline that did not end.
     #[error("{why}; this did not end within {} s{}", waited.as_secs(), at(place))]
@@ -61,7 +61,7 @@ pub enum Refused {
         /// So long was waited.
         waited: Duration,
         /// Where it stood in the end; none of what is no robot's.
-        place: Option<Place>,
+        place: Option<Position>,
     },
     /// The machine stalls: a servant that runs is promised no more.
     #[error("{why}: no servant is promised more meanwhile")]
@@ -72,20 +72,20 @@ pub enum Refused {
 }
 
 /// Behind a refusal: where it stood.
-fn at(place: &Option<Place>) -> String {
+fn at(place: &Option<Position>) -> String {
     place.map_or_else(String::new, |place| format!("; it was {place}"))
 }
 
 /// Where a robot stands among those that wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct Position {
     /// From 1 on.
     pub place: usize,
     /// So many wait.
     pub of: usize,
 }
 
-impl std::fmt::Display for Place {
+impl std::fmt::Display for Position {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(out, "number {} of {} that wait", self.place, self.of)
     }
@@ -226,7 +226,7 @@ impl Book {
     }
 
     /// Where robots that wait stand.
-    pub fn places(&self) -> impl Iterator<Item = (Ticket, Place)> + '_ {
+    pub fn places(&self) -> impl Iterator<Item = (Ticket, Position)> + '_ {
         let robots = self
             .in_turn()
             .into_iter()
@@ -238,7 +238,7 @@ impl Book {
             .count();
         robots
             .zip(1..)
-            .map(move |(waiter, place)| (waiter.ticket, Place { place, of }))
+            .map(move |(waiter, place)| (waiter.ticket, Position { place, of }))
     }
 
     /// Those who wait, as they are to be admitted.

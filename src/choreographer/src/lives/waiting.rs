@@ -12,7 +12,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::decide::Amount;
-use crate::decide::admission::{Admitted, Ask, Book, Origin, Place, Refused, Ticket, Verdict};
+use crate::decide::admission::{Admitted, Ask, Book, Origin, Position, Refused, Ticket, Verdict};
 use crate::decide::capacity::{Lacking, Push};
 
 /// A robot that waited in vain and asks again within this time stands where it stood.
@@ -60,7 +60,7 @@ struct Working {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Standing {
     /// Its place.
-    pub place: Place,
+    pub place: Position,
     /// What the machine itself waits for, in words.
     pub stalled: Option<String>,
 }

@@ -12,16 +12,16 @@ use crate::revision::Revision;
 
 /// Which stub is examined.
 #[derive(Debug, Clone)]
-pub struct Place {
+pub struct ExaminedStub {
     /// Its `share/PKG`.
     pub share: PathBuf,
     /// The ROS package.
     pub package: String,
 }
 
-impl Place {
+impl ExaminedStub {
     /// As asked for; without `--share`, by where this program is: `lib/PKG/cloudroid-stub`.
-    pub fn of(asked: &Doctor) -> anyhow::Result<Place> {
+    pub fn of(asked: &Doctor) -> anyhow::Result<ExaminedStub> {
         let share = match &asked.share {
             Some(share) => share.clone(),
             None => {
@@ -37,7 +37,7 @@ impl Place {
             .clone()
             .or_else(name)
             .context("say which package with --package PKG")?;
-        Ok(Place { share, package })
+        Ok(ExaminedStub { share, package })
     }
 
     /// The command that changes its settings.
@@ -60,23 +60,23 @@ fn beside(program: &Path) -> Option<PathBuf> {
 
 /// All checks of the robot, with variables from `variable`.
 pub fn checks(
-    place: &Place,
+    stub: &ExaminedStub,
     config: &Config,
     variable: &dyn Fn(&str) -> Option<String>,
 ) -> Vec<Check> {
-    let mut checks = vec![shadowing(place, variable)];
-    for node in Revision::read(&place.share).outsourced {
-        checks.push(local(place, config, node, variable));
+    let mut checks = vec![shadowing(stub, variable)];
+    for node in Revision::read(&stub.share).outsourced {
+        checks.push(local(stub, config, node, variable));
     }
     checks
 }
 
 /// Both variables must name the overlay before anything else that holds the package: catkin's tools go by the one,
 /// rospack and rospkg by the other.
-fn shadowing(place: &Place, variable: &dyn Fn(&str) -> Option<String>) -> Check {
-    let overlay = original::overlay(&place.share);
+fn shadowing(stub: &ExaminedStub, variable: &dyn Fn(&str) -> Option<String>) -> Check {
+    let overlay = original::overlay(&stub.share);
     let overlay = overlay.canonicalize().unwrap_or(overlay);
-    let package = &place.package;
+    let package = &stub.package;
     let fix = format!(
         ". {}, after every other setup file",
         overlay.join("setup.sh").display()
@@ -116,15 +116,15 @@ fn shadowing(place: &Place, variable: &dyn Fn(&str) -> Option<String>) -> Check 
 }
 
 fn local(
-    place: &Place,
+    stub: &ExaminedStub,
     config: &Config,
     node: String,
     variable: &dyn Fn(&str) -> Option<String>,
 ) -> Check {
     let wanted = Node {
-        package: place.package.clone(),
+        package: stub.package.clone(),
         node,
-        share: place.share.clone(),
+        share: stub.share.clone(),
     };
     let name = &wanted.node;
     match original::find(&wanted, variable) {
@@ -137,8 +137,8 @@ fn local(
             format!("{name} is not installed on this robot: it runs in the cloud only"),
             format!(
                 "install the package {}, or set local = \"none\" in {}",
-                place.package,
-                place.share.join(crate::config::FILE).display()
+                stub.package,
+                stub.share.join(crate::config::FILE).display()
             ),
         ),
     }
@@ -167,7 +167,7 @@ mod tests {
         }
 
         fn examined(&self, prefixes: &str, packages: &str) -> Check {
-            let place = Place {
+            let stub = ExaminedStub {
                 share: self.path("stub/share/p"),
                 package: "p".into(),
             };
@@ -179,7 +179,7 @@ mod tests {
                     .expect("UTF-8")
             };
             let (prefixes, packages) = (filled(prefixes), filled(packages));
-            shadowing(&place, &|name| match name {
+            shadowing(&stub, &|name| match name {
                 "CMAKE_PREFIX_PATH" => Some(prefixes.clone()),
                 "ROS_PACKAGE_PATH" => Some(packages.clone()),
                 _ => None,

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde_json::Value;
 
-use super::overlay::Place;
+use super::overlay::ExaminedStub;
 use super::{Check, http};
 use crate::config::Config;
 use crate::resolver;
@@ -16,8 +16,8 @@ const SAMPLES: usize = 5;
 const IN_STEP: f64 = 0.1;
 
 /// All checks of the server. When it is not reached there is but one.
-pub async fn checks(config: &Config, place: &Place) -> Vec<Check> {
-    let portal = match Portal::find(config, place).await {
+pub async fn checks(config: &Config, stub: &ExaminedStub) -> Vec<Check> {
+    let portal = match Portal::find(config, stub).await {
         Ok(portal) => portal,
         Err(check) => return vec![*check],
     };
@@ -39,7 +39,7 @@ pub async fn checks(config: &Config, place: &Place) -> Vec<Check> {
             return vec![Check::bad("server", found, portal.other_server())];
         }
     };
-    let mut checks = vec![reached, portal.service(config, place).await];
+    let mut checks = vec![reached, portal.service(config, stub).await];
     checks.push(portal.clock().await);
     checks.push(portal.mtu().await);
     checks
@@ -52,8 +52,8 @@ struct Portal {
 }
 
 impl Portal {
-    async fn find(config: &Config, place: &Place) -> Result<Portal, Box<Check>> {
-        let installer = place.installer();
+    async fn find(config: &Config, stub: &ExaminedStub) -> Result<Portal, Box<Check>> {
+        let installer = stub.installer();
         let fix = format!("{installer} --server ws://HOST:9090");
         let bad = |found: String, fix: String| Box::new(Check::bad("server", found, fix));
         let address = match config.address() {
@@ -98,7 +98,7 @@ impl Portal {
     }
 
     /// The token and the service, by asking for the one with the other.
-    async fn service(&self, config: &Config, place: &Place) -> Check {
+    async fn service(&self, config: &Config, stub: &ExaminedStub) -> Check {
         let name = &config.service;
         let answer = match self.get(&format!("/api/v1/services/{name}")).await {
             Ok(answer) => answer,
@@ -127,7 +127,7 @@ impl Portal {
             }
         }
         let there = body["revision"].as_u64();
-        match (there, place.revision()) {
+        match (there, stub.revision()) {
             (Some(there), Some(here)) if there != here => Check::warning(
                 "service",
                 format!("{name} is at revision {there}, this stub is of revision {here}"),

@@ -10,7 +10,7 @@ use ros::ring::{Bounds, Ring};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use super::place::Place;
+use super::private_master::PrivateMaster;
 
 /// Messages of one publisher kept for a process that is slow, and while its advertisement is made; a newcomer is given the
 /// last one of each publisher.
@@ -76,9 +76,9 @@ impl Drop for Latched {
 }
 
 impl Latched {
-    pub fn begin(place: &Arc<Place>) -> Self {
+    pub fn begin(master: &Arc<PrivateMaster>) -> Self {
         let due = Arc::new(Due::default());
-        let task = tokio::spawn(serve(place.clone(), due.clone())).abort_handle();
+        let task = tokio::spawn(serve(master.clone(), due.clone())).abort_handle();
         Self { due, task }
     }
 
@@ -87,7 +87,7 @@ impl Latched {
         self.due.add(topic, &message.publisher, |news| {
             let lost = news.messages.push(message.clone());
             if lost.messages > 0 {
-                tracing::debug!(%topic, dropped = lost.messages, "newer latched messages took the place of older ones");
+                tracing::debug!(%topic, dropped = lost.messages, "newer latched messages took the master of older ones");
             }
         });
     }
@@ -105,7 +105,7 @@ impl Latched {
 type Repeated = HashMap<Key, (Digest, Box<dyn Publisher>)>;
 
 /// Serves one publisher after the other; only its first message takes time, for the advertisement.
-async fn serve(place: Arc<Place>, due: Arc<Due>) {
+async fn serve(master: Arc<PrivateMaster>, due: Arc<Due>) {
     let mut all = Repeated::new();
     loop {
         let (key, news) = due.next().await;
@@ -120,7 +120,7 @@ async fn serve(place: Arc<Place>, due: Arc<Due>) {
             }
             let of = WireType::clone(&message.wire_type);
             let qos = Qos::keep_last(QUEUE).latching(true);
-            match place.bus().advertise(&key.0, of, qos).await {
+            match master.bus().advertise(&key.0, of, qos).await {
                 Ok(publisher) => {
                     publisher.publish(message.bytes);
                     all.insert(key.clone(), (digest.clone(), publisher));

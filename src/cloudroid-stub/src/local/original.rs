@@ -22,7 +22,7 @@ use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
 use super::latched::Latched;
-use super::place::{Place, Registered};
+use super::private_master::{PrivateMaster, Registered};
 use super::process::{self, Program};
 
 /// Messages kept per topic: what waits longer is old.
@@ -73,7 +73,7 @@ pub struct Original {
     /// The node's name.
     node: String,
     orders: mpsc::UnboundedSender<Order>,
-    place: Arc<Place>,
+    master: Arc<PrivateMaster>,
     publishers: Publishers,
     sources: Sources,
     latched: Latched,
@@ -114,18 +114,18 @@ impl Original {
         robot: Arc<dyn Bus>,
         limit: Duration,
     ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
-        let place = Arc::new(Place::new().await?);
-        place.lend(&setting.node, &robot, limit).await?;
+        let master = Arc::new(PrivateMaster::new().await?);
+        master.lend(&setting.node, &robot, limit).await?;
         let (news, received) = mpsc::unbounded_channel();
         let publishers = Arc::default();
         let sources = Arc::default();
         let expected = Expected::default();
-        let latched = Latched::begin(&place);
+        let latched = Latched::begin(&master);
         let (orders, taken) = mpsc::unbounded_channel();
         let node = setting.node.clone();
         let runner = Runner {
             setting,
-            place: place.clone(),
+            master: master.clone(),
             robot,
             publishers: Arc::clone(&publishers),
             sources: Arc::clone(&sources),
@@ -136,7 +136,7 @@ impl Original {
         let original = Self {
             node,
             orders,
-            place,
+            master,
             publishers,
             sources,
             latched,
@@ -156,7 +156,7 @@ impl Original {
                 continue;
             }
             let subscription = self
-                .place
+                .master
                 .bus()
                 .subscribe(
                     &output,
@@ -181,7 +181,7 @@ impl Original {
         }
         for (topic, wire_type) in interface.inputs {
             if !self.publishers.lock().contains_key(&topic) {
-                let publisher = advertise(&self.place, &topic, &wire_type).await?;
+                let publisher = advertise(&self.master, &topic, &wire_type).await?;
                 self.publishers.lock().insert(topic, publisher);
             }
         }
@@ -190,12 +190,12 @@ impl Original {
 
     /// What it has registered, with types.
     pub async fn registered(&self) -> Registered {
-        self.place.registered_by(&self.node).await
+        self.master.registered_by(&self.node).await
     }
 
     /// Changes with whatever is registered.
     pub fn registrations(&self) -> watch::Receiver<u64> {
-        self.place.changes()
+        self.master.changes()
     }
 
     /// Returns once the process is connected to all inputs, or has had time to be.
@@ -239,10 +239,10 @@ impl Original {
             publisher.publish(message.bytes.clone());
             return;
         }
-        let (place, publishers) = (self.place.clone(), self.publishers.clone());
+        let (master, publishers) = (self.master.clone(), self.publishers.clone());
         let (topic, message) = (topic.to_owned(), message.clone());
         tokio::spawn(async move {
-            match advertise(&place, &topic, &message.wire_type).await {
+            match advertise(&master, &topic, &message.wire_type).await {
                 Ok(publisher) => {
                     publisher.publish(message.bytes);
                     publishers.lock().entry(topic).or_insert(publisher);
@@ -259,16 +259,16 @@ impl Original {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        self.place.bus().call(service, request, timeout).await
+        self.master.bus().call(service, request, timeout).await
     }
 }
 
 async fn advertise(
-    place: &Place,
+    master: &PrivateMaster,
     topic: &str,
     wire_type: &WireType,
 ) -> Result<Box<dyn Publisher>, BusError> {
-    place
+    master
         .bus()
         .advertise(topic, wire_type.clone(), Qos::keep_last(QUEUE))
         .await
@@ -276,7 +276,7 @@ async fn advertise(
 
 struct Runner {
     setting: Setting,
-    place: Arc<Place>,
+    master: Arc<PrivateMaster>,
     robot: Arc<dyn Bus>,
     publishers: Publishers,
     sources: Sources,
@@ -309,13 +309,13 @@ impl Runner {
                     reason = self.watch(&mut child) => reason,
                     () = stopped(orders) => {
                         process::end(&mut child).await;
-                        self.place.process_exited().await;
+                        self.master.process_exited().await;
                         return;
                     }
                 },
                 Err(error) => format!("{error:#}"),
             };
-            self.place.process_exited().await;
+            self.master.process_exited().await;
             let _ = self.news.send(News::Crashed(reason));
             if born.elapsed() > FORGIVEN {
                 pause = BACKOFF.0;
@@ -330,8 +330,8 @@ impl Runner {
 
     async fn spawn(&self, program: &Program) -> anyhow::Result<Child> {
         // They may have changed since the last start.
-        self.place.copy_parameters(&*self.robot).await?;
-        program.spawn(self.place.uri())
+        self.master.copy_parameters(&*self.robot).await?;
+        program.spawn(self.master.uri())
     }
 
     /// Tells when it is ready; gives the reason when it ends.
@@ -346,10 +346,10 @@ impl Runner {
     /// Its node is registered, listens to its inputs, and what it publishes is heard.
     async fn ready(&self) {
         let node = &self.setting.node;
-        self.place.registered(node).await;
+        self.master.registered(node).await;
         let expected = self.expected.lock().clone();
-        let _ = timeout(SETTLE, self.place.registers(node, &expected)).await;
-        let published = self.place.graph();
+        let _ = timeout(SETTLE, self.master.registers(node, &expected)).await;
+        let published = self.master.graph();
         let listens = |topic: &String| {
             let nodes = published.topics.get(topic).map(|topic| &topic.subscribers);
             nodes.is_some_and(|nodes| nodes.contains(node))

@@ -16,7 +16,7 @@ use crate::local;
 
 /// What the cloud was told of.
 #[derive(Default)]
-pub struct Lent {
+pub struct LentServices {
     services: Mutex<HashMap<String, Service>>,
     next: AtomicU32,
 }
@@ -28,7 +28,7 @@ struct Service {
     digest: Digest,
 }
 
-impl Lent {
+impl LentServices {
     /// Another session begins: the cloud knows of none.
     pub fn renew(&self) {
         self.services.lock().clear();

@@ -10,7 +10,7 @@ use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
 
 use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{self, Command, FromShim, NodeStatus, Request, State};
+use crate::protocol::{self, Command, FromShim, NodeStatus, Request, Snapshot};
 
 /// Events that a slow listener may be behind.
 const EVENTS: usize = 256;
@@ -104,7 +104,7 @@ impl Known {
         }
     }
 
-    fn enter(&self, told: State) {
+    fn enter(&self, told: Snapshot) {
         if let Some(pid) = told.init_pid {
             self.init.store(pid, Ordering::Release);
         }

@@ -23,7 +23,7 @@ use super::link::Link;
 use super::nodes::Nodes;
 use super::streams::Streams;
 use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{Command, FromShim, Request, State};
+use crate::protocol::{Command, FromShim, Request, Snapshot};
 use crate::spec::Limits;
 use crate::{Error, cgroup, logs};
 
@@ -229,10 +229,10 @@ impl Driver {
         self.clients.report(&FromShim::State { state });
     }
 
-    fn told(&self) -> State {
+    fn told(&self) -> Snapshot {
         let running = self.state == ContainerState::Running;
         let init = self.init.as_ref().filter(|_| running);
-        State {
+        Snapshot {
             state: self.state.clone(),
             init_pid: init.map(|(pid, _)| *pid),
         }

@@ -17,8 +17,8 @@ use crate::shared::Shared;
 use crate::topic_queue::Wishes;
 use crate::{BridgeOptions, SessionOptions};
 
-/// A session that nobody polls but the test, without pings of its own, and the client's end.
-async fn session(options: SessionOptions) -> (Session<DuplexStream>, DuplexStream) {
+/// A connection that nobody polls but the test, without pings of its own, and the client's end.
+async fn connection(options: SessionOptions) -> (Connection<DuplexStream>, DuplexStream) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions {
@@ -40,7 +40,7 @@ async fn session(options: SessionOptions) -> (Session<DuplexStream>, DuplexStrea
     let socket = WebSocket::new(ours, b"", 1 << 20, 1 << 20);
     let number = client.outbox.attach();
     (
-        Session::new(
+        Connection::new(
             socket,
             Kept::within(&budget::Budget::unlimited()),
             client,
@@ -51,9 +51,9 @@ async fn session(options: SessionOptions) -> (Session<DuplexStream>, DuplexStrea
     )
 }
 
-fn step(session: &mut Session<DuplexStream>) {
-    let step = session.step(&mut Context::from_waker(Waker::noop()));
-    assert!(step.is_pending(), "the session ends");
+fn step(connection: &mut Connection<DuplexStream>) {
+    let step = connection.step(&mut Context::from_waker(Waker::noop()));
+    assert!(step.is_pending(), "the connection ends");
 }
 
 fn sample() -> Arc<Sample> {
@@ -69,9 +69,9 @@ fn sample() -> Arc<Sample> {
 }
 
 #[tokio::test]
-async fn what_a_throttle_rate_holds_back_wakes_the_session_when_it_is_due() {
-    let (mut session, _client) = session(SessionOptions::default()).await;
-    let outbox = session.client.outbox.clone();
+async fn what_a_throttle_rate_holds_back_wakes_the_connection_when_it_is_due() {
+    let (mut connection, _client) = connection(SessionOptions::default()).await;
+    let outbox = connection.client.outbox.clone();
     let wishes = Wishes {
         throttle_rate: Duration::from_secs(300),
         queue_length: 2,
@@ -82,10 +82,10 @@ async fn what_a_throttle_rate_holds_back_wakes_the_session_when_it_is_due() {
     for _ in 0..10 {
         outbox.sample(key, sample(), false);
     }
-    step(&mut session);
+    step(&mut connection);
     let due = outbox.next_due();
     assert!(due.is_some(), "one of them waits");
-    assert_eq!(session.timer_at, due);
+    assert_eq!(connection.timer_at, due);
 }
 
 #[tokio::test]
@@ -94,14 +94,14 @@ async fn an_answer_is_asked_about_when_its_patience_is_over() {
         resume: Some("secret".to_owned()),
         ..SessionOptions::default()
     };
-    let (mut session, _client) = session(options).await;
+    let (mut connection, _client) = connection(options).await;
     let answer = |size: usize| Frame {
         format: Format::Cbor,
         bytes: vec![0; size].into(),
     };
-    session.client.send_frame(answer(10), None, true);
-    step(&mut session);
-    let due = session.acks.ping_due();
+    connection.client.send_frame(answer(10), None, true);
+    step(&mut connection);
+    let due = connection.acks.ping_due();
     assert!(due.is_some(), "nothing has asked about it yet");
-    assert_eq!(session.timer_at, due);
+    assert_eq!(connection.timer_at, due);
 }

@@ -11,12 +11,12 @@ use rosbridge::{Compression, Format, Level};
 use tokio::io::{AsyncRead, AsyncWrite};
 use ws::frame;
 
-use super::{MOVED, SOCKET_FULL, Session, Stop};
+use super::{Connection, MOVED, SOCKET_FULL, Stop};
 use crate::cut::Cuts;
 use crate::outbox::{Control, Outgoing, TopicKey};
 use crate::sample::{Frame, Sample};
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
+impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     /// Moves what waits into the socket. Ready when there is nothing left, pending when the socket takes no more.
     pub(super) fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), Stop>> {
         loop {

@@ -36,7 +36,7 @@ const MOVED: usize = 128 * 1024;
 const CONTROL_HIGH: usize = 256;
 
 /// The socket, its client and what lies between.
-pub(crate) struct Session<S> {
+pub(crate) struct Connection<S> {
     socket: WebSocket<S>,
     client: Arc<Client>,
     /// Which of the client's sockets this is.
@@ -58,7 +58,7 @@ pub(crate) struct Session<S> {
     timer_at: Option<Instant>,
 }
 
-/// Why a session stops.
+/// Why a connection stops.
 enum Stop {
     /// The client sent a close frame.
     Client { code: u16, reason: String },
@@ -72,8 +72,8 @@ enum Stop {
     Lost { reason: String, heard_all: bool },
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
-    /// A session on `socket`, which takes what was `kept` of it first.
+impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
+    /// A connection on `socket`, which takes what was `kept` of it first.
     pub(crate) fn new(
         socket: WebSocket<S>,
         kept: Kept,
@@ -369,5 +369,5 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<S> {
 }
 
 #[cfg(test)]
-#[path = "session_tests.rs"]
+#[path = "connection_tests.rs"]
 mod tests;

@@ -31,14 +31,14 @@ pub struct Registered {
 }
 
 /// A Master and a bus; both end with it.
-pub struct Place {
+pub struct PrivateMaster {
     uri: String,
     master: Master,
     bus: Arc<Ros1Bus>,
     serving: AbortHandle,
 }
 
-impl Place {
+impl PrivateMaster {
     /// Makes it. Only this machine can reach it.
     pub async fn new() -> anyhow::Result<Self> {
         let loopback = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
@@ -181,7 +181,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for PrivateMaster {
     fn drop(&mut self) {
         self.serving.abort();
     }
