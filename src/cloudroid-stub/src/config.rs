@@ -48,8 +48,10 @@
 //! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by a ROS
 //! parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
 
+mod check;
 mod parameters;
 mod requests;
+mod sources;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -57,14 +59,14 @@ use std::time::Duration;
 
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
-use toml::{Table, Value};
 
 use crate::address::Address;
 use crate::revision::Defaults;
-use crate::terms::{self, Aux, Scalar};
+use crate::terms::{Aux, Scalar};
 
 pub use parameters::{Group, groups};
 pub use requests::Requests;
+pub use sources::read;
 
 /// The file's name in the share directory.
 pub const FILE: &str = "stub.toml";
@@ -344,198 +346,6 @@ impl Codec {
             ));
         }
         None
-    }
-}
-
-/// Reads `stub.toml` in `share` with what the environment says instead.
-pub fn read(
-    share: &Path,
-    environment: impl Iterator<Item = (String, String)>,
-) -> anyhow::Result<Config> {
-    let path = share.join(FILE);
-    let text = std::fs::read_to_string(&path).with_context(|| {
-        format!(
-            "cannot read {}: the stub's package is not complete; install it again",
-            path.display()
-        )
-    })?;
-    let table: Table = toml::from_str(&text).with_context(|| format!("{}", path.display()))?;
-    with(
-        table,
-        environment.filter_map(|(name, value)| Some((key_of(&name)?, value))),
-    )
-    .with_context(|| format!("{} with CLOUDROID_* of the environment", path.display()))
-}
-
-/// The key that an environment variable stands for.
-fn key_of(variable: &str) -> Option<String> {
-    let key = variable.strip_prefix("CLOUDROID_")?.to_ascii_lowercase();
-    KEYS.contains(&key.as_str()).then_some(key)
-}
-
-/// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-pub const KEYS: [&str; 30] = [
-    "server",
-    "service",
-    "token",
-    "token_file",
-    "ca_file",
-    "robot",
-    "desire",
-    "max",
-    "threshold",
-    "initial",
-    "cap",
-    "frames_per_second",
-    "desired_frames_per_second",
-    "age",
-    "desired_age",
-    "output",
-    "request",
-    "requests",
-    "fallback_after",
-    "call_limit",
-    "local",
-    "stateful",
-    "safe_stop",
-    "class",
-    "cpus",
-    "memory",
-    "aux",
-    "stamps",
-    "codec",
-    "quality",
-];
-
-/// The file's table with some keys given otherwise, as text.
-fn with(
-    mut table: Table,
-    instead: impl Iterator<Item = (String, String)>,
-) -> anyhow::Result<Config> {
-    for (key, text) in instead {
-        table.insert(key, value_of(&text));
-    }
-    let mut config: Config = table.try_into()?;
-    // The parts that share them write them as whole numbers too.
-    while config.server.ends_with('/') {
-        config.server.pop();
-    }
-    Address::parse(&config.server).map_err(anyhow::Error::msg)?;
-    config.check()?;
-    Ok(config)
-}
-
-/// A key whose value cannot be.
-#[derive(Debug, thiserror::Error)]
-#[error("{key} {reason}")]
-struct Wrong {
-    key: &'static str,
-    /// The reason, and what to do.
-    reason: String,
-}
-
-impl Config {
-    /// What no type can say.
-    fn check(&self) -> Result<(), Wrong> {
-        let wrong = |key, reason| Err(Wrong { key, reason });
-        for (key, value) in [
-            ("desire", self.desire),
-            ("max", self.max),
-            ("age", self.age),
-            ("desired_age", self.desired_age),
-            ("frames_per_second", self.frames_per_second),
-            ("desired_frames_per_second", self.desired_frames_per_second),
-            ("threshold", self.threshold),
-            ("initial", self.initial),
-            ("fallback_after", Some(self.fallback_after)),
-            ("call_limit", Some(self.call_limit)),
-        ] {
-            if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
-                let reason = format!(
-                    "is {value}; it should be a number greater than 0 and less than {MOST}"
-                );
-                return wrong(key, reason);
-            }
-        }
-        if let Err((key, reason)) = terms::check(self) {
-            return wrong(key, reason);
-        }
-        if let Some(quality) = self
-            .quality
-            .filter(|quality| !(1.0..=100.0).contains(quality))
-        {
-            let reason = format!("is {quality}; it should be a number from 1 to 100");
-            return wrong("quality", reason);
-        }
-        if let Some(cap) = self.cap.filter(|cap| cap.is_nan() || *cap <= 0.0) {
-            let reason = format!("is {cap}; it should be a number greater than threshold");
-            return wrong("cap", reason);
-        }
-        if let (Some(desired), Some(least)) =
-            (self.desired_frames_per_second, self.frames_per_second)
-        {
-            if desired < least {
-                let reason = format!(
-                    "({desired}) is less than frames_per_second ({least}), which is the least that will do; raise it, or lower frames_per_second"
-                );
-                return wrong("desired_frames_per_second", reason);
-            }
-        }
-        for (key, desired, (other, most)) in [
-            ("desire", self.desire, ("max", self.max)),
-            ("desired_age", self.desired_age, ("age", self.age)),
-        ] {
-            if let (Some(desired), Some(most)) = (desired, most) {
-                if desired > most {
-                    let reason = format!(
-                        "({desired} s) is greater than {other} ({most} s); lower it, or raise {other}"
-                    );
-                    return wrong(key, reason);
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// What must hold once all that say something have been heard.
-    fn check_whole(&self) -> Result<(), Wrong> {
-        let without = |key, other| {
-            let reason = format!("is given without {other}; set {other}, too, or remove {key}");
-            Err(Wrong { key, reason })
-        };
-        if self.quality.is_some() && self.codec != Codec::Jpeg {
-            return without("quality", "codec = \"jpeg\"");
-        }
-        if self.request.is_some() && self.requests.is_some() {
-            let reason = "and requests are both given; remove one".to_owned();
-            return Err(Wrong {
-                key: "request",
-                reason,
-            });
-        }
-        if self.desired_frames_per_second.is_some() && self.frames_per_second.is_none() {
-            return without("desired_frames_per_second", "frames_per_second");
-        }
-        if self.desired_age.is_some() && self.age.is_none() {
-            return without("desired_age", "age");
-        }
-        match (self.desire, self.max) {
-            (Some(_), None) => without("desire", "max"),
-            (None, Some(_)) => without("max", "desire"),
-            _ => Ok(()),
-        }
-    }
-}
-
-/// A value as TOML would read it, or else as text.
-fn value_of(text: &str) -> Value {
-    match text.trim() {
-        "true" => Value::Boolean(true),
-        "false" => Value::Boolean(false),
-        other => other.parse().map_or_else(
-            |_| Value::String(text.to_owned()),
-            |number: f64| Value::Float(number),
-        ),
     }
 }
 

@@ -7,7 +7,8 @@ use anyhow::bail;
 use ros::bus::ParamValue;
 use toml::{Table, Value};
 
-use super::{Config, with};
+use super::Config;
+use super::sources::with;
 
 /// A group's name: what comes after the namespace.
 const GROUP: &str = "cloudroid";

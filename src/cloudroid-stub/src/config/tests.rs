@@ -1,3 +1,6 @@
+use toml::Table;
+
+use super::sources::{key_of, with};
 use super::*;
 
 const FILE: &str = "server = 'ws://cloud:9090/'\nservice = 'opencv_apps'\ndesire = 0.1\nmax = 1\n";
