@@ -156,3 +156,34 @@ pub struct Pressure {
     /// For a disk.
     pub io: f64,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_are_merged_field_by_field() {
+        let few = Limits {
+            cpus: Some(1.0),
+            pids: Some(9),
+            cpuset: "0".parse().ok(),
+            ..Limits::default()
+        };
+        let more = Limits {
+            cpus: Some(2.0),
+            memory: Some(Size(64)),
+            cpuset: "1".parse().ok(),
+            ..Limits::default()
+        };
+        let (one, nine, first) = (Some(1.0), Some(9), few.cpuset);
+        let merged = |of: Limits| (of.cpus, of.memory, of.pids, of.cpuset);
+        let memory = more.memory;
+        assert_eq!(merged(few.or(more)), (one, memory, nine, first));
+        let shared = (more.cpus, None, None, more.cpuset);
+        assert_eq!(merged(few.and(more)), shared);
+        assert_eq!(merged(few.most(more)), (more.cpus, memory, nine, first));
+        assert_eq!(merged(few.without(few)), (None, None, None, None));
+        let named: Vec<_> = few.or(more).named().map(|(name, _)| name).collect();
+        assert_eq!(named, ["cpus", "cpuset", "memory", "pids"]);
+    }
+}
