@@ -14,12 +14,14 @@
 pub mod decide;
 pub mod glob;
 pub mod grant;
+pub mod guesses;
 pub mod policy;
 pub mod principal;
 
 pub use decide::{Action, Object, Refusal, decide};
 pub use glob::Glob;
 pub use grant::{Grant, Operation};
+pub use guesses::Guesses;
 pub use policy::{Grants, Policy, Rule, Standing, Who};
 pub use principal::{Principal, Role, Scope};
 

@@ -7,6 +7,8 @@ use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
 use choreographer::{Refused, Unchanged, Untenable, with_last_words};
 
+use crate::principals::Unrecognised;
+
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -43,9 +45,12 @@ pub enum Error {
     /// A WebSocket handshake of another version than 13.
     #[error("this is no WebSocket handshake: Sec-WebSocket-Version is not 13")]
     WebSocketVersion,
-    /// No token, or one that is not known.
+    /// No token.
     #[error("{0}")]
     Unauthorised(&'static str),
+    /// A token that lets nobody in.
+    #[error(transparent)]
+    Unrecognised(#[from] Unrecognised),
     /// The request comes from a page that is not ours, or is addressed to another host.
     #[error("{what}")]
     Foreign {
@@ -215,12 +220,18 @@ impl Error {
         if let Some(log) = self.log() {
             problem.log = log.to_vec();
         }
-        let again = status == StatusCode::SERVICE_UNAVAILABLE;
-        let after = match self.of_choreographer() {
-            Some(choreographer::Error::BackOff { again, .. }) => choreographer::seconds(*again),
+        let again = [
+            StatusCode::SERVICE_UNAVAILABLE,
+            StatusCode::TOO_MANY_REQUESTS,
+        ];
+        let after = match (self, self.of_choreographer()) {
+            (Error::Unrecognised(Unrecognised::Slowed(left)), _) => left.div_ceil(1000),
+            (_, Some(choreographer::Error::BackOff { again, .. })) => {
+                choreographer::seconds(*again)
+            }
             _ => RETRY_AFTER,
         };
-        problem.retry_after = again.then_some(after);
+        problem.retry_after = again.contains(&status).then_some(after);
         problem
     }
 
@@ -274,7 +285,12 @@ impl Error {
                 "websocket-version",
                 "other WebSocket version needed",
             ),
-            Error::Unauthorised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
+            Error::Unrecognised(Unrecognised::Slowed(_)) => {
+                (S::TOO_MANY_REQUESTS, "guessing", "too many unknown tokens")
+            }
+            Error::Unauthorised(_) | Error::Unrecognised(_) => {
+                (S::UNAUTHORIZED, "unauthorised", "token needed")
+            }
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
             Error::UnknownToken { .. } => (S::NOT_FOUND, "unknown-token", "unknown token"),
@@ -306,7 +322,10 @@ impl Error {
             ),
             Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
-            Error::Unauthorised(_) => {
+            Error::Unrecognised(Unrecognised::Slowed(_)) => {
+                "ask again then; tokens made by cloudroidctl token create are looked at always".into()
+            }
+            Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
             Error::Foreign { next, .. } => next.clone(),
@@ -649,6 +668,13 @@ mod tests {
         let response = Error::Unauthorised("a token is needed").into_response();
         assert_eq!(response.status(), 401);
         assert_eq!(response.headers()[header::WWW_AUTHENTICATE], "Bearer");
+    }
+
+    #[test]
+    fn who_guesses_is_told_when_to_come_again() {
+        let response = Error::from(Unrecognised::Slowed(3_001)).into_response();
+        assert_eq!(response.status(), 429);
+        assert_eq!(response.headers()[header::RETRY_AFTER], "4");
     }
 
     #[test]

@@ -12,7 +12,7 @@
 
 use std::borrow::Cow;
 use std::fmt;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -26,9 +26,9 @@ use parking_lot::Mutex;
 
 use crate::app::App;
 use crate::errors::Error;
-use crate::principals::{self, Identity, Shown, Stored};
+use crate::principals::{Identity, Recognising, Shown};
 use crate::routes::{self, Access};
-use crate::tokens::{self, Tokens};
+use crate::tokens;
 
 /// Shortest time between two log lines about the same refusal.
 const AGAIN: Duration = Duration::from_secs(60);
@@ -54,6 +54,14 @@ impl fmt::Display for Peer {
 }
 
 impl Peer {
+    /// Its address; users of this machine are at its own.
+    pub fn ip(&self) -> IpAddr {
+        match self {
+            Peer::Tcp(address) => address.ip(),
+            Peer::Unix(_) => Ipv4Addr::LOCALHOST.into(),
+        }
+    }
+
     /// The name of its memory budget: its IP address or, for connections from this machine (a proxy's), its robot's name.
     pub fn client(&self, robot: Option<&str>) -> String {
         match (self, robot) {
@@ -95,10 +103,8 @@ impl Caller {
 pub struct Rules<'a> {
     /// The portal is bound to loopback.
     pub loopback: bool,
-    /// Tokens of the configuration.
-    pub tokens: &'a Tokens,
-    /// Tokens of the database.
-    pub stored: &'a Stored,
+    /// By what tokens are recognised.
+    pub known: Recognising<'a>,
     /// Origins allowed besides loopback's.
     pub origins: &'a [String],
 }
@@ -108,11 +114,10 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     let Some(peer) = request.extensions().get::<Peer>().copied() else {
         return Error::Internal("telling who asks").into_response();
     };
-    let admitted = app.principals.with(|tokens, stored| {
+    let admitted = app.principals.with(|known| {
         let rules = Rules {
             loopback: app.listen.ip().is_loopback(),
-            tokens,
-            stored,
+            known,
             origins: &app.options.origins,
         };
         rules.admit(peer, request.method(), request.uri(), request.headers())
@@ -155,7 +160,7 @@ impl Rules<'_> {
             return admit_user(peer, uid);
         }
         let given = token_in(uri, headers);
-        if self.loopback && self.tokens.is_empty() && self.stored.is_empty() {
+        if self.loopback && self.known.tokens.is_empty() && self.known.stored.is_empty() {
             check_direct(headers)?;
             self.check_host(headers)?;
             self.check_origin(headers)?;
@@ -168,8 +173,7 @@ impl Rules<'_> {
         }
         match given {
             Some(token) => {
-                let who = principals::recognise(self.tokens, self.stored, &token, store::now());
-                let who = who.map_err(Error::Unauthorised)?;
+                let who = self.known.recognise(&token, peer.ip(), store::now())?;
                 Ok(Caller { peer, who })
             }
             None if is_open(method, uri, headers) => {
@@ -327,7 +331,11 @@ fn is_loopback_host(host: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use access::Guesses;
+
     use super::*;
+    use crate::principals::Stored;
+    use crate::tokens::Tokens;
 
     struct Ask<'a> {
         rules: Rules<'a>,
@@ -376,8 +384,11 @@ mod tests {
         let none = Tokens::default();
         let rules = Rules {
             loopback: true,
-            tokens: &none,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &[],
         };
         assert!(
@@ -404,8 +415,11 @@ mod tests {
         let origins = ["https://tool.example".to_owned()];
         let rules = Rules {
             loopback: true,
-            tokens: &none,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &origins,
         };
         assert_eq!(
@@ -437,8 +451,11 @@ mod tests {
         let none = Tokens::default();
         let closed = Rules {
             loopback: true,
-            tokens: &none,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &[],
         };
         let refused = ask(&closed)
@@ -463,8 +480,11 @@ mod tests {
         let (none, some) = (Tokens::default(), tokens());
         let mut rules = Rules {
             loopback: true,
-            tokens: &none,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &[],
         };
         for (name, value) in [
@@ -477,7 +497,7 @@ mod tests {
             let refused = ask(&rules).with("host", "localhost").with(name, value);
             assert_eq!(refused.at("/api/v1/services"), Err(403), "{name}");
         }
-        rules.tokens = &some;
+        rules.known.tokens = &some;
         ask(&rules)
             .with("x-forwarded-proto", "https")
             .at("/api/v1/services?token=open+sesame")
@@ -489,8 +509,11 @@ mod tests {
         let none = Tokens::default();
         let open = Rules {
             loopback: true,
-            tokens: &none,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &[],
         };
         let caller = ask(&open).at("/x?robot=r&token=mine").expect("let through");
@@ -503,8 +526,11 @@ mod tests {
         for loopback in [true, false] {
             let rules = Rules {
                 loopback,
-                tokens: &some,
-                stored: &Stored::default(),
+                known: Recognising {
+                    tokens: &some,
+                    stored: &Stored::default(),
+                    guesses: &Mutex::new(Guesses::default()),
+                },
                 origins: &[],
             };
             let far = || ask(&rules).with("host", "localhost");
@@ -538,8 +564,11 @@ mod tests {
         let some = tokens();
         let rules = Rules {
             loopback: true,
-            tokens: &some,
-            stored: &Stored::default(),
+            known: Recognising {
+                tokens: &some,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+            },
             origins: &[],
         };
         let handshake = |method: Method| ask(&rules).by(method).with("upgrade", "WebSocket");

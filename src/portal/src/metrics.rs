@@ -46,6 +46,17 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
             (labels(&[("result", "failed")]), failed as f64),
         ],
     );
+    let (unknown, slowed) = app.principals.guessed();
+    family(
+        &mut out,
+        "cloudroid_refused_tokens_total",
+        "counter",
+        "Tokens that let nobody in: unknown ones, and those not looked at because too many came from their address.",
+        [
+            (labels(&[("why", "unknown")]), unknown as f64),
+            (labels(&[("why", "slowed")]), slowed as f64),
+        ],
+    );
     capacity(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
     gauge(

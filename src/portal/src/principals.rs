@@ -2,14 +2,15 @@
 //! hold at once, for open connections as for requests.
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use access::{Glob, Policy, Principal, Role, Rule, Scope, Standing};
+use access::{Glob, Guesses, Policy, Principal, Role, Rule, Scope, Standing};
 use api::Millis;
 use catalogue::names;
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 use serde::{Deserialize, Serialize};
 use store::{NewToken, Owner, RuleRecord, State, TokenHash, TokenRecord};
 use tokio::sync::watch;
@@ -55,6 +56,23 @@ pub struct Identity {
     pub owner: Option<Owner>,
 }
 
+/// Why a token lets nobody in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Unrecognised {
+    /// It was good once.
+    #[error("this token was revoked")]
+    Revoked,
+    /// It was good until its end.
+    #[error("this token has expired")]
+    Expired,
+    /// Nobody has it.
+    #[error("this token is not known")]
+    Unknown,
+    /// It was not looked at.
+    #[error("too many tokens that are not known came from this address; none is looked at for {} s", .0.div_ceil(1000))]
+    Slowed(Millis),
+}
+
 /// What the store keeps of a token beside its role.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct StoredScope {
@@ -86,13 +104,12 @@ impl Known {
     }
 
     /// Why it is not good any more.
-    fn over(&self, now: Millis) -> Option<&'static str> {
+    fn over(&self, now: Millis) -> Option<Unrecognised> {
         if self.revoked.is_some() {
-            return Some("this token was revoked");
+            return Some(Unrecognised::Revoked);
         }
-        self.expires
-            .filter(|end| *end <= now)
-            .map(|_| "this token has expired")
+        let end = self.expires.filter(|end| *end <= now);
+        end.map(|_| Unrecognised::Expired)
     }
 
     fn view(&self) -> api::access::Token {
@@ -201,7 +218,7 @@ impl Stored {
     }
 
     /// Whose token it is, by its hash.
-    fn recognise(&self, hash: &str, now: Millis) -> Result<Option<Identity>, &'static str> {
+    fn recognise(&self, hash: &str, now: Millis) -> Result<Option<Identity>, Unrecognised> {
         let Some(known) = self.by_hash.get(hash).map(|at| &self.tokens[*at]) else {
             return Ok(None);
         };
@@ -224,20 +241,54 @@ impl Stored {
     }
 }
 
-/// Whose token it is: of the configuration, or of the database.
-pub fn recognise(
-    configured: &Tokens,
-    stored: &Stored,
-    token: &str,
-    now: Millis,
-) -> Result<Identity, &'static str> {
-    if let Some(hash) = configured.recognise(token) {
-        return Ok(of_configuration(hash));
+/// By what tokens are recognised.
+#[derive(Clone, Copy)]
+pub struct Recognising<'a> {
+    /// Tokens of the configuration.
+    pub tokens: &'a Tokens,
+    /// Tokens of the database.
+    pub stored: &'a Stored,
+    /// What was guessed, by address.
+    pub guesses: &'a Mutex<Guesses>,
+}
+
+impl Recognising<'_> {
+    /// Whose token it is, that came from an address.
+    pub fn recognise(
+        &self,
+        token: &str,
+        from: IpAddr,
+        now: Millis,
+    ) -> Result<Identity, Unrecognised> {
+        self.by(token, from, now, || self.tokens.recognise(token))
     }
-    let hash = tokens::hash(token);
-    stored
-        .recognise(&hash, now)?
-        .ok_or("this token is not known")
+
+    /// Looks for a token in the database and then, with `configured`, among those of the configuration. The former cannot be
+    /// guessed, and are looked for always: who has one is not held up by whoever guesses at the same address. The latter
+    /// people choose.
+    fn by(
+        &self,
+        token: &str,
+        from: IpAddr,
+        now: Millis,
+        configured: impl FnOnce() -> Option<TokenHash>,
+    ) -> Result<Identity, Unrecognised> {
+        if let Some(identity) = self.stored.recognise(&tokens::hash(token), now)? {
+            return Ok(identity);
+        }
+        let mut guesses = self.guesses.lock();
+        guesses.ask(from, now).map_err(Unrecognised::Slowed)?;
+        if let Some(hash) = configured() {
+            return Ok(of_configuration(hash));
+        }
+        if let Some(wait) = guesses.failed(from, now) {
+            let seconds = wait.div_ceil(1000);
+            tracing::warn!(
+                "tokens that are not known come from {from}: for {seconds} s none is looked at"
+            );
+        }
+        Err(Unrecognised::Unknown)
+    }
 }
 
 fn of_configuration(hash: TokenHash) -> Identity {
@@ -254,6 +305,7 @@ pub struct Principals {
     configured: Tokens,
     state: Arc<State>,
     stored: RwLock<Stored>,
+    guesses: Mutex<Guesses>,
     /// Grows by one with every change.
     changed: watch::Sender<u64>,
 }
@@ -265,6 +317,7 @@ impl Principals {
             stored: RwLock::new(Stored::read(&state)?),
             configured,
             state,
+            guesses: Mutex::default(),
             changed: watch::Sender::new(0),
         };
         principals.release_robots()?;
@@ -282,8 +335,17 @@ impl Principals {
     }
 
     /// Calls `look` with what is known now.
-    pub fn with<T>(&self, look: impl FnOnce(&Tokens, &Stored) -> T) -> T {
-        look(&self.configured, &self.stored.read())
+    pub fn with<T>(&self, look: impl FnOnce(Recognising<'_>) -> T) -> T {
+        look(Recognising {
+            tokens: &self.configured,
+            stored: &self.stored.read(),
+            guesses: &self.guesses,
+        })
+    }
+
+    /// Tokens since the daemon started that were not known, and those that were not looked at.
+    pub fn guessed(&self) -> (u64, u64) {
+        self.guesses.lock().counts()
     }
 
     /// Whether nobody was ever named: then this machine's own users need no token.
@@ -291,27 +353,29 @@ impl Principals {
         self.configured.is_empty() && self.stored.read().is_empty()
     }
 
-    /// Who is meant by rosbridge's `auth` message, at `now` (seconds since 1970).
-    pub fn recognise_auth(&self, message: &AuthMessage, now: f64) -> Result<Identity, String> {
-        match self.recognise(&message.mac) {
-            Ok(identity) => Ok(identity),
-            Err(reason) => match self.configured.recognise_auth(message, now) {
-                Ok(hash) => Ok(of_configuration(hash)),
-                // Whose token is known and over hears why; anybody else, what is expected.
-                Err(_) if reason.ends_with("revoked") || reason.ends_with("expired") => {
-                    Err(reason.to_owned())
-                }
-                Err(refusal) => Err(refusal.to_string()),
-            },
+    /// Who is meant by rosbridge's `auth` message that came from an address, at `seconds` since 1970.
+    pub fn recognise_auth(
+        &self,
+        message: &AuthMessage,
+        from: IpAddr,
+        seconds: f64,
+    ) -> Result<Identity, String> {
+        let now = (seconds * 1000.0) as Millis;
+        let mut refusal = None;
+        let identity = self.with(|known| {
+            known.by(&message.mac, from, now, || {
+                let recognised = known.tokens.recognise_auth(message, seconds);
+                recognised.map_err(|why| refusal = Some(why)).ok()
+            })
+        });
+        match identity {
+            Ok(identity) => {
+                self.note_use(&identity, now);
+                Ok(identity)
+            }
+            // What is expected of such a message says more.
+            Err(why) => Err(refusal.map_or_else(|| why.to_string(), |refusal| refusal.to_string())),
         }
-    }
-
-    /// Whose token it is.
-    pub fn recognise(&self, token: &str) -> Result<Identity, &'static str> {
-        let now = store::now();
-        let identity = self.with(|configured, stored| recognise(configured, stored, token, now))?;
-        self.note_use(&identity, now);
-        Ok(identity)
     }
 
     /// Remembers that a token was shown, to the minute.
@@ -339,16 +403,18 @@ impl Principals {
         let stored = self.stored.read();
         let over = match &who.shown {
             Shown::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
-                Some("a token is needed since the first was made")
+                Some("a token is needed since the first was made".to_owned())
             }
             Shown::Stored { id, hash } => match stored.of_id(*id) {
-                Some(known) if known.hash == *hash => known.over(store::now()),
-                _ => Some("this token was replaced by another"),
+                Some(known) if known.hash == *hash => {
+                    known.over(store::now()).map(|over| over.to_string())
+                }
+                _ => Some("this token was replaced by another".to_owned()),
             },
             Shown::Nothing | Shown::Configured | Shown::User => None,
         };
         match over {
-            Some(reason) => Standing::Ended(reason.to_owned()),
+            Some(reason) => Standing::Ended(reason),
             None => Standing::Granted(Arc::new(stored.policy.grants(&who.principal, service))),
         }
     }
@@ -621,6 +687,11 @@ mod tests {
         }
     }
 
+    fn recognised(principals: &Principals, token: &str) -> Result<Identity, Unrecognised> {
+        let here = IpAddr::from([127, 0, 0, 1]);
+        principals.with(|known| known.recognise(token, here, store::now()))
+    }
+
     fn robot(name: &str) -> NewToken {
         NewToken {
             name: name.into(),
@@ -648,23 +719,24 @@ mod tests {
         assert_eq!(made.secret.len(), SECRET);
         let listed = serde_json::to_string(&principals.tokens()).expect("JSON");
         assert!(!listed.contains(&made.secret) && !listed.contains(&tokens::hash(&made.secret)));
-        let who = principals.recognise(&made.secret).expect("known");
+        let who = recognised(&principals, &made.secret).expect("known");
         assert_eq!(
             (&*who.principal.name, who.owner.as_deref()),
             ("rover", Some("robot:r1"))
         );
+        principals.note_use(&who, store::now());
         assert!(principals.tokens()[0].last_used.is_some());
         let rotated = principals.rotate("rover").expect("there");
         assert_eq!(
-            principals.recognise(&made.secret),
-            Err("this token is not known")
+            recognised(&principals, &made.secret),
+            Err(Unrecognised::Unknown)
         );
         let ended = principals.standing(&who, "detector");
         assert_eq!(
             ended,
             Standing::Ended("this token was replaced by another".into())
         );
-        let who = principals.recognise(&rotated.secret).expect("known");
+        let who = recognised(&principals, &rotated.secret).expect("known");
         assert!(permits(
             &principals.standing(&who, "detector"),
             Operation::Publish,
@@ -672,8 +744,8 @@ mod tests {
         ));
         principals.revoke("rover").expect("there");
         assert_eq!(
-            principals.recognise(&rotated.secret),
-            Err("this token was revoked")
+            recognised(&principals, &rotated.secret),
+            Err(Unrecognised::Revoked)
         );
         let ended = principals.standing(&who, "detector");
         assert_eq!(ended, Standing::Ended("this token was revoked".into()));
@@ -696,13 +768,13 @@ mod tests {
         let end = principals.tokens()[0].expires.expect("an end");
         let stored = principals.stored.read();
         assert!(stored.recognise(&hash, end - 1).expect("good").is_some());
-        assert_eq!(stored.recognise(&hash, end), Err("this token has expired"));
+        assert_eq!(stored.recognise(&hash, end), Err(Unrecognised::Expired));
     }
 
     #[test]
     fn tokens_of_the_configuration_are_admins() {
         let World { principals, _home } = world(&["open sesame"]);
-        let who = principals.recognise("open sesame").expect("known");
+        let who = recognised(&principals, "open sesame").expect("known");
         assert!(who.principal.is(Role::Admin));
         assert_eq!(who.owner, Some(tokens::hash("open sesame")));
         assert!(permits(
@@ -710,6 +782,55 @@ mod tests {
             Operation::Call,
             "/x"
         ));
+    }
+
+    #[test]
+    fn who_guesses_is_slowed_and_who_has_a_token_of_the_database_is_not() {
+        let World { principals, _home } = world(&["open sesame"]);
+        let made = principals.create(&robot("rover")).expect("made").secret;
+        let revoked = principals.create(&robot("over")).expect("made").secret;
+        principals.revoke("over").expect("there");
+        let (here, there) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
+        let shows =
+            |token: &str, from| principals.with(|known| known.recognise(token, from, 5_000));
+        // What was good once is no guess.
+        for _ in 0..2 * access::guesses::FREE {
+            assert_eq!(shows(&revoked, here), Err(Unrecognised::Revoked));
+        }
+        for number in 0..access::guesses::FREE {
+            assert_eq!(
+                shows(&format!("guess {number}"), here),
+                Err(Unrecognised::Unknown)
+            );
+        }
+        for token in ["guess", "open sesame"] {
+            assert_eq!(
+                shows(token, here),
+                Err(Unrecognised::Slowed(1_000)),
+                "{token}"
+            );
+        }
+        assert!(shows(&made, here).is_ok() && shows("open sesame", there).is_ok());
+        assert_eq!(principals.guessed(), (u64::from(access::guesses::FREE), 2));
+        // By rosbridge's message they count alike.
+        let message = |mac: &str| -> AuthMessage {
+            serde_json::from_value(serde_json::json!({"mac": mac})).expect("a message")
+        };
+        let far = IpAddr::from([10, 0, 0, 3]);
+        for _ in 0..access::guesses::FREE {
+            let refused = principals
+                .recognise_auth(&message("guess"), far, 0.0)
+                .expect_err("a guess");
+            assert!(
+                refused.contains("neither contains a known token"),
+                "{refused}"
+            );
+        }
+        let refused = principals.recognise_auth(&message("open sesame"), far, 0.0);
+        assert!(refused.expect_err("slowed").contains("none is looked at"));
+        principals
+            .recognise_auth(&message(&made), far, 0.0)
+            .expect("known");
     }
 
     #[test]
@@ -804,7 +925,7 @@ mod tests {
     async fn whoever_follows_hears_of_changes_of_the_policy_and_of_the_end() {
         let World { principals, _home } = world(&[]);
         let secret = principals.create(&robot("rover")).expect("made").secret;
-        let who = principals.recognise(&secret).expect("known");
+        let who = recognised(&principals, &secret).expect("known");
         let (sender, mut standing) = watch::channel(principals.standing(&who, "detector"));
         let change = async {
             let grant: Grant = "subscribe:/camera/**".parse().expect("a grant");

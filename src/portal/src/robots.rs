@@ -373,7 +373,9 @@ async fn session(
         return linked(&app, &asked, &caller, lease, io, read_ahead).await;
     }
     if lease.is_none() {
-        let recognise = |message: &AuthMessage, now| app.principals.recognise_auth(message, now);
+        let from = caller.peer.ip();
+        let recognise =
+            |message: &AuthMessage, now| app.principals.recognise_auth(message, from, now);
         let awaited = auth::first_message(&mut io, read_ahead, recognise);
         match tokio::time::timeout(app.options.handshake, awaited).await {
             Ok(Ok((who, rest))) => {
