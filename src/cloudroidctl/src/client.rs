@@ -21,8 +21,8 @@ use tokio::net::{TcpStream, UnixStream};
 const FALLBACK: &str = "127.0.0.1:9090";
 
 /// What to do about a 401.
-const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root on the \
-                            daemon's own machine needs none over its socket (--server unix:HOME/run/daemon.sock)";
+const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root and the group \
+                            cloudroid need none over the daemon's sockets (--server unix:PATH)";
 
 /// What is sent.
 pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
@@ -92,6 +92,8 @@ impl Server {
             .chain([PathBuf::from("/var/lib/cloudroid")]);
         let sockets: Vec<PathBuf> = candidates
             .map(|home| home.join("run/daemon.sock"))
+            // At which members of a group are admins.
+            .chain([PathBuf::from("/run/cloudroid/daemon.sock")])
             .collect();
         match sockets.iter().find(|socket| socket.exists()) {
             Some(socket) if !chosen || *socket == sockets[0] => Server::Unix(socket.clone()),

@@ -31,6 +31,10 @@ pub struct Config {
     pub listen: SocketAddr,
     /// Bearer tokens, or `sha256:HEX` of them. Needed to listen beyond loopback.
     pub tokens: Vec<String>,
+    /// Name or number of the group whose members are admins at `admin_socket`; `cloudroid` by default, where there is such a group.
+    pub admin_group: Option<String>,
+    /// A socket for them; below the directory that systemd makes for the service by default, else none.
+    pub admin_socket: Option<PathBuf>,
     /// Web origins besides this machine's own whose pages may use the portal without a token.
     pub origins: Vec<String>,
     /// Where a plain `ws://host:9090` goes.
@@ -239,6 +243,8 @@ impl Default for Config {
         Config {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 9090)),
             tokens: Vec::new(),
+            admin_group: None,
+            admin_socket: None,
             origins: Vec::new(),
             default_service: None,
             default_robot: None,

@@ -9,6 +9,7 @@
 
 #![deny(unsafe_code)]
 
+mod admins;
 mod bases;
 mod config;
 mod doctor;
@@ -198,6 +199,9 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     })?;
     let listener = listen(config.listen).await?;
     let socket = home.listen()?;
+    let runtime = std::env::var_os("RUNTIME_DIRECTORY").map(PathBuf::from);
+    let admins = admins::Admins::of(&config, runtime)?;
+    let admins = admins.map(|admins| admins.listen()).transpose()?;
     let app = wiring::build(&config, &home, machine, listener.local_addr()?)?;
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
@@ -221,7 +225,13 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         router.clone(),
         listener,
     ));
-    let unix = tokio::spawn(portal::serve_unix(Arc::clone(&app), router, socket));
+    let unix = tokio::spawn(portal::serve_unix(
+        Arc::clone(&app),
+        router.clone(),
+        socket,
+        None,
+    ));
+    let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
     tracing::info!(
         "cloudroidd {} listens on http://{} with state below {}; {adopted} servants adopted",
         env!("CARGO_PKG_VERSION"),
@@ -237,7 +247,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     supervision::stopping();
     wiring::drain(&app, config.keeps_servants()).await;
     app.ending.cancel();
-    let _ = tokio::join!(tcp, unix);
+    let _ = tokio::join!(tcp, unix, members);
     let _ = std::fs::remove_file(home.socket());
     Ok(())
 }

@@ -41,14 +41,23 @@ pub enum Peer {
     /// An address.
     Tcp(SocketAddr),
     /// A user of this machine.
-    Unix(u32),
+    Unix(User),
+}
+
+/// A user of this machine, by the kernel's word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct User {
+    /// The number.
+    pub uid: u32,
+    /// Whether the process was in the group whose members are admins when it connected.
+    pub is_member: bool,
 }
 
 impl fmt::Display for Peer {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Peer::Tcp(address) => address.fmt(out),
-            Peer::Unix(uid) => write!(out, "user {uid}"),
+            Peer::Unix(user) => write!(out, "user {}", user.uid),
         }
     }
 }
@@ -68,7 +77,7 @@ impl Peer {
             (Peer::Tcp(address), _) if !address.ip().is_loopback() => address.ip().to_string(),
             (_, Some(robot)) => robot.to_owned(),
             (Peer::Tcp(address), None) => address.ip().to_string(),
-            (Peer::Unix(uid), None) => format!("user {uid}"),
+            (Peer::Unix(user), None) => format!("user {}", user.uid),
         }
     }
 }
@@ -156,8 +165,8 @@ impl Rules<'_> {
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Caller, Error> {
-        if let Peer::Unix(uid) = peer {
-            return admit_user(peer, uid);
+        if let Peer::Unix(user) = peer {
+            return admit_user(user);
         }
         let given = token_in(uri, headers);
         if self.loopback && self.known.tokens.is_empty() && self.known.stored.is_empty() {
@@ -220,17 +229,23 @@ impl Rules<'_> {
     }
 }
 
-fn admit_user(peer: Peer, uid: u32) -> Result<Caller, Error> {
-    if uid == 0 || uid == nix::unistd::geteuid().as_raw() {
+fn admit_user(user: User) -> Result<Caller, Error> {
+    let User { uid, is_member } = user;
+    if uid == 0 || uid == nix::unistd::geteuid().as_raw() || is_member {
         let name = match uid {
             0 => "root".to_owned(),
             uid => format!("user {uid}"),
         };
-        return Ok(Caller::new(peer, Principal::admin(&name), Shown::User));
+        return Ok(Caller::new(
+            Peer::Unix(user),
+            Principal::admin(&name),
+            Shown::User,
+        ));
     }
     Err(Error::Foreign {
         what: format!("user {uid} may not use the daemon's socket"),
-        next: "ask as root (sudo), or over TCP with --server".to_owned(),
+        next: "ask as root (sudo) or as a member of the group that admin_group names, or over TCP with --server"
+            .to_owned(),
     })
 }
 
@@ -608,17 +623,23 @@ mod tests {
     }
 
     #[test]
-    fn only_root_and_the_daemons_user_use_the_socket() {
-        let root = admit_user(Peer::Unix(0), 0).expect("root");
-        assert!(root.who.principal.is(access::Role::Admin));
-        let other = nix::unistd::geteuid().as_raw().wrapping_add(1);
-        assert_eq!(
-            admit_user(Peer::Unix(other), other)
-                .expect_err("a stranger")
-                .problem()
-                .status,
-            403
-        );
+    fn only_root_the_daemons_user_and_members_use_the_socket() {
+        let own = nix::unistd::geteuid().as_raw();
+        let stranger = own.wrapping_add(1).max(1);
+        for (uid, is_member, admitted) in [
+            (0, false, true),
+            (own, false, true),
+            (stranger, false, false),
+            (stranger, true, true),
+        ] {
+            match admit_user(User { uid, is_member }) {
+                Ok(caller) => assert!(
+                    admitted && caller.who.principal.is(access::Role::Admin),
+                    "{uid}"
+                ),
+                Err(error) => assert!(!admitted && error.problem().status == 403, "{uid}: {error}"),
+            }
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //!                                            └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod allowed;
 mod api_v1;
@@ -26,6 +26,7 @@ mod metrics;
 mod oci;
 mod openapi;
 mod page;
+mod peer_groups;
 mod policy;
 mod principals;
 mod push;
@@ -40,7 +41,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Router;
+pub use axum::Router;
 use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
@@ -48,14 +49,14 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use socket2::SockRef;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::{TcpListener, TcpStream, UnixListener};
+use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio_util::task::TaskTracker;
 
 pub use app::{App, Machine, Options};
 pub use principals::Principals;
 pub use tokens::{TokenError, Tokens};
 
-use guard::Peer;
+use guard::{Peer, User};
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
@@ -113,21 +114,21 @@ fn tune(stream: &TcpStream) {
     let _ = SockRef::from(stream).set_tcp_notsent_lowat(UNSENT);
 }
 
-/// Accepts connections on the Unix socket until the daemon ends.
-pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener) {
+/// Accepts connections on a Unix socket until the daemon ends. Members of `group` are admins there.
+pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, group: Option<u32>) {
     let connections = TaskTracker::new();
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
             () = app.ending.cancelled() => break,
         };
-        match accepted.and_then(|(stream, _)| Ok((stream.peer_cred()?, stream))) {
-            Ok((peer, stream)) => {
+        match accepted.and_then(|(stream, _)| Ok((user(&stream, group)?, stream))) {
+            Ok((user, stream)) => {
                 connections.spawn(serve(
                     Arc::clone(&app),
                     router.clone(),
                     stream,
-                    Peer::Unix(peer.uid()),
+                    Peer::Unix(user),
                 ));
             }
             Err(error) => {
@@ -137,6 +138,19 @@ pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener) {
         }
     }
     drain(&app, connections).await;
+}
+
+/// Who is at the other end.
+fn user(stream: &UnixStream, group: Option<u32>) -> std::io::Result<User> {
+    let peer = stream.peer_cred()?;
+    let is_member = match group {
+        None => false,
+        Some(group) => peer.gid() == group || peer_groups::of(stream)?.contains(&group),
+    };
+    Ok(User {
+        uid: peer.uid(),
+        is_member,
+    })
 }
 
 async fn drain(app: &App, connections: TaskTracker) {

@@ -417,7 +417,7 @@ async fn session(
     let client = match (&asked.robot, caller.peer) {
         (Some(robot), _) => robot.clone(),
         (None, Peer::Tcp(address)) => address.to_string(),
-        (None, Peer::Unix(uid)) => format!("user {uid}"),
+        (None, user) => user.to_string(),
     };
     let now = app.principals.standing(&caller.who, &asked.service);
     let (standing, granted) = watch::channel(now);
