@@ -120,13 +120,8 @@ pub struct Refusal {
 impl Refusal {
     /// Of this principal.
     pub fn new(principal: &Principal, action: Action, object: impl fmt::Display) -> Refusal {
-        let roles: Vec<_> = principal.roles.iter().map(|role| role.name()).collect();
-        let who = match roles.as_slice() {
-            [] => "who shows no token".to_owned(),
-            roles => format!("{} ({})", principal.name, roles.join(", ")),
-        };
         Refusal {
-            who,
+            who: principal.to_string(),
             action,
             object: object.to_string(),
         }

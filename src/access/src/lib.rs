@@ -17,6 +17,7 @@ pub mod grant;
 pub mod guesses;
 pub mod policy;
 pub mod principal;
+pub mod sparing;
 
 pub use decide::{Action, Object, Refusal, decide};
 pub use glob::Glob;
@@ -24,6 +25,7 @@ pub use grant::{Grant, Operation};
 pub use guesses::Guesses;
 pub use policy::{Grants, Policy, Rule, Standing, Who};
 pub use principal::{Principal, Role, Scope};
+pub use sparing::Sparing;
 
 /// A text that is none of what it should be.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -152,6 +152,16 @@ impl Principal {
     }
 }
 
+impl fmt::Display for Principal {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let roles: Vec<_> = self.roles.iter().map(|role| role.name()).collect();
+        match roles.as_slice() {
+            [] => out.write_str("who shows no token"),
+            roles => write!(out, "{} ({})", self.name, roles.join(", ")),
+        }
+    }
+}
+
 /// Refuses what cannot be the name of a principal.
 pub fn check_name(name: &str) -> Result<(), Error> {
     let inner = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');

@@ -127,3 +127,34 @@ pub struct Whoami {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
 }
+
+/// What somebody did (`GET /api/v1/audit`).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct Audited {
+    /// Its number, never given twice.
+    pub id: i64,
+    /// When.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
+    pub time: Millis,
+    /// Who, with its roles.
+    pub who: String,
+    /// From where: an address and port, or a user of the daemon's machine.
+    pub from: String,
+    /// Which of the policy's actions it is.
+    pub action: String,
+    /// The request, without its query.
+    pub did: String,
+    /// To what.
+    pub object: String,
+    /// The answer's HTTP status: 403 where it was refused.
+    pub status: u16,
+    /// So many alike before it, since the last one that is here, were not recorded.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub more: u64,
+}
+
+fn is_zero(number: &u64) -> bool {
+    *number == 0
+}

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+mod audit;
 mod calibrate;
 mod client;
 mod doctor;
@@ -87,6 +88,7 @@ enum Verb {
     Explain(explain::Explain),
     Fit(fit::Fit),
     Token(token::Tokens),
+    Audit(audit::Audit),
     Policy(policy::Policy),
     Status(status::Status),
     Doctor(doctor::Doctor),
@@ -139,6 +141,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Fit(verb) => verb.run(&client, format).await,
         Verb::Token(verb) => verb.run(&client, format).await,
+        Verb::Audit(verb) => verb.run(&client, format).await,
         Verb::Policy(verb) => verb.run(&client, format).await,
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,

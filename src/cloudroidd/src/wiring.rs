@@ -8,7 +8,7 @@ use anyhow::Context;
 use async_trait::async_trait;
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
-use portal::{App, Machine, Principals, Tokens};
+use portal::{App, Audit, Machine, Principals, Tokens};
 use push::Pusher;
 use reach::{LocalOpener, Opener};
 use rootfs_builder::Builder;
@@ -79,6 +79,7 @@ pub fn build(
     let doubts = config.doubts(supervision::machine());
     Ok(Arc::new(App {
         principals,
+        audit: Audit::new(Arc::clone(&state)),
         listen,
         home: home.path().to_owned(),
         state,

@@ -1,4 +1,5 @@
-//! Whether who asks may: decided for each request by its row of the table of routes, before its handler.
+//! Whether who asks may: decided for each request by its row of the table of routes, before its handler; and what was done,
+//! recorded before it is answered.
 
 use std::sync::Arc;
 
@@ -6,11 +7,13 @@ use access::decide::may_use_class;
 use access::{Action, Object, Role, decide};
 use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{RawPathParams, Request, State};
+use axum::http::StatusCode;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use choreographer::Handle;
 
 use crate::app::App;
+use crate::audit::{About, is_recorded};
 use crate::errors::Error;
 use crate::guard::Caller;
 use crate::routes::{Access, Of, Route};
@@ -22,15 +25,16 @@ const DEFAULT: &str = "default";
 pub async fn allowed(
     State((app, route)): State<(Arc<App>, &'static Route)>,
     params: Result<RawPathParams, RawPathParamsRejection>,
-    request: Request,
+    mut request: Request,
     next: Next,
 ) -> Response {
     let Access::May(action, of) = route.access else {
         return next.run(request).await;
     };
-    let Some(caller) = request.extensions().get::<Caller>() else {
+    let Some(caller) = request.extensions().get::<Caller>().cloned() else {
         return Error::Internal("telling who asks").into_response();
     };
+    let caller = &caller;
     let named = |parameter: &str| {
         let params = params.as_ref().ok()?;
         let (_, value) = params.iter().find(|(name, _)| *name == parameter)?;
@@ -60,10 +64,30 @@ pub async fn allowed(
         }
         Of::Robot(parameter) => at_robot(caller, action, named(parameter).unwrap_or_default()),
     };
-    match decided {
+    let method = request.method().clone();
+    let did = format!("{method} {}", request.uri().path());
+    let object = match of {
+        Of::Machine | Of::Handler => "the server".to_owned(),
+        Of::Service(parameter) => format!("service {}", named(parameter).unwrap_or_default()),
+        Of::Stub(parameter) => format!("stub {}", named(parameter).unwrap_or_default()),
+        Of::Servant(parameter) => format!("servant {}", named(parameter).unwrap_or_default()),
+        Of::Robot(parameter) => format!("robot {}", named(parameter).unwrap_or_default()),
+    };
+    let about = About::default();
+    request.extensions_mut().insert(about.clone());
+    let response = match decided {
         Ok(()) => next.run(request).await,
         Err(error) => error.into_response(),
+    };
+    let status = response.status();
+    if status == StatusCode::FORBIDDEN {
+        app.audit
+            .record_sparingly(caller, action, &did, &about.or(&object), status.as_u16());
+    } else if is_recorded(action, &method) {
+        app.audit
+            .record(caller, action, &did, &about.or(&object), status.as_u16());
     }
+    response
 }
 
 impl Caller {

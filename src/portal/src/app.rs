@@ -11,6 +11,7 @@ use store::State;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use crate::audit::Audit;
 use crate::principals::Principals;
 
 /// What the operator decides of the portal.
@@ -47,6 +48,8 @@ pub struct App {
     pub options: Options,
     /// Who may do what.
     pub principals: Principals,
+    /// What was done.
+    pub audit: Audit,
     /// Where the portal listens, as bound.
     pub listen: std::net::SocketAddr,
     /// The state directory.

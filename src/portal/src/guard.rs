@@ -307,7 +307,27 @@ fn token_in(uri: &Uri, headers: &HeaderMap) -> Option<String> {
             .eq_ignore_ascii_case("bearer")
             .then(|| token.trim().to_owned())
     });
-    bearer.or_else(|| query(uri.query(), "token"))
+    let protocol = || {
+        let token = protocols(headers).find_map(|protocol| protocol.strip_prefix(BEARER))?;
+        Some(token.to_owned())
+    };
+    bearer
+        .or_else(protocol)
+        .or_else(|| query(uri.query(), "token"))
+}
+
+/// A WebSocket subprotocol that begins so is a token, of clients that can set no other header.
+pub const BEARER: &str = "bearer.";
+/// The one that is chosen where they offer it.
+pub const ROSBRIDGE: &str = "rosbridge";
+
+/// The WebSocket subprotocols that are offered.
+pub fn protocols(headers: &HeaderMap) -> impl Iterator<Item = &str> {
+    let offered = headers.get_all(header::SEC_WEBSOCKET_PROTOCOL).iter();
+    offered
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(','))
+        .map(str::trim)
 }
 
 /// One value of the query, decoded.
@@ -566,6 +586,9 @@ mod tests {
                 far()
                     .with("origin", "https://far.example")
                     .at("/api/v1/services?token=open+sesame"),
+                far()
+                    .with("sec-websocket-protocol", "rosbridge, bearer.open sesame")
+                    .at("/opencv_apps?token=wrong"),
             ] {
                 let known = known.expect("a known token");
                 assert_eq!(known.who.token, Some(tokens::hash("open sesame")));

@@ -14,6 +14,7 @@
 mod allowed;
 mod api_v1;
 mod app;
+mod audit;
 mod auth;
 mod body;
 mod calibration;
@@ -53,6 +54,7 @@ use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio_util::task::TaskTracker;
 
 pub use app::{App, Machine, Options};
+pub use audit::Audit;
 pub use principals::Principals;
 pub use tokens::{TokenError, Tokens};
 

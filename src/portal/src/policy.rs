@@ -7,11 +7,11 @@ use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::{Extension, Json};
 use serde::de::DeserializeOwned;
-use store::{Journal, NewEvent};
 
 use super::api_v1::{Answer, held};
 use super::guard::Caller;
 use crate::app::App;
+use crate::audit::About;
 use crate::errors::Error;
 
 /// The longest body.
@@ -26,13 +26,6 @@ async fn read<T: DeserializeOwned>(
     let body = held(app, caller, body, LARGEST).await?.bytes;
     serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
-}
-
-/// Tells the operator's journal what was changed, and by whom.
-fn record(app: &App, caller: &Caller, kind: &'static str, what: &str) {
-    let by = &caller.who.principal.name;
-    let message = format!("{what}, by {by} from {}", caller.peer);
-    Journal::new(Arc::clone(&app.state)).info(kind, &message, &NewEvent::default());
 }
 
 /// Who asks.
@@ -55,13 +48,13 @@ pub async fn tokens(State(app): State<Arc<App>>) -> Json<Vec<Token>> {
 pub async fn create(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<Secret> {
     let new: NewToken = read(&app, &caller, body, "token").await?;
+    about.is(format!("token {} ({})", new.name, new.role));
     let first = app.principals.names_nobody();
     let made = app.principals.create(&new)?;
-    let what = format!("token {} ({}) was made", new.name, new.role);
-    record(&app, &caller, "token-made", &what);
     if first {
         tracing::warn!("the first token was made: from now on every request over TCP needs one");
     }
@@ -72,31 +65,20 @@ pub async fn create(
 pub async fn rotate(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
 ) -> Answer<Secret> {
-    let rotated = app.principals.rotate(&name)?;
-    record(
-        &app,
-        &caller,
-        "token-rotated",
-        &format!("token {name} was given another secret"),
-    );
-    Ok(Json(rotated))
+    about.is(format!("token {name}"));
+    Ok(Json(app.principals.rotate(&name)?))
 }
 
 /// Ends a token, and the connections that show it; gives all there are.
 pub async fn revoke(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
 ) -> Answer<Vec<Token>> {
+    about.is(format!("token {name}"));
     app.principals.revoke(&name)?;
-    record(
-        &app,
-        &caller,
-        "token-revoked",
-        &format!("token {name} was revoked"),
-    );
     Ok(Json(app.principals.tokens()))
 }
 
@@ -109,18 +91,18 @@ pub async fn rules(State(app): State<Arc<App>>) -> Json<Vec<Rule>> {
 pub async fn add_rule(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<Vec<Rule>> {
     let new: NewRule = read(&app, &caller, body, "rule").await?;
-    app.principals.add_rule(&new)?;
     let allow: Vec<String> = new.allow.iter().map(ToString::to_string).collect();
-    let what = format!(
-        "{} was granted [{}] at {}",
+    about.is(format!(
+        "{} at {}: {}",
         new.who,
-        allow.join(", "),
-        new.services
-    );
-    record(&app, &caller, "policy-changed", &what);
+        new.services,
+        allow.join(" ")
+    ));
+    app.principals.add_rule(&new)?;
     Ok(Json(app.principals.rules()))
 }
 
@@ -128,8 +110,9 @@ pub async fn add_rule(
 pub async fn remove_rule(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
-    Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
 ) -> Answer<Vec<Rule>> {
+    about.is(format!("rule {id}"));
     let removed = match id.parse() {
         Ok(number) => app.principals.remove_rule(number)?,
         Err(_) => false,
@@ -141,11 +124,5 @@ pub async fn remove_rule(
             exists: rules.iter().map(|rule| rule.id.to_string()).collect(),
         });
     }
-    record(
-        &app,
-        &caller,
-        "policy-changed",
-        &format!("rule {id} of the policy was removed"),
-    );
     Ok(Json(rules))
 }

@@ -56,6 +56,16 @@ pub struct Identity {
     pub owner: Option<Owner>,
 }
 
+impl Identity {
+    /// To what its resume tokens are bound: to whoever has a token of the database, whichever its secret is now; else to the token.
+    pub fn bound_by(&self) -> Option<String> {
+        match &self.shown {
+            Shown::Stored { id, .. } => Some(format!("token {id}")),
+            _ => self.token.clone(),
+        }
+    }
+}
+
 /// Why a token lets nobody in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Unrecognised {
@@ -726,6 +736,7 @@ mod tests {
         );
         principals.note_use(&who, store::now());
         assert!(principals.tokens()[0].last_used.is_some());
+        let earlier = who.clone();
         let rotated = principals.rotate("rover").expect("there");
         assert_eq!(
             recognised(&principals, &made.secret),
@@ -742,6 +753,8 @@ mod tests {
             Operation::Publish,
             "/x"
         ));
+        // What it left behind is still its own.
+        assert_eq!(who.bound_by(), earlier.bound_by());
         principals.revoke("rover").expect("there");
         assert_eq!(
             recognised(&principals, &rotated.secret),
@@ -750,6 +763,14 @@ mod tests {
         let ended = principals.standing(&who, "detector");
         assert_eq!(ended, Standing::Ended("this token was revoked".into()));
         assert!(!principals.names_nobody(), "the door does not open again");
+        let next = principals.create(&robot("rover")).expect("made").secret;
+        let next = recognised(&principals, &next).expect("known");
+        assert_ne!(
+            next.bound_by(),
+            earlier.bound_by(),
+            "another's, of the same name"
+        );
+        principals.revoke("rover").expect("there");
         let unknown = principals.revoke("rover").expect_err("once").problem();
         assert_eq!(unknown.status, 404);
     }

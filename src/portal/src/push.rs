@@ -34,7 +34,7 @@ pub async fn push(
     let archive = body.into_data_stream().map_err(io::Error::other).boxed();
     let pusher = Arc::clone(&app.pusher);
     let (options, by) = match read_options(uri.query()).and_then(|options| {
-        let by = deployer(&app, caller);
+        let by = deployer(&app, caller.clone());
         pusher.check(&options, &by)?;
         Ok((options, by))
     }) {
@@ -48,6 +48,11 @@ pub async fn push(
     let last = sender.clone();
     // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
     let guard = pusher.begin(options, by, archive, sender, |outcome| async move {
+        if let Ok(published) = &outcome {
+            let object = format!("service {}", published.service);
+            app.audit
+                .record(&caller, Action::Deploy, "published", &object, 200);
+        }
         let event = match outcome
             .map_err(Error::from)
             .and_then(|done| told(&app, done))

@@ -189,10 +189,10 @@ impl Asked {
         }
     }
 
-    /// The resume token, bound to the caller's bearer token.
+    /// The resume token, bound to the caller.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
-        Some(tokens::bound_to(caller.who.token.as_ref(), token))
+        Some(tokens::bound_to(caller.who.bound_by().as_deref(), token))
     }
 }
 
@@ -211,7 +211,9 @@ async fn connect(
     }
     if caller.is_known() {
         asked.by(&caller)?;
-        check(&app, &asked, &caller)?;
+        let allowed = check(&app, &asked, &caller);
+        note(&app, &asked, &caller, &allowed);
+        allowed?;
     }
     // Who has yet to show a token is not told what there is, nor whether this is: the auth message comes first.
     if caller.is_known() && app.state.service_package(&asked.service)?.is_none() {
@@ -233,7 +235,10 @@ async fn connect(
             "this connection cannot become a WebSocket".to_owned(),
         ));
     };
-    let is_link = asked.link;
+    let protocol = match asked.link {
+        true => Some(link::SUBPROTOCOL),
+        false => rosbridge_protocol(request.headers())?,
+    };
     let sessions = app.sessions.clone();
     sessions.spawn(async move {
         match upgrade.await {
@@ -247,8 +252,8 @@ async fn connect(
     headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
     headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
     headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
-    if is_link {
-        let protocol = HeaderValue::from_static(link::SUBPROTOCOL);
+    if let Some(protocol) = protocol {
+        let protocol = HeaderValue::from_static(protocol);
         headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
     }
     Ok(response)
@@ -256,12 +261,7 @@ async fn connect(
 
 /// Whether a robot's stub asks, in a version of the link's protocol that is spoken here.
 fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
-    let offered: Vec<&str> = headers
-        .get_all(header::SEC_WEBSOCKET_PROTOCOL)
-        .iter()
-        .filter_map(|value| value.to_str().ok())
-        .flat_map(|value| value.split(','))
-        .map(str::trim)
+    let offered: Vec<&str> = guard::protocols(headers)
         .filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS))
         .collect();
     match offered.as_slice() {
@@ -271,6 +271,21 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
             "the stub speaks {}, this server {}; install the stub again from /stubs, or the server's newer version",
             offered.join(", "),
             link::SUBPROTOCOL
+        ))),
+    }
+}
+
+/// The subprotocol to choose: a browser gives up where it offered some and none is chosen, and the one that is a token must not
+/// be written into an answer.
+fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error> {
+    if guard::protocols(headers).any(|protocol| protocol == guard::ROSBRIDGE) {
+        return Ok(Some(guard::ROSBRIDGE));
+    }
+    match guard::protocols(headers).any(|protocol| protocol.starts_with(guard::BEARER)) {
+        false => Ok(None),
+        true => Err(Error::BadRequest(format!(
+            "a token alone is no subprotocol that can be chosen; offer {} before it",
+            guard::ROSBRIDGE
         ))),
     }
 }
@@ -319,6 +334,28 @@ fn check(app: &App, asked: &Asked, caller: &Caller) -> Result<(), Error> {
         });
     }
     allowed::known_to(app, caller, &asked.service)
+}
+
+/// Records that somebody connected, or was refused, aside: it does not wait for that.
+fn note(app: &Arc<App>, asked: &Asked, caller: &Caller, allowed: &Result<(), Error>) {
+    let status = match allowed {
+        Ok(()) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
+        Err(error) => error.problem().status,
+    };
+    let did = match asked.link {
+        true => "connected by a stub",
+        false => "connected by rosbridge",
+    };
+    let object = match &asked.robot {
+        Some(robot) => format!("service {} as robot {robot}", asked.service),
+        None => format!("service {}", asked.service),
+    };
+    let (app, caller) = (Arc::clone(app), caller.clone());
+    let sessions = app.sessions.clone();
+    sessions.spawn_blocking(move || {
+        app.audit
+            .record_sparingly(&caller, Action::Connect, did, &object, status);
+    });
 }
 
 /// Nobody takes over another's robot.
@@ -391,6 +428,9 @@ async fn session(
     let allowed = asked
         .by(&caller)
         .and_then(|()| check(&app, &asked, &caller));
+    if lease.is_none() {
+        note(&app, &asked, &caller, &allowed);
+    }
     if let Err(error) = allowed {
         return bridge::refuse(io, POLICY, &error.in_a_line()).await;
     }
@@ -563,6 +603,26 @@ mod tests {
             let refused = check_node(node).expect_err(node);
             assert!(refused.len() < LONGEST_NODE + 200, "{refused}");
         }
+    }
+
+    #[test]
+    fn a_token_among_the_subprotocols_is_never_chosen() {
+        let offers = |text: &'static str| {
+            let mut headers = HeaderMap::new();
+            headers.insert(
+                header::SEC_WEBSOCKET_PROTOCOL,
+                HeaderValue::from_static(text),
+            );
+            rosbridge_protocol(&headers).map_err(|error| error.problem().detail)
+        };
+        assert_eq!(offers("rosbridge, bearer.secret"), Ok(Some("rosbridge")));
+        assert_eq!(offers("bearer.secret,rosbridge"), Ok(Some("rosbridge")));
+        assert_eq!(offers("something.else"), Ok(None));
+        let refused = offers("bearer.secret").expect_err("a token alone");
+        assert!(
+            refused.contains("offer rosbridge") && !refused.contains("secret"),
+            "{refused}"
+        );
     }
 
     #[test]

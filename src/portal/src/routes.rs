@@ -12,7 +12,7 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots,
+    App, api_v1, audit, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots,
     shadow, stubs,
 };
 use crate::errors::Error;
@@ -375,6 +375,11 @@ pub const ROUTES: &[Route] = &[
             "Why a robot is slow, or on its local original, now.",
         )
         .answers::<api::explain::Explanation>()
+    }),
+    at("GET", "/api/v1/audit", ADMINISTER, || get(audit::audit)).described(|| {
+        operation("audit", "Who did what to what from where, oldest first.")
+            .asks::<audit::Which>()
+            .streams::<access::Audited>()
     }),
     at("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
         .described(|| operation("whoami", "Who asks, as the daemon knows it.").answers::<access::Whoami>()),

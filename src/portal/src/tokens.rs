@@ -143,10 +143,10 @@ impl Tokens {
     }
 }
 
-/// The key of a client's resume token: a hash of it and of the bearer token that it came with, so that a client with another
-/// bearer token, or none, cannot resume by it.
-pub fn bound_to(principal: Option<&TokenHash>, resume: &str) -> String {
-    let principal = principal.map_or("", String::as_str);
+/// The key of a client's resume token: a hash of it and of what it is bound to, so that nobody else, or nobody known, can
+/// resume by it.
+pub fn bound_to(principal: Option<&str>, resume: &str) -> String {
+    let principal = principal.unwrap_or_default();
     hash(&format!("{principal} {resume}"))
 }
 

@@ -6,6 +6,7 @@
 //! perhaps the last); publishing waits for it. What only tells of the past is kept in memory while the disk is full or
 //! another has locked the database ([`backlog`]); what promises something fails then.
 
+mod audit;
 mod backlog;
 mod dictionary;
 mod events;
@@ -28,6 +29,7 @@ use parking_lot::Mutex;
 use rusqlite::Connection;
 use serde::Serialize;
 
+pub use audit::NewAudited;
 use backlog::Backlog;
 pub use backlog::watch;
 pub use events::{EventFilter, NewEvent};
@@ -39,7 +41,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 7] = [
+const MIGRATIONS: [&str; 8] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -47,6 +49,7 @@ const MIGRATIONS: [&str; 7] = [
     include_str!("005-dictionary.sql"),
     include_str!("006-rollouts.sql"),
     include_str!("007-access.sql"),
+    include_str!("008-audit.sql"),
 ];
 
 /// What can go wrong.

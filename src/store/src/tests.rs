@@ -538,3 +538,56 @@ fn a_robots_name_can_be_bound_again() {
         .expect("read");
     assert_eq!(found, Some(owner("robot:r1")));
 }
+
+#[test]
+fn the_audit_log_is_only_added_to() {
+    let (home, state) = state();
+    let did = |object| NewAudited {
+        who: "alice (deployer)",
+        peer: "10.0.0.3:5000",
+        action: "deploy",
+        did: "POST /api/v1/push",
+        object,
+        status: 200,
+        more: 0,
+    };
+    for object in ["one", "two", "three"] {
+        state.add_audited(&did(object)).expect("recorded");
+    }
+    let objects = |since, limit| -> Vec<String> {
+        let records = state.audited(since, limit).expect("readable");
+        records.into_iter().map(|record| record.object).collect()
+    };
+    assert_eq!(objects(0, 2), ["two", "three"]);
+    assert_eq!(objects(2, 100), ["three"]);
+    // Not even by who has the database open.
+    let connection = Connection::open(home.path().join("cloudroid.db")).expect("opened");
+    for statement in [
+        "DELETE FROM audit",
+        "UPDATE audit SET who = 'bob'",
+        "DELETE FROM audit WHERE id = 1",
+    ] {
+        let refused = connection
+            .execute(statement, [])
+            .expect_err(statement)
+            .to_string();
+        assert!(refused.contains("only added to"), "{refused}");
+    }
+    assert_eq!(objects(0, 100).len(), 3);
+    // Beyond a million the oldest may go.
+    connection
+        .execute(
+            "UPDATE sqlite_sequence SET seq = 1000001 WHERE name = 'audit'",
+            [],
+        )
+        .expect("set");
+    assert_eq!(
+        connection
+            .execute("DELETE FROM audit WHERE id = 1", [])
+            .expect("old"),
+        1
+    );
+    connection
+        .execute("DELETE FROM audit WHERE id = 2", [])
+        .expect_err("not old enough");
+}

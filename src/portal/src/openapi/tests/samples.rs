@@ -1,6 +1,6 @@
 //! One value or more of every type that the document describes.
 
-use api::access::{NewRule, NewToken, Rule, Secret, Token, Whoami};
+use api::access::{Audited, NewRule, NewToken, Rule, Secret, Token, Whoami};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
@@ -581,6 +581,20 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 who: new_rule().who,
                 services: new_rule().services,
                 allow: new_rule().allow,
+            },
+        ),
+        sample(
+            "Audited",
+            Audited {
+                id: 7,
+                time: 1,
+                who: "alice (deployer)".into(),
+                from: "10.0.0.3:5000".into(),
+                action: "deploy".into(),
+                did: "POST /api/v1/push".into(),
+                object: "service adder".into(),
+                status: 200,
+                more: 3,
             },
         ),
         sample(
