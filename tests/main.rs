@@ -10,6 +10,8 @@ use support::Verdict;
 mod access;
 #[path = "stories/answer.rs"]
 mod answer;
+#[path = "stories/audit.rs"]
+mod audit;
 #[path = "stories/bounds.rs"]
 mod bounds;
 #[path = "stories/burglary.rs"]
@@ -224,6 +226,12 @@ fn main() -> ExitCode {
             a_deployer_changes_its_own_services_alone,
             what_robots_may_changes_while_they_are_connected,
             this_machines_users_see_and_are_robots_and_change_nothing,
+        ],
+        stories![audit:
+            who_did_what_is_recorded_and_told_as_it_comes,
+            no_secret_is_in_any_log,
+            members_of_a_group_are_admins_at_a_socket_of_theirs,
+            whoever_guesses_is_slowed_and_counted,
         ],
         stories![tokens:
             no_route_answers_without_a_token,

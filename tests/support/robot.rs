@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
-use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+use tokio_tungstenite::tungstenite::{self, ClientRequestBuilder, Message, WebSocket};
 
 /// How long a story waits for what must come. Long: these machines are slow and shared.
 pub const PATIENCE: Duration = Duration::from_secs(60);
@@ -44,6 +44,14 @@ impl Robot {
 
     /// Connects, or says with which HTTP status and body it was refused.
     pub fn try_connect(url: &str) -> Result<Robot, Refusal> {
+        Robot::try_connect_offering(url, &[]).map(|(robot, _)| robot)
+    }
+
+    /// The same with WebSocket subprotocols on offer; gives also the one that was chosen.
+    pub fn try_connect_offering(
+        url: &str,
+        protocols: &[&str],
+    ) -> Result<(Robot, Option<String>), Refusal> {
         let address = url
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
@@ -51,12 +59,25 @@ impl Robot {
         let stream =
             TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
         let _ = stream.set_nodelay(true);
-        match tungstenite::client(url, stream) {
-            Ok((socket, _)) => Ok(Robot {
-                socket,
-                backlog: VecDeque::new(),
-                calls: 0,
-            }),
+        let uri = url
+            .parse()
+            .map_err(|error| Refusal::other(&format!("{error}")))?;
+        let request = protocols
+            .iter()
+            .fold(ClientRequestBuilder::new(uri), |request, protocol| {
+                request.with_sub_protocol(*protocol)
+            });
+        match tungstenite::client(request, stream) {
+            Ok((socket, response)) => {
+                let chosen = response.headers().get("sec-websocket-protocol");
+                let chosen = chosen.and_then(|chosen| Some(chosen.to_str().ok()?.to_owned()));
+                let robot = Robot {
+                    socket,
+                    backlog: VecDeque::new(),
+                    calls: 0,
+                };
+                Ok((robot, chosen))
+            }
             Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => {
                 Err(Refusal {
                     status: response.status().as_u16(),
