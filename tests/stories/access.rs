@@ -8,8 +8,8 @@ use support::deployer::{Deployer, Outcome};
 use support::robot::Robot;
 use support::world::world;
 
-/// The portal's own table, so that an address that is added to it is walked, too.
-const TABLE: &str = include_str!("../../src/portal/src/routes.rs");
+/// It has a row for each address: a unit test of the portal says so.
+const MATRIX: &str = include_str!("../../docs/access.md");
 
 pub fn daemon(name: &str) -> anyhow::Result<Daemon> {
     world().own(name).start()
@@ -33,119 +33,232 @@ pub fn with_token(daemon: &Daemon, token: &str, arguments: &[&str]) -> anyhow::R
     deployer.types(&[&["--server", &server, "--token", token], arguments].concat())
 }
 
-/// Method, address and access of each row, the access as it is written there.
-fn routes() -> anyhow::Result<Vec<(String, String, String)>> {
-    let (_, rows) = TABLE.split_once("ROUTES: &[Route]").context("the table")?;
-    let mut routes = Vec::new();
-    for row in rows.split("at(").skip(1) {
-        let mut words = row.split('"');
-        let method = words.nth(1).context("a method")?.to_owned();
-        let path = words.nth(1).context("an address")?.to_owned();
-        let (_, rest) = row.split_once(&format!("\"{path}\",")).context("a row")?;
-        let (access, _) = rest.split_once("||").context("a handler")?;
-        let access: String = access.split_whitespace().collect();
-        routes.push((method, path, access.trim_end_matches(',').to_owned()));
-    }
-    Ok(routes)
+/// A row of the matrix in docs/access.md: who is answered at an address.
+struct Row {
+    method: String,
+    path: String,
+    /// By the names of the columns.
+    cells: Vec<(String, String)>,
 }
 
-/// Whether docs/access.md's table allows it: to whom a row of the table of routes answers at a service that `deployer` owns.
-fn allowed(role: &str, access: &str) -> anyhow::Result<bool> {
-    let of = |roles: &[&str]| Ok(roles.contains(&role));
-    let everybody = ["admin", "operator", "deployer", "robot", "viewer"];
-    match access {
-        "ENTER" | "service(See)" | "May(See,Of::Stub(\"file\"))" => of(&everybody),
-        "LOOK" => of(&["admin", "operator"]),
-        "ADMINISTER" => of(&["admin"]),
-        "service(Deploy)" | "service(Try)" | "May(Deploy,Of::Handler)" => {
-            of(&["admin", "operator", "deployer"])
-        }
-        // Of all servants: the deployer may for services of its own.
-        "May(Operate,Of::Handler)" => of(&["admin", "operator"]),
-        // There is no such servant, and no such robot, which only those hear who are told of all.
-        "servant(See)" | "servant(Operate)" | "servant(Logs)" | "May(See,Of::Robot(\"name\"))" => {
-            of(&["admin", "operator"])
-        }
-        other => anyhow::bail!("{other} has no row here; say whom it allows"),
+impl Row {
+    fn cell(&self, column: &str) -> anyhow::Result<&str> {
+        let cell = self.cells.iter().find(|(name, _)| name == column);
+        Ok(&cell.with_context(|| format!("no column {column}"))?.1)
     }
+
+    /// With what there is in the story in place of parameters.
+    fn address(&self, servant: &str) -> String {
+        let name = match self.path.contains("/robots/") {
+            true => "r1",
+            false => "adder_py",
+        };
+        let id = match self.path.contains("/servants/") {
+            true => servant,
+            false => "x",
+        };
+        self.path
+            .replace("{name}", name)
+            .replace("{id}", id)
+            .replace("{file}", "adder_py.tar.gz")
+            .replace("{service}", "adder_py")
+            .replace("{reference}", "x")
+            .replace("{digest}", "x")
+    }
+
+    /// The method to ask with: one that changes nothing where the row has all.
+    fn asks(&self) -> &str {
+        match (&*self.method, &*self.path) {
+            ("ANY", _) => "GET",
+            (_, "/stubs/{file}") => "HEAD",
+            (method, _) => method,
+        }
+    }
+
+    fn reads(&self) -> bool {
+        matches!(self.asks(), "GET" | "HEAD")
+    }
+
+    fn is_of_robots(&self) -> bool {
+        self.path.starts_with("/{service}")
+    }
+}
+
+/// The matrix as the document has it, which a unit test holds to the portal's table.
+fn matrix() -> anyhow::Result<Vec<Row>> {
+    let (_, matrix) = MATRIX
+        .split_once("| method | address |")
+        .context("the matrix")?;
+    let mut lines = matrix.lines().take_while(|line| !line.is_empty());
+    let cells = |line: &str| -> Vec<String> {
+        let cells = line.trim().trim_matches('|').split('|');
+        cells
+            .map(|cell| cell.trim().trim_matches('`').to_owned())
+            .collect()
+    };
+    let columns = cells(lines.next().context("its head")?);
+    let rows: Vec<Row> = lines
+        .skip(1)
+        .map(|line| {
+            let mut cells = cells(line).into_iter();
+            Row {
+                method: cells.next().unwrap_or_default(),
+                path: cells.next().unwrap_or_default(),
+                cells: columns.iter().cloned().zip(cells).collect(),
+            }
+        })
+        .collect();
+    ensure!(rows.len() > 45, "the matrix was read badly: {}", rows.len());
+    Ok(rows)
+}
+
+/// A token that has expired.
+fn expired(daemon: &Daemon) -> anyhow::Result<String> {
+    let short = token(daemon, &["short", "--role", "admin", "--expires", "1s"])?;
+    let bearer = format!("Bearer {short}");
+    support::until("the token's end", || {
+        let asked = daemon.request("GET", "/api/v1/whoami", &[("Authorization", &bearer)])?;
+        Ok(match asked.0 {
+            401 => Ok(()),
+            status => Err(format!("{status}")),
+        })
+    })?;
+    Ok(short)
 }
 
 pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
     let daemon = daemon("matrix")?;
-    let alice = token(
-        &daemon,
-        &["alice", "--role", "deployer", "--service", "adder*"],
-    )?;
-    let pushed = pushes_adder(&daemon, &alice, &[])?;
-    pushed.succeeded()?;
-    let scope = ["--service", "adder_py"];
-    let mut principals = vec![("deployer", alice)];
-    for role in ["admin", "operator"] {
-        principals.push((role, token(&daemon, &[role, "--role", role])?));
+    let rows = matrix()?;
+    let asks = |row: &Row, address: &str, token: Option<&str>| {
+        let bearer = token.map(|token| format!("Bearer {token}"));
+        let headers = bearer.as_deref().map(|bearer| ("Authorization", bearer));
+        daemon.request(row.asks(), address, headers.as_slice())
+    };
+    // While nobody was ever named.
+    let mut walked = 0;
+    for row in rows.iter().filter(|row| !row.is_of_robots()) {
+        let allowed = row.cell("local")? == "yes";
+        if allowed && !row.reads() {
+            continue;
+        }
+        let (status, body) = asks(row, &row.address("x"), None)?;
+        ensure!(
+            (status != 403) == allowed && status != 401,
+            "local {} {}: {status} {body}",
+            row.method,
+            row.path
+        );
+        walked += 1;
     }
-    let viewer = [&["eve", "--role", "viewer"], &scope[..]].concat();
-    principals.push(("viewer", token(&daemon, &viewer)?));
-    let rover = [&["rover", "--role", "robot", "--robot", "r1"], &scope[..]].concat();
-    principals.push(("robot", token(&daemon, &rover)?));
-    let over = token(&daemon, &["over", "--role", "admin"])?;
+    // Of each role one whose the service is, and one for which it is not.
+    let scoped = |name: &str, more: &[&str]| -> anyhow::Result<(String, String)> {
+        let made = |name: &str, service: &str, robot: &str| {
+            let given = [&[name, "--service", service], more].concat();
+            let given: Vec<&str> = given
+                .into_iter()
+                .map(|word| if word == "ROBOT" { robot } else { word })
+                .collect();
+            token(&daemon, &given)
+        };
+        Ok((
+            made(name, "adder*", "r1")?,
+            made(&format!("other-{name}"), "other*", "r2")?,
+        ))
+    };
+    let (alice, bob) = scoped("deployer", &["--role", "deployer"])?;
+    let (rover, other) = scoped("robot", &["--role", "robot", "--robot", "ROBOT"])?;
+    let (eve, oscar) = scoped("viewer", &["--role", "viewer"])?;
+    let mut principals = vec![
+        ("deployer", alice.clone(), bob),
+        ("robot", rover.clone(), other),
+        ("viewer", eve.clone(), oscar),
+    ];
+    for role in ["admin", "operator"] {
+        let one = token(&daemon, &[role, "--role", role])?;
+        principals.push((role, one.clone(), one));
+    }
+    pushes_adder(&daemon, &alice, &[])?.succeeded()?;
+    let at_work = daemon.robot(&format!("adder_py?token={rover}"))?;
+    let servant = support::until("the robot's servant", || {
+        let servant = daemon.servant_of("adder_py", "r1");
+        Ok(servant.map_err(|error| format!("{error:#}")))
+    })?;
+    let servant = servant["id"].as_str().context("an id")?.to_owned();
+    let revoked = token(&daemon, &["over", "--role", "admin"])?;
     daemon
         .deployer()
         .types(&["token", "revoke", "over"])?
         .succeeded()?;
-    let routes = routes()?;
-    ensure!(routes.len() > 40, "the table was read badly: {routes:?}");
-    let mut walked = 0;
-    for (method, path, access) in &routes {
-        if matches!(&**access, "Read" | "Connect" | "ReadOrConnect") {
+    let expired = expired(&daemon)?;
+    for row in &rows {
+        let address = row.address(&servant);
+        for (role, own, foreign) in &principals {
+            let cell = row.cell(role)?;
+            // Of what the query or the body names, each is asked about its own: there is none here.
+            let named_later = matches!(&*row.path, "/api/v1/push" | "/api/v1/servants");
+            for (whose, token, allowed) in [
+                ("own", own, cell != "-"),
+                ("another's", foreign, cell == "yes"),
+            ] {
+                if row.is_of_robots() {
+                    // Who is let in is told by the other stories.
+                    if !allowed {
+                        let path = format!("{}?token={token}", &address[1..]);
+                        let Err(refusal) = Robot::try_connect(&daemon.url(&path)) else {
+                            anyhow::bail!("{role} ({whose}) connected to {address}");
+                        };
+                        ensure!(
+                            refusal.status == 403,
+                            "{role} ({whose}) {address}: {refusal}"
+                        );
+                    }
+                    continue;
+                }
+                // What changes something is not done here: only that it is refused.
+                if (allowed || named_later && cell == "own") && !row.reads() {
+                    continue;
+                }
+                let (status, body) = asks(row, &address, Some(token))?;
+                ensure!(
+                    (status != 403) == allowed && status != 401,
+                    "{role} ({whose}) {} {address} ({cell}): {status} {body}",
+                    row.method
+                );
+                walked += 1;
+            }
+        }
+        if row.is_of_robots() {
             continue;
         }
-        let filled = path
-            .replace("{name}", "adder_py")
-            .replace("{file}", "adder_py.tar.gz")
-            .replace("{id}", "x")
-            .replace("{reference}", "x")
-            .replace("{digest}", "x");
-        // An archive is no text.
-        let method = match (&**method, &**path) {
-            ("ANY", _) => "GET",
-            (_, "/stubs/{file}") => "HEAD",
-            (method, _) => method,
-        };
-        for (role, token) in &principals {
-            let allowed = allowed(role, access)?;
-            // What changes something is not done here: only that it is refused.
-            if allowed && !matches!(method, "GET" | "HEAD") {
-                continue;
-            }
-            let bearer = format!("Bearer {token}");
-            let (status, body) = daemon.request(method, &filled, &[("Authorization", &bearer)])?;
-            ensure!(
-                (status != 403) == allowed && status != 401,
-                "{role} {method} {filled} ({access}): {status} {body}"
-            );
-            walked += 1;
-        }
-        for (token, words) in [(&*over, "was revoked"), ("guess", "not known")] {
-            let bearer = format!("Bearer {token}");
-            let (status, body) = daemon.request(method, &filled, &[("Authorization", &bearer)])?;
+        let (status, body) = asks(row, &address, None)?;
+        let open = row.cell("no token")? == "yes";
+        ensure!(
+            (status != 401) == open,
+            "{} {address}: {status} {body}",
+            row.method
+        );
+        for (token, words) in [
+            (&*revoked, "was revoked"),
+            (&*expired, "has expired"),
+            ("guess", "not known"),
+        ] {
+            let (status, body) = asks(row, &address, Some(token))?;
             // Whoever guesses is slowed after a while.
-            let guessed = token == "guess" && status == 429;
+            let slowed = token == "guess" && status == 429;
             ensure!(
-                guessed || status == 401 && (method == "HEAD" || body.contains(words)),
-                "{method} {filled}: {status} {body}"
+                slowed || status == 401 && (row.asks() == "HEAD" || body.contains(words)),
+                "{} {address}: {status} {body}",
+                row.method
             );
         }
     }
-    ensure!(walked > 100, "{walked} were walked");
+    ensure!(walked > 300, "{walked} were walked");
+    drop(at_work);
     // Nobody is told what is not of its scope, nor whether it is there.
-    let (_, eve) = principals
-        .iter()
-        .find(|(role, _)| *role == "viewer")
-        .context("eve")?;
-    let bearer = format!("Bearer {eve}");
     let mut told = Vec::new();
     for name in ["hidden", "nothing_such"] {
         let path = format!("/api/v1/services/{name}");
+        let bearer = format!("Bearer {eve}");
         let (status, body) = daemon.request("GET", &path, &[("Authorization", &bearer)])?;
         told.push((status, body.replace(name, "NAME")));
     }

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use access::decide::may_use_class;
-use access::{Action, Object, Role, decide};
+use access::{Action, Object, Principal, Role, decide};
 use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{RawPathParams, Request, State};
 use axum::http::StatusCode;
@@ -62,7 +62,11 @@ pub async fn allowed(
         Of::Servant(parameter) => {
             at_servant(&app, caller, action, named(parameter).unwrap_or_default())
         }
-        Of::Robot(parameter) => at_robot(caller, action, named(parameter).unwrap_or_default()),
+        Of::Robot(parameter) => at_robot(
+            &caller.who.principal,
+            action,
+            named(parameter).unwrap_or_default(),
+        ),
     };
     let method = request.method().clone();
     let did = format!("{method} {}", request.uri().path());
@@ -184,8 +188,8 @@ fn at_servant(app: &App, caller: &Caller, action: Action, id: &str) -> Result<()
     }
 }
 
-fn at_robot(caller: &Caller, action: Action, robot: &str) -> Result<(), Error> {
-    let principal = &caller.who.principal;
+/// Whether somebody may be told of a robot.
+pub fn at_robot(principal: &Principal, action: Action, robot: &str) -> Result<(), Error> {
     let own = principal.is(Role::Robot) && principal.scope.robot.as_deref() == Some(robot);
     match own || principal.sees_all() {
         true => Ok(()),

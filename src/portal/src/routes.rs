@@ -1,6 +1,9 @@
 //! Every address that the portal answers, in one table: its method, who is answered there, its handler, and what the
 //! OpenAPI document says of it. Router, guard and document are made of it.
 
+#[cfg(test)]
+mod matrix;
+
 use ::access::Action;
 use api::access;
 use axum::extract::{DefaultBodyLimit, OriginalUri};
