@@ -237,6 +237,7 @@ fn main() -> ExitCode {
             no_route_answers_without_a_token,
             whoever_lacks_a_token_is_told_how_to_give_one,
             a_proxy_s_clients_are_told_from_this_machine_s,
+            a_page_of_another_site_uses_nobodys_browser,
             services_are_told_to_those_who_have_shown_a_token,
             a_resume_token_is_no_way_into_another_s_servant,
         ],

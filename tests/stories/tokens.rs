@@ -140,6 +140,30 @@ pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Verdict {
     Ok(())
 }
 
+pub fn a_page_of_another_site_uses_nobodys_browser() -> Verdict {
+    let daemon = world().with(ADDER)?;
+    let evil = [
+        // A page that fetches, and one whose name was made to lead to this machine.
+        ("Origin", "http://evil.example"),
+        ("Origin", "null"),
+        ("Host", "evil.example"),
+    ];
+    for header in evil {
+        for path in ["/api/v1/services", "/adder_py"] {
+            for upgrade in [&[][..], &UPGRADE[..]] {
+                let headers = [upgrade, &[header]].concat();
+                let (status, body) = daemon.request("GET", path, &headers)?;
+                ensure!(
+                    status == 403 && !body.contains("revision"),
+                    "{header:?} {path}: {status} {body}"
+                );
+            }
+        }
+    }
+    ensure!(daemon.get("/api/v1/services")?.0 == 200);
+    Ok(())
+}
+
 pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
     let daemon = guarded("untold")?;
     daemon

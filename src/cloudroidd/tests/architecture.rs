@@ -98,3 +98,33 @@ fn the_map_says_what_the_manifests_say() {
         .collect();
     assert!(untold.is_empty(), "the map has no row for {untold:?}");
 }
+
+#[test]
+fn the_stories_that_security_rests_on_exist() {
+    let document = std::fs::read_to_string(root().join("docs/security.md")).expect("it is there");
+    let (table, _) = document.split_once("\n## ").expect("the table's end");
+    let registered = std::fs::read_to_string(root().join("tests/main.rs")).expect("it is there");
+    let mut named = 0;
+    for row in table.lines().filter(|line| line.starts_with("| ")).skip(1) {
+        let cells: Vec<&str> = row.trim_matches('|').split(" | ").collect();
+        assert_eq!(cells.len(), 4, "{row}");
+        let stories: Vec<&str> = cells[3]
+            .split('`')
+            .filter(|text| text.contains("::"))
+            .collect();
+        assert!(!stories.is_empty(), "no story shows: {row}");
+        for story in stories {
+            let (module, name) = story.split_once("::").expect("a module");
+            let of_module = registered.split_once(&format!("stories![{module}:"));
+            let (of_module, _) = of_module
+                .and_then(|(_, rest)| rest.split_once("],"))
+                .expect(story);
+            let is_there = of_module
+                .lines()
+                .any(|line| line.trim().trim_end_matches(',') == name);
+            assert!(is_there, "tests/main.rs has no {story}");
+            named += 1;
+        }
+    }
+    assert!(named > 15, "{named} were found");
+}
