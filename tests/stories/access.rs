@@ -295,7 +295,7 @@ pub fn a_deployer_changes_its_own_services_alone() -> Verdict {
 }
 
 pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
-    let daemon = daemon("granted")?;
+    let daemon = daemon("policies")?;
     let deployer = daemon.deployer();
     deployer
         .pushes("adder_py", &["--node", "adder.py"])?
