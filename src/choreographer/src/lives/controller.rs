@@ -237,7 +237,10 @@ impl Looked {
             throttled: self.throttled,
             waited: self.waited,
             goal: self.goal,
-            measured: inner.recent.of(&self.handle.id, now),
+            // What was asked before its cores were raised says nothing of what they do for it.
+            measured: inner
+                .recent
+                .since(&self.handle.id, self.history.raised(), now),
             history: self.history,
         }
     }

@@ -25,6 +25,7 @@ pub(crate) struct Recent {
 
 #[derive(Clone, Copy)]
 struct Took {
+    asked: Instant,
     known: Instant,
     total: f64,
     cloud: f64,
@@ -47,7 +48,9 @@ impl Recent {
         if took.len() >= MOST {
             took.pop_front();
         }
+        let age = Duration::try_from_secs_f64(total / 1e3).ok();
         took.push_back(Took {
+            asked: age.and_then(|age| now.checked_sub(age)).unwrap_or(now),
             known: now,
             total,
             cloud,
@@ -56,7 +59,22 @@ impl Recent {
 
     /// What 19 of 20 requests of this servant did not exceed lately; none where too few are known.
     pub(crate) fn of(&self, servant: &str, now: Instant) -> Option<Measured> {
-        let (total, cloud) = self.times(servant, now)?;
+        self.measured(servant, None, now)
+    }
+
+    /// The same of those that were asked since then; of all lately, where these are too few.
+    pub(crate) fn since(
+        &self,
+        servant: &str,
+        since: Option<Instant>,
+        now: Instant,
+    ) -> Option<Measured> {
+        let measured = self.measured(servant, since, now);
+        measured.or_else(|| self.of(servant, now))
+    }
+
+    fn measured(&self, servant: &str, since: Option<Instant>, now: Instant) -> Option<Measured> {
+        let (total, cloud) = self.times(servant, since, now)?;
         if total.len() < LEAST {
             return None;
         }
@@ -68,7 +86,7 @@ impl Recent {
 
     /// The same to be shown; none where nothing is known.
     pub(crate) fn shown(&self, servant: &str, now: Instant) -> Option<ResponseTimes> {
-        let (total, _) = self.times(servant, now)?;
+        let (total, _) = self.times(servant, None, now)?;
         Some(ResponseTimes {
             requests: total.len(),
             p50_ms: nearest_rank(&total, 50)?,
@@ -76,13 +94,19 @@ impl Recent {
         })
     }
 
-    /// What requests took lately, and of that in the cloud; each in ascending order.
-    fn times(&self, servant: &str, now: Instant) -> Option<(Vec<f64>, Vec<f64>)> {
+    /// What requests took lately that were asked `since` then, and of that in the cloud; each in ascending order.
+    fn times(
+        &self,
+        servant: &str,
+        since: Option<Instant>,
+        now: Instant,
+    ) -> Option<(Vec<f64>, Vec<f64>)> {
         let mut all = self.by_servant.lock();
         let took = all.get_mut(servant)?;
         took.retain(|one| now.saturating_duration_since(one.known) < LATELY);
+        let counts = |one: &&Took| since.is_none_or(|since| one.asked >= since);
         let sorted = |of: fn(&Took) -> f64| {
-            let mut times: Vec<f64> = took.iter().map(of).collect();
+            let mut times: Vec<f64> = took.iter().filter(counts).map(of).collect();
             times.sort_unstable_by(f64::total_cmp);
             times
         };
@@ -142,6 +166,27 @@ mod tests {
             (recent.of("b", now), recent.of("c", now).is_some()),
             (None, true)
         );
+    }
+
+    #[test]
+    fn what_was_asked_before_does_not_count_once_enough_was_asked_since() {
+        let began = Instant::now();
+        let recent = Recent::default();
+        for _ in 0..20 {
+            recent.note("a", 500.0, 1.0, began);
+        }
+        let raised = began + Duration::from_secs(2);
+        let later = raised + Duration::from_secs(2);
+        let since = |since| recent.since("a", since, later).map(|it| it.total);
+        // The first was asked before, although it is answered after it.
+        for total in [1500.0, 40.0, 30.0] {
+            recent.note("a", total, 1.0, raised + Duration::from_secs(1));
+        }
+        assert_eq!(since(Some(raised)), Some(500.0), "two are too few");
+        recent.note("a", 20.0, 1.0, later);
+        assert_eq!(since(Some(raised)), Some(40.0));
+        assert_eq!(since(None), Some(500.0));
+        assert_eq!(recent.since("b", None, later), None);
     }
 
     #[test]
