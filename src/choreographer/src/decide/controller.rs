@@ -11,8 +11,13 @@
 //! decrease (AIMD; Chiu and Jain, 1989) for the steps; two thresholds and a time to hold against flapping (a Schmitt
 //! trigger with a dwell time).
 //!
+//! Where the cores do not suffice for all that are near, some of them leave what nobody was promised to the others
+//! ([`yielding`]).
+//!
 //! What a robot waits for on the network is not helped by cores. So a servant is near only where its own share of the time
 //! (waiting and computing in the cloud) is not small.
+
+mod yielding;
 
 use std::time::{Duration, Instant};
 
@@ -85,6 +90,17 @@ pub struct History {
     raised: Option<Instant>,
     /// … and lowered.
     lowered: Option<Instant>,
+    /// Since when it leaves what nobody was promised to others that are near; none while it does not.
+    yielded: Option<Instant>,
+    /// So often it tried again in vain.
+    vain: u32,
+}
+
+impl History {
+    /// Since when requests tell what its cores do for it.
+    pub fn raised(self) -> Option<Instant> {
+        self.raised
+    }
 }
 
 /// A servant that works. Cores are in thousandths.
@@ -140,7 +156,7 @@ enum Role {
     Near,
     /// Its robot said what it accepts, and gets it.
     Content,
-    /// Nobody said anything: gets what is left.
+    /// Nobody said anything, or it yields to others that are near: gets what is left.
     Rest,
 }
 
@@ -197,11 +213,13 @@ impl Facts<'_> {
 
 /// Shares of all servants on a machine with so many `cores` (thousandths), in their order.
 pub fn control(cores: u64, servants: &[Facts<'_>], now: Instant) -> Vec<Outcome> {
-    let histories: Vec<History> = servants.iter().map(|one| remembered(one, now)).collect();
+    let mut histories: Vec<History> = servants.iter().map(|one| remembered(one, now)).collect();
+    yielding::decide(cores, servants, &mut histories, now);
     let roles: Vec<Role> = servants
         .iter()
         .zip(&histories)
         .map(|(one, history)| match (history.near, one.goal) {
+            (Some(_), _) if history.yielded.is_some() => Role::Rest,
             (Some(_), _) => Role::Near,
             (None, Some(_)) => Role::Content,
             (None, None) => Role::Rest,

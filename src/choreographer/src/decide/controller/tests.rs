@@ -204,6 +204,145 @@ fn those_that_are_near_are_not_throttled_for_each_other() {
     }
 }
 
+/// One of several that were given as much as there is, and use so many cores; its robot accepts 300 ms.
+fn sharing(id: &str, promised: u64, used: u64, total: f64) -> Facts<'_> {
+    let facts = takes(total, servant(id, promised, used));
+    let cloud = total;
+    Facts {
+        quota: CORES,
+        measured: Some(Measured { total, cloud }),
+        history: History {
+            near: Some(Instant::now()),
+            ..History::default()
+        },
+        ..facts
+    }
+}
+
+#[test]
+fn where_the_cores_do_not_suffice_as_many_as_possible_are_in_time() {
+    let now = Instant::now() + HOLD * 2;
+    let throttled = |facts| Facts {
+        throttled: 0.5,
+        ..facts
+    };
+    let raised = |facts: Facts<'static>| {
+        let history = History {
+            raised: Some(now - HOLD / 2),
+            ..facts.history
+        };
+        Facts { history, ..facts }
+    };
+    let unknown = |facts| Facts {
+        used: None,
+        ..facts
+    };
+    let idle = takes(50.0, servant("d", 500, 100));
+    let [a, b, c] =
+        [("a", 1200), ("b", 900), ("c", 1500)].map(|(id, used)| sharing(id, 500, used, 360.0));
+    let in_time = |facts: Facts<'static>| sharing(facts.id, 500, facts.used.unwrap_or(0), 290.0);
+    for (what, all, yields) in [
+        // 1440, 1080 and 1800 would be needed, of which two fit: those that need least.
+        ("all are late", vec![a, b, c, idle], vec!["c"]),
+        // 1440, 870 and 1450: the cores suffice.
+        ("one is late", vec![a, in_time(b), in_time(c), idle], vec![]),
+        (
+            "all are in time",
+            vec![in_time(a), in_time(b), in_time(c), idle],
+            vec![],
+        ),
+        (
+            "one is alone",
+            vec![sharing("a", 500, 3600, 360.0), idle],
+            vec![],
+        ),
+        // It is not for want of cores that they are late.
+        (
+            "cores are idle",
+            ["a", "b", "c"]
+                .map(|id| sharing(id, 500, 900, 900.0))
+                .to_vec(),
+            vec![],
+        ),
+        (
+            "cpu.max keeps them",
+            [a, b, c].map(throttled).to_vec(),
+            vec![],
+        ),
+        (
+            "they were raised just now",
+            [a, b, c].map(raised).to_vec(),
+            vec![],
+        ),
+        ("one is not known", vec![a, b, c, unknown(idle)], vec!["c"]),
+        // Who needs less is helped all the same.
+        (
+            "none fits",
+            vec![
+                sharing("a", 500, 3000, 900.0),
+                sharing("b", 500, 900, 2000.0),
+            ],
+            vec!["a"],
+        ),
+    ] {
+        let outcomes = control(CORES, &all, now);
+        let named = all.iter().zip(&outcomes);
+        let yielding = named.filter(|(_, outcome)| outcome.history.yielded.is_some());
+        let ids: Vec<&str> = yielding.map(|(one, _)| one.id).collect();
+        assert_eq!(ids, yields, "{what}");
+    }
+}
+
+#[test]
+fn one_that_yields_has_what_it_was_promised_and_tries_again() {
+    let began = Instant::now();
+    // 1680 for each: two fit.
+    let late = ["a", "b", "c"].map(|id| sharing(id, 500, 1200, 420.0));
+    let told = control(CORES, &late, began + HOLD * 2);
+    assert_eq!(
+        told[2].reason,
+        "servant a needs cores that this one is not promised"
+    );
+    let mut all = looks(late.to_vec(), began, 6..12);
+    let quotas: Vec<u64> = all.iter().map(|one| one.quota).collect();
+    assert_eq!(quotas, [CORES, CORES, 500]);
+    // With that the others are in time. It tries again after long, in vain, and then not for twice as long.
+    for one in &mut all[..2] {
+        let measured = one.measured.map(|_| Measured {
+            total: 299.0,
+            cloud: 299.0,
+        });
+        one.measured = measured;
+    }
+    let helped = all.clone();
+    let (mut began_at, mut yielded) = (Vec::new(), true);
+    let wait = yielding::RETRY.as_secs() as u32;
+    for second in 12..6 * wait {
+        let outcomes = control(CORES, &all, began + LOOK * second);
+        carry_out(&mut all, &outcomes);
+        let yields = all[2].history.yielded.is_some();
+        if yielded && !yields {
+            began_at.push(second);
+        }
+        yielded = yields;
+        assert!(
+            all[..2].iter().all(|one| one.quota == CORES),
+            "the others stay"
+        );
+    }
+    let [first, second] = began_at[..] else {
+        panic!("it tried at {began_at:?}")
+    };
+    assert!(first >= wait && second - first >= 2 * wait, "{began_at:?}");
+    // Once the others are gone, it has their cores, although it would need more than there are.
+    let alone = Facts {
+        throttled: 0.5,
+        ..takes(4200.0, helped[2])
+    };
+    let alone = looks(vec![alone], began, 20..40);
+    assert!(alone[0].quota > 2000, "{alone:?}");
+}
+
 #[test]
 fn of_one_whose_use_is_not_known_nothing_is_taken() {
     let near = takes(
