@@ -1,7 +1,8 @@
 //! How many robots of a machine are answered in time, with limits as they were promised and with the controller. All are promised the
-//! same part of the machine. Half of them ask again as soon as they are answered, and accept less than that part gives; the
-//! others ask seldom, and accept more.
+//! same part of the machine. Every other one, beginning with the first, asks again as soon as it is answered, and accepts less than
+//! that part gives; the others ask seldom, and accept more.
 
+use std::sync::Barrier;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
@@ -10,7 +11,7 @@ use support::daemon::Daemon;
 
 use crate::worker::{self, WORK, calls, cores, robot};
 
-const ROBOTS: [usize; 4] = [2, 4, 6, 8];
+const ROBOTS: [usize; 7] = [2, 3, 4, 5, 6, 7, 8];
 const LASTS: Duration = Duration::from_secs(15);
 /// Until the controller has come to rest.
 const SETTLES: Duration = Duration::from_secs(15);
@@ -50,7 +51,8 @@ fn counts(controller: &str) -> Result<Vec<usize>> {
     let daemon = worker::daemon(place.path(), &config)?;
     let mut counts = Vec::new();
     for robots in ROBOTS {
-        let part = format!("{:.2}", cores() / robots as f64);
+        // Rounded down: together no more is promised than there is.
+        let part = format!("{:.3}", (cores() / robots as f64 * 1000.0).floor() / 1000.0);
         worker::push(&daemon, &format!("worker{robots}"), &["--cpus", &part])?;
         counts.push(count(&daemon, robots)?);
         eprintln!(
@@ -68,6 +70,8 @@ fn count(daemon: &Daemon, robots: usize) -> Result<usize> {
     // With twice its part an eager one is in time, if that is not more than its one thread can use.
     let eager = (WORK / (2.0 * part) * 1.4).max(WORK * 1.6);
     let patient = WORK / part * 4.0 + 200.0;
+    // All begin together: one that is measured while another's servant still starts has its cores, or lacks them.
+    let ready = Barrier::new(robots);
     let outcomes: Vec<Result<bool>> = std::thread::scope(|scope| {
         let all: Vec<_> = (0..robots)
             .map(|number| {
@@ -75,13 +79,25 @@ fn count(daemon: &Daemon, robots: usize) -> Result<usize> {
                     0 => (eager, Duration::ZERO),
                     _ => (patient, Duration::from_secs(1)),
                 };
+                let ready = &ready;
                 scope.spawn(move || {
                     let path = format!("worker{robots}?robot=r{number}&max_rrt={accepts:.0}ms");
-                    let mut robot = robot(daemon, &path)?;
+                    let robot = robot(daemon, &path);
+                    ready.wait();
+                    let mut robot = robot?;
                     calls(&mut robot, SETTLES, pause)?;
                     let times = calls(&mut robot, LASTS, pause)?;
                     let within = times.iter().filter(|time| **time <= accepts).count();
-                    Ok(within as f64 >= times.len() as f64 * IN_TIME)
+                    let part = within as f64 / times.len() as f64;
+                    let at = |part| bench_report::quantile(&times, part).unwrap_or(f64::NAN);
+                    eprintln!(
+                        "  r{number} accepts {accepts:.0} ms: {:.0} % of {} in time, p50 {:.0} ms, p95 {:.0} ms",
+                        part * 100.0,
+                        times.len(),
+                        at(0.5),
+                        at(0.95),
+                    );
+                    Ok(part >= IN_TIME)
                 })
             })
             .collect();
