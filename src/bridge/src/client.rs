@@ -9,6 +9,7 @@ mod subscribing;
 mod under_way;
 mod withdrawn;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
 
@@ -28,6 +29,16 @@ use crate::shared::Shared;
 use crate::{Granted, SessionOptions};
 pub(crate) use inbox::Inbox;
 use under_way::UnderWay;
+
+/// Removes the entries of the names that are chosen.
+fn take_chosen<T>(
+    from: &mut HashMap<String, T>,
+    chosen: impl Fn(&str) -> bool,
+) -> Vec<(String, T)> {
+    let names: Vec<String> = from.keys().filter(|name| chosen(name)).cloned().collect();
+    let taken = names.iter().filter_map(|name| from.remove_entry(name));
+    taken.collect()
+}
 
 /// Characters of a strange field's name that its sender is told.
 const SHOWN: usize = 48;

@@ -53,7 +53,7 @@ pub struct Audit {
 /// Whether a request is recorded however it ends: others only when they were refused.
 pub fn is_recorded(action: Action, method: &Method) -> bool {
     let reads = [Action::Enter, Action::Look, Action::See];
-    !reads.contains(&action) && !(method == Method::GET || method == Method::HEAD)
+    !reads.contains(&action) && method != Method::GET && method != Method::HEAD
 }
 
 impl Audit {

@@ -650,7 +650,8 @@ fn check(new: &api::access::NewToken) -> Result<(), String> {
             "a {role} is for services that are named; name them with --service, or all with --service '*'"
         ));
     }
-    if !scoped && !(new.services.is_empty() && new.classes.is_empty()) {
+    let names_some = !new.services.is_empty() || !new.classes.is_empty();
+    if !scoped && names_some {
         return Err(format!(
             "an {role} is for all services and classes; leave out --service and --class, or choose another role"
         ));

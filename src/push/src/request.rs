@@ -35,12 +35,15 @@ impl Reporter {
     }
 }
 
+/// Whether a service of this name may be published; else why not.
+type MayPublish = dyn Fn(&str) -> Result<(), String> + Send + Sync;
+
 /// Whoever pushes.
 pub struct Deployer {
     /// Whose a service is that is published for the first time; none: its operators'.
     pub owner: Option<String>,
-    /// Whether it may publish a service of that name; else why not.
-    pub may: Box<dyn Fn(&str) -> Result<(), String> + Send + Sync>,
+    /// What it may publish.
+    pub may: Box<MayPublish>,
 }
 
 impl Deployer {

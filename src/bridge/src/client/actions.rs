@@ -12,7 +12,7 @@ use ros::schema::ActionDef;
 use rosbridge::Id;
 use tokio_util::sync::CancellationToken;
 
-use super::Client;
+use super::{Client, take_chosen};
 use crate::lacking::explain;
 use crate::names::plain_type;
 use goals::ActionClient;
@@ -45,7 +45,7 @@ impl Actions {
         &mut self,
         chosen: impl Fn(&str) -> bool,
     ) -> Vec<(String, Arc<ActionServer>)> {
-        self.served.extract_if(|name, _| chosen(name)).collect()
+        take_chosen(&mut self.served, chosen)
     }
 
     /// Goals under way at actions of these names, with those.

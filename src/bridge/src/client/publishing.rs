@@ -9,7 +9,7 @@ use ros::codec::{self, FillOptions, Time};
 use ros::schema::MessageType;
 use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Unadvertise};
 
-use super::{Client, Reply};
+use super::{Client, Reply, take_chosen};
 use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::tf;
@@ -51,7 +51,7 @@ impl TopicPublishers {
     pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Advertised)> {
         self.untyped.retain(|topic, _| !chosen(topic));
         self.told.retain(|topic| !chosen(topic));
-        self.open.extract_if(|topic, _| chosen(topic)).collect()
+        take_chosen(&mut self.open, chosen)
     }
 
     /// Names of the topics advertised.

@@ -13,7 +13,7 @@ use tokio::sync::{oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::publishing::decode_args;
-use super::{Client, Reply, print_format};
+use super::{Client, Reply, print_format, take_chosen};
 use crate::lacking::explain;
 use crate::names::{plain_type, resolve};
 use crate::sample::Frame;
@@ -33,7 +33,7 @@ impl Services {
     /// Removes those of these names; their unanswered calls fail.
     pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Served)> {
         self.requests.retain(|_, request| !chosen(&request.service));
-        self.served.extract_if(|name, _| chosen(name)).collect()
+        take_chosen(&mut self.served, chosen)
     }
 
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
