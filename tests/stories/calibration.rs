@@ -348,7 +348,7 @@ pub fn a_calibration_gives_way_to_a_robot() -> Verdict {
         .env("CLOUDROID_HOME", &daemon.home)
         .env_remove("CLOUDROID_SERVER")
         .args(["calibrate", "opencv_apps", "--cpus", "1"])
-        .args(["--requests", "100000", "--frames"])
+        .args(["--requests", "10000", "--frames"])
         .arg(place.path())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
