@@ -27,6 +27,8 @@ use crate::{Choreographer, Error, Measured};
 const GRACE: Duration = Duration::from_secs(5);
 /// So long nothing has come, and as much of both sides: then nothing is on its way any more.
 const QUIET: Duration = Duration::from_secs(2);
+/// What is waited for publishers, at least and at most.
+const SETTLES: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(2));
 /// Bytes of JSON that a message may become; a longer one is compared as a whole.
 const LONGEST: usize = 4 << 20;
 /// Differences of interfaces that are named.
@@ -134,8 +136,18 @@ impl<'a> Mirror<'a> {
             exchanges: Exchanges::new(from, to),
             notes,
         };
-        mirror.follow().await;
+        mirror.settle_in().await;
         Ok(mirror)
+    }
+
+    /// Follows what there is, and begins once publishers are likely to know of it: a publisher of ROS 1 counts a subscriber some time
+    /// after it has answered it, and tells nobody. That takes it about as long as it took to answer.
+    async fn settle_in(&mut self) {
+        let began = Instant::now();
+        self.follow().await;
+        tokio::time::sleep((began.elapsed() * 2).clamp(SETTLES.0, SETTLES.1)).await;
+        // What these made nodes publish may not have been heard.
+        while self.tapping.told.try_recv().is_ok() {}
     }
 
     async fn follow(&mut self) {
