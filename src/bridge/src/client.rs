@@ -51,7 +51,7 @@ pub(crate) struct Client {
     /// Counts what waits for it.
     pub(crate) budget: Budget,
     /// What it may do.
-    pub(crate) granted: Granted,
+    granted: Mutex<Granted>,
     hears_clients: bool,
     resumable: bool,
     level: AtomicU8,
@@ -74,6 +74,16 @@ pub(crate) struct Reply {
 }
 
 impl Client {
+    /// What it may do.
+    pub(crate) fn granted(&self) -> Granted {
+        self.granted.lock().clone()
+    }
+
+    /// It has come back: what it may do is told by its new connection from now on.
+    pub(crate) fn grant(&self, granted: Granted) {
+        *self.granted.lock() = granted;
+    }
+
     pub(crate) fn new(shared: Arc<Shared>, options: &SessionOptions) -> Arc<Self> {
         let budget = options.budget.clone();
         let outbox = Outbox::new(&shared.options, shared.metrics.clone(), &budget);
@@ -83,7 +93,7 @@ impl Client {
             name: options.client.clone(),
             outbox,
             budget,
-            granted: options.granted.clone(),
+            granted: Mutex::new(options.granted.clone()),
             hears_clients: options.hears_clients,
             resumable: options.resume.is_some(),
             level: AtomicU8::new(options.level as u8),

@@ -298,7 +298,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 
     /// Serves the socket until it is to be left; takes back what is not granted any more whenever that changes.
     async fn serve(&mut self) -> Stop {
-        let mut granted = self.client.granted.clone();
+        let mut granted = self.client.granted();
         loop {
             if let Some(reason) = granted.ended() {
                 return Stop::Close {

@@ -121,6 +121,7 @@ impl Shared {
             && let Some(client) = clients.resumable.get(token)
         {
             self.metrics.resumed.add(1);
+            client.grant(options.granted.clone());
             return Ok(client.clone());
         }
         let client = Client::new(self.clone(), options);

@@ -84,7 +84,9 @@ pub async fn allowed(
         Err(error) => error.into_response(),
     };
     let status = response.status();
-    if status == StatusCode::FORBIDDEN {
+    // What fails can be tried without end: it does not push what was done out of the log.
+    let failed = status.is_client_error() && is_recorded(action, &method);
+    if status == StatusCode::FORBIDDEN || failed {
         app.audit
             .record_sparingly(caller, action, &did, &about.or(&object), status.as_u16());
     } else if is_recorded(action, &method) {
@@ -111,7 +113,7 @@ impl Caller {
     }
 
     /// Whether it is no robot, or this one.
-    fn is_robot_of(&self, robot: &str) -> bool {
+    pub fn is_robot_of(&self, robot: &str) -> bool {
         let principal = &self.who.principal;
         let own = principal.scope.robot.as_deref();
         !principal.is(Role::Robot) || own.is_none_or(|own| own == robot)

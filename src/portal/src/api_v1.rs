@@ -18,6 +18,7 @@ use store::EventFilter;
 use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
+use super::allowed::at_robot;
 use super::body::{self, Held};
 use super::guard::Caller;
 use crate::app::App;
@@ -285,8 +286,16 @@ pub async fn fit(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Query(statement): Query<Statement>,
+    Extension(caller): Extension<Caller>,
 ) -> Answer<api::Fit> {
-    Ok(Json(app.choreographer.fit(&name, statement.read()?).await?))
+    let mut fit = app.choreographer.fit(&name, statement.read()?).await?;
+    let sees = |id: &str| {
+        let servant = app.choreographer.servant(id);
+        servant.is_ok_and(|servant| caller.sees_servant(&app, &servant))
+    };
+    fit.costs.retain(|cost| sees(&cost.servant));
+    fit.ends.retain(|id| sees(id));
+    Ok(Json(fit))
 }
 
 /// What a service makes of a recording or a picture, and how fast.
@@ -334,7 +343,7 @@ pub async fn back_offs(
     Extension(caller): Extension<Caller>,
 ) -> Json<Vec<api::BackOff>> {
     let mut back_offs = app.choreographer.back_offs();
-    back_offs.retain(|of| caller.sees(&app, &of.service));
+    back_offs.retain(|of| caller.is_robot_of(&of.robot) && caller.sees(&app, &of.service));
     Json(back_offs)
 }
 
@@ -364,10 +373,16 @@ pub async fn set_limits(
 pub async fn explain(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
+    Extension(caller): Extension<Caller>,
 ) -> Answer<api::explain::Explanation> {
-    Ok(Json(
-        crate::explain::robot(&app.choreographer, &app.state, &name).await?,
-    ))
+    let explained = crate::explain::robot(&app.choreographer, &app.state, &name).await;
+    Ok(Json(explained.map_err(|mut error| {
+        if let Error::UnknownRobot { exists, .. } = &mut error {
+            let who = &caller.who.principal;
+            exists.retain(|robot| at_robot(who, Action::See, robot).is_ok());
+        }
+        error
+    })?))
 }
 
 /// Ends one servant.

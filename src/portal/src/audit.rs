@@ -1,6 +1,7 @@
 //! The audit log: who did what to what from where. Secrets are in none of it: of a request only method and path, which has
 //! names alone, never its query, headers or body.
 
+use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
 use access::{Action, Sparing};
@@ -46,7 +47,8 @@ impl About {
 /// Records what callers do.
 pub struct Audit {
     state: Arc<State>,
-    alike: Mutex<Sparing>,
+    /// Of each principal, so that nobody takes another's room.
+    alike: Mutex<HashMap<String, Sparing>>,
     last: watch::Sender<i64>,
 }
 
@@ -54,6 +56,10 @@ pub struct Audit {
 pub fn is_recorded(action: Action, method: &Method) -> bool {
     let reads = [Action::Enter, Action::Look, Action::See];
     !reads.contains(&action) && method != Method::GET && method != Method::HEAD
+}
+
+fn cut(text: &str) -> String {
+    text.chars().take(LONGEST).collect()
 }
 
 impl Audit {
@@ -89,8 +95,13 @@ impl Audit {
         status: u16,
     ) {
         let (who, address) = (&caller.who.principal.name, caller.peer.ip());
-        let alike = format!("{who} {address} {did} {object} {status}");
-        let more = self.alike.lock().ask(&alike, store::now());
+        let (did, object) = (&cut(did), &cut(object));
+        let alike = format!("{address} {did} {object} {status}");
+        let more = {
+            let mut all = self.alike.lock();
+            let of_it = all.entry(who.clone()).or_default();
+            of_it.ask(&alike, store::now())
+        };
         if let Some(more) = more {
             let what = What {
                 action,
@@ -110,7 +121,6 @@ impl Audit {
         what: &What<'_>,
         add: fn(&State, &NewAudited<'_>) -> Result<i64, store::Error>,
     ) {
-        let cut = |text: &str| text.chars().take(LONGEST).collect::<String>();
         let recorded = add(
             &self.state,
             &NewAudited {

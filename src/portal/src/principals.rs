@@ -22,6 +22,9 @@ use crate::tokens::{self, AuthMessage, Tokens};
 const SECRET: usize = 52;
 /// A token's last use is written no more often.
 const USED: Millis = 60_000;
+/// How often it is looked whether a token has expired: no more, and no less, often.
+const SOONEST: Duration = Duration::from_millis(10);
+const LATEST: Duration = Duration::from_secs(60);
 /// Names of principals that are known without a token.
 const RESERVED: [&str; 3] = ["local", "root", "configured"];
 
@@ -445,17 +448,19 @@ impl Principals {
             let now = self.standing(who, service);
             standing.send_if_modified(|known| {
                 let new = *known != now;
-                *known = now;
+                known.clone_from(&now);
                 new
             });
             let expires = async {
-                match self
+                let ends = self
                     .expiry(who)
-                    .and_then(|end| end.checked_sub(store::now()))
-                {
-                    Some(left) if left > 0 => tokio::time::sleep(Duration::from_millis(left)).await,
-                    _ => std::future::pending().await,
-                }
+                    .filter(|_| matches!(now, Standing::Granted(_)));
+                let Some(end) = ends else {
+                    return std::future::pending().await;
+                };
+                // The clock may be set meanwhile, or the machine have slept: it is looked at again.
+                let left = Duration::from_millis(end.saturating_sub(store::now()));
+                tokio::time::sleep(left.clamp(SOONEST, LATEST)).await;
             };
             tokio::select! {
                 _ = changed.changed() => {}

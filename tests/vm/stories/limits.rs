@@ -148,7 +148,7 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     // The best of some, each time: whatever else the machine below this one does only adds.
     let mut work = || -> anyhow::Result<f64> {
         let mut best = f64::INFINITY;
-        for _ in 0..4 {
+        for _ in 0..6 {
             let took = tries(&mut promised, "work", "20000000")?.report;
             best = best.min(took.parse::<f64>()? / 1e6);
         }
@@ -173,6 +173,8 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     for neighbour in &mut neighbours {
         tries(neighbour, "rest", "")?;
     }
+    // The machine below may have been busier while it was alone.
+    let alone = alone.min(with);
     ensure!(
         without > alone * 1.5,
         "the neighbours are not greedy: {without} against {alone}"

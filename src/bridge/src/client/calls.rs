@@ -116,7 +116,7 @@ impl Client {
         let told = server.is_none()
             && rosapi::Service::find(&call.service).is_some_and(rosapi::Service::is_filtered);
         if !told {
-            self.granted.check(Operation::Call, &call.service)?;
+            self.granted().check(Operation::Call, &call.service)?;
         }
         if server.is_none()
             && let Some(answer) = self.answer_ourselves(call).await
@@ -219,7 +219,7 @@ impl Client {
                 self.own_frame(
                     call,
                     &def,
-                    &api.answer(&self.shared, &args, &self.granted.grants())
+                    &api.answer(&self.shared, &args, &self.granted().grants())
                         .await?,
                 )
             };

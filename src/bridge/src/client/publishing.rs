@@ -75,7 +75,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let topic = resolve(&op.topic)?;
-        self.granted.check(Operation::Publish, &topic)?;
+        self.granted().check(Operation::Publish, &topic)?;
         let message_type = self
             .publishable_type(&topic, &op.type_name)
             .inspect_err(|_| {
@@ -180,7 +180,7 @@ impl Client {
         let id = advertised.then(|| reply.id.clone());
         let mut topic_publishers = self.topic_publishers.lock();
         // Under the lock: what is taken back meanwhile is taken after this.
-        self.granted.check(Operation::Publish, topic)?;
+        self.granted().check(Operation::Publish, topic)?;
         let count = topic_publishers.count();
         let known = topic_publishers.open.get_mut(topic);
         if let Some(known) = &known
@@ -251,7 +251,7 @@ impl Client {
         let topic_publisher = match known {
             Some(topic_publisher) => topic_publisher,
             None => match self
-                .granted
+                .granted()
                 .check(Operation::Publish, &topic)
                 .and_then(|()| self.type_to_publish(&topic, &op))
             {

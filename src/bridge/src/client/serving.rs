@@ -148,7 +148,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let service = resolve(&op.service)?.into_owned();
-        self.granted.check(Operation::Advertise, &service)?;
+        self.granted().check(Operation::Advertise, &service)?;
         let def = self
             .shared
             .registry

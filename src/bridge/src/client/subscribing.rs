@@ -87,7 +87,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let name = resolve(&op.topic)?;
-        self.granted.check(Operation::Subscribe, &name)?;
+        self.granted().check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
         let wishes = Wishes {
             throttle_rate: op.throttle_rate,

@@ -9,7 +9,7 @@ use crate::names::resolve;
 impl Client {
     /// Takes back what is not granted any more, and tells the client what. Calls that nodes work on already are answered.
     pub(crate) fn withdraw(&self) {
-        let grants = self.granted.grants();
+        let grants = self.granted().grants();
         if grants.is_everything() {
             return;
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use access::{Grants, Standing};
 use async_trait::async_trait;
-use bridge::{Granted, SessionOptions};
+use bridge::{Granted, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::json;
@@ -252,6 +252,35 @@ async fn a_connection_whose_token_is_over_ends_with_the_reason() {
         .send(json!({"op": "call_service", "service": "/rosapi/get_time"}))
         .await;
     client.json().await;
+    sender.send_replace(Standing::Ended("this token was revoked".into()));
+    let closed = client.closed().await;
+    assert_eq!(closed, (1008, "this token was revoked".to_owned()));
+}
+
+#[tokio::test]
+async fn who_comes_back_has_what_the_new_connection_is_granted() {
+    let world = World::new().await;
+    let resumable = |granted| SessionOptions {
+        resume: Some("secret".to_owned()),
+        ..with(granted)
+    };
+    let (first, granted) = watch::channel(standing(&["*:**"]));
+    let client = world.client_with(resumable(granted)).await;
+    assert!(matches!(client.lose().await, SessionEnd::Lost(_)));
+    drop(first);
+
+    let (sender, granted) = watch::channel(standing(&["call:/rosapi/get_time"]));
+    let mut client = world.client_with(resumable(granted)).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text", "type": "std_msgs/String"}))
+        .await;
+    let refused = client.json().await;
+    assert!(
+        refused["msg"]
+            .as_str()
+            .is_some_and(|words| words.contains("not granted")),
+        "{refused}"
+    );
     sender.send_replace(Standing::Ended("this token was revoked".into()));
     let closed = client.closed().await;
     assert_eq!(closed, (1008, "this token was revoked".to_owned()));

@@ -18,7 +18,7 @@ impl Client {
         reply: &Reply,
     ) -> Result<(), String> {
         let name = resolve(&op.action)?.into_owned();
-        self.granted.check(Operation::Advertise, &name)?;
+        self.granted().check(Operation::Advertise, &name)?;
         let def = self.action_def(&name, &op.type_name)?;
         let limit = self.shared.options.max_advertisements;
         if self.actions.lock().served.len() >= limit {

@@ -84,7 +84,7 @@ impl Client {
         compression: Compression,
     ) -> Result<Prepared, String> {
         let name = resolve(&op.action)?.into_owned();
-        self.granted.check(Operation::Call, &name)?;
+        self.granted().check(Operation::Call, &name)?;
         let def = self.action_def(&name, &op.action_type)?;
         self.report_surplus(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
