@@ -225,6 +225,7 @@ fn main() -> ExitCode {
             every_route_answers_those_whom_the_table_allows,
             a_deployer_changes_its_own_services_alone,
             what_robots_may_changes_while_they_are_connected,
+            what_was_begun_with_a_token_ends_with_it,
             this_machines_users_see_and_are_robots_and_change_nothing,
         ],
         stories![audit:

@@ -1,5 +1,8 @@
 //! Principals, tokens and the policy: who may do what, and nothing else.
 
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
+
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::Verdict;
@@ -396,5 +399,37 @@ pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
         "the door does not open again"
     );
     deployer.types(&["services"])?.succeeded()?;
+    Ok(())
+}
+
+pub fn what_was_begun_with_a_token_ends_with_it() -> Verdict {
+    let daemon = daemon("access-revoked")?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let secret = token(&daemon, &["watcher", "--role", "operator"])?;
+    // Nobody uses the service: it would wait for an hour.
+    let mut going = Command::new(support::binaries::path("cloudroidctl"))
+        .args(["--server", &format!("http://{}", daemon.address)])
+        .args(["--token", &secret, "--format", "json"])
+        .args(["shadow", "adder_py", "1", "--seconds", "3600"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()?;
+    let said = going.stdout.take().context("its standard output")?;
+    let first = BufReader::new(said).lines().next();
+    let first = first.context("it said nothing")??;
+    ensure!(first.contains("waiting for a robot"), "{first}");
+    daemon
+        .deployer()
+        .types(&["token", "revoke", "watcher"])?
+        .succeeded()?;
+    let ended = support::until("its end", || {
+        Ok(going.try_wait()?.ok_or_else(|| "it goes on".to_owned()))
+    });
+    let _ = going.kill();
+    let _ = going.wait();
+    ensure!(!ended?.success(), "nothing was compared");
     Ok(())
 }

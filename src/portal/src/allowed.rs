@@ -107,6 +107,18 @@ impl Caller {
         self.who.principal.sees_all() || self.may_at(app, Action::See, service, None).is_ok()
     }
 
+    /// Comes back when what it is answered about a service is to end: the daemon does, or whoever asked has shown a token that is not
+    /// good any more.
+    pub fn over(&self, app: &Arc<App>, service: &str) -> impl Future<Output = ()> + Send + use<> {
+        let (app, who, service) = (Arc::clone(app), self.who.clone(), service.to_owned());
+        async move {
+            tokio::select! {
+                () = app.ending.cancelled() => {}
+                _ = app.principals.ended(&who, &service, false) => {}
+            }
+        }
+    }
+
     /// Whether it may be told of a servant: a robot sees its own alone.
     pub fn sees_servant(&self, app: &App, handle: &Handle) -> bool {
         self.is_robot_of(&handle.robot) && self.sees(app, handle.service())

@@ -452,14 +452,7 @@ pub async fn logs(
     if part.follow {
         let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
         // A follower must not keep the daemon from ending.
-        let ending = async move {
-            let service = handle.service().to_owned();
-            tokio::select! {
-                () = app.ending.cancelled() => {}
-                // Who shows a token that is revoked reads no further.
-                _ = app.principals.ended(&caller.who, &service, false) => {}
-            }
-        };
+        let ending = caller.over(&app, handle.service());
         return Ok(lines(printed.map(views::log_line).take_until(ending)));
     }
     let past = container.logs(count, None).await;

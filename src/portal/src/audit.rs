@@ -209,13 +209,7 @@ pub async fn audit(
     let coming = coming
         .take_while(|new| std::future::ready(new.is_ok()))
         .flat_map(|new| futures_util::stream::iter(new.unwrap_or_default()));
-    let ending = async move {
-        tokio::select! {
-            () = app.ending.cancelled() => {}
-            // Who shows a token that is revoked reads no further.
-            _ = app.principals.ended(&caller.who, "", false) => {}
-        }
-    };
+    let ending = caller.over(&app, "");
     Ok(lines(
         futures_util::stream::iter(past)
             .chain(coming)

@@ -49,7 +49,7 @@ pub async fn calibration(
         Source::Bag | Source::Frames => Some(recording(&app, &caller, body).await?),
     };
     let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
-    let ending = app.ending.clone().cancelled_owned();
+    let ending = caller.over(&app, &name);
     let work = async move {
         let outcome = async {
             let (requests, permit) = match given {
@@ -78,7 +78,7 @@ pub async fn calibration(
     };
     // Lives in the answer: when the client goes away the answer is dropped, and the calibration with it.
     let work = AbortOnDropHandle::new(tokio::spawn(work));
-    let events = ReceiverStream::new(receiver).take_until(ending);
+    let events = ReceiverStream::new(receiver).take_until(Box::pin(ending));
     Ok(lines(events.map(move |event| {
         let _ = &work;
         event

@@ -290,7 +290,7 @@ fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error
     }
 }
 
-/// The right to the servant that is asked for, if the robot's name is the caller's.
+/// The right to the servant that is asked for.
 fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
     let (service, stated) = (&asked.service, asked.stated.clone());
     let request = match &asked.robot {
@@ -302,9 +302,6 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
             }
         }
         Some(robot) => {
-            if !asked.shared {
-                check_owner(app, robot, caller)?;
-            }
             let request = ServantRequest::new(service, robot);
             match asked.link {
                 true => request.by_stub(&asked.node),
@@ -333,7 +330,11 @@ fn check(app: &App, asked: &Asked, caller: &Caller) -> Result<(), Error> {
             ),
         });
     }
-    allowed::known_to(app, caller, &asked.service)
+    allowed::known_to(app, caller, &asked.service)?;
+    match asked.robot.as_deref().filter(|_| !asked.shared) {
+        Some(robot) => check_owner(app, robot, caller),
+        None => Ok(()),
+    }
 }
 
 /// Records that somebody connected, or was refused, aside: it does not wait for that.

@@ -37,7 +37,7 @@ pub async fn shadow(
     check(&options).map_err(Error::BadRequest)?;
     app.catalogue.current(&name)?;
     let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
-    let ending = app.ending.clone().cancelled_owned();
+    let ending = caller.over(&app, &name);
     let work = async move {
         let choreographer = &app.choreographer;
         let budget = choreographer.memory().client(&caller.peer.client(None));
@@ -54,7 +54,7 @@ pub async fn shadow(
     };
     // Lives in the answer: when the client goes away the answer is dropped, and the candidate with it.
     let work = AbortOnDropHandle::new(tokio::spawn(work));
-    let events = ReceiverStream::new(receiver).take_until(ending);
+    let events = ReceiverStream::new(receiver).take_until(Box::pin(ending));
     Ok(lines(events.map(move |event| {
         let _ = &work;
         event

@@ -163,7 +163,7 @@ impl Pusher {
         // Pushes of one service follow one another: whose it is does not change until this one is done.
         by.may(&name)?;
         let is_new = self.catalogue.package(&name)?.is_none();
-        let shown = self.shown(id, options, built, name.clone(), report);
+        let shown = self.shown(id, options, built, (name.clone(), by), report);
         let layers = left.during(shown).await?;
         if let Some(owner) = by.owner.as_deref().filter(|_| is_new) {
             self.catalogue.own(&name, owner)?;
@@ -210,7 +210,7 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         built: BuildOutcome,
-        name: String,
+        (name, by): (String, &Deployer),
         report: &Reporter,
     ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
@@ -238,6 +238,8 @@ impl Pusher {
         if plan.shared.is_some() {
             shared::check_interface(&interface)?;
         }
+        // The token may have been revoked meanwhile.
+        by.may(&name)?;
         let record = RevisionRecord {
             service: name.clone(),
             number: 0,
