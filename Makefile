@@ -12,6 +12,8 @@ export CLOUDROID_PYTHON := $(VENV)/bin/python
 # The same for the stories' client in JavaScript.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
+# cargo-deny and cargo-audit, as programs that were built already: compiling them takes as long as the project.
+AUDIT := $(CACHE)/audit-$(shell sha256sum scripts/audit.txt | cut -c1-12)
 PREFIX ?= /usr/local
 
 .PHONY: help
@@ -100,6 +102,14 @@ lint:
 	@echo "== clippy, warnings denied"
 	@cargo clippy $(DEV) --all-targets -- -D warnings
 	@cargo clippy $(DEV) --features codec/video --test properties -- -D warnings
+	@echo "== licences and sources of dependencies"
+	@scripts/python "$(AUDIT)" scripts/audit.txt
+	@"$(AUDIT)/bin/cargo-deny" --locked --log-level error check licenses bans sources
+
+.PHONY: audit
+audit: ## look for known vulnerabilities of dependencies; ADVISORIES=DIR names a clone of RustSec's database
+	@scripts/python "$(AUDIT)" scripts/audit.txt
+	@scripts/audit "$(AUDIT)/bin"
 
 # A change is judged by the same cases every time; `make unit SEED=$RANDOM` looks for new ones.
 SEED ?= 1

@@ -58,10 +58,14 @@ mod names;
 mod patience;
 #[path = "stories/portal.rs"]
 mod portal;
+#[path = "stories/privileges.rs"]
+mod privileges;
 #[path = "stories/push.rs"]
 mod push;
 #[path = "stories/queue.rs"]
 mod queue;
+#[path = "stories/quotas.rs"]
+mod quotas;
 #[path = "stories/readiness.rs"]
 mod readiness;
 #[path = "stories/refusals.rs"]
@@ -172,6 +176,14 @@ fn main() -> ExitCode {
             limits_are_changed_while_it_works,
             a_node_that_takes_too_much_memory_is_killed_and_its_robot_told,
             two_robots_see_nothing_of_each_other,
+        ],
+        stories![quotas:
+            what_a_servant_may_not_write_is_refused_to_it_alone,
+            a_node_that_shouts_costs_no_disk,
+        ],
+        stories![privileges:
+            threads_that_read_what_strangers_send_have_no_rights,
+            the_portals_user_is_who_the_configuration_says,
         ],
         stories![terms:
             a_robot_is_given_what_its_sla_costs,
@@ -339,6 +351,11 @@ fn main() -> ExitCode {
         stories![tls:
             a_robot_works_through_tls,
             what_stands_against_tls_is_said,
+            beyond_loopback_nothing_is_answered_in_plain_text,
+            robots_of_all_kinds_come_through_the_daemons_tls,
+            a_certificate_is_remembered_and_no_other_is_taken_for_it,
+            a_certificate_is_read_again_when_it_changes,
+            clients_of_a_named_proxy_are_told_apart,
         ],
         stories![trying:
             a_packaged_node_is_tried_on_a_picture,
@@ -356,6 +373,7 @@ fn main() -> ExitCode {
             without_the_original_the_stub_stands_alone,
             what_is_not_outsourced_becomes_the_original,
             the_installer_checks_before_it_writes_and_undoes_itself,
+            a_stub_that_was_changed_on_its_way_is_not_installed,
             its_nodelets_cannot_be_loaded_on_the_robot,
             stubs_are_served_to_those_who_may_and_say_what_is_lacking,
         ],

@@ -22,8 +22,13 @@ pub async fn cancellable<F: Future>(future: F) -> F::Output {
 
 /// Runs `work` on a thread where it may block; it is cancelled with the [`cancellable`] future that calls this.
 pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    tokio::task::spawn_blocking(cancelled_with_this(work))
+}
+
+/// `work` that is cancelled with the [`cancellable`] future that calls this, wherever it is done.
+pub fn cancelled_with_this<T>(work: impl FnOnce() -> T) -> impl FnOnce() -> T {
     let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();
-    tokio::task::spawn_blocking(move || cancel.during(work))
+    move || cancel.during(work)
 }
 
 #[cfg(test)]

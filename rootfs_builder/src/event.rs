@@ -21,9 +21,9 @@ pub enum BuildEvent {
     Progress {
         /// What is counted.
         unit: &'static str,
-        /// So many are done.
+        /// Number of those that are done.
         done: u64,
-        /// Of so many, where known.
+        /// Number of all, where it is known.
         total: Option<u64>,
     },
     /// Something to know that is no failure.

@@ -50,6 +50,11 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
             }
         }
     };
+    // Before anybody is named, a page that has made its name point here.
+    let host = [("Host", "evil.example")];
+    let (status, _) = daemon.request("GET", "/api/v1/status", &host)?;
+    ensure!(status == 403, "{status}");
+    hears("evil.example")?;
     let scope = ["--service", "adder*"];
     let alice = token(
         &daemon,
@@ -74,6 +79,10 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     deployer
         .types(&["policy", "allow", "rover", "call:/x"])?
         .succeeded()?;
+    let mut robot = daemon.robot(&format!("adder_py?token={rover}"))?;
+    robot.says(json!({"op": "subscribe", "topic": "/cmd_vel", "type": "std_msgs/String"}))?;
+    hears("was refused subscribe:/cmd_vel")?;
+    drop(robot);
     deployer.types(&["token", "revoke", "eve"])?.succeeded()?;
     hears("token eve")?;
     let records = audited(&daemon)?;
@@ -330,6 +339,9 @@ pub fn members_of_a_group_are_admins_at_a_socket_of_theirs() -> Verdict {
             && answer.contains("user 61001 may not use the daemon's socket"),
         "{answer}"
     );
+    // Nor is it for the user whose rights the portal's threads have.
+    let answer = asks_as(&socket, 65_521, &[])?;
+    ensure!(answer.starts_with("HTTP/1.1 403"), "{answer}");
     // The daemon's own socket is for none of them.
     let own = daemon.deployer().home.join("run/daemon.sock");
     ensure!(

@@ -143,7 +143,7 @@ pub fn another_version_of_the_protocol_is_named() -> Verdict {
 pub fn a_wrong_token_is_named() -> Verdict {
     let daemon = world()
         .own("mishap-token")
-        .config("tokens = [\"open sesame\"]\n")
+        .config("tokens = [\"open sesame\"]\n[tls]\nserve = \"plain-text-beyond-loopback\"\n")
         .listen("0.0.0.0:0")
         .start()?;
     let port = daemon.address.rsplit(':').next().context("a port")?;

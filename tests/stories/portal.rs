@@ -168,7 +168,7 @@ pub fn beyond_loopback_only_with_a_token() -> Verdict {
     ensure!(said.contains("token"), "{said}");
     let daemon = world()
         .own("guarded")
-        .config("tokens = [\"open sesame\"]\n")
+        .config("tokens = [\"open sesame\"]\n[tls]\nserve = \"plain-text-beyond-loopback\"\n")
         .listen("0.0.0.0:0")
         .start()?;
     let port = daemon

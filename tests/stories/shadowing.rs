@@ -292,6 +292,25 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
     Ok(())
 }
 
+pub fn a_stub_that_was_changed_on_its_way_is_not_installed() -> Verdict {
+    let machine = machine()?;
+    let program = "opencv_apps-stub/lib/opencv_apps/cloudroid-stub";
+    let tampered = format!(
+        "printf '#!/bin/sh\\ntouch /root/ran\\n' > {program}; sh opencv_apps-stub/install.sh"
+    );
+    machine.runs("sh", &tampered)?.failed_saying(&[
+        "./lib/opencv_apps/cloudroid-stub",
+        "not what the server signed",
+    ])?;
+    let left = machine.runs("sh", &format!("ls -d {OVERLAY} /root/ran"))?;
+    ensure!(left.stdout.is_empty(), "{}", left.said());
+    let unsigned = "rm opencv_apps-stub/MANIFEST.sig; sh opencv_apps-stub/install.sh";
+    machine
+        .runs("sh", unsigned)?
+        .failed_saying(&["this archive is not signed"])?;
+    Ok(())
+}
+
 pub fn its_nodelets_cannot_be_loaded_on_the_robot() -> Verdict {
     let machine = installed()?;
     let port = free_port()?;

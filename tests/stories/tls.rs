@@ -1,11 +1,19 @@
-//! A robot whose server is behind TLS, under an authority of its owner's.
+//! TLS: the daemon's own, and that of a proxy in front, under an authority of its owner's.
 
-use anyhow::ensure;
-use support::Verdict;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use support::daemon::Daemon;
+use support::deployer::{Outcome, run};
 use support::machine::{Machine, free_port};
+use support::robot::PATIENCE;
 use support::site::Site;
 use support::tls::Proxy;
-use support::world::{TELLER, world};
+use support::world::{ADDER, TELLER, world};
+use support::{Verdict, binaries, until};
 
 pub fn a_robot_works_through_tls() -> Verdict {
     let daemon = world().with(TELLER)?;
@@ -87,5 +95,309 @@ pub fn what_stands_against_tls_is_said() -> Verdict {
         let stub = site.stub_with(&toml, "teller_py", "teller.py", &[])?;
         stub.says(words)?;
     }
+    Ok(())
+}
+
+const TOKENS: &str = "tokens = [\"open sesame\"]\n";
+
+/// curl at an address of a daemon that shows a certificate of its own.
+fn curl(daemon: &Daemon, url: &str) -> anyhow::Result<Outcome> {
+    let own = daemon.home.join("tls/own.pem");
+    run(Command::new("curl")
+        .args(["--silent", "--show-error", "--max-time", "60"])
+        .args(["--write-out", "\n%{http_code}", "--cacert"])
+        .arg(own)
+        .args(["-H", "Authorization: Bearer open sesame", url]))
+}
+
+fn port(daemon: &Daemon) -> anyhow::Result<&str> {
+    daemon.address.rsplit(':').next().context("a port")
+}
+
+pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
+    let daemon = world()
+        .own("secured")
+        .config(TOKENS)
+        .listen("0.0.0.0:0")
+        .start()?;
+    let port = port(&daemon)?;
+    for (path, words) in [("/healthz", "ok"), ("/api/v1/services", "[]")] {
+        let answer = curl(&daemon, &format!("https://localhost:{port}{path}"))?.succeeded()?;
+        ensure!(
+            answer.stdout.contains(words) && answer.stdout.ends_with("\n200"),
+            "{path}: {}",
+            answer.said()
+        );
+        let refused = curl(&daemon, &format!("http://localhost:{port}{path}"))?.succeeded()?;
+        let instead = format!("use https://localhost:{port}{path}");
+        ensure!(
+            refused.stdout.contains(&instead) && refused.stdout.ends_with("\n400"),
+            "{path}: {}",
+            refused.said()
+        );
+    }
+    // Its fingerprint is told, and the key is nobody else's.
+    let shown = fingerprint(&daemon.home.join("tls/own.pem"))?;
+    ensure!(
+        daemon.last_words().contains(&shown),
+        "{shown}: {}",
+        daemon.last_words()
+    );
+    // Who says nothing, or something else than both, is let go.
+    let connects = || -> anyhow::Result<TcpStream> {
+        let stream = TcpStream::connect(("127.0.0.1", port.parse()?))?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        Ok(stream)
+    };
+    let (mut silent, mut garbled) = (connects()?, connects()?);
+    garbled.write_all(&[22, 3, 1, 0, 5, 255, 255, 255, 255, 255])?;
+    garbled.read_to_end(&mut Vec::new())?;
+    ensure!(silent.read(&mut [0])? == 0, "who says nothing is kept");
+    Ok(())
+}
+
+pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
+    let daemon = world()
+        .own("secure-robots")
+        .config("[tls]\nserve = \"tls\"\n")
+        .start()?;
+    let deployer = daemon.deployer();
+    deployer.pushes("adder_py", ADDER.arguments)?.succeeded()?;
+    let port = port(&daemon)?;
+    let own = daemon.home.join("tls/own.pem");
+    let url = format!("wss://localhost:{port}/{}?robot=secure", ADDER.name);
+    let mut robot = Command::new(binaries::python());
+    robot.arg("-c").arg(ROSLIBPY).arg(&url);
+    let outcome = run(&mut robot)?.succeeded()?;
+    ensure!(outcome.stdout.contains("42"), "{}", outcome.said());
+    let site = Site::new()?;
+    let toml = format!(
+        "server = \"wss://localhost:{port}\"\nservice = \"no_such\"\nrobot = \"stub\"\nlocal = \"none\"\nca_file = {own:?}\n"
+    );
+    let stub = site.stub_with(&toml, "no_such", "node", &[])?;
+    // It got as far as the portal's own words.
+    stub.says("404")?;
+    // A stub's archive names the certificate: its robot needs no first use.
+    let place = world().directory("archive")?;
+    let archive = place.path().join("stub.tar.gz");
+    let url = format!("https://localhost:{port}/stubs/{}.tar.gz", ADDER.name);
+    let fetched = run(Command::new("curl")
+        .args(["--silent", "--show-error", "--fail", "--cacert"])
+        .arg(&own)
+        .arg("--output")
+        .arg(&archive)
+        .arg(&url))?;
+    fetched.succeeded()?;
+    let settings = run(Command::new("tar")
+        .args(["--wildcards", "-xzOf"])
+        .arg(&archive)
+        .arg("*/stub.toml"))?
+    .succeeded()?;
+    let server = format!("server = \"wss://localhost:{port}\"");
+    let fingerprint = format!("fingerprint = \"{}\"", fingerprint(&own)?);
+    for line in [server, fingerprint] {
+        ensure!(
+            settings.stdout.contains(&line),
+            "{line}: {}",
+            settings.said()
+        );
+    }
+    Ok(())
+}
+
+/// The fingerprint of a certificate, by openssl's word.
+fn fingerprint(certificate: &Path) -> anyhow::Result<String> {
+    let shown = run(Command::new("openssl")
+        .args(["x509", "-noout", "-fingerprint", "-sha256", "-in"])
+        .arg(certificate))?
+    .succeeded()?;
+    let digits = shown.stdout.rsplit('=').next().unwrap_or_default();
+    let digits = digits.trim().replace(':', "").to_lowercase();
+    Ok(format!("SHA256:{digits}"))
+}
+
+pub fn a_certificate_is_remembered_and_no_other_is_taken_for_it() -> Verdict {
+    let setup = world().own("pinned").config(TOKENS);
+    let daemon = setup.clone().listen("0.0.0.0:0").start()?;
+    let port = port(&daemon)?.to_owned();
+    let place = world().directory("user")?;
+    let site = Site::new()?;
+    let types = |arguments: &[&str]| {
+        run(Command::new(binaries::path("cloudroidctl"))
+            .args(["--token", "open sesame"])
+            .args(arguments)
+            .env("XDG_CONFIG_HOME", place.path()))
+    };
+    let server = format!("https://localhost:{port}");
+    let known = place.path().join("stubs/known_servers");
+    let stub = || {
+        let toml = format!(
+            "server = \"wss://localhost:{port}\"\nservice = \"none\"\nrobot = \"pinned\"\nlocal = \"none\"\ntoken = \"open sesame\"\nknown_servers = {known:?}\n"
+        );
+        site.stub_with(&toml, "none", "node", &[])
+    };
+    let asks = ["--server", &server, "services"];
+    let first = fingerprint(&daemon.home.join("tls/own.pem"))?;
+    let outcome = types(&asks)?.succeeded()?;
+    for words in ["is new here", &first, "cloudroid/known_servers"] {
+        ensure!(
+            outcome.stderr.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    ensure!(types(&asks)?.succeeded()?.stderr.is_empty(), "known by now");
+    let plain = format!("http://localhost:{port}");
+    types(&["--server", &plain, "services"])?
+        .failed_saying(&["this port speaks https", &server])?;
+    stub()?.says("404")?;
+    ensure!(std::fs::read_to_string(&known)?.contains(&first));
+    let address = daemon.address.clone();
+    daemon.ends()?;
+    // Somebody else, or the same with another certificate: nobody can tell but the operator.
+    std::fs::remove_file(setup.home().join("tls/own.pem"))?;
+    let daemon = setup.listen(&address).start()?;
+    let other = fingerprint(&daemon.home.join("tls/own.pem"))?;
+    ensure!(first != other);
+    let accept = format!("cloudroidctl trust {server} {other}");
+    types(&asks)?.failed_saying(&[&first, &other, &accept])?;
+    stub()?.says(&format!("install.sh --fingerprint {other}"))?;
+    types(&["trust", &server, &other])?.succeeded()?;
+    types(&asks)?.succeeded()?;
+    Ok(())
+}
+
+pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
+    let place = world().directory("certificates")?;
+    let at = |name: &str| place.path().join(name);
+    let makes = |name: &str| {
+        run(Command::new("openssl")
+            .args(["req", "-x509", "-newkey", "ec", "-pkeyopt"])
+            .args(["ec_paramgen_curve:P-256", "-nodes", "-days", "2"])
+            .args([
+                "-subj",
+                "/CN=server",
+                "-addext",
+                "subjectAltName=DNS:localhost",
+            ])
+            .args([
+                "-keyout",
+                &format!("{name}.key"),
+                "-out",
+                &format!("{name}.pem"),
+            ])
+            .current_dir(place.path()))?
+        .succeeded()
+    };
+    makes("shown")?;
+    makes("next")?;
+    let config = format!(
+        "[tls]\ncertificate = {:?}\nkey = {:?}\n",
+        at("shown.pem"),
+        at("shown.key")
+    );
+    let daemon = world().own("renewed").config(&config).start()?;
+    let port = port(&daemon)?;
+    let healthy = |authority: &str| {
+        let url = format!("https://localhost:{port}/healthz");
+        run(Command::new("curl")
+            .args([
+                "--silent",
+                "--show-error",
+                "--fail",
+                "--max-time",
+                "60",
+                "--cacert",
+            ])
+            .arg(at(authority))
+            .arg(url))
+    };
+    std::fs::copy(at("shown.pem"), at("first.pem"))?;
+    healthy("first.pem")?.succeeded()?;
+    std::fs::write(at("shown.pem"), "no certificate\n")?;
+    let refused = daemon.awaits_event("a word about what is there now", |event| {
+        event["kind"] == "certificate-refused"
+    })?;
+    let message = refused["message"].as_str().unwrap_or_default();
+    let kept = fingerprint(&at("first.pem"))?;
+    for words in ["shown.pem", "PEM file", &kept] {
+        ensure!(message.contains(words), "{words}: {message}");
+    }
+    healthy("first.pem")?.succeeded()?;
+    for kind in ["key", "pem"] {
+        std::fs::rename(at(&format!("next.{kind}")), at(&format!("shown.{kind}")))?;
+    }
+    let new = fingerprint(&at("shown.pem"))?;
+    daemon.awaits_event("the new one to be shown", |event| {
+        let message = event["message"].as_str().unwrap_or_default();
+        event["kind"] == "certificate-shown" && message.contains(&new)
+    })?;
+    healthy("shown.pem")?.succeeded()?;
+    ensure!(
+        healthy("first.pem")?.status != 0,
+        "the first is still shown"
+    );
+    Ok(())
+}
+
+const ROSLIBPY: &str = r#"
+import sys
+import roslibpy
+ros = roslibpy.Ros(sys.argv[1])
+ros.run(timeout=60)
+adder = roslibpy.Service(ros, "/add_two", "adder_py/AddTwo")
+print(adder.call(roslibpy.ServiceRequest({"a": 40, "b": 2}), timeout=60)["sum"])
+ros.terminate()
+"#;
+
+pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
+    let named = "trusted_proxies = [\"127.0.0.1\"]\n";
+    let daemon = world()
+        .own("proxied")
+        .config(&format!("{TOKENS}{named}"))
+        .start()?;
+    let asks = |method: &str, path: &str, token: &str, client: &str| {
+        let bearer = format!("Bearer {token}");
+        let headers = [
+            ("Authorization", bearer.as_str()),
+            ("X-Forwarded-For", client),
+            ("X-Forwarded-Proto", "https"),
+        ];
+        daemon.request(method, path, &headers)
+    };
+    // Each guess makes the next wait longer: however slow this is, one comes too soon.
+    until("who guesses to be slowed", || {
+        let (status, body) = asks("GET", "/api/v1/services", "guess", "192.0.2.1")?;
+        ensure!(status == 401 || status == 429, "{status} {body}");
+        Ok(match status {
+            429 => Ok(()),
+            _ => Err(body),
+        })
+    })?;
+    // It cannot pretend to be another, and others are not slowed.
+    for client in ["192.0.2.2", "192.0.2.1, 192.0.2.3"] {
+        let (status, body) = asks("GET", "/api/v1/services", "guess", client)?;
+        ensure!(status == 401, "{client}: {status} {body}");
+    }
+    let (status, _) = asks(
+        "DELETE",
+        "/api/v1/services/none",
+        "open sesame",
+        "192.0.2.4",
+    )?;
+    ensure!(status == 404, "{status}");
+    daemon.awaits("/api/v1/audit", "the client's address", |records| {
+        let text = records.to_string();
+        text.contains("192.0.2.4").then_some(())
+    })?;
+    let two = [
+        ("X-Forwarded-For", "192.0.2.5"),
+        ("Forwarded", "for=192.0.2.6"),
+    ];
+    let (status, body) = daemon.request("GET", "/healthz", &two)?;
+    ensure!(
+        status == 400 && body.contains("two clients"),
+        "{status} {body}"
+    );
     Ok(())
 }

@@ -81,6 +81,11 @@ impl Setup {
         self
     }
 
+    /// The state directory.
+    pub fn home(&self) -> &Path {
+        &self.home
+    }
+
     fn command(&self) -> anyhow::Result<Command> {
         std::fs::create_dir_all(&self.home)?;
         let mut command = Command::new(binaries::path("cloudroidd"));

@@ -6,12 +6,15 @@ use std::fs;
 /// The fields of `/proc/PID/status`; none when the process is gone.
 pub fn status(pid: i32) -> Option<BTreeMap<String, String>> {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    Some(
-        text.lines()
-            .filter_map(|line| line.split_once(':'))
-            .map(|(key, value)| (key.to_owned(), value.trim().to_owned()))
-            .collect(),
-    )
+    Some(fields(&text))
+}
+
+/// Fields of a `status`, each at a line of its own.
+pub fn fields(status: &str) -> BTreeMap<String, String> {
+    let fields = status.lines().filter_map(|line| line.split_once(':'));
+    fields
+        .map(|(key, value)| (key.to_owned(), value.trim().to_owned()))
+        .collect()
 }
 
 /// The command line, arguments separated by spaces.

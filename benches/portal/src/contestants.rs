@@ -88,7 +88,7 @@ impl Course<'_> {
     }
 
     fn daemon(&self, encoding: Encoding) -> Result<Open> {
-        let mut line = Line::websocket(&self.daemon.address, line::ROBOT)?;
+        let mut line = Line::robot(self.daemon)?;
         let (kind, mut message) = (self.kind(), Vec::new());
         if let Some(topic) = self.hops.outward {
             let compression = match encoding {

@@ -5,9 +5,11 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 
 use anyhow::{Context, Result, bail, ensure};
+use bench_servant::Daemon;
 use tokio_tungstenite::tungstenite;
 
 use crate::node::PATIENCE;
+use crate::secure::{self, Secure};
 
 /// The path of the robot that everything is measured with.
 pub(crate) const ROBOT: &str = "meter?robot=bench";
@@ -23,11 +25,17 @@ pub(crate) enum Framing {
     WebSocket,
 }
 
+/// With or without TLS.
+enum Stream {
+    Plain(TcpStream),
+    Tls(Box<Secure>),
+}
+
 /// A connection.
 pub(crate) struct Line {
-    /// Where messages are sent; often the same connection.
-    sender: TcpStream,
-    stream: TcpStream,
+    /// Where messages are sent, where that is another connection.
+    sender: Option<TcpStream>,
+    stream: Stream,
     framing: Framing,
     /// Read and not looked at: `buffer[at..filled]`.
     buffer: Vec<u8>,
@@ -42,21 +50,41 @@ impl Line {
     pub(crate) fn new(stream: TcpStream, framing: Framing) -> Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(PATIENCE))?;
-        Ok(Self {
-            sender: stream.try_clone()?,
+        Ok(Self::over(Stream::Plain(stream), framing))
+    }
+
+    fn over(stream: Stream, framing: Framing) -> Self {
+        Self {
+            sender: None,
             stream,
             framing,
             buffer: vec![0; 256 << 10],
             at: 0,
             filled: 0,
             missing: None,
-        })
+        }
+    }
+
+    /// The robot at a daemon, through TLS where the daemon speaks it.
+    pub(crate) fn robot(daemon: &Daemon) -> Result<Self> {
+        let Some(token) = secure::token(daemon)? else {
+            return Self::websocket(&daemon.address, ROBOT);
+        };
+        let stream = secure::connect(daemon)?;
+        let url = format!("wss://localhost/{ROBOT}&token={token}");
+        match tungstenite::client(url, stream) {
+            Ok((socket, _)) => {
+                let stream = Stream::Tls(Box::new(socket.into_inner()));
+                Ok(Self::over(stream, Framing::WebSocket))
+            }
+            Err(error) => bail!("no WebSocket through TLS: {error}"),
+        }
     }
 
     /// With another connection to send on.
     pub(crate) fn sending_on(mut self, sender: TcpStream) -> Result<Self> {
         sender.set_nodelay(true)?;
-        self.sender = sender;
+        self.sender = Some(sender);
         Ok(self)
     }
 
@@ -74,7 +102,14 @@ impl Line {
 
     /// Sends bytes that are framed already.
     pub(crate) fn send(&mut self, framed: &[u8]) -> Result<()> {
-        Ok(self.sender.write_all(framed)?)
+        match (&mut self.sender, &mut self.stream) {
+            (Some(stream), _) | (None, Stream::Plain(stream)) => stream.write_all(framed)?,
+            (None, Stream::Tls(stream)) => {
+                stream.write_all(framed)?;
+                stream.flush()?;
+            }
+        }
+        Ok(())
     }
 
     /// Sends a text.
@@ -176,7 +211,11 @@ impl Line {
             self.buffer.copy_within(self.at..self.filled, 0);
             (self.at, self.filled) = (0, self.filled - self.at);
         }
-        let read = self.stream.read(&mut self.buffer[self.filled..])?;
+        let space = &mut self.buffer[self.filled..];
+        let read = match &mut self.stream {
+            Stream::Plain(stream) => stream.read(space)?,
+            Stream::Tls(stream) => stream.read(space)?,
+        };
         ensure!(read > 0, "the connection was closed");
         self.filled += read;
         Ok(())

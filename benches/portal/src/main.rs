@@ -1,6 +1,7 @@
 //! `make bench ONLY=portal`: how fast messages and calls pass the daemon, between a client on loopback and a roscpp node
 //! in a servant. Beside it, in turns: the same node by raw TCPROS; a process that moves the bytes over the same hops;
-//! one that converts them by way of a tree of values. Before that, WebSocket framing alone, beside other libraries of it
+//! one that converts them by way of a tree of values; and another daemon that speaks TLS and holds a robot to its token and
+//! the policy. Before that, WebSocket framing alone, beside other libraries of it
 //! (`make bench ONLY=portal`; the words `framing of` as an argument run that part alone). Needs root. The program calls itself for the relays
 //! (`relay PID HOW …`).
 
@@ -13,6 +14,7 @@ mod node;
 mod rates;
 mod raw;
 mod relay;
+mod secure;
 mod slow_reader;
 mod trips;
 mod value;
@@ -45,6 +47,20 @@ fn main() -> Result<()> {
     }
 }
 
+/// Publishes the node that everything is measured with.
+fn push(daemon: &Daemon) -> Result<()> {
+    eprintln!("pushing rosbridge_fixture");
+    let fixture = bench_report::root().join("tests/packages/rosbridge_fixture");
+    daemon.push(&[
+        fixture.to_str().context("UTF-8")?,
+        "--name",
+        "meter",
+        "--node",
+        "rosbridge_fixture/meter",
+    ])?;
+    Ok(())
+}
+
 /// All figures whose names contain `only`.
 fn measure(only: &str) -> Result<()> {
     let mut report = Report::new("portal");
@@ -62,21 +78,14 @@ fn measure(only: &str) -> Result<()> {
         .prefix("cloudroid-bench-")
         .tempdir()?;
     let daemon = Daemon::start(place, CONFIG, &[])?;
-    eprintln!("pushing rosbridge_fixture");
-    let fixture = bench_report::root().join("tests/packages/rosbridge_fixture");
-    daemon.push(&[
-        fixture.to_str().context("UTF-8")?,
-        "--name",
-        "meter",
-        "--node",
-        "rosbridge_fixture/meter",
-    ])?;
+    push(&daemon)?;
     let node = Node::find(&daemon)?;
     let watch = Watch::over(daemon.pid());
     trips::measure(&mut report, &daemon, &node, only)?;
     rates::measure(&mut report, &daemon, &node, only)?;
     slow_reader::measure(&mut report, &daemon, &node, only)?;
     let memory = watch.end()?;
+    secure::measure(&mut report, &daemon, &node, only)?;
     report
         .figure("memory of the daemon, at its peak", "MB", memory.rss)
         .reach(Target::AtMost(MEMORY))

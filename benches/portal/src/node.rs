@@ -19,7 +19,7 @@ use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
 
-use crate::line::{self, Line};
+use crate::line::Line;
 
 /// Where every servant's Master listens.
 pub(crate) const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
@@ -76,7 +76,7 @@ pub(crate) struct Node {
 impl Node {
     /// Has a servant started, which stays for its grace time.
     pub(crate) fn find(daemon: &Daemon) -> Result<Self> {
-        let mut robot = Line::websocket(&daemon.address, line::ROBOT)?;
+        let mut robot = Line::robot(daemon)?;
         robot.ask(r#"{"op":"call_service","service":"/rosapi/nodes"}"#)?;
         let id = daemon.servants()?.into_iter().next().context("a servant")?;
         let path = daemon

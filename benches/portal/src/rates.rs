@@ -179,7 +179,7 @@ impl Clock {
 }
 
 /// The node publishes what it has credit for.
-fn outward(course: &Course<'_>, way: Way, credit: &Credit) -> Result<(f64, u64)> {
+pub(crate) fn outward(course: &Course<'_>, way: Way, credit: &Credit) -> Result<(f64, u64)> {
     let mut open = course.open(way)?;
     credit.pay(1);
     check(way, course.hops.images, &open.line.whole()?)?;

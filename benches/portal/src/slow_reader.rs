@@ -10,7 +10,7 @@ use bench_report::{Report, Target};
 use bench_servant::{Daemon, full};
 
 use crate::contestants::{Course, Encoding, Way};
-use crate::line::{self, Line};
+use crate::line::Line;
 use crate::node::{Credit, Node};
 use crate::relay::Hops;
 use crate::watch::resident;
@@ -68,7 +68,7 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &
 }
 
 fn subscribe(daemon: &Daemon) -> Result<Line> {
-    let mut line = Line::websocket(&daemon.address, line::ROBOT)?;
+    let mut line = Line::robot(daemon)?;
     line.say(&format!(
         r#"{{"op":"subscribe","topic":"{PICTURES}","type":"sensor_msgs/Image"}}"#
     ))?;

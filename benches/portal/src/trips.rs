@@ -51,6 +51,22 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &
     Ok(())
 }
 
+/// p50 and p99 of one turn.
+pub(crate) fn turn(course: &Course<'_>, way: Way) -> Result<[Duration; 2]> {
+    let mut open = course.open(way)?;
+    let mut times = Vec::with_capacity(TRIPS);
+    for _ in 0..TRIPS {
+        let begun = Instant::now();
+        open.line.send(&open.message)?;
+        open.line.receive()?;
+        times.push(begun.elapsed());
+    }
+    course.close(open)?;
+    let counted = &mut times[TRIPS / 10..];
+    counted.sort_unstable();
+    Ok([50, 99].map(|part| counted[counted.len() * part / 100]))
+}
+
 /// The best p50 and the best p99 of each way's turns.
 fn race(course: &Course<'_>, ways: &[Way], what: &str) -> Result<Vec<[Duration; 2]>> {
     let rounds = if full() { 30 } else { 10 };
@@ -58,19 +74,8 @@ fn race(course: &Course<'_>, ways: &[Way], what: &str) -> Result<Vec<[Duration; 
     for round in 1..=rounds {
         eprintln!("{what}: round {round} of {rounds}");
         for (way, best) in ways.iter().zip(&mut best) {
-            let mut open = course.open(*way)?;
-            let mut times = Vec::with_capacity(TRIPS);
-            for _ in 0..TRIPS {
-                let begun = Instant::now();
-                open.line.send(&open.message)?;
-                open.line.receive()?;
-                times.push(begun.elapsed());
-            }
-            course.close(open)?;
-            let counted = &mut times[TRIPS / 10..];
-            counted.sort_unstable();
-            for (best, part) in best.iter_mut().zip([50, 99]) {
-                *best = (*best).min(counted[counted.len() * part / 100]);
+            for (best, found) in best.iter_mut().zip(turn(course, *way)?) {
+                *best = (*best).min(found);
             }
         }
     }

@@ -62,7 +62,12 @@ pub(crate) fn configuration(
     staged: &Staged,
     uid_range: (u32, u32),
 ) -> Result<Value> {
-    let mut config = serde_json::to_value(servant::bundle::config(spec, staged, uid_range)?)?;
+    let mut config = serde_json::to_value(servant::bundle::config(
+        spec,
+        staged,
+        uid_range,
+        &servant::quotas::Quotas::default(),
+    )?)?;
     config["process"]["args"] = json!(PROGRAM);
     config["process"]["env"] = json!(["PATH=/usr/bin:/bin", "HOME=/"]);
     let namespaces = config["linux"]["namespaces"]

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use package::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
 use ros::bus::{Bus, BusError, Graph, ParamValue, WireType};
+use ros::ros1::own_parameters::every_node_asks_for;
 use ros::schema::{Base, MessageType, Registry};
 use tokio::time::timeout;
 
@@ -306,7 +307,7 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
             nodes.iter().filter(|node| *node != own).cloned().collect()
         };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
-        let plumbing = is_plumbing(name);
+        let plumbing = every_node_asks_for(name);
         if plumbing || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
@@ -319,23 +320,6 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
         });
     }
     parameters
-}
-
-/// What every roscpp or rospy node asks for.
-fn is_plumbing(name: &str) -> bool {
-    const NAMES: [&str; 7] = [
-        "/run_id",
-        "/rosdistro",
-        "/rosversion",
-        "/use_sim_time",
-        "/tcp_keepalive",
-        "/enable_statistics",
-        "/rosout_disable_topics_generation",
-    ];
-    NAMES.contains(&name)
-        || ["/roslaunch/", "/statistics_window_"]
-            .iter()
-            .any(|start| name.starts_with(start))
 }
 
 fn json(value: &ParamValue) -> serde_json::Value {

@@ -72,7 +72,7 @@ impl Action {
     }
 }
 
-/// To what.
+/// What an action is done to.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Object<'a> {
     /// The service; none: the machine, or all services.
@@ -111,9 +111,9 @@ impl<'a> Object<'a> {
 pub struct Refusal {
     /// The principal, with its roles.
     pub who: String,
-    /// What it wanted.
+    /// The action that was refused.
     pub action: Action,
-    /// To what.
+    /// The object, in words.
     pub object: String,
 }
 

@@ -43,11 +43,11 @@ impl fmt::Display for Who {
 /// What somebody may use of services.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rule {
-    /// Who.
+    /// The principals that it is for.
     pub who: Who,
-    /// Of which services.
+    /// The services that it is for.
     pub services: Glob,
-    /// What.
+    /// The operations on names that it allows.
     pub allow: Vec<Grant>,
 }
 

@@ -100,10 +100,10 @@ pub struct NewRule {
 pub struct Rule {
     /// Its number, never given twice.
     pub id: i64,
-    /// For whom.
+    /// The principals that it is for.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub who: Who,
-    /// For which services.
+    /// The services that it is for.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub services: Glob,
     /// What is granted.
@@ -134,7 +134,7 @@ pub struct Whoami {
 pub struct Audited {
     /// Its number, never given twice.
     pub id: i64,
-    /// When.
+    /// When it was done.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
     /// Who, with its roles.
@@ -145,7 +145,7 @@ pub struct Audited {
     pub action: String,
     /// The request, without its query.
     pub did: String,
-    /// To what.
+    /// The object that it was done to.
     pub object: String,
     /// The answer's HTTP status: 403 where it was refused.
     pub status: u16,

@@ -98,9 +98,9 @@ pub enum PushEvent {
     Progress {
         /// What is counted, such as `packages`, or `bytes`.
         unit: String,
-        /// So many are done.
+        /// Number of those that are done.
         done: u64,
-        /// Of so many, where known.
+        /// Number of all, where it is known.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         total: Option<u64>,
     },

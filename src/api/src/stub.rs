@@ -1,4 +1,5 @@
-//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE` answers with an archive, `GET /stubs` with [`Stubs`].
+//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE` answers with an archive, `NAME.tar.gz.sig` with its signature, `GET /stubs`
+//! with [`Stubs`].
 
 use serde::{Deserialize, Serialize};
 
@@ -7,6 +8,15 @@ pub const ARCHITECTURES: [&str; 3] = ["x86_64", "aarch64", "armv7"];
 
 /// The header of an archive that names the architecture it is for.
 pub const ARCHITECTURE: &str = "cloudroid-architecture";
+
+/// The header of an archive with its signature: the lines of the detached one, without those that begin and end it.
+pub const SIGNATURE: &str = "cloudroid-signature";
+/// What archives are signed as: the namespace of `ssh-keygen -Y verify -n`.
+pub const ARCHIVE: &str = "cloudroid-archive";
+/// What the list of an archive's files is signed as.
+pub const CONTENTS: &str = "cloudroid-stub";
+/// As whom robots' lists of signers name a server.
+pub const SIGNER: &str = "cloudroid";
 
 /// What stubs this server has.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,6 +27,9 @@ pub struct Stubs {
     pub architectures: Vec<String>,
     /// Those it could hold and does not.
     pub lacking: Vec<String>,
+    /// The key that archives are signed by, as OpenSSH writes it; empty: an earlier version's, which signs none.
+    #[serde(default)]
+    pub key: String,
 }
 
 /// The architecture that is meant by a name in use for it.

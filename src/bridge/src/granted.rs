@@ -1,5 +1,6 @@
 //! What a client may do, as its operator says now.
 
+use std::fmt;
 use std::sync::Arc;
 
 use access::{Grants, Operation, Standing};
@@ -7,8 +8,20 @@ use tokio::sync::watch;
 
 /// What a client may do to topics, services and actions, and why its connection ends when that is so. It changes while the
 /// client is connected; then what it has and may not have any more is taken back.
-#[derive(Debug, Clone)]
-pub struct Granted(watch::Receiver<Standing>);
+#[derive(Clone)]
+pub struct Granted {
+    standing: watch::Receiver<Standing>,
+    refused: Option<Arc<Refused>>,
+}
+
+/// Hears of an operation that was refused, such as `publish:/cmd_vel`.
+type Refused = dyn Fn(&str) + Send + Sync;
+
+impl fmt::Debug for Granted {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.debug_tuple("Granted").field(&self.standing).finish()
+    }
+}
 
 impl Default for Granted {
     /// Everything, for good.
@@ -20,18 +33,29 @@ impl Default for Granted {
 impl Granted {
     /// What this says, as it changes.
     pub fn by(standing: watch::Receiver<Standing>) -> Granted {
-        Granted(standing)
+        Granted {
+            standing,
+            refused: None,
+        }
+    }
+
+    /// The same; `hears` is told of each operation that is refused.
+    pub fn telling(self, hears: impl Fn(&str) + Send + Sync + 'static) -> Granted {
+        Granted {
+            refused: Some(Arc::new(hears)),
+            ..self
+        }
     }
 
     /// These grants, for good.
     pub fn always(grants: Grants) -> Granted {
         let (_, standing) = watch::channel(Standing::Granted(Arc::new(grants)));
-        Granted(standing)
+        Granted::by(standing)
     }
 
     /// What is granted now.
     pub(crate) fn grants(&self) -> Arc<Grants> {
-        match &*self.0.borrow() {
+        match &*self.standing.borrow() {
             Standing::Granted(grants) => Arc::clone(grants),
             Standing::Ended(_) => Arc::default(),
         }
@@ -43,15 +67,18 @@ impl Granted {
         if grants.permits(operation, name) {
             return Ok(());
         }
+        let asked = format!("{}:{name}", operation.name());
+        if let Some(hears) = &self.refused {
+            hears(&asked);
+        }
         Err(format!(
-            "{}:{name} is not granted to this client (granted: {grants}); the operator can, with cloudroidctl policy allow",
-            operation.name()
+            "{asked} is not granted to this client (granted: {grants}); the operator can, with cloudroidctl policy allow"
         ))
     }
 
     /// Why the connection is to end, if it is.
     pub(crate) fn ended(&self) -> Option<String> {
-        match &*self.0.borrow() {
+        match &*self.standing.borrow() {
             Standing::Granted(_) => None,
             Standing::Ended(reason) => Some(reason.clone()),
         }
@@ -59,7 +86,7 @@ impl Granted {
 
     /// Comes back when it has changed since this was made or last asked; never, where nobody can change it.
     pub(crate) async fn changed(&mut self) {
-        if self.0.changed().await.is_err() {
+        if self.standing.changed().await.is_err() {
             std::future::pending().await
         }
     }

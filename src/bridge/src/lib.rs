@@ -42,6 +42,7 @@ mod metrics;
 mod names;
 mod options;
 mod outbox;
+mod own;
 mod presence;
 mod registrations;
 mod rosapi;

@@ -9,12 +9,14 @@ mod typedefs;
 use std::sync::Arc;
 
 use access::Grants;
+use async_trait::async_trait;
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::clock;
+use crate::own::OwnService;
 use crate::shared::Shared;
 
 /// The node that seems to serve these services.
@@ -70,38 +72,6 @@ impl Service {
         format!("rosapi/{}", self.srv)
     }
 
-    /// Whether its answer is about what nodes have registered.
-    pub(crate) fn shows_graph(self) -> bool {
-        !matches!(self.name, "get_time" | "get_ros_version")
-            && !self.name.contains("param")
-            && !self.name.ends_with("_details")
-            || self.name == "node_details"
-    }
-
-    /// Whether anybody may call it: it tells of names and types alone, and of those names alone that its caller may use.
-    pub(crate) fn is_filtered(self) -> bool {
-        !self.name.contains("param")
-    }
-
-    /// Its definition.
-    pub(crate) fn definition(self) -> Result<Arc<ServiceDef>, String> {
-        definitions::registry()
-            .service(&self.type_name())
-            .map_err(|error| error.to_string())
-    }
-
-    /// The response, as JSON, to a request in JSON: what a client with these grants is shown.
-    pub(crate) async fn answer(
-        self,
-        shared: &Arc<Shared>,
-        args: &[u8],
-        grants: &Grants,
-    ) -> Result<Vec<u8>, String> {
-        let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
-        let values = self.values(shared, &args, grants).await?;
-        Ok(values.to_string().into_bytes())
-    }
-
     async fn values(
         self,
         shared: &Arc<Shared>,
@@ -144,6 +114,37 @@ impl Service {
             }),
             other => return Err(format!("rosapi has no service {other}")),
         })
+    }
+}
+
+#[async_trait]
+impl OwnService for Service {
+    fn is_filtered(&self) -> bool {
+        !self.name.contains("param")
+    }
+
+    fn shows_graph(&self) -> bool {
+        !matches!(self.name, "get_time" | "get_ros_version")
+            && !self.name.contains("param")
+            && !self.name.ends_with("_details")
+            || self.name == "node_details"
+    }
+
+    fn definition(&self, _: &Registry) -> Result<Arc<ServiceDef>, String> {
+        definitions::registry()
+            .service(&self.type_name())
+            .map_err(|error| error.to_string())
+    }
+
+    async fn answer(
+        &self,
+        shared: &Arc<Shared>,
+        args: &[u8],
+        grants: &Grants,
+    ) -> Result<Vec<u8>, String> {
+        let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
+        let values = self.values(shared, &args, grants).await?;
+        Ok(values.to_string().into_bytes())
     }
 }
 

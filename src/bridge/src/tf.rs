@@ -18,7 +18,7 @@ use serde_json::json;
 
 use buffer::Buffer;
 pub(crate) use republish::{
-    ACTION, GOAL_TOPIC, Republisher, SERVICE, STATUS_TOPIC, TOPICS, definition,
+    ACTION, GOAL_TOPIC, RepublishTfs, Republisher, SERVICE, STATUS_TOPIC, TOPICS,
 };
 use transform::Transform;
 

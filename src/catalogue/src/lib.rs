@@ -96,12 +96,12 @@ impl Catalogue {
     }
 }
 
-/// Runs `work`, which blocks, beside the runtime's threads; `what` names it where it breaks.
+/// Runs `work`, which blocks and needs files of the image store, where it may have them; `what` names it where it breaks.
 async fn blocking<T: Send + 'static>(
     what: &'static str,
     work: impl FnOnce() -> Result<T, Error> + Send + 'static,
 ) -> Result<T, Error> {
-    tokio::task::spawn_blocking(work)
+    privilege::blocking(work)
         .await
         .map_err(|_| Error::Internal(what))?
 }

@@ -8,7 +8,11 @@ use std::path::{Path, PathBuf};
 use api::stub::{ARCHITECTURES, architecture};
 use flate2::{Compression, GzBuilder};
 use package::inventory::Inventory;
-use package::stub::{About, Content, Contents, Files, PROGRAM, compose};
+use package::stub::{
+    About, Content, Contents, Files, MANIFEST, PROGRAM, Portal, SIGNATURE, SIGNER, compose,
+    manifest,
+};
+use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
 
@@ -99,7 +103,7 @@ pub fn files(
     revision: &RevisionRecord,
     inventory: &Inventory,
     architecture: &str,
-    server: &str,
+    portal: &Portal,
 ) -> Result<Files, Error> {
     let no_stub = |error: package::Error| Error::NoStub {
         service: revision.service.clone(),
@@ -115,7 +119,7 @@ pub fn files(
         package: &revision.package,
         revision: revision.number,
         image: &revision.image,
-        server,
+        portal,
         architecture,
         outsourced: &inventory.programs.keys().cloned().collect(),
         interface: &revision.interface,
@@ -131,37 +135,50 @@ fn times(sla: &api::Sla) -> Option<(f64, f64)> {
     Some((desire.as_seconds(), max.as_seconds()))
 }
 
-/// The archive of a revision's stub, in a file that is gone when it is closed.
+/// A packed stub.
+pub struct Archive {
+    /// It, from its beginning; the file is gone when it is closed.
+    pub file: File,
+    /// Its signature, of [`api::stub::ARCHIVE`].
+    pub signature: String,
+}
+
+/// The archive of a revision's stub.
 pub fn archive(
     store: &image::Store,
     revision: &RevisionRecord,
     inventory: &Inventory,
     program: &Program,
-    server: &str,
-) -> Result<File, Error> {
-    let files = files(store, revision, inventory, program.architecture, server)?;
+    portal: &Portal,
+    key: &SigningKey,
+) -> Result<Archive, Error> {
+    let mut files = files(store, revision, inventory, program.architecture, portal)?;
     let failed = |error: std::io::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: format!("it could not be packed: {error}"),
     };
-    let mut binary = File::open(&program.path).map_err(failed)?;
-    let packed = pack(&revision.service, &revision.package, &files, &mut binary);
-    packed.map_err(failed)
+    let bytes = std::fs::read(&program.path).map_err(failed)?;
+    let executable = true;
+    files.insert(
+        format!("lib/{}/{PROGRAM}", revision.package),
+        Content::File { bytes, executable },
+    );
+    pack(&revision.service, files, key).map_err(failed)
 }
 
-fn pack(service: &str, package: &str, files: &Files, binary: &mut File) -> std::io::Result<File> {
+fn pack(service: &str, mut files: Files, key: &SigningKey) -> std::io::Result<Archive> {
+    sign_all(&mut files, key)?;
     let file = tempfile::tempfile()?;
     let gzip = GzBuilder::new()
         .mtime(0)
         .write(file, Compression::default());
     let mut archive = tar::Builder::new(gzip);
     let top = format!("{service}-stub");
-    let program = format!("lib/{package}/{PROGRAM}");
-    for directory in directories(files.keys().chain([&program])) {
+    for directory in directories(files.keys()) {
         let mut header = header(EntryType::Directory, true, 0);
         archive.append_data(&mut header, format!("{top}/{directory}"), std::io::empty())?;
     }
-    for (path, content) in files {
+    for (path, content) in &files {
         let at = format!("{top}/{path}");
         match content {
             Content::File { bytes, executable } => {
@@ -174,12 +191,30 @@ fn pack(service: &str, package: &str, files: &Files, binary: &mut File) -> std::
             }
         }
     }
-    let mut header = header(EntryType::Regular, true, binary.metadata()?.len());
-    archive.append_data(&mut header, format!("{top}/{program}"), binary)?;
     let mut file = archive.into_inner()?.finish()?;
     file.flush()?;
     file.seek(SeekFrom::Start(0))?;
-    Ok(file)
+    let digest = sign::digest(&mut file)?;
+    file.seek(SeekFrom::Start(0))?;
+    Ok(Archive {
+        file,
+        signature: key.sign(api::stub::ARCHIVE, &digest),
+    })
+}
+
+/// Adds the key, the list of all files, and its signature.
+fn sign_all(files: &mut Files, key: &SigningKey) -> std::io::Result<()> {
+    let plain = |text: String| Content::File {
+        bytes: text.into_bytes(),
+        executable: false,
+    };
+    let signer = format!("{}\n", key.public().signer());
+    files.insert(SIGNER.to_owned(), plain(signer));
+    let list = manifest(files);
+    let signature = key.sign(api::stub::CONTENTS, &sign::digest(&mut list.as_bytes())?);
+    files.insert(MANIFEST.to_owned(), plain(list));
+    files.insert(SIGNATURE.to_owned(), plain(signature));
+    Ok(())
 }
 
 /// Every directory that these paths are in, each after its parent.
@@ -212,56 +247,66 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn the_same_files_make_the_same_archive() {
-        let place = tempfile::tempdir().expect("a directory");
-        let path = place.path().join("program");
-        std::fs::write(&path, "ELF").expect("written");
+    fn packed(key: &SigningKey) -> (Vec<u8>, String) {
+        let executable = true;
+        let node = Content::File {
+            bytes: b"#!/bin/sh".to_vec(),
+            executable,
+        };
         let files: Files = [
-            (
-                "lib/p/node".to_owned(),
-                Content::File {
-                    bytes: b"#!/bin/sh".to_vec(),
-                    executable: true,
-                },
-            ),
+            ("lib/p/node".to_owned(), node),
             ("share/p/a/b".to_owned(), Content::Link("c".into())),
         ]
         .into();
-        let pack = || {
-            let mut binary = File::open(&path).expect("opened");
-            let mut bytes = Vec::new();
-            super::pack("serves", "p", &files, &mut binary)
-                .expect("packed")
-                .read_to_end(&mut bytes)
-                .expect("read");
-            bytes
-        };
-        let bytes = pack();
-        assert_eq!(bytes, pack());
+        let mut archive = super::pack("serves", files, key).expect("packed");
+        let mut bytes = Vec::new();
+        archive.file.read_to_end(&mut bytes).expect("read");
+        (bytes, archive.signature)
+    }
+
+    #[test]
+    fn the_same_files_make_the_same_archive_and_each_has_its_mode() {
+        let (key, _) = SigningKey::generate().expect("made");
+        let (bytes, signature) = packed(&key);
+        assert_eq!((bytes.clone(), signature), packed(&key));
         let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&bytes[..]));
-        let names: Vec<String> = archive
+        let entries: Vec<(String, u32)> = archive
             .entries()
             .expect("an archive")
             .map(|entry| {
                 let entry = entry.expect("an entry");
-                entry.path().expect("a path").display().to_string()
+                let path = entry.path().expect("a path").display().to_string();
+                (path, entry.header().mode().expect("a mode"))
             })
             .collect();
-        assert_eq!(
-            names,
-            [
-                "serves-stub/",
-                "serves-stub/lib/",
-                "serves-stub/lib/p/",
-                "serves-stub/share/",
-                "serves-stub/share/p/",
-                "serves-stub/share/p/a/",
-                "serves-stub/lib/p/node",
-                "serves-stub/share/p/a/b",
-                "serves-stub/lib/p/cloudroid-stub",
-            ]
-        );
+        let expected = [
+            ("serves-stub/", 0o755),
+            ("serves-stub/lib/", 0o755),
+            ("serves-stub/lib/p/", 0o755),
+            ("serves-stub/share/", 0o755),
+            ("serves-stub/share/p/", 0o755),
+            ("serves-stub/share/p/a/", 0o755),
+            ("serves-stub/MANIFEST", 0o644),
+            ("serves-stub/MANIFEST.sig", 0o644),
+            ("serves-stub/lib/p/node", 0o755),
+            ("serves-stub/server.pub", 0o644),
+            ("serves-stub/share/p/a/b", 0o755),
+        ];
+        let expected = expected.map(|(path, mode)| (path.to_owned(), mode));
+        assert_eq!(entries, expected);
+    }
+
+    #[test]
+    fn an_archive_is_signed_as_such() {
+        let (key, _) = SigningKey::generate().expect("made");
+        let (mut bytes, signature) = packed(&key);
+        let verify = |bytes: &[u8]| {
+            let digest = sign::digest(&mut &*bytes).expect("read");
+            key.public().verify(api::stub::ARCHIVE, &digest, &signature)
+        };
+        verify(&bytes).expect("signed");
+        bytes.pop();
+        verify(&bytes).expect_err("truncated");
     }
 
     #[test]

@@ -1,6 +1,32 @@
+use api::Size;
+
 use crate::decide::admission::Refused;
 use crate::decide::terms::Untenable;
-use crate::lives::limits::Unchanged;
+
+/// Nodes of one robot whose stubs may state something: what they say is kept, and written down, for as long as the servant lives.
+pub(crate) const STATING: usize = 64;
+
+/// Why a servant is not resized.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Unchanged {
+    /// On no terms.
+    #[error(transparent)]
+    Untenable(Untenable),
+    /// There is no room for more.
+    #[error(transparent)]
+    Full(Refused),
+    /// It would be killed for want of memory.
+    #[error("it uses {used} of memory, which is more than the {wanted} that it would have")]
+    Used {
+        /// What it uses.
+        used: Size,
+        /// What it would have.
+        wanted: Size,
+    },
+    /// Too many clients of one robot state something.
+    #[error("{STATING} nodes of its robot have stated something already")]
+    Many,
+}
 
 /// Why a servant cannot be had, used or changed.
 #[derive(Debug, thiserror::Error)]
@@ -58,7 +84,7 @@ pub enum Error {
     /// Its servants have failed again and again.
     #[error(
         "servants of {service} for robot {robot} have failed {failures} times in a row (the last one {reason}); the next is started in {} s at the earliest",
-        crate::lives::back_off::seconds(*again)
+        crate::decide::back_off::seconds(*again)
     )]
     BackOff {
         /// The service.

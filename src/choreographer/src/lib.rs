@@ -1,5 +1,5 @@
 //! Decides which servants live: one for each robot of each service, started when the robot first connects, kept
-//! for a grace time after it left.
+//! for a grace time after it left; of a shared service a group of servants for all its robots.
 //!
 //! ```text
 //!              no room                 engine, node or time-out
@@ -19,12 +19,14 @@
 //!             │ ask                                          │ facts
 //!             ▼                                              ▼
 //!   ┌ lives ───────────────────────────────────────────────────────────────────────────┐
-//!   │ ensure, waiting, limits     driver ─ starting ─ lifetime ─ nodes     warm_pool   │
+//!   │ ensure, waiting, limits,    driver ─ starting ─ lifetime ─ nodes,    warm_pool,  │
+//!   │ rollouts, group             controller, measuring, hung              shadow, …   │
 //!   └──────┬──────────────────────────────────┬──────────────────────────────┬─────────┘
 //!      facts ▼ ▲ what to do, and why      facts ▼ ▲                      facts ▼ ▲
 //!   ┌ decide ──────────────────────────────────────────────────────────────────────────┐
-//!   │ placement, admission,             lifetime, nodes                 warm_pool      │
-//!   │ capacity, demand                  adoption                                       │
+//!   │ terms, dictionary,                lifetime, nodes,                warm_pool,     │
+//!   │ placement, admission,             adoption, controller,           forecast,      │
+//!   │ capacity, rollout, group          measured, hung, stall           shadow, …      │
 //!   └──────────────────────────────────────────────────────────────────────────────────┘
 //! ```
 //!
@@ -36,18 +38,17 @@
 
 mod decide;
 mod error;
-mod handle;
 pub mod limits;
 mod lives;
 mod memory;
 mod options;
 mod request;
+mod shown;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use api::Phase;
 use bridge::BridgeOptions;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
@@ -55,36 +56,36 @@ use reach::{Material, Opener, Pace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 use tokio::sync::watch;
-use tokio::time::Instant;
 
 pub use decide::Amount;
 pub use decide::admission::{Position, Refused};
+pub use decide::back_off::seconds;
 pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};
-pub use error::{Error, with_last_words};
-pub use handle::{Handle, Lease};
+pub use error::{Error, Unchanged, with_last_words};
 pub use limits::engine_limits;
-pub use lives::back_off::seconds;
 pub use lives::calibration::Requests;
 pub use lives::capture::Bounds;
-pub use lives::limits::Unchanged;
+pub use lives::handle::Handle;
+pub use lives::lease::Lease;
 pub use lives::rollouts::check_terms;
 pub use lives::waiting::{Admission, Permit, Standing};
 pub use memory::{Memory, MemoryOptions};
 pub use options::{Class, DEFAULT_CLASS, Hung, Options};
 pub use request::ServantRequest;
+pub use shown::usage;
 
 use decide::admission::Ask;
 use decide::dictionary::Aux;
 use decide::placement::{Placement, place};
 use decide::terms::explain;
-use handle::Anew;
 use lives::Inner;
 use lives::back_off::BackOffs;
 use lives::driver::{self, Beginning};
 use lives::group::is_place;
 use lives::hung;
+use lives::lease::Anew;
 use lives::warm_pool::{self, WarmPool};
 
 /// In a trial, for one answer: a message of a recording that is answered by nothing must not hold up the rest.
@@ -425,49 +426,6 @@ impl Choreographer {
         Ok(self.inner.admission.check(self.inner.promised(limits))?)
     }
 
-    /// A servant as the API shows it.
-    pub async fn describe(&self, handle: &Handle) -> api::Servant {
-        let inner = &self.inner;
-        let life = handle.life();
-        let reach = handle.reach();
-        let running = runs(life.phase);
-        let container = handle.container().filter(|_| running);
-        let enforced = container.as_ref().map(|container| container.enforced());
-        let pids = container
-            .as_ref()
-            .map(|container| inner.opener.processes(container.id()));
-        api::Servant {
-            id: handle.id.clone(),
-            service: handle.service().to_owned(),
-            revision: handle.revision.number,
-            robot: handle.robot.clone(),
-            phase: life.phase,
-            reason: life.reason().or_else(|| {
-                handle
-                    .watch_standing()
-                    .borrow()
-                    .as_ref()
-                    .map(ToString::to_string)
-            }),
-            created: handle.created,
-            connections: handle.connections(),
-            idle_until: handle.idle_until(),
-            terms: Some(handle.terms())
-                .filter(|terms| !terms.stated.is_empty() || terms.class.is_some()),
-            limits: handle.limits(),
-            cgroup_version: enforced
-                .as_ref()
-                .map_or(0, |enforced| enforced.cgroup_version),
-            enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
-            usage: usage(handle).await,
-            response: inner.recent.shown(&handle.id, Instant::now().into_std()),
-            pids: pids.unwrap_or_default(),
-            dropped: reach.map_or(0, |reach| reach.dropped()),
-            down: handle.down(),
-            hung: handle.hung(),
-        }
-    }
-
     /// Images that live servants and warm containers were started from; they must stay.
     pub fn images_in_use(&self) -> Vec<String> {
         let mut images = self.inner.warm_pool.images();
@@ -491,29 +449,6 @@ impl Drop for Measured {
     fn drop(&mut self) {
         self.lease.handle().end("it has been measured");
     }
-}
-
-/// What a servant uses, while it runs.
-pub async fn usage(handle: &Handle) -> Option<api::Usage> {
-    let container = handle.container().filter(|_| runs(handle.life().phase))?;
-    // One that has ended meanwhile uses nothing.
-    let usage = container.usage().await.ok()?;
-    Some(api::Usage {
-        cpu_usec: usage.cpu_usec,
-        memory: usage.memory,
-        pids: usage.pids,
-        oom_kills: usage.oom_kills,
-        throttled_usec: usage.throttled_usec,
-        pressure: usage.pressure.map(|pressure| api::Pressure {
-            cpu: pressure.cpu,
-            memory: pressure.memory,
-            io: pressure.io,
-        }),
-    })
-}
-
-fn runs(phase: Phase) -> bool {
-    matches!(phase, Phase::Created | Phase::Starting | Phase::Ready)
 }
 
 #[cfg(test)]

@@ -9,12 +9,12 @@ use crate::memory::MemoryOptions;
 /// What is done about nodes that are given inputs and answer none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Hung {
-    /// Nothing is done.
+    /// Hung nodes are left alone, and no event says so.
     Ignore,
-    /// It is told.
+    /// An event says so.
     #[default]
     Report,
-    /// It is told, and they are started again.
+    /// An event says so, and the nodes are started again.
     Restart,
 }
 

@@ -1,5 +1,6 @@
 use std::time::Duration;
 
+use api::Phase;
 use in_memory::MemoryEngine;
 
 use super::*;

@@ -14,6 +14,14 @@ pub struct Address {
 }
 
 impl Address {
+    /// The name by which its certificate is remembered: host and port.
+    pub fn known_as(&self) -> String {
+        match self.host.contains(':') {
+            true => format!("[{}]:{}", self.host, self.port),
+            false => format!("{}:{}", self.host, self.port),
+        }
+    }
+
     /// Reads it; says what is wrong with it.
     pub fn parse(server: &str) -> Result<Self, String> {
         let wrong = |what: &str| {

@@ -4,6 +4,10 @@
 //! server = "ws://cloud.example:9090"   # the portal; wss:// where TLS is spoken
 //! service = "opencv_apps"              # what was published
 //! ca_file = "/path/ca.pem"             # for wss://: whom to trust, PEM; by default the system's authorities
+//! # For wss://: the server's certificate, where no authority that is trusted has signed it; without it a certificate that
+//! # signs itself is remembered when it is first seen, in the file that known_servers names.
+//! fingerprint = "SHA256:5d215d215d215d215d215d215d215d215d215d215d215d215d215d215d215d21"
+//! known_servers = "~/.config/cloudroid/known_servers"
 //! token_file = "~/.config/cloudroid/token"   # holds the bearer token; none is needed where the portal asks for none
 //! robot = "rover1"                     # this robot's id; by default its host name
 //!
@@ -48,10 +52,13 @@
 //! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by a ROS
 //! parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
 
+mod aux_parameters;
 mod check;
 mod parameters;
 mod requests;
 mod sources;
+
+pub use aux_parameters::{Aux, Scalar};
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -60,9 +67,10 @@ use std::time::Duration;
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
+use tls::{Fingerprint, KnownServers, Trust};
+
 use crate::address::Address;
 use crate::revision::Defaults;
-use crate::terms::{Aux, Scalar};
 
 pub use parameters::{Group, groups};
 pub use requests::Requests;
@@ -91,6 +99,12 @@ pub struct Config {
     /// For `wss://`: a PEM file with the certificates to trust; the system's where absent.
     #[serde(default)]
     pub ca_file: Option<PathBuf>,
+    /// For `wss://`: the certificate to trust, by its fingerprint, besides those that an authority has signed.
+    #[serde(default)]
+    pub fingerprint: Option<Fingerprint>,
+    /// For `wss://`: where certificates are remembered that were seen first; below the user's configuration where absent.
+    #[serde(default)]
+    pub known_servers: Option<PathBuf>,
     /// This robot's id; its host name where absent.
     #[serde(default)]
     pub robot: Option<String>,
@@ -174,6 +188,9 @@ pub struct Config {
 /// Default of [`Config::fallback_after`], seconds.
 pub const FALLBACK_AFTER: f64 = 3.0;
 
+/// What a robot says that has no authorities.
+const NOBODY_TRUSTED: &str = "this robot trusts nobody yet: sudo apt install ca-certificates, or name the server's authority by ca_file in stub.toml";
+
 fn fallback_after() -> f64 {
     FALLBACK_AFTER
 }
@@ -235,9 +252,16 @@ impl Config {
         Address::parse(&self.server)
     }
 
-    /// Where the certificates to trust are, if they are not the system's.
-    pub fn authorities(&self) -> Option<PathBuf> {
-        self.ca_file.as_deref().map(at_home)
+    /// Whom to trust where TLS is spoken.
+    pub fn trust(&self) -> Trust {
+        let named = self.known_servers.as_deref().map(at_home);
+        Trust {
+            authorities: self.ca_file.as_deref().map(at_home),
+            fingerprint: self.fingerprint,
+            known: named.map(KnownServers::at).or_else(KnownServers::of_user),
+            accept: "install.sh --fingerprint".to_owned(),
+            advice: NOBODY_TRUSTED,
+        }
     }
 
     /// The bearer token.

@@ -1,10 +1,10 @@
 //! Opens a WebSocket to the portal (RFC 6455, section 4.1).
 
-use std::path::Path;
 use std::time::Duration;
 
 use base64_simd::STANDARD;
 use sha1::{Digest, Sha1};
+use tls::Trust;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -45,8 +45,8 @@ pub async fn open(
     patience: Duration,
 ) -> Result<WebSocket<Stream>, Error> {
     let address = config.address().map_err(Error::Refused)?;
-    let authorities = config.authorities();
-    let opening = handshake(&address, authorities.as_deref(), path, token);
+    let trust = config.trust();
+    let opening = handshake(&address, &trust, path, token);
     match timeout(patience, opening).await {
         Ok(opened) => opened,
         Err(_) => Err(Error::Unreachable(format!(
@@ -58,7 +58,7 @@ pub async fn open(
 
 async fn handshake(
     address: &Address,
-    authorities: Option<&Path>,
+    trust: &Trust,
     path: &str,
     token: Option<&str>,
 ) -> Result<WebSocket<Stream>, Error> {
@@ -79,7 +79,7 @@ async fn handshake(
     let _ = socket.set_tcp_nodelay(true);
     let _ = socket.set_tcp_keepalive(&keepalive());
     let _ = socket.set_tcp_notsent_lowat(UNSENT);
-    let mut stream = Stream::over(stream, address, authorities)
+    let mut stream = Stream::over(stream, address, trust)
         .await
         .map_err(|error| unreachable("no TLS with", error))?;
     let key = STANDARD.encode_to_string(rand::random::<[u8; 16]>());

@@ -5,9 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError, ParamValue};
-
-/// Those of a Master itself.
-pub const OWN: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
+use ros::ros1::own_parameters::is_of_master;
 
 /// Named once for each life of the stub.
 static TOLD: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
@@ -20,7 +18,7 @@ pub async fn all(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError
         Err(error) if is_of_values(&error) => one_by_one(bus).await?,
         Err(error) => return Err(error),
     };
-    all.retain(|name, _| !OWN.contains(&name.as_str()));
+    all.retain(|name, _| !is_of_master(name));
     without_nothing(&mut all, "");
     Ok(all)
 }

@@ -1,18 +1,14 @@
 //! A connection to the portal: TCP, or TLS over it (TLS 1.2 and 1.3, by rustls).
 
 use std::io;
-use std::path::Path;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll};
 
+use tls::Trust;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
-use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
-use tokio_rustls::rustls::pki_types::pem::PemObject;
-use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
-use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
+use tokio_rustls::rustls;
 
 use crate::address::Address;
 
@@ -25,20 +21,21 @@ pub enum Stream {
 }
 
 impl Stream {
-    /// Over a connection that stands. `authorities` is a PEM file with the certificates to trust, the system's where
-    /// there is none.
-    pub async fn over(
-        tcp: TcpStream,
-        address: &Address,
-        authorities: Option<&Path>,
-    ) -> io::Result<Self> {
+    /// Over a connection that stands, to a portal that `trust` accepts.
+    pub async fn over(tcp: TcpStream, address: &Address, trust: &Trust) -> io::Result<Self> {
         if !address.secure {
             return Ok(Self::Plain(tcp));
         }
-        let name = ServerName::try_from(address.host.clone()).map_err(io::Error::other)?;
-        let connector = TlsConnector::from(Arc::new(configuration(authorities)?));
-        let connected = connector.connect(name, tcp).await;
-        Ok(Self::Tls(Box::new(connected.map_err(explained)?)))
+        let connected = trust.connect(tcp, &address.host, &address.known_as()).await;
+        let connected = connected.map_err(explained)?;
+        if let (Some(first), Some(known)) = (connected.first, &trust.known) {
+            tracing::warn!(
+                "{} is new to this robot; its certificate {first} is remembered in {}: compare it with what the server's operator tells",
+                address.authority,
+                known.path().display()
+            );
+        }
+        Ok(Self::Tls(Box::new(connected.stream)))
     }
 
     /// What it goes over.
@@ -48,44 +45,6 @@ impl Stream {
             Self::Tls(tls) => tls.get_ref().0,
         }
     }
-}
-
-fn configuration(authorities: Option<&Path>) -> io::Result<ClientConfig> {
-    let mut trusted = RootCertStore::empty();
-    match authorities {
-        Some(path) => {
-            let unreadable = |error: &dyn std::fmt::Display| {
-                io::Error::other(format!(
-                    "ca_file {} holds no certificate: {error}; it should be a PEM file",
-                    path.display()
-                ))
-            };
-            let certificates =
-                CertificateDer::pem_file_iter(path).map_err(|error| unreadable(&error))?;
-            for certificate in certificates {
-                let certificate = certificate.map_err(|error| unreadable(&error))?;
-                trusted
-                    .add(certificate)
-                    .map_err(|error| unreadable(&error))?;
-            }
-            if trusted.is_empty() {
-                return Err(unreadable(&"it has no BEGIN CERTIFICATE"));
-            }
-        }
-        None => {
-            // One of many that is not understood is no reason to trust none.
-            trusted.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
-            if trusted.is_empty() {
-                return Err(io::Error::other(
-                    "this robot trusts nobody yet: sudo apt install ca-certificates, or name the server's authority by ca_file in stub.toml",
-                ));
-            }
-        }
-    }
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let begun = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
-    let begun = begun.map_err(io::Error::other)?;
-    Ok(begun.with_root_certificates(trusted).with_no_client_auth())
 }
 
 /// With what to do, where it is known.

@@ -1,12 +1,9 @@
 //! What the robot states to the server when it asks for its servant, before it is admitted: in the query of each handshake. A
 //! server of an earlier version does not look at it.
 
-use std::collections::BTreeMap;
 use std::fmt::Write;
 
-use serde::{Deserialize, Serialize};
-
-use crate::config::Config;
+use crate::config::{Aux, Config, Scalar};
 
 /// Bytes of a name, and of an auxiliary parameter's value, as the server takes them.
 const LONGEST: usize = 64;
@@ -16,57 +13,6 @@ const MOST_AUX: usize = 16;
 const LEAST_MEMORY: f64 = (4 << 20) as f64;
 /// Cores, as the server takes them.
 const CPUS: std::ops::RangeInclusive<f64> = 0.01..=4096.0;
-
-/// A number or a text.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "a number or a text")]
-pub enum Scalar {
-    /// A number.
-    Number(f64),
-    /// A text.
-    Text(String),
-}
-
-impl std::fmt::Display for Scalar {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Number(number) => write!(out, "{number}"),
-            Self::Text(text) => out.write_str(text.trim()),
-        }
-    }
-}
-
-/// Auxiliary parameters: a table, or text such as `width=640 model=big`, as the environment gives it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "a table such as { width = 640 }, or text such as \"width=640\""
-)]
-pub enum Aux {
-    /// By name.
-    Table(BTreeMap<String, Scalar>),
-    /// Pairs with spaces between them.
-    Text(String),
-}
-
-impl Aux {
-    /// Names and values; why it is not such a list.
-    fn pairs(&self) -> Result<Vec<(String, String)>, String> {
-        match self {
-            Self::Table(table) => Ok(table
-                .iter()
-                .map(|(key, value)| (key.clone(), value.to_string()))
-                .collect()),
-            Self::Text(text) => text
-                .split_whitespace()
-                .map(|pair| match pair.split_once('=') {
-                    Some((key, value)) => Ok((key.to_owned(), value.to_owned())),
-                    None => Err(format!("is {text:?}; write KEY=VALUE, such as width=640")),
-                })
-                .collect(),
-        }
-    }
-}
 
 /// Refuses what the server would; the key, the reason and what to write.
 pub fn check(config: &Config) -> Result<(), (&'static str, String)> {

@@ -15,14 +15,19 @@ use hyper::{Method, Request, Response, StatusCode, header};
 use hyper_util::rt::TokioIo;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use tls::{KnownServers, Trust};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
+use tokio_rustls::client::TlsStream;
 
 const FALLBACK: &str = "127.0.0.1:9090";
 
 /// What to do about a 401.
 const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root and the group \
                             cloudroid need none over the daemon's sockets (--server unix:PATH)";
+
+/// Where no authority is known.
+const NOBODY_TRUSTED: &str = "no authority is trusted here, and the server's certificate does not sign itself: apt install ca-certificates";
 
 /// What is sent.
 pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
@@ -32,6 +37,8 @@ pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
 pub enum Server {
     /// `HOST:PORT`.
     Tcp(String),
+    /// The same through TLS.
+    Tls(String),
     /// Unix socket of the daemon on this machine.
     Unix(PathBuf),
 }
@@ -40,6 +47,7 @@ impl fmt::Display for Server {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Server::Tcp(authority) => write!(out, "http://{authority}"),
+            Server::Tls(authority) => write!(out, "https://{authority}"),
             Server::Unix(path) => write!(out, "unix:{}", path.display()),
         }
     }
@@ -55,25 +63,32 @@ impl Server {
         if text.starts_with('/') {
             return Ok(Server::Unix(text.into()));
         }
-        let rest = match text.split_once("://") {
-            Some(("http" | "ws", rest)) => rest,
+        // Without a port: the daemon's own, and that of a proxy (RFC 9110, section 4.2.2).
+        let (secure, rest, port) = match text.split_once("://") {
+            Some(("http" | "ws", rest)) => (false, rest, 9090),
+            Some(("https" | "wss", rest)) => (true, rest, 443),
             Some((scheme, _)) => {
-                bail!("{text}: {scheme} is not spoken here; write http://HOST:PORT or unix:PATH")
+                bail!(
+                    "{text}: {scheme} is not spoken here; write https://HOST:PORT, http://HOST:PORT or unix:PATH"
+                )
             }
-            None => text,
+            None => (false, text, 9090),
         };
         let authority = rest.trim_end_matches('/');
         if authority.is_empty() || authority.contains(['/', '?', ' ']) {
-            bail!("{text} names no server; write http://HOST:PORT or unix:PATH");
+            bail!("{text} names no server; write https://HOST:PORT, http://HOST:PORT or unix:PATH");
         }
         let has_port = authority.rsplit_once(':').is_some_and(|(host, port)| {
             (!host.contains(':') || host.ends_with(']')) && port.parse::<u16>().is_ok()
         });
-        Ok(Server::Tcp(if has_port {
-            authority.to_owned()
-        } else {
-            format!("{authority}:9090")
-        }))
+        let authority = match has_port {
+            true => authority.to_owned(),
+            false => format!("{authority}:{port}"),
+        };
+        Ok(match secure {
+            true => Server::Tls(authority),
+            false => Server::Tcp(authority),
+        })
     }
 
     /// The daemon of this machine.
@@ -205,11 +220,44 @@ impl Client {
                 let _ = stream.set_nodelay(true);
                 self.exchange(stream, authority, method, path, body).await
             }
+            Server::Tls(authority) => {
+                let stream = TcpStream::connect(authority).await.map_err(unreachable)?;
+                let _ = stream.set_nodelay(true);
+                let stream = self.secured(stream, authority).await?;
+                self.exchange(stream, authority, method, path, body).await
+            }
             Server::Unix(socket) => {
                 let stream = connect(socket).await.map_err(unreachable)?;
                 self.exchange(stream, "localhost", method, path, body).await
             }
         }
+    }
+
+    async fn secured(
+        &self,
+        stream: TcpStream,
+        authority: &str,
+    ) -> anyhow::Result<TlsStream<TcpStream>> {
+        let (host, _) = authority.rsplit_once(':').unwrap_or((authority, ""));
+        let trust = Trust {
+            authorities: None,
+            fingerprint: None,
+            known: KnownServers::of_user(),
+            accept: format!("cloudroidctl trust {}", self.server),
+            advice: NOBODY_TRUSTED,
+        };
+        let connected = trust
+            .connect(stream, host.trim_matches(['[', ']']), authority)
+            .await
+            .with_context(|| format!("no TLS with {}", self.server))?;
+        if let (Some(first), Some(known)) = (connected.first, &trust.known) {
+            eprintln!(
+                "note: {} is new here; its certificate {first} is remembered in {}: compare it with what the daemon said at its start",
+                self.server,
+                known.path().display()
+            );
+        }
+        Ok(connected.stream)
     }
 
     async fn exchange(
@@ -366,18 +414,22 @@ mod tests {
     #[test]
     fn servers_are_named_in_several_ways() {
         let tcp = |text: &str| Server::Tcp(text.to_owned());
+        let tls = |text: &str| Server::Tls(text.to_owned());
         for (text, server) in [
             ("http://10.0.0.1:9091", tcp("10.0.0.1:9091")),
             ("http://robot-server/", tcp("robot-server:9090")),
             ("robot-server:80", tcp("robot-server:80")),
             ("http://[::1]", tcp("[::1]:9090")),
             ("http://[::1]:80", tcp("[::1]:80")),
+            ("https://10.0.0.1:9091/", tls("10.0.0.1:9091")),
+            ("wss://robot-server", tls("robot-server:443")),
+            ("https://[::1]", tls("[::1]:443")),
             ("unix:/run/x.sock", Server::Unix("/run/x.sock".into())),
             ("unix:///run/x.sock", Server::Unix("/run/x.sock".into())),
         ] {
             assert_eq!(Server::parse(text).expect(text), server);
         }
-        for text in ["https://x", "http://", "http://x/api", ""] {
+        for text in ["ftp://x", "https://", "http://", "http://x/api", ""] {
             Server::parse(text).expect_err(text);
         }
     }

@@ -30,6 +30,7 @@ mod stub;
 mod terminal;
 mod token;
 mod trial;
+mod trust;
 
 use std::process::ExitCode;
 
@@ -48,7 +49,7 @@ use output::Format;
     propagate_version = true
 )]
 struct Arguments {
-    /// The daemon: http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME, that of
+    /// The daemon: https://HOST:PORT, http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME, that of
     /// your own or of the installed daemon, or http://127.0.0.1:9090 where there is none.
     #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
     server: Option<String>,
@@ -90,6 +91,7 @@ enum Verb {
     Token(token::Tokens),
     Audit(audit::Audit),
     Policy(policy::Policy),
+    Trust(trust::TrustServer),
     Status(status::Status),
     Doctor(doctor::Doctor),
 }
@@ -143,6 +145,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Token(verb) => verb.run(&client, format).await,
         Verb::Audit(verb) => verb.run(&client, format).await,
         Verb::Policy(verb) => verb.run(&client, format).await,
+        Verb::Trust(verb) => verb.run(),
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
     }

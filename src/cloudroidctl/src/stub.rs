@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use api::Stubs;
-use api::stub::{ARCHITECTURE, architecture};
+use api::stub::{ARCHITECTURE, ARCHIVE, SIGNATURE, SIGNER, architecture};
 use hyper::Method;
+use sign::PublicKey;
 
 use crate::client::{Client, empty, escaped};
 use crate::output::{self, Format};
@@ -22,6 +23,9 @@ pub struct Stub {
     /// The robot's architecture, as `uname -m` says it there; this machine's by default.
     #[arg(long, value_name = "ARCH")]
     arch: Option<String>,
+    /// The server's key, which the archive has to be signed by ("ssh-ed25519 AAAA…"); what the server says by default.
+    #[arg(long, value_name = "KEY")]
+    key: Option<PublicKey>,
 }
 
 /// What was fetched.
@@ -31,6 +35,8 @@ struct Fetched {
     architecture: String,
     path: PathBuf,
     bytes: u64,
+    signature: PathBuf,
+    key: String,
 }
 
 impl Stub {
@@ -38,6 +44,16 @@ impl Stub {
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let Some(service) = &self.service else {
             return list(client, format).await;
+        };
+        let key = match self.key {
+            Some(key) => key,
+            None => {
+                let stubs: Stubs = client.get("/stubs").await?;
+                if stubs.key.is_empty() {
+                    bail!("this server signs no stubs: it is of an earlier version; update it");
+                }
+                stubs.key.parse().context("the server's key")?
+            }
         };
         let asked = self.arch.as_deref().unwrap_or(std::env::consts::ARCH);
         let path = format!(
@@ -52,6 +68,12 @@ impl Stub {
             .and_then(|value| value.to_str().ok())
             .unwrap_or(asked)
             .to_owned();
+        let signature = answer
+            .headers()
+            .get(SIGNATURE)
+            .and_then(|value| value.to_str().ok())
+            .map(sign::in_lines)
+            .context("the archive is not signed: the server is of an earlier version; update it")?;
         let target = self.output.join(format!("{service}.tar.gz"));
         let failed = || format!("cannot write {}", target.display());
         std::fs::create_dir_all(&self.output).with_context(failed)?;
@@ -70,12 +92,26 @@ impl Stub {
             bail!("the daemon sent an empty archive");
         }
         file.sync_all().with_context(failed)?;
+        let digest = std::fs::File::open(&half)
+            .and_then(|mut file| sign::digest(&mut file))
+            .with_context(failed)?;
+        if let Err(refused) = key.verify(ARCHIVE, &digest, &signature) {
+            let _ = std::fs::remove_file(&half);
+            return Err(anyhow::Error::new(refused).context(format!(
+                "the archive of {service} is not what a server with the key {key} signed; nothing was written"
+            )));
+        }
+        let beside = self.output.join(format!("{service}.tar.gz.sig"));
+        std::fs::write(&beside, signature)
+            .with_context(|| format!("cannot write {}", beside.display()))?;
         std::fs::rename(&half, &target).with_context(failed)?;
         let fetched = Fetched {
             service: service.clone(),
             architecture,
             path: target,
             bytes,
+            signature: beside,
+            key: key.to_string(),
         };
         match format {
             Format::Json => output::json(&fetched),
@@ -86,12 +122,21 @@ impl Stub {
                     fetched.architecture,
                     api::Size(fetched.bytes)
                 ))?;
-                output::line(&format!(
-                    "on the robot:  tar xzf {service}.tar.gz && sh {service}-stub/install.sh"
-                ))
+                output::line(&format!("signed by {key}"))?;
+                output::line("on the robot, with both files:")?;
+                output::line(&format!("  {}", to_install(service, key)))
             }
         }
     }
+}
+
+/// Verifies the archive before anything of it runs, and has what follows verified by the same key.
+fn to_install(service: &str, key: PublicKey) -> String {
+    format!(
+        "echo '{}' > server.pub && ssh-keygen -Y verify -f server.pub -I {SIGNER} -n {ARCHIVE} -s {service}.tar.gz.sig < {service}.tar.gz \
+         && tar xzf {service}.tar.gz && sh {service}-stub/install.sh --key server.pub",
+        key.signer()
+    )
 }
 
 async fn list(client: &Client, format: Format) -> anyhow::Result<()> {
@@ -105,6 +150,7 @@ async fn list(client: &Client, format: Format) -> anyhow::Result<()> {
         Format::Table => {
             output::line(&format!("services       {}", list(&stubs.services)))?;
             output::line(&format!("architectures  {}", list(&stubs.architectures)))?;
+            output::line(&format!("signed by      {}", stubs.key))?;
             if stubs.lacking.is_empty() {
                 return Ok(());
             }

@@ -38,7 +38,8 @@ pub struct SocketFile(PathBuf);
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.0);
+        let path = std::mem::take(&mut self.0);
+        let _ = privilege::now(move || std::fs::remove_file(path));
     }
 }
 

@@ -5,6 +5,7 @@ mod class;
 mod doubts;
 mod options;
 mod time;
+mod tls;
 mod words;
 
 use std::collections::BTreeMap;
@@ -15,13 +16,16 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow, bail};
 use api::{Limits, Size};
 use choreographer::limits::check as check_limits;
-use portal::Tokens;
+use portal::{Proxies, Tokens};
 use serde::Deserialize;
 use servant::local::grants::Allow;
+use servant::quotas::Quotas;
+
+use crate::machine;
 
 pub use class::Class;
-pub use doubts::Has;
 pub use time::Time;
+pub use tls::Tls;
 
 /// Everything that can be configured.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -35,8 +39,12 @@ pub struct Config {
     pub admin_group: Option<String>,
     /// A socket for them; below the directory that systemd makes for the service by default, else none.
     pub admin_socket: Option<PathBuf>,
+    /// Name or number of the user whose rights to files the threads have that read what strangers send.
+    pub portal_user: Option<String>,
     /// Web origins besides this machine's own whose pages may use the portal without a token.
     pub origins: Vec<String>,
+    /// Addresses and networks of proxies in front of the portal that are believed for whom they ask.
+    pub trusted_proxies: Vec<String>,
     /// Where a plain `ws://host:9090` goes.
     pub default_service: Option<String>,
     /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
@@ -56,6 +64,8 @@ pub struct Config {
     pub capacity: Capacity,
     /// The life of a servant.
     pub servant: Servant,
+    /// Where TLS is spoken.
+    pub tls: Tls,
     /// What clients may do.
     pub portal: Portal,
     /// Limits of memory outside of servants' containers.
@@ -140,17 +150,23 @@ pub struct Servant {
     pub hung: Hung,
     /// They hang that answer nothing for so many times the T_max that their robot stated.
     pub hung_after: f64,
+    /// Bytes of each file system that a servant writes; half of its memory by default.
+    pub scratch: Option<Size>,
+    /// Files, directories and links in each of them.
+    pub inodes: u64,
+    /// Bytes a second of its log, on the average.
+    pub log_rate: Size,
 }
 
 /// What is done about nodes that hang.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Hung {
-    /// Nothing is done.
+    /// Hung nodes are left alone, and no event says so.
     Ignore,
-    /// It is told.
+    /// An event says so.
     Report,
-    /// It is told, and they are started again.
+    /// An event says so, and the nodes are started again.
     Restart,
 }
 
@@ -245,14 +261,16 @@ impl Default for Config {
             tokens: Vec::new(),
             admin_group: None,
             admin_socket: None,
+            portal_user: None,
             origins: Vec::new(),
+            trusted_proxies: Vec::new(),
             default_service: None,
             default_robot: None,
             isolation: IsolationMode::default(),
             keep_servants: None,
             definitions: None,
             limits: Limits {
-                cpus: Some(machine_cores()),
+                cpus: Some(machine::cores()),
                 cpu_weight: Some(100),
                 memory: Some(Size(1 << 30)),
                 pids: Some(512),
@@ -261,6 +279,7 @@ impl Default for Config {
             class: BTreeMap::new(),
             capacity: Capacity::default(),
             servant: Servant::default(),
+            tls: Tls::default(),
             portal: Portal::default(),
             memory: Memory::default(),
             push: Push::default(),
@@ -295,6 +314,9 @@ impl Default for Servant {
             warm_nodes: 0,
             hung: Hung::Report,
             hung_after: 10.0,
+            scratch: None,
+            inodes: Quotas::default().inodes,
+            log_rate: Size(Quotas::default().log_rate),
         }
     }
 }
@@ -364,7 +386,7 @@ impl Capacity {
 
     /// Cores that there are for servants.
     pub fn cores(&self) -> f64 {
-        self.cpus.unwrap_or_else(machine_cores)
+        self.cpus.unwrap_or_else(machine::cores)
     }
 }
 
@@ -409,8 +431,17 @@ impl Config {
         Ok(config)
     }
 
+    /// Whose rights to files the portal's threads have.
+    pub fn account(&self) -> anyhow::Result<privilege::Account> {
+        match &self.portal_user {
+            Some(written) => Ok(privilege::Account::find(written)?),
+            None => Ok(privilege::Account::default()),
+        }
+    }
+
     /// Refuses what cannot work together, before anything is started.
     pub fn check(&self) -> anyhow::Result<()> {
+        self.account()?;
         Tokens::new(&self.tokens)?;
         if !self.listen.ip().is_loopback() && self.tokens.is_empty() {
             bail!(
@@ -420,11 +451,29 @@ impl Config {
                 self.listen.port()
             );
         }
+        self.proxies()
+            .context("trusted_proxies of the configuration")?;
+        self.tls.check().context("[tls] of the configuration")?;
         check_limits(&self.limits).context("[limits] of the configuration")?;
         if !(self.servant.hung_after >= 1.0 && self.servant.hung_after <= 1e6) {
             bail!(
                 "[servant] hung_after = {} in the configuration is no number of times; write one from 1 to 1000000, such as 10",
                 self.servant.hung_after
+            );
+        }
+        // To the kernel, none is no limit.
+        let Servant {
+            scratch,
+            inodes,
+            log_rate,
+            ..
+        } = self.servant;
+        if scratch.is_some_and(|scratch| scratch.0 < 1 << 20)
+            || inodes < 256
+            || log_rate.0 < 1 << 10
+        {
+            bail!(
+                "[servant] of the configuration: programs need a scratch of at least 1M, 256 inodes, and a log_rate of at least 1K"
             );
         }
         for (name, class) in &self.class {
@@ -468,6 +517,12 @@ impl Config {
         Ok(())
     }
 
+    /// The proxies that are believed.
+    pub fn proxies(&self) -> Result<Proxies, portal::NoNetwork> {
+        let networks = self.trusted_proxies.iter().map(|written| written.parse());
+        Ok(Proxies(networks.collect::<Result<_, _>>()?))
+    }
+
     /// Whether servants outlive this daemon when it is ended.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
@@ -505,11 +560,6 @@ impl Memory {
     }
 }
 
-/// Cores of this machine that this process may use.
-pub fn machine_cores() -> f64 {
-    std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -543,7 +593,11 @@ mod tests {
                 ..Capacity::default()
             }
         );
-        assert_eq!(written.servant, Servant::default());
+        let servant = Servant {
+            scratch: Some(Size(512 << 20)),
+            ..Servant::default()
+        };
+        assert_eq!(written.servant, servant);
         assert_eq!(written.portal, Portal::default());
         let memory = Memory {
             daemon: Some(Size(1 << 30)),
@@ -562,6 +616,17 @@ mod tests {
     }
 
     #[test]
+    fn what_is_no_proxys_address_is_named() {
+        let config =
+            Config::parse("trusted_proxies = [\"10.0.0.0/8\", \"proxy.lab\"]").expect("read");
+        let refused = format!("{:#}", config.check().expect_err("a name"));
+        assert!(
+            refused.contains("trusted_proxies") && refused.contains("proxy.lab"),
+            "{refused}"
+        );
+    }
+
+    #[test]
     fn a_misspelt_key_is_named() {
         for (text, key) in [
             ("lsiten = \"127.0.0.1:1\"", "lsiten"),
@@ -569,6 +634,15 @@ mod tests {
         ] {
             let refused = format!("{:#}", Config::parse(text).expect_err(key));
             assert!(refused.contains(key), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_quota_that_would_be_none_is_refused() {
+        for text in ["scratch = \"0\"", "inodes = 0", "log_rate = \"0\""] {
+            let config = Config::parse(&format!("[servant]\n{text}\n")).expect("understood");
+            let refused = config.check().expect_err(text).to_string();
+            assert!(refused.contains("256 inodes"), "{refused}");
         }
     }
 

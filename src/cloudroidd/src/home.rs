@@ -1,7 +1,7 @@
 //! The state directory: where everything of one daemon is, and the lock that makes it one.
 //!
 //! ```text
-//! lock  cloudroid.db  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/
+//! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/
 //! ```
 //!
 //! Nobody else enters it (docs/adr/033).
@@ -117,13 +117,19 @@ impl Home {
         closed("definitions", 1, &nothing)?;
         closed("logs", 1, &nothing)?;
         closed("run", 1, &nothing)?;
+        closed("tls", 1, &nothing)?;
         closed("layers", 0, &nothing)?;
         closed("build", 1, &nothing)?;
         // Below a servant's there is only the topmost layer of its root.
         closed("servants", 2, &|path| {
             path.is_dir() && path.ends_with("skeleton")
         })?;
-        for name in ["cloudroid.db", "cloudroid.db-wal", "cloudroid.db-shm"] {
+        for name in [
+            "cloudroid.db",
+            "cloudroid.db-wal",
+            "cloudroid.db-shm",
+            "signing.pem",
+        ] {
             closed(name, 0, &nothing)?;
         }
         if !is_ours(&self.path).map_err(io(CLOSE, &self.path))? {
@@ -155,6 +161,11 @@ impl Home {
     /// The database.
     pub fn database(&self) -> PathBuf {
         self.path.join("cloudroid.db")
+    }
+
+    /// The key that stubs are signed by.
+    pub fn signing_key(&self) -> PathBuf {
+        self.path.join("signing.pem")
     }
 
     /// Listens on the command line's socket, for root and this user alone.
@@ -196,13 +207,14 @@ impl Home {
 }
 
 /// Directories that a daemon, or a new file system, makes in a home.
-const DIRECTORIES: [&str; 9] = [
+const DIRECTORIES: [&str; 10] = [
     "images",
     "layers",
     "run",
     "servants",
     "build",
     "logs",
+    "tls",
     "definitions",
     "cache",
     "lost+found",

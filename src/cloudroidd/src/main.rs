@@ -2,18 +2,20 @@
 //! connects a servant of its own. Here: config → build → serve → drain.
 //!
 //! ```text
-//!   cloudroidctl push ─▶ [push] ─▶ rootfs_builder ─▶ image ─▶ [state]
-//!   robot ─▶ [portal] ─▶ [choreographer] ─▶ servant engine ─▶ shim ─▶ container
-//!              └──────▶ bridge ◀──────────── ros (through the container's network namespace)
+//!   cloudroidctl push ─▶ portal ─▶ push ─▶ rootfs_builder ─▶ image ─▶ catalogue ─▶ store
+//!   robot ─▶ portal ─▶ choreographer ─▶ servant engine ─▶ shim ─▶ container
+//!              └─────▶ reach: bridge, links ◀──── ros (through the container's network namespace)
 //! ```
 
 #![deny(unsafe_code)]
 
 mod admins;
 mod bases;
+mod certificates;
 mod config;
 mod doctor;
 mod home;
+mod machine;
 mod shim;
 mod supervision;
 mod wiring;
@@ -84,13 +86,12 @@ fn main() -> ExitCode {
     let outcome = match &arguments.verb {
         Some(Verb::Doctor { json }) => examine(&arguments, *json),
         None => prepare(arguments).and_then(|(config, home, machine)| {
-            let runtime = tokio::runtime::Builder::new_multi_thread()
-                .enable_all()
-                .build()?;
-            let outcome = runtime.block_on(run(config, home, machine));
+            let (engine, portal) = threads(&config)?;
+            let outcome = portal.block_on(run(config, home, machine));
             // Threads that still work for a cancelled push are not waited for: what they make is half-made, and the
             // next daemon sweeps it.
-            runtime.shutdown_timeout(LAST_WORK);
+            portal.shutdown_timeout(LAST_WORK);
+            engine.end(LAST_WORK);
             outcome
         }),
     };
@@ -103,6 +104,30 @@ fn main() -> ExitCode {
     }
 }
 
+/// The engine's threads, which keep what containers take, and the portal's, which have no rights and on which everything runs
+/// that is not handed over.
+fn threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::runtime::Runtime)> {
+    let account = config.account()?;
+    privilege::limit()?;
+    let engine = privilege::Engine::start(account)?;
+    // Tried once where it can be said why it fails.
+    std::thread::scope(|scope| scope.spawn(|| privilege::confine(account)).join())
+        .unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+    let portal = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .thread_name("portal")
+        .on_thread_start(move || {
+            if let Err(error) = privilege::confine(account) {
+                tracing::error!(
+                    "{error}; ending, because no thread may answer strangers with rights"
+                );
+                std::process::abort();
+            }
+        })
+        .build()?;
+    Ok((engine, portal))
+}
+
 fn home_of(arguments: &Arguments) -> anyhow::Result<PathBuf> {
     match &arguments.home {
         Some(home) => Ok(home.clone()),
@@ -112,7 +137,7 @@ fn home_of(arguments: &Arguments) -> anyhow::Result<PathBuf> {
 
 fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
     let config = Config::read(arguments.config.as_deref())?;
-    let doubts = config.doubts(supervision::machine());
+    let doubts = config.doubts(machine::has());
     let doctor = doctor::examine(&home_of(arguments)?, None, &doubts);
     if json {
         println!("{}", serde_json::to_string_pretty(&doctor)?);
@@ -145,9 +170,7 @@ fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
     require_root(nix::unistd::geteuid())?;
     let home = Home::open(&path)?;
     let (mut machine, missing) = doctor::look(home.path());
-    machine
-        .warnings
-        .extend(config.doubts(supervision::machine()));
+    machine.warnings.extend(config.doubts(machine::has()));
     if !missing.is_empty() {
         bail!(
             "this machine lacks what servants need:\n{}",
@@ -195,7 +218,7 @@ fn as_root() -> String {
 async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()> {
     let socket = home.socket();
     let asked = supervision::end_asked(move || {
-        let _ = std::fs::remove_file(socket);
+        let _ = privilege::now(move || std::fs::remove_file(socket));
     })?;
     let listener = listen(config.listen).await?;
     let socket = home.listen()?;
@@ -232,8 +255,17 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         None,
     ));
     let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
+    if let Some((certificate, key)) = config.tls.files() {
+        // The key is root's.
+        let keeping = certificates::keep(Arc::clone(&app), certificate, key);
+        tokio::spawn(privilege::run(keeping));
+    }
+    let (scheme, shown) = match &app.tls {
+        Some(tls) => ("https", format!(" (certificate {})", tls.fingerprint())),
+        None => ("http", String::new()),
+    };
     tracing::info!(
-        "cloudroidd {} listens on http://{} with state below {}; {adopted} servants adopted",
+        "cloudroidd {} listens on {scheme}://{}{shown} with state below {}; {adopted} servants adopted",
         env!("CARGO_PKG_VERSION"),
         app.listen,
         home.path().display()

@@ -6,8 +6,6 @@ use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use crate::config::{Has, machine_cores};
-
 /// Hears of signals that ask for the daemon's end: the first cancels what this gives. The second ends the process at
 /// once, whatever it is doing, after `at_once`; servants go on, and the next daemon sweeps what was half-made.
 pub fn end_asked(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<CancellationToken> {
@@ -57,17 +55,4 @@ fn report(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(false, state) {
         tracing::debug!("systemd was not told: {error}");
     }
-}
-
-/// What this machine has.
-pub fn machine() -> Has {
-    Has {
-        cores: machine_cores(),
-        memory: servant::host::memory().unwrap_or(u64::MAX),
-    }
-}
-
-/// Nine tenths of the machine's memory.
-pub fn machine_memory() -> u64 {
-    servant::host::memory().map_or(1 << 30, |bytes| bytes / 10 * 9)
 }

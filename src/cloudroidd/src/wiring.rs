@@ -21,7 +21,7 @@ use tokio_util::task::TaskTracker;
 
 use crate::config::{Config, IsolationMode};
 use crate::home::Home;
-use crate::{bases, doctor, supervision};
+use crate::{bases, certificates, doctor, machine};
 
 /// Why something is not to be had.
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
@@ -48,7 +48,7 @@ pub fn build(
     let promised = &config.capacity;
     let memory = promised
         .memory
-        .map_or_else(supervision::machine_memory, |size| size.0);
+        .map_or_else(machine::most_memory, |size| size.0);
     let capacity = Amount::new(promised.cores() * promised.overcommit, memory);
     let choreographer = Choreographer::new(
         config.choreographer(),
@@ -67,7 +67,7 @@ pub fn build(
         Arc::new(local),
     )?;
     let parts = push::Parts {
-        builder,
+        builder: Arc::new(builder),
         catalogue: Arc::clone(&catalogue),
         engine,
         opener,
@@ -76,11 +76,13 @@ pub fn build(
     };
     let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
-    let doubts = config.doubts(supervision::machine());
+    let doubts = config.doubts(machine::has());
     Ok(Arc::new(App {
         principals,
         audit: Audit::new(Arc::clone(&state)),
         listen,
+        tls: certificates::tls(&config.tls, home, listen)?,
+        signing: Arc::new(sign::SigningKey::of_file(&home.signing_key())?),
         home: home.path().to_owned(),
         state,
         catalogue,
@@ -149,6 +151,11 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
         cpus: Some(config.memory.shim_cpus),
         memory: Some(config.memory.shim.0),
         ..servant::spec::Limits::default()
+    };
+    engine.quotas = servant::quotas::Quotas {
+        scratch: config.servant.scratch.map(|size| size.0),
+        inodes: config.servant.inodes,
+        log_rate: config.servant.log_rate.0,
     };
     engine.allow = config.allow.clone();
     engine.isolation = match config.isolation {

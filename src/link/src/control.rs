@@ -174,9 +174,9 @@ pub enum FromRobot {
     Dropped(Vec<Drop>),
     /// Messages of this session that it has not sent, so far.
     Unsent {
-        /// A newer one took their place.
+        /// Messages that a newer one replaced.
         replaced: u64,
-        /// They were too old.
+        /// Messages that had become too old.
         stale: u64,
     },
     /// What was decided about the local original, for the cloud's events, oldest first.

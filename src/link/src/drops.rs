@@ -62,9 +62,9 @@ impl Cause {
 /// Messages that were not sent, as was meant.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Dropped {
-    /// A newer one took their place.
+    /// Messages that a newer one replaced.
     pub replaced: u64,
-    /// They were too old.
+    /// Messages that had become too old.
     pub stale: u64,
 }
 

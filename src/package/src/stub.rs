@@ -10,12 +10,15 @@
 //! gives the same files. The robot's program, `lib/PACKAGE/cloudroid-stub`, is added by the caller, who has it.
 
 mod contents;
+mod manifest;
+mod needed;
 mod nodelets;
 mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
 
 pub use contents::{Content, Contents};
+pub use manifest::{MANIFEST, SIGNATURE, SIGNER, manifest};
 
 use crate::Error;
 use crate::interface::Interface;
@@ -31,6 +34,15 @@ const SETUP_ZSH: &str = include_str!("stub/inside/setup.zsh");
 const INSTALL: &str = include_str!("stub/inside/install.sh");
 const README: &str = include_str!("stub/inside/README.md");
 
+/// Where robots reach the portal.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Portal {
+    /// Such as `wss://server:9090`.
+    pub address: String,
+    /// The fingerprint of its certificate, where no authority has signed it.
+    pub fingerprint: Option<String>,
+}
+
 /// What a stub stands for.
 #[derive(Debug, Clone)]
 pub struct About<'a> {
@@ -42,8 +54,8 @@ pub struct About<'a> {
     pub revision: u64,
     /// Digest of its image.
     pub image: &'a str,
-    /// Where robots reach the portal, such as `ws://server:9090`.
-    pub server: &'a str,
+    /// Where robots reach the portal.
+    pub portal: &'a Portal,
     /// Architecture of the robot's program, as `uname -m` says it.
     pub architecture: &'a str,
     /// Executables that run in the cloud.
@@ -97,7 +109,9 @@ pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
     let refused = nodelets::plugin_lists(&contents.share);
     for (path, content) in contents.share {
         // Below such a name, too: then it is a directory.
-        if OURS.contains(&path.split('/').next().unwrap_or_default()) {
+        if OURS.contains(&path.split('/').next().unwrap_or_default())
+            || !goes_along(&path, &content)
+        {
             continue;
         }
         let content = if refused.contains(&path) {
@@ -123,6 +137,15 @@ pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
     Ok(files)
 }
 
+fn goes_along(path: &str, content: &Content) -> bool {
+    match content {
+        Content::File { executable, .. } => needed::is_needed(path, *executable),
+        Content::Link(target) => {
+            needed::is_needed(path, false) && !target.chars().any(char::is_control)
+        }
+    }
+}
+
 /// Every name that has a launcher in `lib/PACKAGE`: those of the image, and those outsourced.
 fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
     let in_share = |name: &String| {
@@ -140,7 +163,7 @@ fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
             .filter(|name| !in_share(name))
             .cloned(),
     );
-    names.remove(PROGRAM);
+    names.retain(|name| name != PROGRAM && !name.chars().any(char::is_control));
     names
 }
 
@@ -171,8 +194,9 @@ fn launcher(about: &About<'_>, node: &str, up: &str) -> Content {
     };
     let text = template
         .replace("@PACKAGE@", about.package)
-        .replace("@NODE@", &quoted(node))
-        .replace("@UP@", up);
+        .replace("@UP@", up)
+        // The last, since anything may stand in it.
+        .replace("@NODE@", &quoted(node));
     Content::File {
         bytes: text.into_bytes(),
         executable: true,

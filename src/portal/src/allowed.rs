@@ -17,6 +17,7 @@ use crate::audit::{About, is_recorded};
 use crate::errors::Error;
 use crate::guard::Caller;
 use crate::routes::{Access, Of, Route};
+use crate::stubs;
 
 /// The class of robots that name none.
 const DEFAULT: &str = "default";
@@ -52,12 +53,8 @@ pub async fn allowed(
         }
         Of::Stub(parameter) => {
             let file = named(parameter).unwrap_or_default();
-            at_service(
-                &app,
-                caller,
-                action,
-                file.strip_suffix(".tar.gz").unwrap_or(file),
-            )
+            let service = stubs::service(file).map_or(file, |(service, _)| service);
+            at_service(&app, caller, action, service)
         }
         Of::Servant(parameter) => {
             at_servant(&app, caller, action, named(parameter).unwrap_or_default())

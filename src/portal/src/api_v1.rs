@@ -1,6 +1,6 @@
 //! `/api/v1`: what cloudroidctl and the page ask.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use access::{Action, Object};
@@ -52,7 +52,7 @@ pub async fn clock() -> Json<api::Clock> {
 
 /// All checks of the machine, made anew.
 pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
-    let doctor = tokio::task::spawn_blocking(move || (app.examine)())
+    let doctor = privilege::blocking(move || (app.examine)())
         .await
         .map_err(|_| Error::Internal("examining the machine"))?;
     Ok(Json(doctor))
@@ -89,18 +89,29 @@ pub async fn events(
         servant: which.servant.as_deref(),
         robot: which.robot.as_deref(),
     };
-    let mut events = app.state.events_of(filter, which.since, limit)?;
     let principal = &caller.who.principal;
-    if !principal.sees_all() {
-        // A robot is told of itself, and everybody of services that they see; the machine's own are for those who see it.
-        let own = principal.scope.robot.as_deref();
-        events.retain(|event| {
-            let service = event.service.as_deref();
-            service.is_some_and(|service| caller.sees(&app, service))
-                && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
-        });
+    if principal.sees_all() {
+        return Ok(Json(app.state.events_of(filter, which.since, limit)?));
     }
-    Ok(Json(events))
+    // Of all that are kept: the newest may be of what others see alone.
+    let mut events = app.state.events_of(filter, which.since, u32::MAX)?;
+    let mut seen: HashMap<String, bool> = HashMap::new();
+    // A robot is told of itself, and everybody of services that they see; the machine's own are for those who see it.
+    let own = principal.scope.robot.as_deref();
+    events.retain(|event| {
+        let mut sees = |service: &str| match seen.get(service) {
+            Some(sees) => *sees,
+            None => {
+                let sees = caller.sees(&app, service);
+                seen.insert(service.to_owned(), sees);
+                sees
+            }
+        };
+        event.service.as_deref().is_some_and(&mut sees)
+            && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
+    });
+    let beyond = events.len().saturating_sub(limit as usize);
+    Ok(Json(events.split_off(beyond)))
 }
 
 /// All services.

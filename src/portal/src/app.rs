@@ -13,12 +13,16 @@ use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
 use crate::principals::Principals;
+use crate::proxies::Proxies;
+use crate::tls::Tls;
 
 /// What the operator decides of the portal.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// Web origins besides this machine's own whose pages may use the portal without a token.
     pub origins: Vec<String>,
+    /// Proxies in front of the portal that are believed for whom they ask.
+    pub proxies: Proxies,
     /// Where a plain `ws://host:9090` goes.
     pub default_service: Option<String>,
     /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
@@ -52,6 +56,10 @@ pub struct App {
     pub audit: Audit,
     /// Where the portal listens, as bound.
     pub listen: std::net::SocketAddr,
+    /// TLS of the TCP listener; none: plain text.
+    pub tls: Option<Arc<Tls>>,
+    /// What stubs are signed by.
+    pub signing: Arc<sign::SigningKey>,
     /// The state directory.
     pub home: std::path::PathBuf,
     /// The database.
@@ -77,6 +85,7 @@ pub struct App {
 impl App {
     /// Where robots reach a service.
     pub fn address(&self, service: &str) -> String {
+        let scheme = if self.tls.is_some() { "wss" } else { "ws" };
         let mut address = self.listen;
         if address.ip().is_unspecified() {
             let local: std::net::IpAddr = match address.ip() {
@@ -87,13 +96,13 @@ impl App {
                 .ok()
                 .and_then(|name| name.into_string().ok());
             return match host {
-                Some(host) => format!("ws://{host}:{}/{service}", address.port()),
+                Some(host) => format!("{scheme}://{host}:{}/{service}", address.port()),
                 None => {
                     address.set_ip(local);
-                    format!("ws://{address}/{service}")
+                    format!("{scheme}://{address}/{service}")
                 }
             };
         }
-        format!("ws://{address}/{service}")
+        format!("{scheme}://{address}/{service}")
     }
 }

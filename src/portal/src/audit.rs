@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use access::{Action, Sparing};
 use axum::Extension;
-use axum::extract::{Query, State as Asked};
+use axum::extract::{Query, State as AxumState};
 use axum::http::Method;
 use axum::response::Response;
 use futures_util::StreamExt;
@@ -176,7 +176,7 @@ pub struct Which {
 
 /// The audit log, as JSON lines.
 pub async fn audit(
-    Asked(app): Asked<Arc<App>>,
+    AxumState(app): AxumState<Arc<App>>,
     Query(which): Query<Which>,
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {

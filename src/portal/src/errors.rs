@@ -51,6 +51,12 @@ pub enum Error {
     /// A token that lets nobody in.
     #[error(transparent)]
     Unrecognised(#[from] Unrecognised),
+    /// HTTP without TLS, where TLS is spoken.
+    #[error("this port speaks https, and this request came as plain text")]
+    PlainText {
+        /// The address to ask instead.
+        instead: String,
+    },
     /// The request comes from a page that is not ours, or is addressed to another host.
     #[error("{what}")]
     Foreign {
@@ -291,6 +297,7 @@ impl Error {
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 (S::UNAUTHORIZED, "unauthorised", "token needed")
             }
+            Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https is spoken here"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
             Error::UnknownToken { .. } => (S::NOT_FOUND, "unknown-token", "unknown token"),
@@ -328,6 +335,9 @@ impl Error {
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
+            Error::PlainText { instead } => format!(
+                "use {instead}; what was sent, such as a token, could be read by anybody on the way"
+            ),
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),

@@ -6,7 +6,7 @@
 //! and a robot's WebSocket handshake (whose first message must be rosbridge's `auth`) are answered.
 //!
 //! Where there never was a token the portal listens on loopback only, and requests need none: this machine's users see
-//! everything and are any robot; root and the daemon's own user, at its socket, are admins. Web pages of other sites must
+//! everything and are any robot; root, at its socket, is an admin. Web pages of other sites must
 //! not use the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS
 //! rebinding), with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
@@ -16,13 +16,14 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use access::Principal;
+use access::{Action, Principal};
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use catalogue::names;
 use parking_lot::Mutex;
+use tokio_rustls::rustls::pki_types::CertificateDer;
 
 use crate::app::App;
 use crate::errors::Error;
@@ -82,11 +83,44 @@ impl Peer {
     }
 }
 
+/// What is known of a connection before its first request.
+#[derive(Debug, Clone)]
+pub struct Connection {
+    /// The other end.
+    pub peer: Peer,
+    /// Whether nobody on the way can overhear or change what is sent: through TLS, or on this machine's own socket.
+    pub secure: bool,
+    /// Whether a proxy that the operator named asks for somebody else, whose address the peer is then.
+    pub forwarded: bool,
+    /// The certificates that the client has shown in TLS, its own first; none where it showed none.
+    #[cfg_attr(
+        not(test),
+        expect(dead_code, reason = "no certificate of a client is asked for")
+    )]
+    pub certificates: Arc<[CertificateDer<'static>]>,
+}
+
+impl Connection {
+    /// One without TLS.
+    pub fn plain(peer: Peer) -> Connection {
+        Connection {
+            peer,
+            secure: matches!(peer, Peer::Unix(_)),
+            forwarded: false,
+            certificates: Arc::default(),
+        }
+    }
+}
+
 /// Who asks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {
     /// From where.
     pub peer: Peer,
+    /// Whether nobody on the way can overhear or change what is sent.
+    pub secure: bool,
+    /// Whether a proxy that the operator named asks for it.
+    pub forwarded: bool,
     /// Who. Nobody gets the page, `/healthz`, and a WebSocket on which it must first send `auth`.
     pub who: Identity,
 }
@@ -97,14 +131,23 @@ impl Caller {
         !self.who.principal.roles.is_empty()
     }
 
-    fn new(peer: Peer, principal: Principal, shown: Shown) -> Caller {
+    fn new(connection: &Connection, principal: Principal, shown: Shown) -> Caller {
         let who = Identity {
             principal: Arc::new(principal),
             shown,
             token: None,
             owner: None,
         };
-        Caller { peer, who }
+        Caller::by(connection, who)
+    }
+
+    fn by(connection: &Connection, who: Identity) -> Caller {
+        Caller {
+            peer: connection.peer,
+            secure: connection.secure,
+            forwarded: connection.forwarded,
+            who,
+        }
     }
 }
 
@@ -120,16 +163,26 @@ pub struct Rules<'a> {
 
 /// Lets a request through with its [`Caller`], or refuses it.
 pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next) -> Response {
-    let Some(peer) = request.extensions().get::<Peer>().copied() else {
+    let Some(connection) = request.extensions().get::<Connection>() else {
         return Error::Internal("telling who asks").into_response();
     };
+    let connection = match app.options.proxies.seen(connection, request.headers()) {
+        Ok(seen) => seen,
+        Err(error) => return error.into_response(),
+    };
+    let peer = connection.peer;
     let admitted = app.principals.with(|known| {
         let rules = Rules {
             loopback: app.listen.ip().is_loopback(),
             known,
             origins: &app.options.origins,
         };
-        rules.admit(peer, request.method(), request.uri(), request.headers())
+        rules.admit(
+            &connection,
+            request.method(),
+            request.uri(),
+            request.headers(),
+        )
     });
     match admitted {
         Ok(caller) => {
@@ -140,6 +193,11 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
         Err(error) => {
             if let Error::Foreign { what, next } = &error {
                 report(peer, what, next);
+                let (method, path) = (request.method(), request.uri().path());
+                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
+                let (did, status) = (format!("{method} {path}"), error.problem().status);
+                app.audit
+                    .record_sparingly(&nobody, Action::Enter, &did, what, status);
             }
             error.into_response()
         }
@@ -160,20 +218,20 @@ fn report(peer: Peer, what: &str, next: &str) {
 impl Rules<'_> {
     fn admit(
         &self,
-        peer: Peer,
+        connection: &Connection,
         method: &Method,
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Caller, Error> {
-        if let Peer::Unix(user) = peer {
-            return admit_user(user);
+        if let Peer::Unix(user) = connection.peer {
+            return admit_user(connection, user);
         }
         let given = token_in(uri, headers);
         if self.loopback && self.known.tokens.is_empty() && self.known.stored.is_empty() {
             check_direct(headers)?;
             self.check_host(headers)?;
             self.check_origin(headers)?;
-            let mut caller = Caller::new(peer, Principal::local(), Shown::Nothing);
+            let mut caller = Caller::new(connection, Principal::local(), Shown::Nothing);
             // Any token is taken; it only owns robots' names.
             let token = given.as_deref().map(tokens::hash);
             caller.who.owner.clone_from(&token);
@@ -182,11 +240,13 @@ impl Rules<'_> {
         }
         match given {
             Some(token) => {
-                let who = self.known.recognise(&token, peer.ip(), store::now())?;
-                Ok(Caller { peer, who })
+                let from = connection.peer.ip();
+                let who = self.known.recognise(&token, from, store::now())?;
+                Ok(Caller::by(connection, who))
             }
             None if is_open(method, uri, headers) => {
-                Ok(Caller::new(peer, Principal::nobody(), Shown::Nothing))
+                let nobody = Principal::nobody();
+                Ok(Caller::new(connection, nobody, Shown::Nothing))
             }
             None => Err(Error::Unauthorised("a token is needed")),
         }
@@ -229,15 +289,16 @@ impl Rules<'_> {
     }
 }
 
-fn admit_user(user: User) -> Result<Caller, Error> {
+fn admit_user(connection: &Connection, user: User) -> Result<Caller, Error> {
     let User { uid, is_member } = user;
-    if uid == 0 || uid == nix::unistd::geteuid().as_raw() || is_member {
+    // The daemon is root's. This thread is not, and its own user may nothing.
+    if uid == 0 || is_member {
         let name = match uid {
             0 => "root".to_owned(),
             uid => format!("user {uid}"),
         };
         return Ok(Caller::new(
-            Peer::Unix(user),
+            connection,
             Principal::admin(&name),
             Shown::User,
         ));
@@ -406,7 +467,9 @@ mod tests {
         fn told(&self, uri: &str) -> Result<Caller, Error> {
             let peer = Peer::Tcp("127.0.0.1:5000".parse().expect("an address"));
             let uri = uri.parse().expect("a URI");
-            self.rules.admit(peer, &self.method, &uri, &self.headers)
+            let connection = Connection::plain(peer);
+            self.rules
+                .admit(&connection, &self.method, &uri, &self.headers)
         }
     }
 
@@ -646,16 +709,15 @@ mod tests {
     }
 
     #[test]
-    fn only_root_the_daemons_user_and_members_use_the_socket() {
-        let own = nix::unistd::geteuid().as_raw();
-        let stranger = own.wrapping_add(1).max(1);
+    fn only_root_and_members_use_the_socket() {
         for (uid, is_member, admitted) in [
             (0, false, true),
-            (own, false, true),
-            (stranger, false, false),
-            (stranger, true, true),
+            (1, false, false),
+            (1, true, true),
+            (privilege::DEFAULT_USER, false, false),
         ] {
-            match admit_user(User { uid, is_member }) {
+            let user = User { uid, is_member };
+            match admit_user(&Connection::plain(Peer::Unix(user)), user) {
                 Ok(caller) => assert!(
                     admitted && caller.who.principal.is(access::Role::Admin),
                     "{uid}"

@@ -1,7 +1,7 @@
 //! Everything on the port, and on the daemon's Unix socket: one router.
 //!
 //! ```text
-//!  TCP, Unix ─▶ hyper ─▶ guard ─▶ allowed ─┬─▶ /            the page, or the default service
+//!  TLS, TCP, Unix ─▶ hyper ─▶ guard ─▶ allowed ─┬─▶ /            the page, or the default service
 //!                      who asks    may they  ├─▶ /healthz /metrics /assets
 //!                                            ├─▶ /api/v1      what cloudroidctl does
 //!                                            ├─▶ /v2          images, read-only (OCI distribution)
@@ -30,11 +30,13 @@ mod page;
 mod peer_groups;
 mod policy;
 mod principals;
+mod proxies;
 mod push;
 mod robots;
 mod routes;
 mod shadow;
 mod stubs;
+mod tls;
 mod tokens;
 mod views;
 
@@ -53,12 +55,16 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio_util::task::TaskTracker;
 
+pub use ::tls::Fingerprint;
 pub use app::{App, Machine, Options};
 pub use audit::Audit;
 pub use principals::Principals;
+pub use proxies::{Network, NoNetwork, Proxies};
+pub use tls::{Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
 
-use guard::{Peer, User};
+use guard::{Connection, Peer, User};
+use tls::Accepted;
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
@@ -92,12 +98,8 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
         match accepted {
             Ok((stream, address)) => {
                 tune(&stream);
-                connections.spawn(serve(
-                    Arc::clone(&app),
-                    router.clone(),
-                    stream,
-                    Peer::Tcp(address),
-                ));
+                let peer = Peer::Tcp(address);
+                connections.spawn(secured(Arc::clone(&app), router.clone(), stream, peer));
             }
             Err(error) => {
                 tracing::warn!("no connection can be accepted: {error}");
@@ -126,12 +128,8 @@ pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, g
         };
         match accepted.and_then(|(stream, _)| Ok((user(&stream, group)?, stream))) {
             Ok((user, stream)) => {
-                connections.spawn(serve(
-                    Arc::clone(&app),
-                    router.clone(),
-                    stream,
-                    Peer::Unix(user),
-                ));
+                let connection = Connection::plain(Peer::Unix(user));
+                connections.spawn(serve(Arc::clone(&app), router.clone(), stream, connection));
             }
             Err(error) => {
                 tracing::warn!("no connection can be accepted on the socket: {error}");
@@ -160,29 +158,56 @@ async fn drain(app: &App, connections: TaskTracker) {
     let _ = tokio::time::timeout(app.options.drain, connections.wait()).await;
 }
 
+/// Serves a TCP connection, through TLS where the portal speaks it.
+async fn secured(app: Arc<App>, router: Router, stream: TcpStream, peer: Peer) {
+    let Some(tls) = &app.tls else {
+        return serve(app, router, stream, Connection::plain(peer)).await;
+    };
+    let accepted = tokio::select! {
+        accepted = tokio::time::timeout(app.options.handshake, tls.accept(stream)) => accepted,
+        () = app.ending.cancelled() => return,
+    };
+    match accepted {
+        Ok(Ok(Accepted::Tls(stream))) => {
+            let connection = Connection {
+                secure: true,
+                certificates: tls::certificates(&stream),
+                ..Connection::plain(peer)
+            };
+            serve(app, router, *stream, connection).await;
+        }
+        Ok(Ok(Accepted::Plain(stream))) => {
+            serve(app, tls::refusing(), stream, Connection::plain(peer)).await;
+        }
+        Ok(Err(error)) => tracing::debug!("no TLS with {peer}: {error}"),
+        Err(_) => tracing::debug!("no TLS with {peer}: its handshake did not end in time"),
+    }
+}
+
 async fn serve(
     app: Arc<App>,
     router: Router,
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    peer: Peer,
+    connection: Connection,
 ) {
+    let peer = connection.peer;
     let router = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: Request<Incoming>| {
-        request.extensions_mut().insert(peer);
+        request.extensions_mut().insert(connection.clone());
         let answer = hyper::service::Service::call(&router, request);
         async move { Ok::<_, Infallible>(answer.await.unwrap_or_else(|never| match never {})) }
     });
-    let connection = hyper::server::conn::http1::Builder::new()
+    let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(app.options.handshake)
         .serve_connection(TokioIo::new(stream), service)
         .with_upgrades();
-    tokio::pin!(connection);
+    tokio::pin!(served);
     let outcome = tokio::select! {
-        outcome = connection.as_mut() => outcome,
+        outcome = served.as_mut() => outcome,
         () = app.ending.cancelled() => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+            served.as_mut().graceful_shutdown();
+            served.await
         }
     };
     if let Err(error) = outcome {

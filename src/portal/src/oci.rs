@@ -77,7 +77,7 @@ pub async fn manifest(
         ));
     };
     let store = Arc::clone(app.catalogue.images());
-    let found = tokio::task::spawn_blocking(move || store.manifest(&image))
+    let found = privilege::blocking(move || store.manifest(&image))
         .await
         .map_err(|_| Error::Internal("reading a manifest"))??;
     let Some(manifest) = found else {
@@ -115,7 +115,7 @@ pub async fn blob(
         }
     };
     let store = Arc::clone(app.catalogue.images());
-    let found = tokio::task::spawn_blocking(move || {
+    let found = privilege::blocking(move || {
         if let Some(images) = images
             && !is_of(&store, &images, &parsed)?
         {

@@ -49,7 +49,7 @@ pub enum Shown {
 /// Somebody who has been recognised.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
-    /// Who.
+    /// The principal.
     pub principal: Arc<Principal>,
     /// By what.
     pub shown: Shown,

@@ -21,6 +21,7 @@ use reach::{Reach, Stream};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::sync::{mpsc, watch};
+use tokio_rustls::server::TlsStream;
 
 use super::guard::{self, Caller, Peer};
 use super::{App, allowed, auth, handshake, page};
@@ -120,7 +121,7 @@ fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result
 }
 
 /// What the address says about the robot.
-struct Asked {
+struct RobotRequest {
     service: String,
     robot: Option<String>,
     /// The configured default robot, which is everybody's.
@@ -134,8 +135,8 @@ struct Asked {
     stated: Stated,
 }
 
-impl Asked {
-    fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<Asked, Error> {
+impl RobotRequest {
+    fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<RobotRequest, Error> {
         let named = guard::query(uri.query(), "robot");
         let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
         let robot = if shared {
@@ -149,7 +150,7 @@ impl Asked {
         let node = guard::query(uri.query(), "node").unwrap_or_default();
         check_node(&node).map_err(Error::BadRequest)?;
         let stated = Stated::read(guard::pairs(uri.query()));
-        Ok(Asked {
+        Ok(RobotRequest {
             node,
             stated: stated.map_err(Error::Unstatable)?,
             link,
@@ -173,7 +174,7 @@ fn check_node(node: &str) -> Result<(), String> {
     }
 }
 
-impl Asked {
+impl RobotRequest {
     /// Takes for granted what the caller's token says: who has one of a robot is that robot.
     fn by(&mut self, caller: &Caller) -> Result<(), Error> {
         if let Some(own) = &caller.who.principal.scope.robot
@@ -204,7 +205,7 @@ async fn connect(
 ) -> Result<Response, Error> {
     let accept = handshake::accept(&request)?;
     let link = asks_for_link(request.headers())?;
-    let mut asked = Asked::read(&app, service, link, request.uri())?;
+    let mut asked = RobotRequest::read(&app, service, link, request.uri())?;
     // A stub shows its token at once; without it nothing is told, not even what there is.
     if asked.link && !caller.is_known() {
         return Err(Error::Unauthorised("a link needs a token"));
@@ -291,7 +292,7 @@ fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error
 }
 
 /// The right to the servant that is asked for.
-fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
+fn lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lease, Error> {
     let (service, stated) = (&asked.service, asked.stated.clone());
     let request = match &asked.robot {
         None => {
@@ -313,7 +314,7 @@ fn lease(app: &App, asked: &Asked, caller: &Caller) -> Result<Lease, Error> {
 }
 
 /// Whether the caller may be that robot at that service, on those terms.
-fn check(app: &App, asked: &Asked, caller: &Caller) -> Result<(), Error> {
+fn check(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
     caller.may_at(app, Action::Connect, &asked.service, asked.robot.as_deref())?;
     if let Some(class) = &asked.stated.class {
         caller.may_use_class(class)?;
@@ -338,7 +339,7 @@ fn check(app: &App, asked: &Asked, caller: &Caller) -> Result<(), Error> {
 }
 
 /// Records that somebody connected, or was refused, aside: it does not wait for that.
-fn note(app: &Arc<App>, asked: &Asked, caller: &Caller, allowed: &Result<(), Error>) {
+fn note(app: &Arc<App>, asked: &RobotRequest, caller: &Caller, allowed: &Result<(), Error>) {
     let status = match allowed {
         Ok(()) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
         Err(error) => error.problem().status,
@@ -383,7 +384,7 @@ fn nameless(resume: Option<&str>) -> (String, bool) {
 
 async fn upgraded_to(
     app: Arc<App>,
-    asked: Asked,
+    asked: RobotRequest,
     caller: Caller,
     lease: Option<Lease>,
     upgraded: Upgraded,
@@ -393,7 +394,10 @@ async fn upgraded_to(
         Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
         Err(upgraded) => match upgraded.downcast::<TokioIo<UnixStream>>() {
             Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
-            Err(upgraded) => (Box::new(TokioIo::new(upgraded)), bytes::Bytes::new()),
+            Err(upgraded) => match upgraded.downcast::<TokioIo<TlsStream<TcpStream>>>() {
+                Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
+                Err(upgraded) => (Box::new(TokioIo::new(upgraded)), bytes::Bytes::new()),
+            },
         },
     };
     session(app, asked, caller, lease, io, read_ahead).await
@@ -401,7 +405,7 @@ async fn upgraded_to(
 
 async fn session(
     app: Arc<App>,
-    mut asked: Asked,
+    mut asked: RobotRequest,
     mut caller: Caller,
     lease: Option<Lease>,
     mut io: Stream,
@@ -466,7 +470,7 @@ async fn session(
         budget,
         client,
         resume: asked.bound_resume(&caller),
-        granted: Granted::by(granted),
+        granted: Granted::by(granted).telling(refusals(&app, &asked, &caller)),
         ..SessionOptions::default()
     };
     let end = tokio::select! {
@@ -491,6 +495,22 @@ async fn session(
     }
 }
 
+/// Records operations that were refused because nothing grants them.
+fn refusals(
+    app: &Arc<App>,
+    asked: &RobotRequest,
+    caller: &Caller,
+) -> impl Fn(&str) + Send + Sync + 'static {
+    let (app, caller, service) = (Arc::clone(app), caller.clone(), asked.service.clone());
+    move |operation| {
+        let did = format!("was refused {operation}");
+        let object = format!("service {service}");
+        let status = StatusCode::FORBIDDEN.as_u16();
+        app.audit
+            .record_sparingly(&caller, Action::Connect, &did, &object, status);
+    }
+}
+
 /// With which code a robot's connection is closed that has no servant.
 fn code(error: &Error) -> u16 {
     match error.is_final() {
@@ -502,7 +522,7 @@ fn code(error: &Error) -> u16 {
 /// The servant that is asked for, once it is ready, and its lease.
 async fn servant(
     app: &App,
-    asked: &Asked,
+    asked: &RobotRequest,
     caller: &Caller,
     lease: Option<Lease>,
     news: &mpsc::Sender<String>,
@@ -540,7 +560,7 @@ async fn admitted(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), chor
 /// A connection of a robot's stub.
 async fn linked(
     app: &App,
-    asked: &Asked,
+    asked: &RobotRequest,
     caller: &Caller,
     lease: Option<Lease>,
     mut io: Stream,

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use api::Stubs;
-use api::stub::ARCHITECTURE;
+use api::stub::{ARCHITECTURE, SIGNATURE};
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, Query, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use catalogue::stubs::{self, Programs};
+use package::stub::Portal;
 use serde::Deserialize;
 use tokio_util::io::ReaderStream;
 
@@ -27,11 +28,12 @@ pub async fn list(
 ) -> Result<Json<Stubs>, Error> {
     let mut services = app.state.service_names()?;
     services.retain(|name| caller.sees(&app, name));
-    let programs = Programs::look();
+    let programs = privilege::now(Programs::look);
     Ok(Json(Stubs {
         services,
         architectures: programs.held(),
         lacking: programs.lacking(),
+        key: app.signing.public().to_string(),
     }))
 }
 
@@ -42,7 +44,15 @@ pub struct For {
     arch: Option<String>,
 }
 
-/// `/stubs/NAME.tar.gz`.
+/// The service of `NAME.tar.gz` and `NAME.tar.gz.sig`, and whether it is the latter.
+pub fn service(file: &str) -> Option<(&str, bool)> {
+    let signature = file.strip_suffix(".sig");
+    let name = signature.unwrap_or(file).strip_suffix(".tar.gz")?;
+    Some((name, signature.is_some()))
+}
+
+/// `/stubs/NAME.tar.gz`, and `/stubs/NAME.tar.gz.sig`: asked alike, they belong together as long as the service has
+/// the same revision.
 pub async fn archive(
     State(app): State<Arc<App>>,
     Path(file): Path<String>,
@@ -51,21 +61,29 @@ pub async fn archive(
     Extension(caller): Extension<Caller>,
     headers: HeaderMap,
 ) -> Result<Response, Error> {
-    let Some(name) = file.strip_suffix(".tar.gz") else {
+    let Some((name, is_signature)) = service(&file) else {
         return Err(Error::UnknownPath {
-            path: format!("{}; a stub is at /stubs/NAME.tar.gz", uri.path()),
+            path: format!(
+                "{}; a stub is at /stubs/NAME.tar.gz, its signature at /stubs/NAME.tar.gz.sig",
+                uri.path()
+            ),
         });
     };
     let revision = app.catalogue.current(name)?;
-    let program = Programs::look().of(asked.arch.as_deref())?;
-    let server = server(&app, &caller, &headers);
+    let program = privilege::now(Programs::look).of(asked.arch.as_deref())?;
+    let portal = portal(&app, &caller, &headers);
     let inventory = app.catalogue.known(&revision).await?.inventory;
     let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
-    let packing = move || stubs::archive(&store, &revision, &inventory, &program, &server);
-    let file = tokio::task::spawn_blocking(packing)
+    let key = Arc::clone(&app.signing);
+    let packing = move || stubs::archive(&store, &revision, &inventory, &program, &portal, &key);
+    let archive = privilege::blocking(packing)
         .await
         .map_err(|_| Error::Internal("packing a stub"))??;
+    if is_signature {
+        let kind = [(header::CONTENT_TYPE, "application/x-ssh-signature")];
+        return Ok((kind, archive.signature).into_response());
+    }
     let headers = [
         (header::CONTENT_TYPE, "application/gzip".to_owned()),
         (
@@ -76,47 +94,31 @@ pub async fn archive(
             header::HeaderName::from_static(ARCHITECTURE),
             architecture.to_owned(),
         ),
+        (
+            header::HeaderName::from_static(SIGNATURE),
+            sign::in_a_line(&archive.signature),
+        ),
     ];
-    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
+    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(archive.file), CHUNK);
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 
 /// Where the robot reaches this portal: as whoever asks for the stub reached it.
-fn server(app: &App, caller: &Caller, headers: &HeaderMap) -> String {
+fn portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
     let host = headers
         .get(header::HOST)
         .and_then(|host| host.to_str().ok())
         .filter(|host| stubs::is_authority(host));
-    match (caller.peer, host) {
-        (Peer::Tcp(_), Some(host)) => format!("{}://{host}", scheme(headers)),
-        _ => {
-            let address = app.address("");
-            address.trim_end_matches('/').to_owned()
-        }
-    }
-}
-
-/// A proxy in front of the portal speaks TLS in its place, and says so.
-fn scheme(headers: &HeaderMap) -> &'static str {
-    let forwarded = headers.get("x-forwarded-proto");
-    match forwarded.and_then(|protocol| protocol.to_str().ok()) {
-        Some("https" | "wss") => "wss",
-        _ => "ws",
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_stub_fetched_through_tls_is_linked_through_tls() {
-        let mut headers = HeaderMap::new();
-        assert_eq!(scheme(&headers), "ws");
-        headers.insert(
-            "x-forwarded-proto",
-            header::HeaderValue::from_static("https"),
-        );
-        assert_eq!(scheme(&headers), "wss");
+    let scheme = if caller.secure { "wss" } else { "ws" };
+    let address = match (caller.peer, host) {
+        (Peer::Tcp(_), Some(host)) => format!("{scheme}://{host}"),
+        _ => app.address("").trim_end_matches('/').to_owned(),
+    };
+    // What a proxy shows is its own.
+    let direct = !caller.forwarded;
+    let tls = app.tls.as_ref().filter(|tls| direct && tls.signs_itself());
+    Portal {
+        address,
+        fingerprint: tls.map(|tls| tls.fingerprint().to_string()),
     }
 }

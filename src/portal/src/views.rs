@@ -164,7 +164,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
 /// What they use together, and how much the machine waits.
 async fn used(servants: &[Arc<Handle>]) -> api::Usage {
     let mut sum = api::Usage {
-        pressure: machine_pressure(),
+        pressure: servant::host::pressure(),
         ..api::Usage::default()
     };
     for servant in servants {
@@ -190,13 +190,4 @@ pub fn log_line(line: servant::engine::LogLine) -> api::LogLine {
         },
         line: line.line,
     }
-}
-
-/// How much the whole machine waits; none where its kernel does not tell (PSI).
-fn machine_pressure() -> Option<api::Pressure> {
-    servant::host::pressure().map(|some| api::Pressure {
-        cpu: some.cpu,
-        memory: some.memory,
-        io: some.io,
-    })
 }

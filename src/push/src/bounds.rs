@@ -12,6 +12,7 @@ use std::time::Duration;
 use api::Size;
 use foreign::Visit;
 use nix::sys::statvfs::statvfs;
+use rootfs_builder::blocking;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::Error;
@@ -83,7 +84,8 @@ async fn overfull(most: Size, directory: &Path) -> String {
     let mut known = None;
     loop {
         ticks.tick().await;
-        let taken = taken(directory);
+        let of = directory.to_owned();
+        let taken = privilege::blocking(move || taken(&of)).await.unwrap_or(0);
         if let Some((at, size, then)) = known
             && Instant::now() < at + MEASURE_EVERY
             && size + taken.saturating_sub(then) <= most.0
@@ -93,7 +95,8 @@ async fn overfull(most: Size, directory: &Path) -> String {
         }
         let measured = directory.to_owned();
         // Cancelled with the push.
-        match rootfs_builder::blocking::spawn(move || measure(measured, most.0)).await {
+        let work = blocking::cancelled_with_this(move || measure(measured, most.0));
+        match privilege::blocking(work).await {
             Ok(Ok(size)) if size > most.0 => {
                 return format!("its files take more than the {most} that a push may have");
             }

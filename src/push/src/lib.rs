@@ -61,7 +61,7 @@ const HOME_INSIDE: &str = "/root";
 /// What a push is done with.
 pub struct Parts {
     /// Makes images.
-    pub builder: Builder,
+    pub builder: Arc<Builder>,
     /// Where they are published.
     pub catalogue: Arc<Catalogue>,
     /// Starts the container in which the interface is looked for.
@@ -82,7 +82,7 @@ pub struct Pusher {
     engine: Arc<dyn Engine>,
     opener: Arc<dyn Opener>,
     choreographer: Choreographer,
-    builder: Builder,
+    builder: Arc<Builder>,
     journal: Journal,
     places: Places,
     published: AtomicU64,
@@ -196,7 +196,11 @@ impl Pusher {
                 let tree = self.home.join("build").join(id).join(PUSHED);
                 receive::unpack(archive, &tree, &self.options, report).await?;
                 if let Some(name) = &options.name {
-                    self.check_owner(name, &receive::packages_of(&tree))?;
+                    let of = tree.clone();
+                    let packages = privilege::blocking(move || receive::packages_of(&of)).await;
+                    let packages =
+                        packages.map_err(|_| Error::Internal("looking at the package"))?;
+                    self.check_owner(name, &packages)?;
                 }
                 Source::Tree(tree)
             }
@@ -310,7 +314,11 @@ impl Pusher {
                 report.event(push_event(event)).await;
             }
         };
-        let (built, ()) = tokio::join!(self.builder.build(&request, sender), forwarded);
+        let builder = Arc::clone(&self.builder);
+        let work = async move { builder.build(&request, sender).await };
+        // However this is left: what the build has begun is cleared away when it has seen so (`Pusher::run`).
+        let work = privilege::run(report.building.track_future(work));
+        let (built, ()) = tokio::join!(work, forwarded);
         built.map_err(|error| push_error(&error, &self.home, &options.source))
     }
 }

@@ -197,7 +197,7 @@ mod tests {
     async fn pushes_take_turns_and_no_more_wait_than_may() {
         let places = Arc::new(Places::new(&options()));
         let (sender, mut told) = mpsc::channel(16);
-        let report = Reporter(sender);
+        let report = Reporter::new(sender);
         let first = places.enter(None, &report).await.expect("free");
         let (again, report_again) = (Arc::clone(&places), report.clone());
         let second = tokio::spawn(async move { again.enter(None, &report_again).await.map(drop) });
@@ -225,7 +225,7 @@ mod tests {
         };
         let places = Arc::new(Places::new(&options));
         let (sender, mut told) = mpsc::channel(16);
-        let report = Reporter(sender);
+        let report = Reporter::new(sender);
         let first = places.enter(Some("a"), &report).await.expect("free");
         let (again, report_again) = (Arc::clone(&places), report.clone());
         let named = tokio::spawn(async move {

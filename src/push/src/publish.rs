@@ -1,5 +1,7 @@
 //! Publishing, rolling back and removing services: the catalogue does it, servants and warm containers follow.
 
+use std::sync::Arc;
+
 use api::rollout::RolloutTerms;
 use catalogue::RolledBack;
 use package::inventory::Inventory;
@@ -91,7 +93,10 @@ impl Pusher {
     }
 
     pub(super) async fn collect_garbage(&self) {
-        let mut keep = self.builder.keep();
+        let builder = Arc::clone(&self.builder);
+        let mut keep = privilege::blocking(move || builder.keep())
+            .await
+            .unwrap_or_default();
         let in_use = self.choreographer.images_in_use();
         keep.extend(
             in_use

@@ -1,7 +1,9 @@
 //! The archive of a push: unpacked while it comes in, so that it is never on disk as such.
 
+use std::fs::File;
 use std::io::{self, Read};
-use std::path::Path;
+use std::os::fd::AsRawFd;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -63,14 +65,12 @@ pub(super) async fn unpack(
     };
     let (limit, slowest) = (limits.archive, limits.min_rate);
     let destination = tree.to_owned();
+    let place = privilege::blocking(move || Place::make(&destination))
+        .await
+        .map_err(|_| Error::Internal("making room for the archive"))??;
+    let inside = place.inside();
     let work = blocking::spawn(move || {
-        let parent = destination.parent().unwrap_or(&destination);
-        store::private::make_directory(parent).map_err(|error| Error::Failed {
-            message: format!("cannot make {}: {error}", parent.display()),
-            next: None,
-            log: Vec::new(),
-        })?;
-        let outcome = image::unpack(&mut counted, &destination, &unpacked);
+        let outcome = image::unpack(&mut counted, &inside, &unpacked);
         if counted.exceeded {
             return Err(Error::TooLarge { limit });
         }
@@ -98,6 +98,88 @@ pub(super) async fn unpack(
     tokio::select! {
         outcome = work => outcome.map_err(|_| Error::Internal("unpacking the archive"))?,
         () = told => Ok(()),
+    }?;
+    let done = blocking::cancelled_with_this(move || place.done());
+    privilege::blocking(done)
+        .await
+        .map_err(|_| Error::Internal("taking over what was unpacked"))?
+}
+
+/// Where an archive is unpacked by threads that may write nowhere else: a directory that is theirs, which they know by its
+/// descriptor, since they cannot get to it by its path.
+struct Place {
+    /// That directory.
+    opened: File,
+    path: PathBuf,
+    /// Where the tree is to be in the end.
+    tree: PathBuf,
+}
+
+/// The tree, in the directory in which it is unpacked.
+const UNPACKED: &str = "tree";
+
+impl Place {
+    fn make(tree: &Path) -> Result<Self, Error> {
+        let parent = tree.parent().unwrap_or(tree);
+        let path = parent.join("received");
+        let failed = cannot("make", &path);
+        store::private::make_directory(&path).map_err(failed)?;
+        let opened = File::open(&path).map_err(cannot("open", &path))?;
+        if let Some(account) = privilege::confined() {
+            std::os::unix::fs::fchown(&opened, Some(account.user), Some(account.group))
+                .map_err(cannot("give away", &path))?;
+        }
+        Ok(Self {
+            opened,
+            path,
+            tree: tree.to_owned(),
+        })
+    }
+
+    /// The tree's path for those threads.
+    fn inside(&self) -> PathBuf {
+        PathBuf::from(format!(
+            "/proc/self/fd/{}/{UNPACKED}",
+            self.opened.as_raw_fd()
+        ))
+    }
+
+    /// Takes the tree over: it is this user's from now on, and where it is to be.
+    fn done(self) -> Result<(), Error> {
+        let found = self.path.join(UNPACKED);
+        if privilege::confined().is_some() {
+            let failed = cannot("take over", &found);
+            take_over(&found).map_err(|error| failed(io::Error::other(error)))?;
+        }
+        std::fs::rename(&found, &self.tree).map_err(cannot("move", &found))?;
+        std::fs::remove_dir(&self.path).map_err(cannot("remove", &self.path))
+    }
+}
+
+/// Makes the files of a tree this user's, and no link's target.
+fn take_over(tree: &Path) -> Result<(), foreign::Error> {
+    let (user, group) = (rustix::process::geteuid(), rustix::process::getegid());
+    let ours = |error: rustix::io::Errno| foreign::Error::File {
+        action: "take over",
+        path: tree.to_owned(),
+        source: error.into(),
+    };
+    // First the directories that lead there: nobody else changes them from then on.
+    let no_link = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
+    rustix::fs::chownat(rustix::fs::CWD, tree, Some(user), Some(group), no_link).map_err(ours)?;
+    foreign::walk(tree, |entry| {
+        let (parent, name) = entry.place();
+        rustix::fs::chownat(parent, name, Some(user), Some(group), no_link).map_err(ours)?;
+        Ok(foreign::Visit::Into)
+    })
+}
+
+fn cannot(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.display().to_string();
+    move |error| Error::Failed {
+        message: format!("cannot {action} {path}: {error}"),
+        next: None,
+        log: Vec::new(),
     }
 }
 
@@ -247,7 +329,7 @@ mod tests {
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
         let whole = futures_util::stream::iter([Ok(Bytes::from(bytes))]).boxed();
-        unpack(whole, &tree, limits, &Reporter(sender)).await?;
+        unpack(whole, &tree, limits, &Reporter::new(sender)).await?;
         Ok(packages_of(&tree))
     }
 
@@ -293,7 +375,7 @@ mod tests {
             stall: Duration::from_millis(50),
             ..Options::wide()
         };
-        let refused = unpack(body, &tree, &limits, &Reporter(sender))
+        let refused = unpack(body, &tree, &limits, &Reporter::new(sender))
             .await
             .expect_err("it never ends");
         assert!(
@@ -319,7 +401,7 @@ mod tests {
         });
         let push = tokio::spawn(async move {
             let body = never.boxed();
-            unpack(body, &tree, &Options::wide(), &Reporter(sender)).await
+            unpack(body, &tree, &Options::wide(), &Reporter::new(sender)).await
         });
         waiting.await.expect("it reads");
         push.abort();

@@ -11,14 +11,26 @@ use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::task::TaskTracker;
 
 use super::{Archive, Error, Pusher, receive, shared};
 
 /// Tells the client what is being done. It may have gone away: that cancels the push by itself.
 #[derive(Clone)]
-pub(super) struct Reporter(pub(super) mpsc::Sender<PushEvent>);
+pub(super) struct Reporter {
+    events: mpsc::Sender<PushEvent>,
+    /// The build of this push, as long as it works.
+    pub(super) building: TaskTracker,
+}
 
 impl Reporter {
+    pub(super) fn new(events: mpsc::Sender<PushEvent>) -> Self {
+        Self {
+            events,
+            building: TaskTracker::new(),
+        }
+    }
+
     pub(super) async fn step(&self, title: &str) {
         self.event(PushEvent::Step {
             title: title.to_owned(),
@@ -31,7 +43,7 @@ impl Reporter {
     }
 
     pub(super) async fn event(&self, event: PushEvent) {
-        let _ = self.0.send(event).await;
+        let _ = self.events.send(event).await;
     }
 }
 
@@ -82,7 +94,7 @@ impl Pusher {
         let pusher = Arc::clone(self);
         self.tasks.spawn(async move {
             let outcome = pusher
-                .run(&options, &by, archive, &Reporter(events), cancel)
+                .run(&options, &by, archive, &Reporter::new(events), cancel)
                 .await;
             let failed = outcome.is_err();
             finished(outcome).await;
@@ -137,9 +149,11 @@ impl Pusher {
             () = cancel.cancelled() => Err(Error::Ending),
         };
         // First what the builder has in there: it goes when its containers have ended.
+        report.building.close();
+        report.building.wait().await;
         self.builder.removed(&id).await;
         let build = self.home.join("build").join(&id);
-        let removed = tokio::task::spawn_blocking(move || foreign::remove(&build)).await;
+        let removed = privilege::blocking(move || foreign::remove(&build)).await;
         if let Ok(Err(error)) = removed {
             tracing::warn!("what the push {id} left remains until the next start: {error}");
         }

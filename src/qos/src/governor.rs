@@ -14,6 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::arbiter::{Arbiter, Kind, Limits, Record, Verdict};
+use crate::channel::Channel;
 use crate::decider::{Decider, Event, LocalState};
 use crate::measure::Meter;
 use crate::pair::{Correlation, Pair};
@@ -23,7 +24,7 @@ use crate::request::{Failure, Key, Leg, RequestId, Side, Sides};
 use crate::satisfaction::Satisfaction;
 use crate::sla::{Mode, Sla};
 
-pub use effect::{Channel, Effect};
+pub use effect::Effect;
 use frames::Metered;
 use stream::Stream;
 

@@ -26,6 +26,7 @@
 #![forbid(unsafe_code)]
 
 mod arbiter;
+mod channel;
 mod decider;
 mod finder;
 mod governor;
@@ -43,9 +44,10 @@ mod sla_error;
 mod span;
 
 pub use arbiter::{Arbiter, Limits, Verdict};
+pub use channel::Channel;
 pub use decider::{Decider, Event, LocalState, Why};
 pub use finder::{Found, Topic, find};
-pub use governor::{Channel, Effect, Governor};
+pub use governor::{Effect, Governor};
 pub use hand_over::{HandOver, Ledger, Missed};
 pub use measure::Meter;
 pub use outcome::Outcome;

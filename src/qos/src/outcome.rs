@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::governor::Channel;
+use crate::channel::Channel;
 use crate::phases::Phases;
 use crate::request::{RequestId, Side, Stamp};
 

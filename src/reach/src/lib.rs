@@ -7,8 +7,9 @@
 //!  hosts outside ◀─ relays ◀─ loopback addresses inside
 //! ```
 //!
-//! It knows one servant at a time, and of the rest of the daemon what [`Observer`] and [`Tenant`] show. The rest of the daemon
-//! knows it as a [`Reach`], which an [`Opener`] gives for a servant of its engine; [`LocalOpener`] is that of this host.
+//! It knows one servant at a time (a [`group`] knows those of one shared service), and of the rest of the daemon what
+//! [`Observer`] and [`Tenant`] show. The rest of the daemon knows it as a [`Reach`], which an [`Opener`] gives for a servant of
+//! its engine; [`LocalOpener`] is that of this host.
 
 #![forbid(unsafe_code)]
 

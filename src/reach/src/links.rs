@@ -19,37 +19,39 @@ mod inputs;
 mod lent;
 mod mirror;
 mod node_link;
+mod nodes;
 mod outputs;
 mod parameters;
+mod status;
 mod turns;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 use std::time::Duration;
 
-use async_trait::async_trait;
 use budget::Budget;
 use parking_lot::Mutex;
 use ros::bus::{Bus, ParamValue};
 use ros::schema::Registry;
 use ros::sizes::{Inputs, Seen};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::sync::{OnceCell, mpsc, watch};
+use tokio::sync::{OnceCell, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use link::control::{Decision, Exit, FromCloud, Hello, Node, Request, Sla, Welcome};
-use link::drops::Drop;
+use link::control::{FromCloud, Hello, Sla, Welcome};
 use link::packing::decoded_here;
 use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
 use link::{MAX_FRAME, MAX_RECORD};
 
-use crate::{Flow, Linked, Tenant};
+use crate::Flow;
 use attempts::Attempts;
 use duplicates::Machine;
 use node_link::NodeLink;
+pub use nodes::Nodes;
+pub use status::LinkStatus;
 use turns::Turns;
 
 /// For the robot's hello.
@@ -62,41 +64,6 @@ const STOP: [(i32, Duration); 3] = [
 ];
 /// Where the runs of nodes are remembered beyond this process: below this key of the servant's parameters.
 const RUNS: &str = "/cloudroid_runs";
-
-/// What a servant does for its links.
-#[async_trait]
-pub trait Nodes: Send + Sync + 'static {
-    /// Starts the node; comes back when its program runs, or says why it cannot.
-    async fn start(&self, node: &Node) -> Result<(), String>;
-    /// Sends it a signal.
-    async fn signal(&self, node: &str, signal: i32) -> Result<(), String>;
-    /// Waits for its end; at once if it does not run.
-    async fn ended(&self, node: &str) -> Exit;
-    /// Whether it runs.
-    async fn is_running(&self, node: &str) -> bool;
-    /// Those that were started and run, as the robot's stubs said; none where they are not started one by one.
-    async fn running(&self) -> Vec<Linked> {
-        Vec::new()
-    }
-    /// Parameters that the deployer gave for this executable: they win over the robot's.
-    fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)>;
-    /// A path or text of the robot as the servant knows it.
-    fn translate(&self, node: &Node, text: &str) -> String;
-    /// What the node prints from now on: on standard error or not, and the line.
-    fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)>;
-    /// Its robot has decided something about the local original.
-    fn decided(&self, _node: &str, _decision: &Decision) {}
-    /// The cloud's time of a request, and its parts, have become known: once for each request.
-    fn measured(&self, _request: &Request) {}
-    /// Something that whoever looks after the server should know of this robot.
-    fn warn(&self, kind: &str, text: &str);
-    /// What this robot gives its node, and the node that answers in its place does not heed; in words.
-    fn unheeded(&self, _hello: &Hello) -> Option<String> {
-        None
-    }
-    /// From now on the nodes are this one's.
-    fn bind(&self, _tenant: Weak<dyn Tenant>) {}
-}
 
 /// Habits of a hub.
 #[derive(Debug, Clone)]
@@ -148,41 +115,6 @@ pub struct Hub {
     /// How large what robots send to nodes is.
     inputs: Inputs,
     closed: watch::Sender<Option<String>>,
-}
-
-/// How a link is doing, for whoever explains.
-#[derive(Debug, Clone)]
-pub struct LinkStatus {
-    /// The node.
-    pub node: String,
-    /// Its connection is there and not silent.
-    pub up: bool,
-    /// Last round trip, milliseconds.
-    pub round_trip: Option<f64>,
-    /// The robot's clock minus ours, milliseconds.
-    pub clock: Option<f64>,
-    /// Bytes per second downwards, when it had to hurry.
-    pub throughput: Option<f64>,
-    /// Messages that were dropped in the cloud.
-    pub drops: Vec<Drop>,
-    /// Messages dropped on the robot, as its stub reported.
-    pub dropped: Vec<Drop>,
-    /// What the robot asked for.
-    pub sla: Sla,
-    /// Its last requests, as it told them, oldest first.
-    pub requests: Vec<Request>,
-    /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
-    pub unsent: u64,
-    /// The number of the last inputs that the node was given and that have a stamp.
-    pub given: usize,
-    /// Of these, the inputs that it has left out: it answered later ones first.
-    pub left_out: usize,
-    /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
-    pub unfed: Vec<String>,
-    /// Services that the node has looked for in vain, and that are not known to be there now.
-    pub unserved: Vec<String>,
-    /// Other machines that are connected as the same robot.
-    pub duplicates: Vec<String>,
 }
 
 impl Hub {

@@ -11,7 +11,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use tokio::sync::watch;
 
-use crate::ring::DropCount;
+use crate::ring::{DropCount, Held};
 use crate::schema::ActionDef;
 
 mod actions;
@@ -64,6 +64,12 @@ pub struct Message {
     pub publisher: PeerId,
     /// Whether the publisher is transient-local: a newcomer must be given the last one per publisher.
     pub latching: bool,
+}
+
+impl Held for Message {
+    fn held(&self) -> usize {
+        self.bytes.len()
+    }
 }
 
 /// A live subscription; dropping it unsubscribes.

@@ -24,7 +24,6 @@ mod json_in;
 mod json_out;
 mod json_text;
 mod number;
-pub(crate) mod plan;
 mod stamps;
 mod typed_array;
 mod value;

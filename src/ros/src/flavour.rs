@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::bus::{ParamValue, RosVersion};
+pub use crate::identity::Identity;
 use crate::ros1::process;
 
 /// The base that an image is built upon, and its ROS.
@@ -45,15 +46,6 @@ impl Default for Flavour {
             distribution: "noetic".to_owned(),
         }
     }
-}
-
-/// What tells a program which node it is.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Identity {
-    /// To be added to its command line.
-    pub argument: String,
-    /// To be added to its environment.
-    pub environment: (String, String),
 }
 
 impl Flavour {

@@ -6,9 +6,12 @@
 
 pub mod bag;
 pub mod bus;
+mod cbor_head;
 pub mod codec;
 mod connect;
 pub mod flavour;
+mod identity;
+mod join;
 pub mod net;
 pub mod ring;
 pub mod ros1;
@@ -16,4 +19,5 @@ pub mod schema;
 pub mod sizes;
 pub mod turns;
 
-pub use connect::{JoinOptions, connect};
+pub use connect::connect;
+pub use join::JoinOptions;

@@ -3,11 +3,14 @@
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
 
 /// A place in which TCP sockets can be opened: a servant's network namespace, or the host's own.
 #[async_trait]
@@ -44,6 +47,48 @@ pub fn watch(stream: &TcpStream) {
         .and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
     if let Err(error) = asked {
         tracing::debug!(%error, "a peer that goes without a word will not be noticed");
+    }
+}
+
+/// Accepts connections and has each served by a task of its own, until dropped, which also ends every connection. At most
+/// `most` are served at a time; further ones wait in the backlog. `what` names the protocol in the log.
+pub(crate) async fn serve_each<F, E>(
+    listener: TcpListener,
+    most: usize,
+    what: &'static str,
+    serve: impl Fn(TcpStream) -> F,
+) where
+    F: Future<Output = Result<(), E>> + Send + 'static,
+    E: std::fmt::Display,
+{
+    let places = Arc::new(Semaphore::new(most));
+    let mut connections = JoinSet::new();
+    loop {
+        let Ok(place) = places.clone().acquire_owned().await else {
+            return;
+        };
+        let stream = loop {
+            tokio::select! {
+                accepted = listener.accept() => match accepted {
+                    Ok((stream, _)) => break stream,
+                    Err(error) => {
+                        // Out of file descriptors, mostly: serving must go on once there are some again.
+                        tracing::warn!(%error, "cannot accept a connection of {what}");
+                        tokio::time::sleep(Duration::from_millis(100)).await;
+                    }
+                },
+                Some(_) = connections.join_next() => {}
+            }
+        };
+        let _ = stream.set_nodelay(true);
+        watch(&stream);
+        let served = serve(stream);
+        connections.spawn(async move {
+            let _place = place;
+            if let Err(error) = served.await {
+                tracing::debug!(%error, "a connection of {what} broke");
+            }
+        });
     }
 }
 

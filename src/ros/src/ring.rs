@@ -10,8 +10,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 
-use crate::bus::Message;
-
 /// What a ring holds. Its size may not change while it is held.
 pub trait Held {
     /// Bytes of memory that it takes while it waits.
@@ -21,12 +19,6 @@ pub trait Held {
 impl Held for Bytes {
     fn held(&self) -> usize {
         self.len()
-    }
-}
-
-impl Held for Message {
-    fn held(&self) -> usize {
-        self.bytes.len()
     }
 }
 

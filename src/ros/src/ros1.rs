@@ -4,6 +4,7 @@ pub mod actions;
 mod bus;
 pub mod master;
 pub mod names;
+pub mod own_parameters;
 pub mod process;
 mod reply;
 pub mod tcpros;

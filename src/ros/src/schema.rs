@@ -7,6 +7,7 @@
 mod action;
 mod limits;
 mod parse;
+pub(crate) mod plan;
 mod registry;
 mod resolve;
 mod text;

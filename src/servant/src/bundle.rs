@@ -11,14 +11,12 @@ use oci_spec::runtime::{
 };
 
 use crate::container::{ContainerSpec, Profile};
+use crate::quotas::Quotas;
 use crate::rootfs::{COMPILE_USER, Staged};
 use crate::seccomp;
 
 /// Open files of one process; more only slows down programs that close every number they might have open.
 const OPEN_FILES: u64 = 16_384;
-
-/// Bytes of each tmpfs where neither spec nor engine bounds memory.
-const SCRATCH: u64 = 256 << 20;
 
 const MASKED: [&str; 9] = [
     "/proc/acpi",
@@ -47,6 +45,7 @@ pub fn config(
     spec: &ContainerSpec,
     staged: &Staged,
     uid: (u32, u32),
+    quotas: &Quotas,
 ) -> Result<OciSpec, OciSpecError> {
     let mapping = LinuxIdMappingBuilder::default()
         .container_id(0_u32)
@@ -88,7 +87,7 @@ pub fn config(
                 .build()?,
         )
         .process(process(spec)?)
-        .mounts(mounts(spec, &staged.volumes)?)
+        .mounts(mounts(spec, &staged.volumes, quotas)?)
         .linux(linux)
         .build()
 }
@@ -164,8 +163,12 @@ fn rlimit(kind: PosixRlimitType, wanted: u64) -> Result<PosixRlimit, OciSpecErro
         .build()
 }
 
-fn mounts(spec: &ContainerSpec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSpecError> {
-    let scratch = spec.limits.memory.map_or(SCRATCH, |bytes| bytes / 2);
+fn mounts(
+    spec: &ContainerSpec,
+    volumes: &[PathBuf],
+    quotas: &Quotas,
+) -> Result<Vec<Mount>, OciSpecError> {
+    let scratch = quotas.scratch(spec.limits.memory);
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
         let mut options: Vec<String> = safe
@@ -173,7 +176,12 @@ fn mounts(spec: &ContainerSpec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSp
             .chain(extra)
             .map(|option| (*option).to_owned())
             .collect();
-        options.extend([format!("mode={mode}"), format!("size={size}")]);
+        let inodes = quotas.inodes;
+        options.extend([
+            format!("mode={mode}"),
+            format!("size={size}"),
+            format!("nr_inodes={inodes}"),
+        ]);
         mount(target, "tmpfs", "tmpfs", options)
     };
     let words = |list: &[&str]| {
@@ -192,7 +200,13 @@ fn mounts(spec: &ContainerSpec, volumes: &[PathBuf]) -> Result<Vec<Mount>, OciSp
             "/dev",
             "tmpfs",
             "tmpfs",
-            words(&["nosuid", "strictatime", "mode=755", "size=64k"]),
+            words(&[
+                "nosuid",
+                "strictatime",
+                "mode=755",
+                "size=64k",
+                "nr_inodes=1024",
+            ]),
         )?,
         mount(
             "/dev/pts",
@@ -277,6 +291,7 @@ mod tests {
                     volumes: vec![],
                 },
                 (5, 65536),
+                &Quotas::default(),
             )
             .unwrap(),
         )
@@ -321,7 +336,8 @@ mod tests {
     #[test]
     fn every_tmpfs_is_bounded() {
         for mount in json(Profile::Servant)["mounts"].as_array().unwrap() {
-            let bounded = mount["options"].to_string().contains("size=");
+            let options = mount["options"].to_string();
+            let bounded = options.contains("\"size=") && options.contains("\"nr_inodes=");
             assert_eq!(mount["type"] == "tmpfs", bounded, "{mount}");
         }
     }

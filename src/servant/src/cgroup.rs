@@ -29,13 +29,11 @@ mod cores;
 mod disk;
 mod files;
 mod hosts;
-mod unmet;
 mod v1;
 mod v2;
 
 use files::{read_number, read_pids};
 pub use hosts::Parent;
-pub use unmet::{missing, unmet};
 
 /// The directories of one servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

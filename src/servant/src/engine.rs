@@ -1,14 +1,18 @@
 //! The seam to whoever starts servants. It speaks of servants alone: no pid, user id, path or namespace of a host.
 
+mod unmet;
+
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use api::Grants;
+use api::{Grants, Pressure};
 use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::spec::{Limits, NodeSpec, Spec};
+
+pub use unmet::missing;
 
 /// Where a servant's container is in its life. (Admission and readiness, which need more knowledge than the
 /// engine has, are the choreographer's.)
@@ -97,13 +101,6 @@ pub struct Enforced {
     pub shim: Limits,
 }
 
-impl Enforced {
-    /// Which of the limits asked for are not in force, each with the reason.
-    pub fn unmet(&self, asked: &Limits) -> Vec<String> {
-        crate::cgroup::unmet(asked, self)
-    }
-}
-
 /// Usage as the kernel counts it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Usage {
@@ -122,17 +119,6 @@ pub struct Usage {
     pub throttled_usec: u64,
     /// How much of the last ten seconds some of it waited for what others used; none where the kernel does not tell.
     pub pressure: Option<Pressure>,
-}
-
-/// Percent of the last ten seconds in which some thread waited (`some avg10` of pressure stall information).
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Pressure {
-    /// For a core.
-    pub cpu: f64,
-    /// For memory.
-    pub memory: f64,
-    /// For a disk.
-    pub io: f64,
 }
 
 /// One line that a process printed.

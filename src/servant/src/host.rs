@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::engine::Pressure;
+use api::Pressure;
 
 /// Bytes of memory that the host has; none where `/proc/meminfo` cannot be read.
 pub fn memory() -> Option<u64> {

@@ -14,17 +14,18 @@ use std::fs;
 use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::cgroup::{Cgroup, Parent};
-use crate::container::ContainerSpec;
+use crate::container::{ContainerSpec, Profile};
 use crate::engine::ContainerState;
-use crate::local::{Grace, Isolation};
 use crate::process::Identity;
 use crate::protocol::NodeStatus;
+use crate::quotas::Quotas;
 use crate::spec::Limits;
 
 /// [`Launch`]'s file.
@@ -41,6 +42,35 @@ pub const SHIM_LOG: &str = "shim.log";
 /// Cores that a shim may use, however few its servant has.
 const SHIM_CPUS: f64 = 0.1;
 
+/// Whether a servant may run with less than was asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Isolation {
+    /// Refuse to start when any limit cannot be put in force.
+    #[default]
+    Require,
+    /// Start, and say what is not in force.
+    BestEffort,
+}
+
+/// How long the nodes have to end by themselves.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Grace {
+    /// From SIGINT to SIGTERM.
+    pub interrupt: Duration,
+    /// From SIGTERM to SIGKILL.
+    pub terminate: Duration,
+}
+
+impl Default for Grace {
+    fn default() -> Self {
+        Self {
+            interrupt: Duration::from_secs(3),
+            terminate: Duration::from_secs(2),
+        }
+    }
+}
+
 /// Everything a shim needs to know.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Launch {
@@ -53,6 +83,9 @@ pub struct Launch {
     /// The shim's own limits; of processor time it never has more than its servant.
     #[serde(default)]
     pub shim_limits: Limits,
+    /// Bounds of what a servant writes.
+    #[serde(default)]
+    pub quotas: Quotas,
     /// Whether every limit must be in force.
     pub isolation: Isolation,
     /// How long nodes have to end.
@@ -62,6 +95,14 @@ pub struct Launch {
 }
 
 impl Launch {
+    /// Bounds of what this container writes.
+    pub(crate) fn quotas(&self) -> Quotas {
+        match self.spec.profile {
+            Profile::Servant => self.quotas,
+            Profile::Compile | Profile::Install => Quotas::of_build(),
+        }
+    }
+
     /// What the shim may take beside a servant with these limits.
     pub fn limits_of_shim(&self, servant: &Limits) -> Limits {
         // The Master must be able to answer at all.

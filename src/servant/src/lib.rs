@@ -24,6 +24,7 @@ pub mod logs;
 pub mod netns;
 pub mod process;
 pub mod protocol;
+pub mod quotas;
 pub mod rootfs;
 pub mod sandbox;
 pub mod seccomp;

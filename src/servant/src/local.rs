@@ -6,7 +6,6 @@ use std::ffi::OsString;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
-use std::time::Duration;
 
 use api::Grants;
 
@@ -18,6 +17,8 @@ use crate::cgroup::Parent;
 use crate::container::{ContainerSpec, Profile};
 use crate::engine::{Adopted, Ended, Engine, Servant};
 use crate::launch::{self, Exit, Runtime};
+pub use crate::launch::{Grace, Isolation};
+use crate::quotas::Quotas;
 use crate::spec::{Limits, Spec};
 
 mod connection;
@@ -34,17 +35,6 @@ pub use handle::LocalServant;
 /// documentation of user ids lists as unused. Ranges for `/etc/subuid` grow from 100000, those of systemd-nspawn from
 /// 524288; both would collide sooner or later with one that we picked among them.
 pub const DEFAULT_UID_BASE: u32 = 0x7000_0000;
-
-/// Whether a servant may run with less than was asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Isolation {
-    /// Refuse to start when any limit cannot be put in force.
-    #[default]
-    Require,
-    /// Start, and say what is not in force.
-    BestEffort,
-}
 
 /// What the engine of this host is told by those who know it.
 #[async_trait]
@@ -79,24 +69,6 @@ impl Resources for NoResources {
     }
 }
 
-/// How long the nodes have to end by themselves.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct Grace {
-    /// From SIGINT to SIGTERM.
-    pub interrupt: Duration,
-    /// From SIGTERM to SIGKILL.
-    pub terminate: Duration,
-}
-
-impl Default for Grace {
-    fn default() -> Self {
-        Self {
-            interrupt: Duration::from_secs(3),
-            terminate: Duration::from_secs(2),
-        }
-    }
-}
-
 /// What the local engine needs to know.
 #[derive(Debug, Clone)]
 pub struct LocalEngineConfig {
@@ -110,6 +82,8 @@ pub struct LocalEngineConfig {
     pub default_limits: Limits,
     /// For each servant's shim: memory and cores. Its processor time is bounded by its servant's, too.
     pub shim_limits: Limits,
+    /// For each servant: what it may write.
+    pub quotas: Quotas,
     /// First uid of the first range; see [`DEFAULT_UID_BASE`].
     pub uid_base: u32,
     /// Whether less isolation than asked for is accepted.
@@ -138,6 +112,7 @@ impl LocalEngineConfig {
                 memory: Some(256 << 20),
                 ..Limits::default()
             },
+            quotas: Quotas::default(),
             uid_base: DEFAULT_UID_BASE,
             isolation: Isolation::Require,
             grace: Grace::default(),
@@ -221,7 +196,8 @@ impl LocalEngine {
 
     /// Makes network namespaces ahead, so that the next servants start sooner.
     pub fn warm_up(&self) {
-        self.shared.networks.refill();
+        let shared = self.shared.clone();
+        privilege::now(move || shared.networks.refill());
     }
 
     /// What a servant's container is on this host.
@@ -258,13 +234,15 @@ impl LocalEngine {
         let shared = self.shared.clone();
         let id = spec.id.clone();
         // A task of its own: when the caller is cancelled half-way, what was half-made is still ended properly.
-        tokio::spawn(async move {
-            let outcome = start::start(&shared, spec).await;
-            if let Err(Ok(unwanted)) = sender.send(outcome) {
-                if let Err(error) = unwanted.stop().await {
-                    tracing::warn!(%error, "a servant that nobody waited for could not be ended");
+        let _began = privilege::now(move || {
+            tokio::spawn(async move {
+                let outcome = start::start(&shared, spec).await;
+                if let Err(Ok(unwanted)) = sender.send(outcome) {
+                    if let Err(error) = unwanted.stop().await {
+                        tracing::warn!(%error, "a servant that nobody waited for could not be ended");
+                    }
                 }
-            }
+            })
         });
         let gone = |_| Error::Start {
             id,
@@ -320,11 +298,27 @@ impl Shared {
 #[async_trait]
 impl Engine for LocalEngine {
     async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, Error> {
-        let spec = self.resolve(spec).await?;
-        Ok(self.start_container(spec).await?)
+        let engine = self.clone();
+        privilege::run(async move {
+            let spec = engine.resolve(spec).await?;
+            Ok(engine.start_container(spec).await? as Arc<dyn Servant>)
+        })
+        .await
     }
 
     async fn adopt(&self) -> Result<Adopted, Error> {
+        let engine = self.clone();
+        privilege::run(async move { engine.adopt_all().await }).await
+    }
+
+    fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {
+        let (engine, grants) = (self.clone(), grants.clone());
+        privilege::now(move || Ok(engine.granted(&grants)?.unfulfilled))
+    }
+}
+
+impl LocalEngine {
+    async fn adopt_all(&self) -> Result<Adopted, Error> {
         let home = &self.shared.config.home_servants_dir;
         let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
         let mut adoption = Adopted::default();
@@ -364,9 +358,5 @@ impl Engine for LocalEngine {
             }
         }
         Ok(adoption)
-    }
-
-    fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {
-        Ok(self.granted(grants)?.unfulfilled)
     }
 }

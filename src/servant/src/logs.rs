@@ -7,9 +7,10 @@
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Instant, SystemTime};
 
 use crate::engine::LogLine;
+use crate::quotas::Rate;
 
 mod follow;
 mod tail;
@@ -26,6 +27,9 @@ pub const LONGEST_LINE: usize = 16 * 1024;
 /// Bytes after which the file is rotated.
 pub const ROTATE_AT: u64 = 16 << 20;
 
+/// What a line takes in the file beside its text, about.
+const OVERHEAD: usize = 100;
+
 /// Appends lines.
 #[derive(Debug)]
 pub struct Writer {
@@ -35,13 +39,18 @@ pub struct Writer {
     rotate_at: u64,
     number: u64,
     failed: bool,
+    rate: Rate,
+    /// Lines and bytes that came faster than that, and are not told of yet.
+    dropped: (u64, u64),
 }
 
 impl Writer {
     /// Starts an empty log at `path`.
-    pub fn create(path: &Path, rotate_at: u64) -> io::Result<Self> {
+    pub fn create(path: &Path, rotate_at: u64, per_second: u64) -> io::Result<Self> {
         let file = open(path)?;
         Ok(Self {
+            rate: Rate::new(per_second, Instant::now()),
+            dropped: (0, 0),
             path: path.into(),
             file,
             written: 0,
@@ -51,9 +60,34 @@ impl Writer {
         })
     }
 
-    /// Appends one line. A full disk must not end a servant: what cannot be written is dropped, counted by the gap in
+    /// Appends one line, or drops it where lines come faster than they may: then the first that passes is preceded by how many
+    /// did not. A full disk must not end a servant: what cannot be written is dropped, counted by the gap in
     /// the numbers, and said once on standard error.
     pub fn append(&mut self, node: &str, stream: &str, line: &str) {
+        let bytes = (line.len() + OVERHEAD) as u64;
+        if !self.rate.passes(bytes, Instant::now()) {
+            self.dropped.0 += 1;
+            self.dropped.1 += line.len() as u64;
+            return;
+        }
+        self.tell_dropped();
+        self.record(node, stream, line);
+    }
+
+    /// Says what was dropped since it was said last.
+    pub fn tell_dropped(&mut self) {
+        let (lines, bytes) = std::mem::take(&mut self.dropped);
+        if lines > 0 {
+            let told = format!(
+                "{lines} lines ({bytes} bytes) are not in this log: they came faster than {} bytes a second (log_rate in [servant] of \
+                 the configuration)",
+                self.rate.per_second()
+            );
+            self.record("cloudroid", "stderr", &told);
+        }
+    }
+
+    fn record(&mut self, node: &str, stream: &str, line: &str) {
         let record = LogLine {
             number: Some(self.number),
             time: SystemTime::now(),
@@ -145,6 +179,35 @@ impl Lines {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lines_that_come_too_fast_are_left_out_and_that_is_said() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("log.jsonl");
+        let mut writer = Writer::create(&path, 1 << 20, 1024).unwrap();
+        let line = "x".repeat(1000);
+        for _ in 0..1000 {
+            writer.append("/n", "stdout", &line);
+        }
+        writer.tell_dropped();
+        writer.tell_dropped();
+        let text = fs::read_to_string(&path).unwrap();
+        let lines: Vec<LogLine> = text
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
+        // Ten seconds' worth, and what came while this ran.
+        let (told, kept): (Vec<_>, Vec<_>) =
+            lines.iter().partition(|line| line.node == "cloudroid");
+        assert!((9..500).contains(&kept.len()), "{}", kept.len());
+        let count = |line: &LogLine| line.line.split(' ').next()?.parse::<usize>().ok();
+        let left_out: usize = told.iter().filter_map(|line| count(line)).sum();
+        assert_eq!(kept.len() + left_out, 1000);
+        assert!(told[0].line.contains("log_rate"), "{}", told[0].line);
+        // No number is missing, which would be told as lost.
+        let numbers = lines.iter().map(|line| line.number.unwrap());
+        assert!(numbers.eq(0..lines.len() as u64));
+    }
 
     #[test]
     fn lines_come_whole_however_they_are_read() {

@@ -8,7 +8,9 @@ use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 use std::os::unix::fs::MetadataExt;
 use std::sync::{Arc, OnceLock, mpsc};
 
+use caps::Capability;
 use nix::sched::{CloneFlags, setns, unshare};
+use nix::sys::socket::{SockaddrStorage, bind, setsockopt, sockopt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::oneshot;
 
@@ -92,21 +94,23 @@ impl NetNs {
 
     /// Connects to `address` as seen from inside. Only the socket is made there; the connecting is awaited here.
     pub async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
-        let stream = self.socket(address).await?.connect(address).await?;
+        let stream = self.socket(address, None).await?.connect(address).await?;
         stream.set_nodelay(true)?;
         Ok(stream)
     }
 
     /// Listens on `address` as seen from inside; port 0 picks a free one.
     pub async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
-        let socket = self.socket(address).await?;
-        socket.set_reuseaddr(true)?;
-        socket.bind(address)?;
-        socket.listen(1024)
+        self.socket(address, Some(address)).await?.listen(1024)
     }
 
-    /// A TCP socket made inside, for addresses of the family of `address`.
-    async fn socket(&self, address: SocketAddr) -> io::Result<TcpSocket> {
+    /// A TCP socket made inside, for addresses of the family of `address`; bound where that is asked for: of ports below
+    /// 1024 that takes a capability.
+    async fn socket(
+        &self,
+        address: SocketAddr,
+        bound: Option<SocketAddr>,
+    ) -> io::Result<TcpSocket> {
         let family = if address.is_ipv4() {
             libc::AF_INET
         } else {
@@ -116,6 +120,7 @@ impl NetNs {
         let order = Order {
             namespace: self.file.clone(),
             family,
+            bound,
             answer,
         };
         let gone = || io::Error::other("the thread that opens sockets in namespaces has ended");
@@ -128,6 +133,7 @@ impl NetNs {
 struct Order {
     namespace: Arc<OwnedFd>,
     family: i32,
+    bound: Option<SocketAddr>,
     answer: oneshot::Sender<io::Result<OwnedFd>>,
 }
 
@@ -138,23 +144,33 @@ fn opener() -> &'static mpsc::Sender<Order> {
     OPENER.get_or_init(|| {
         let (sender, orders) = mpsc::channel::<Order>();
         let work = move || {
+            // Where this fails it has more than it needs, as all threads of a program that is not the daemon.
+            let _ = privilege::only(&OPENERS);
             for order in orders {
+                let socket = open_socket(order.namespace.as_fd(), order.family, order.bound);
                 // Nobody waits any more when the asker was cancelled; the socket then closes.
-                let _ = order
-                    .answer
-                    .send(open_socket(order.namespace.as_fd(), order.family));
+                let _ = order.answer.send(socket);
             }
         };
         // Where no thread can be started the receiver is dropped and every order is answered with an error.
-        let _ = std::thread::Builder::new()
-            .name("netns-sockets".into())
-            .stack_size(64 * 1024)
-            .spawn(work);
+        privilege::now(|| {
+            let _ = std::thread::Builder::new()
+                .name("netns-sockets".into())
+                .stack_size(64 * 1024)
+                .spawn(work);
+        });
         sender
     })
 }
 
-fn open_socket(namespace: BorrowedFd<'_>, family: i32) -> io::Result<OwnedFd> {
+/// What entering a namespace takes, and binding to ports below 1024 there.
+const OPENERS: [Capability; 2] = [Capability::CAP_SYS_ADMIN, Capability::CAP_NET_BIND_SERVICE];
+
+fn open_socket(
+    namespace: BorrowedFd<'_>,
+    family: i32,
+    bound: Option<SocketAddr>,
+) -> io::Result<OwnedFd> {
     setns(namespace, CloneFlags::CLONE_NEWNET)?;
     let kind = libc::SOCK_STREAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
     // SAFETY: no pointers.
@@ -163,7 +179,12 @@ fn open_socket(namespace: BorrowedFd<'_>, family: i32) -> io::Result<OwnedFd> {
         return Err(io::Error::last_os_error());
     }
     // SAFETY: opened just now, owned by nobody else.
-    Ok(unsafe { OwnedFd::from_raw_fd(fd) })
+    let socket = unsafe { OwnedFd::from_raw_fd(fd) };
+    if let Some(address) = bound {
+        setsockopt(&socket, sockopt::ReuseAddr, &true)?;
+        bind(fd, &SockaddrStorage::from(address))?;
+    }
+    Ok(socket)
 }
 
 fn in_own_thread<T: Send>(work: impl FnOnce() -> Result<T, Error> + Send) -> Result<T, Error> {

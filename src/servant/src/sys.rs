@@ -149,19 +149,6 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     }
 }
 
-/// Unmaps pages of a private mapping of a file; those that are touched again are read from the file again (madvise(2),
-/// MADV_DONTNEED).
-///
-/// # Safety
-/// Nobody has changed them since they were mapped: changes would be lost.
-pub(crate) unsafe fn forget_pages(start: usize, end: usize) {
-    // SAFETY: whoever reads unchanged pages of a file finds the same bytes before and after. A range that is not mapped
-    // is only refused.
-    unsafe {
-        libc::madvise(start as *mut libc::c_void, end - start, libc::MADV_DONTNEED);
-    }
-}
-
 /// Gives memory that was freed back to the kernel (malloc_trim(3)).
 pub(crate) fn give_back_memory() {
     #[cfg(target_env = "gnu")]

@@ -19,7 +19,7 @@ pub struct NewAudited<'a> {
     pub action: &'a str,
     /// The request.
     pub did: &'a str,
-    /// To what.
+    /// The object that it was done to.
     pub object: &'a str,
     /// The answer's HTTP status.
     pub status: u16,

@@ -1,6 +1,6 @@
-//! What must survive: services, their revisions, who owns a robot's name, which servant is whose, and the
-//! journal of events. SQLite in WAL mode; short statements; one connection that writes, and one that only reads, which
-//! no writer holds up.
+//! What must survive: services, their revisions, dictionaries and rollouts, who owns a robot's name, which servant is whose,
+//! tokens, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
+//! writes, and one that only reads, which no writer holds up.
 //!
 //! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
 //! perhaps the last); publishing waits for it. What only tells of the past is kept in memory while the disk is full or
@@ -126,7 +126,7 @@ impl State {
         connection
             .execute_batch(
                 "PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; \
-                 PRAGMA foreign_keys = ON;",
+                 PRAGMA foreign_keys = ON; PRAGMA temp_store = MEMORY;",
             )
             .map_err(failed)?;
         connection
@@ -139,8 +139,14 @@ impl State {
             .busy_handler(Some(wait_for_another))
             .map_err(failed)?;
         reader
-            .execute_batch("PRAGMA query_only = ON;")
+            .execute_batch("PRAGMA query_only = ON; PRAGMA temp_store = MEMORY;")
             .map_err(failed)?;
+        // The threads that ask from now on may open none of its files: the first question opens the last of them.
+        for connection in [&connection, &reader] {
+            connection
+                .query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
+                .map_err(failed)?;
+        }
         Ok(State {
             connection: Mutex::new(connection),
             reader: Mutex::new(reader),

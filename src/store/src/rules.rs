@@ -9,9 +9,9 @@ use super::{Error, State};
 pub struct RuleRecord {
     /// Its number, never given twice.
     pub id: i64,
-    /// For whom.
+    /// The principals that it is for, as text.
     pub who: String,
-    /// For which services.
+    /// The services that it is for, as text.
     pub services: String,
     /// What is granted, as JSON.
     pub allow: String,

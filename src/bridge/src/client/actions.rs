@@ -23,18 +23,18 @@ use server::ActionServer;
 pub(super) struct Actions {
     /// Those it sends goals to, by action name.
     used: HashMap<String, Arc<ActionClient>>,
-    /// Goals under way, by the id the client gave.
-    goals: HashMap<Id<'static>, UnderWayGoal>,
+    /// Goals under way, by what the server calls them.
+    goals: HashMap<String, UnderWayGoal>,
     /// Those it serves, by action name.
     served: HashMap<String, Arc<ActionServer>>,
 }
 
-/// A goal that the client can cancel.
+/// A goal that can be cancelled.
 struct UnderWayGoal {
     /// The action's name.
     action: String,
-    /// What the server calls it.
-    goal_id: String,
+    /// What the client calls it, by which it cancels it.
+    id: Option<Id<'static>>,
     /// Cancelled before it was sent.
     recalled: CancellationToken,
 }
@@ -48,12 +48,19 @@ impl Actions {
         take_chosen(&mut self.served, chosen)
     }
 
-    /// Goals under way at actions of these names, with those.
-    pub(super) fn goals_at(&self, chosen: impl Fn(&str) -> bool) -> Vec<(Id<'static>, String)> {
+    /// Goals under way at actions of these names, as their servers call them, with those.
+    pub(super) fn goals_at(&self, chosen: impl Fn(&str) -> bool) -> Vec<(String, String)> {
         let goals = self.goals.iter().filter(|(_, goal)| chosen(&goal.action));
         goals
-            .map(|(id, goal)| (id.clone(), goal.action.clone()))
+            .map(|(goal_id, goal)| (goal_id.clone(), goal.action.clone()))
             .collect()
+    }
+
+    /// What the server calls the goal that the client calls `id`.
+    fn goal_of(&self, id: &Id<'_>) -> Option<String> {
+        let named = |goal: &UnderWayGoal| goal.id.as_ref() == Some(id);
+        let mut goals = self.goals.iter();
+        goals.find_map(|(goal_id, goal)| named(goal).then(|| goal_id.clone()))
     }
 }
 

@@ -16,9 +16,8 @@ use super::publishing::decode_args;
 use super::{Client, Reply, print_format};
 use crate::lacking::explain;
 use crate::names::resolve;
-use crate::rosapi;
+use crate::own::{self, OwnService};
 use crate::sample::Frame;
-use crate::tf;
 
 /// A call, free of the frame it came in.
 struct Call {
@@ -113,15 +112,12 @@ impl Client {
         self.serves_itself(&call.service).await;
         let bus = &self.shared.bus;
         let server = bus.graph().borrow().services.get(&call.service).cloned();
-        let told = server.is_none()
-            && rosapi::Service::find(&call.service).is_some_and(rosapi::Service::is_filtered);
-        if !told {
+        let own = server.is_none().then(|| own::find(&call.service)).flatten();
+        if !own.as_ref().is_some_and(|own| own.is_filtered()) {
             self.granted().check(Operation::Call, &call.service)?;
         }
-        if server.is_none()
-            && let Some(answer) = self.answer_ourselves(call).await
-        {
-            return answer;
+        if let Some(own) = own {
+            return self.answer_ourselves(call, &*own).await;
         }
         let service_type = self
             .shared
@@ -207,34 +203,16 @@ impl Client {
         let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
     }
 
-    /// Answers for the bridge itself, where the call is for it.
-    async fn answer_ourselves(&self, call: &Call) -> Option<Result<Frame, String>> {
-        if let Some(api) = rosapi::Service::find(&call.service) {
-            if api.shows_graph() {
-                self.is_registered().await;
-            }
-            let answer = async {
-                let def = api.definition()?;
-                let args = self.own_args(call, &def)?;
-                self.own_frame(
-                    call,
-                    &def,
-                    &api.answer(&self.shared, &args, &self.granted().grants())
-                        .await?,
-                )
-            };
-            return Some(answer.await);
+    /// Answers a call of a service of the bridge's own.
+    async fn answer_ourselves(&self, call: &Call, own: &dyn OwnService) -> Result<Frame, String> {
+        if own.shows_graph() {
+            self.is_registered().await;
         }
-        if call.service == tf::SERVICE {
-            let answer = || {
-                let def = tf::definition(&self.shared.registry)?;
-                let args = self.own_args(call, &def)?;
-                let values = self.shared.republisher.call(&self.shared, &args)?;
-                self.own_frame(call, &def, &values)
-            };
-            return Some(answer());
-        }
-        None
+        let def = own.definition(&self.shared.registry)?;
+        let args = self.own_args(call, &def)?;
+        let grants = self.granted().grants();
+        let values = own.answer(&self.shared, &args, &grants).await?;
+        self.own_frame(call, &def, &values)
     }
 
     /// The arguments of a call that the bridge answers, as a JSON object.

@@ -1,7 +1,7 @@
 //! What a client has and may not have any more, because its operator has changed what it is granted.
 
 use access::{Grants, Operation};
-use rosbridge::{CancelActionGoal, Format, Id, Level};
+use rosbridge::{Format, Level};
 
 use super::Client;
 use crate::names::resolve;
@@ -66,8 +66,7 @@ impl Client {
 
         let mut actions = self.actions.lock();
         let served = actions.take_served(|action| lacks(Operation::Advertise, action));
-        let goals: Vec<(Id<'static>, String)> =
-            actions.goals_at(|action| lacks(Operation::Call, action));
+        let goals = actions.goals_at(|action| lacks(Operation::Call, action));
         drop(actions);
         told.extend(
             served
@@ -75,13 +74,9 @@ impl Client {
                 .map(|(action, _)| (Operation::Advertise, action.clone())),
         );
         drop(served);
-        for (id, action) in goals {
-            let cancelled = self.cancel_action_goal(&CancelActionGoal {
-                id,
-                action: action.as_str().into(),
-            });
+        for (goal_id, action) in goals {
             // One that has ended meanwhile need not be cancelled.
-            if cancelled.is_ok() {
+            if self.cancel_goal(&goal_id) {
                 told.push((Operation::Call, action));
             }
         }

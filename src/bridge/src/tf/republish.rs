@@ -4,6 +4,8 @@ use std::collections::HashMap;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
+use access::Grants;
+use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{Message, PeerId, WireType};
@@ -19,6 +21,7 @@ use super::transform::Transform;
 use super::{Buffer, SharedBuffer, buffer, write_transforms};
 use crate::clock;
 use crate::fanout::{Listener, Listening};
+use crate::own::OwnService;
 use crate::sample::Sample;
 use crate::shared::Shared;
 
@@ -102,11 +105,25 @@ pub(crate) struct Republisher {
     listening: OnceLock<[Listening; 2]>,
 }
 
-/// The service's definition.
-pub(crate) fn definition(registry: &Registry) -> Result<Arc<ServiceDef>, String> {
-    registry
-        .service("tf2_web_republisher/RepublishTFs")
-        .map_err(|error| error.to_string())
+/// The service `/republish_tfs`.
+pub(crate) struct RepublishTfs;
+
+#[async_trait]
+impl OwnService for RepublishTfs {
+    fn definition(&self, registry: &Registry) -> Result<Arc<ServiceDef>, String> {
+        registry
+            .service("tf2_web_republisher/RepublishTFs")
+            .map_err(|error| error.to_string())
+    }
+
+    async fn answer(
+        &self,
+        shared: &Arc<Shared>,
+        args: &[u8],
+        _: &Grants,
+    ) -> Result<Vec<u8>, String> {
+        shared.republisher.call(shared, args)
+    }
 }
 
 impl Republisher {
@@ -117,7 +134,7 @@ impl Republisher {
     }
 
     /// Answers a call of the service; request and response in JSON.
-    pub(crate) fn call(&self, shared: &Arc<Shared>, request: &[u8]) -> Result<Vec<u8>, String> {
+    fn call(&self, shared: &Arc<Shared>, request: &[u8]) -> Result<Vec<u8>, String> {
         let wanted: Wanted =
             serde_json::from_slice(request).map_err(|error| format!("args: {error}"))?;
         check(&wanted, self.topics.lock().len())?;

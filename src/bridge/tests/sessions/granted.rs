@@ -285,3 +285,60 @@ async fn who_comes_back_has_what_the_new_connection_is_granted() {
     let closed = client.closed().await;
     assert_eq!(closed, (1008, "this token was revoked".to_owned()));
 }
+
+#[tokio::test]
+async fn a_goal_is_cancelled_with_its_grant_whether_it_has_an_id_or_not() {
+    for id in [None, Some("g")] {
+        let world = World::new().await;
+        let mut server = world.client().await;
+        super::actions::serve(&mut server).await;
+        let (sender, granted) = watch::channel(standing(&["*:**"]));
+        let mut client = world.client_with(with(granted)).await;
+        let mut goal = json!({"op": "send_action_goal", "action": "/count", "action_type": "x_msgs/Count",
+                              "args": {"to": 1}});
+        if let Some(id) = id {
+            goal["id"] = json!(id);
+        }
+        client.send(goal).await;
+        let asked = server.json().await;
+        assert_eq!(asked["op"], "send_action_goal");
+        sender.send_replace(standing(&["subscribe:/kept"]));
+        let told = server.json().await;
+        assert_eq!(
+            (&told["op"], &told["id"]),
+            (&json!("cancel_action_goal"), &asked["id"]),
+            "{id:?}"
+        );
+        let told = client.json().await;
+        let words = "call:/count is not granted to this client any more";
+        assert!(
+            told["msg"]
+                .as_str()
+                .is_some_and(|told| told.contains(words)),
+            "{told}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn what_is_refused_is_told_to_whoever_records_it() {
+    let world = World::new().await;
+    let (_sender, granted) = watch::channel(standing(&["subscribe:/other"]));
+    let (told, mut heard) = tokio::sync::mpsc::unbounded_channel();
+    let options = SessionOptions {
+        granted: Granted::by(granted).telling(move |operation| {
+            let _ = told.send(operation.to_owned());
+        }),
+        ..SessionOptions::default()
+    };
+    let mut client = world.client_with(options).await;
+    client
+        .send(json!({"op": "subscribe", "topic": "/text"}))
+        .await;
+    let call = json!({"op": "call_service", "service": "/nothing", "id": "c"});
+    client.send(call).await;
+    for operation in ["subscribe:/text", "call:/nothing"] {
+        let refused = patiently(heard.recv()).await.expect("told");
+        assert_eq!(refused, operation);
+    }
+}

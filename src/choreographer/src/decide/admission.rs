@@ -48,19 +48,19 @@ pub enum Refused {
     /// No capacity came free until the deadline.
     #[error("this machine is full; no room came free within {} s{}", waited.as_secs(), at(place))]
     Deadline {
-        /// So long was waited.
+        /// How long the robot waited.
         waited: Duration,
-        /// Where it stood in the end; none of what is no robot's.
+        /// Its last position in the queue; none where it was no robot that waited.
         place: Option<Position>,
     },
-    /// The machine stalls; until the deadline that did not end.
+    /// The machine stalled until the deadline.
     #[error("{why}; this did not end within {} s{}", waited.as_secs(), at(place))]
     Stalled {
         /// What it waits for, in words.
         why: String,
-        /// So long was waited.
+        /// How long the robot waited.
         waited: Duration,
-        /// Where it stood in the end; none of what is no robot's.
+        /// Its last position in the queue; none where it was no robot that waited.
         place: Option<Position>,
     },
     /// The machine stalls: a servant that runs is promised no more.

@@ -10,7 +10,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(300);
 const LONGEST_SHARED: Duration = Duration::from_secs(4);
 /// A servant that was ready for so long before it failed had recovered, and so had a node that ran for so long.
 pub const RECOVERED: Duration = Duration::from_secs(60);
-/// So long after its pause a failure is forgotten.
+/// Time after a failure's pause until the failure is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(600);
 
 /// Failures of one robot's servants of one revision, one after the other.
@@ -74,6 +74,11 @@ pub fn refusal(of: &Failing, revision: u64, now: Instant) -> Option<Duration> {
 /// Whether it is too long ago to count.
 pub fn is_forgotten(of: &Failing, now: Instant) -> bool {
     now >= of.again + FORGOTTEN
+}
+
+/// The seconds that are left, rounded up: whoever comes after them is not too early.
+pub fn seconds(left: Duration) -> u64 {
+    left.as_millis().div_ceil(1000) as u64
 }
 
 #[cfg(test)]

@@ -9,8 +9,8 @@ use tokio::time::Instant;
 
 use super::Inner;
 use crate::Error;
-use crate::decide::back_off::{Failing, RECOVERED, after_failure, is_forgotten, refusal};
-use crate::handle::{Failure, Handle};
+use crate::decide::back_off::{Failing, RECOVERED, after_failure, is_forgotten, refusal, seconds};
+use crate::lives::handle::{Failure, Handle};
 
 /// Robots without a name are one here: each has a name of its own, and would never meet its pause.
 const NAMELESS: &str = "~";
@@ -146,9 +146,4 @@ impl Inner {
         all.sort_by(|one, other| (&one.service, &one.robot).cmp(&(&other.service, &other.robot)));
         all
     }
-}
-
-/// Whole seconds, none of them too early.
-pub fn seconds(left: Duration) -> u64 {
-    left.as_millis().div_ceil(1000) as u64
 }

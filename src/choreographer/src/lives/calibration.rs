@@ -12,8 +12,8 @@ use tokio::sync::mpsc;
 
 use crate::decide::Amount;
 use crate::decide::calibration::{self as decide, Next};
-use crate::handle::Handle;
 use crate::lives::driver::GAVE_WAY;
+use crate::lives::handle::Handle;
 use crate::{Choreographer, Error, Measured};
 
 /// Requests at each limit where nobody says how many.

@@ -25,11 +25,11 @@ const QUEUE: usize = 64;
 /// When a recording is long enough.
 #[derive(Debug, Clone, Copy)]
 pub struct Bounds {
-    /// So long.
+    /// How long it records at most.
     pub time: Duration,
-    /// So many bytes.
+    /// Most bytes that it records.
     pub bytes: usize,
-    /// So many messages.
+    /// Most messages that it records.
     pub messages: usize,
 }
 

@@ -18,7 +18,7 @@ use super::limits::PLAIN_WEIGHT;
 use crate::decide::controller::{Facts, Goal, History, Outcome, control};
 use crate::decide::stall::{Reading, Stall};
 use crate::engine_limits;
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);

@@ -16,7 +16,7 @@ use super::waiting::Permit;
 use super::warm_pool::{self, Warm};
 use super::{Inner, group, limits, starting};
 use crate::decide::admission::Ask;
-use crate::handle::{Failure, Handle};
+use crate::lives::handle::{Failure, Handle};
 use crate::with_last_words;
 
 /// Lines of the log that explain a failure.

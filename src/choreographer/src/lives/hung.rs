@@ -9,7 +9,7 @@ use tokio::time::Instant;
 
 use super::Inner;
 use crate::decide::hung::{Flow, Hung, Watched, look};
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 use crate::options::{self, Class};
 
 /// Between two looks.

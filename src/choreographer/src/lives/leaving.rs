@@ -10,7 +10,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::Inner;
 use super::measuring::Refusal;
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);

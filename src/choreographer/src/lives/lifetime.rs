@@ -10,7 +10,7 @@ use tokio::time::{Instant, timeout_at};
 
 use super::Inner;
 use crate::decide::lifetime::{Need, Readiness, Shown, Stage, Tenancy, needed, readiness};
-use crate::handle::{Failure, Handle};
+use crate::lives::handle::{Failure, Handle};
 
 /// Waits until everything that the interface promises is registered. Nodes may take their time between their
 /// registration and their first topic: all that the servant's start may take.

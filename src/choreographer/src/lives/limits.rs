@@ -8,13 +8,13 @@ use servant::engine::Servant;
 use servant::spec::UNLIMITED;
 
 use super::Inner;
-use crate::decide::admission::Refused;
 use crate::decide::demand::{Asked, with_weight};
 use crate::decide::measured::{Input, grown, measured};
 use crate::decide::terms::{Untenable, in_words, pairs_of, terms};
 use crate::decide::told::left_out;
-use crate::handle::Handle;
+use crate::error::{STATING, Unchanged};
 use crate::limits::limits_of;
+use crate::lives::handle::Handle;
 use crate::{Choreographer, Error, ServantRequest, engine_limits};
 use store::NewEvent;
 use tokio::time::{Instant, timeout};
@@ -23,31 +23,6 @@ use tokio::time::{Instant, timeout};
 const PATIENCE: Duration = Duration::from_secs(5);
 /// `cpu.weight` where nobody has asked for one.
 pub(super) const PLAIN_WEIGHT: u64 = 100;
-
-/// Nodes of one robot whose stubs may state something: what they say is kept, and written down, for as long as the servant lives.
-const STATING: usize = 64;
-
-/// Why a servant is not resized.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Unchanged {
-    /// On no terms.
-    #[error(transparent)]
-    Untenable(Untenable),
-    /// There is no room for more.
-    #[error(transparent)]
-    Full(Refused),
-    /// It would be killed for want of memory.
-    #[error("it uses {used} of memory, which is more than the {wanted} that it would have")]
-    Used {
-        /// What it uses.
-        used: Size,
-        /// What it would have.
-        wanted: Size,
-    },
-    /// Too many clients of one robot state something.
-    #[error("{STATING} nodes of its robot have stated something already")]
-    Many,
-}
 
 impl Choreographer {
     /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.

@@ -11,7 +11,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 use super::Inner;
 use crate::Error;
 use crate::decide::measured::Input;
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);

@@ -15,7 +15,7 @@ use tokio::time::Instant;
 
 use super::Inner;
 use crate::decide::nodes::{Crew, Ended, Event, Next, after};
-use crate::handle::{Failure, Handle};
+use crate::lives::handle::{Failure, Handle};
 
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;

@@ -16,7 +16,7 @@ pub use orders::check_terms;
 
 use super::Inner;
 use crate::decide::rollout::{Given, Rollout, Step, given, step};
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 use crate::request::serves_no_robot;
 use crate::{Error, ServantRequest};
 

@@ -27,7 +27,7 @@ use tokio::time::Instant;
 
 use super::driver::{self, Beginning};
 use crate::decide::demand::Asked;
-use crate::handle::Handle;
+use crate::lives::handle::Handle;
 use crate::{Choreographer, Error, Lease, Measured};
 
 use mirror::Mirror;

@@ -13,7 +13,7 @@ use tokio::time::{Instant, timeout_at};
 use super::warm_pool::Warm;
 use super::{Inner, limits, reaching};
 use crate::decide::terms::in_words;
-use crate::handle::{Failure, Handle};
+use crate::lives::handle::{Failure, Handle};
 use crate::{Error, engine_limits};
 
 /// Writes down that the servant is, before it runs: a daemon killed now finds it again.

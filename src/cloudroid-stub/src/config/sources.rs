@@ -35,12 +35,14 @@ pub(super) fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-const KEYS: [&str; 30] = [
+const KEYS: [&str; 32] = [
     "server",
     "service",
     "token",
     "token_file",
     "ca_file",
+    "fingerprint",
+    "known_servers",
     "robot",
     "desire",
     "max",

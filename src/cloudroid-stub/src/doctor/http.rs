@@ -2,10 +2,10 @@
 
 use std::io;
 use std::net::IpAddr;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use nix::sys::socket::{getsockopt, sockopt::IpMtu};
+use tls::Trust;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -35,8 +35,8 @@ pub struct Server {
     pub address: Address,
     /// The address to which its name was resolved.
     pub ip: IpAddr,
-    /// Whom to trust, where that is not the system's to say.
-    pub authorities: Option<PathBuf>,
+    /// Whom to trust where TLS is spoken.
+    pub trust: Trust,
 }
 
 /// `GET path`.
@@ -53,7 +53,7 @@ async fn exchange(server: &Server, path: &str, token: Option<&str>) -> io::Resul
     let authority = &server.address.authority;
     let stream = TcpStream::connect((server.ip, server.address.port)).await?;
     stream.set_nodelay(true)?;
-    let mut stream = Stream::over(stream, &server.address, server.authorities.as_deref()).await?;
+    let mut stream = Stream::over(stream, &server.address, &server.trust).await?;
     let mut request = format!(
         "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\nUser-Agent: cloudroid-stub/{}\r\n",
         env!("CARGO_PKG_VERSION")

@@ -70,7 +70,7 @@ impl Portal {
                 server: http::Server {
                     address,
                     ip,
-                    authorities: config.authorities(),
+                    trust: config.trust(),
                 },
                 token,
                 installer,

@@ -8,7 +8,8 @@ use parking_lot::Mutex;
 use ros::bus::{ParamChange, ParamValue};
 
 use super::Mirror;
-use crate::parameters::{self, OWN};
+use crate::parameters;
+use ros::ros1::own_parameters::is_of_master;
 
 /// What was set here in the cloud's name: it does not go back.
 #[derive(Default)]
@@ -18,11 +19,7 @@ pub struct Parameters {
 
 impl Parameters {
     fn is_news(&self, key: &str, value: Option<&ParamValue>) -> bool {
-        let own = key
-            .trim_start_matches('/')
-            .split('/')
-            .next()
-            .is_some_and(|first| OWN.contains(&first));
+        let own = is_of_master(key);
         let mut set = self.set.lock();
         let echo = set.get(key) == value;
         if !echo {

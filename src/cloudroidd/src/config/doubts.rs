@@ -3,15 +3,7 @@
 use api::Size;
 
 use super::Config;
-
-/// What a machine has.
-#[derive(Debug, Clone, Copy)]
-pub struct Has {
-    /// Cores.
-    pub cores: f64,
-    /// Bytes of memory, all of them.
-    pub memory: u64,
-}
+use crate::machine::Has;
 
 impl Config {
     /// What this machine cannot keep, each with what to write instead.

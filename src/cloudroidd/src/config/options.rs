@@ -4,8 +4,8 @@ use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{Class, Config, Controller, Hung, NonFinite, Push, machine_cores};
-use crate::supervision::machine_memory;
+use super::{Class, Config, Controller, Hung, NonFinite, Push};
+use crate::machine;
 
 /// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
 /// `MOST` bytes.
@@ -24,7 +24,7 @@ impl Config {
                 .iter()
                 .map(|(name, class)| (name.clone(), of(class)))
                 .collect(),
-            cores: self.capacity.cores().min(machine_cores()),
+            cores: self.capacity.cores().min(machine::cores()),
             controller: self.capacity.controller == Controller::On,
             reserve_cpus: servant.reserve_cpus,
             reserve_memory: servant.reserve_memory.0,
@@ -43,7 +43,7 @@ impl Config {
             hung_after: servant.hung_after,
             bridge: bridge_options(self),
             memory: MemoryOptions {
-                daemon: daemon.unwrap_or_else(|| (machine_memory() / PART).min(MOST)),
+                daemon: daemon.unwrap_or_else(|| (machine::most_memory() / PART).min(MOST)),
                 client: memory.client.0,
                 servant: memory.servant.0,
                 unfinished: memory.unfinished.0,
@@ -72,6 +72,8 @@ impl Config {
     pub fn portal(&self) -> portal::Options {
         portal::Options {
             origins: self.origins.clone(),
+            // They were checked before anything was started.
+            proxies: self.proxies().unwrap_or_default(),
             default_service: self.default_service.clone(),
             default_robot: self.default_robot.clone(),
             handshake: self.portal.handshake.0,

@@ -11,11 +11,14 @@ pub(super) fn stub(about: &About<'_>) -> String {
     #[derive(Serialize)]
     struct Where<'a> {
         server: &'a str,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        fingerprint: Option<&'a str>,
         service: &'a str,
         stateful: bool,
     }
     let known = Where {
-        server: about.server,
+        server: &about.portal.address,
+        fingerprint: about.portal.fingerprint.as_deref(),
         service: about.service,
         stateful: about.stateful,
     };

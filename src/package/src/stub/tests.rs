@@ -1,7 +1,7 @@
 use super::*;
 use crate::interface::{Direction, Topic};
 
-const MANIFEST: &str = r#"<package format="2"><name>p</name>
+const PACKAGE_XML: &str = r#"<package format="2"><name>p</name>
 <export><nodelet plugin="${prefix}/nodelets.xml"/><rviz plugin="${prefix}/rviz.xml"/></export></package>"#;
 
 fn file(text: &str, executable: bool) -> Content {
@@ -20,7 +20,7 @@ fn text(content: &Content) -> &str {
 
 fn contents() -> Contents {
     let share = [
-        ("package.xml", file(MANIFEST, false)),
+        ("package.xml", file(PACKAGE_XML, false)),
         ("launch/a.launch", file("<launch/>", false)),
         ("scripts/tool.py", file("#!/usr/bin/python3", true)),
         ("scripts/other.py", file("#!/usr/bin/python3", true)),
@@ -69,7 +69,10 @@ fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
         package: "p",
         revision: 3,
         image: "sha256:0",
-        server: "ws://here:9090",
+        portal: &Portal {
+            address: "wss://here:9090".into(),
+            fingerprint: Some("SHA256:00".into()),
+        },
         architecture: "x86_64",
         outsourced: &outsourced,
         interface: &interface,
@@ -84,7 +87,7 @@ fn every_executable_has_a_launcher_and_only_outsourced_ones_run_in_the_cloud() {
     let files = composed(&["node", "tool.py"]);
     let node = text(&files["lib/p/node"]);
     assert!(
-        node.contains("cloudroid-stub\" run --package p --node 'node' --share"),
+        node.contains("cloudroid-stub run --package 'p' --node 'node' --share"),
         "{node}"
     );
     assert!(node.contains("prefix=$here/../..\n"), "{node}");
@@ -113,7 +116,7 @@ fn an_outsourced_name_that_the_image_has_not_gets_a_launcher_too() {
 #[test]
 fn all_that_is_shared_is_there() {
     let files = composed(&["node"]);
-    assert_eq!(text(&files["share/p/package.xml"]), MANIFEST);
+    assert_eq!(text(&files["share/p/package.xml"]), PACKAGE_XML);
     assert_eq!(text(&files["share/p/launch/a.launch"]), "<launch/>");
     assert_eq!(
         files["share/p/launch/same"],
@@ -147,7 +150,8 @@ fn all_that_is_shared_is_there() {
 fn settings_and_origin_are_told_in_toml() {
     let files = composed(&["node"]);
     let stub: toml::Table = text(&files["share/p/stub.toml"]).parse().expect("TOML");
-    assert_eq!(stub["server"].as_str(), Some("ws://here:9090"));
+    assert_eq!(stub["server"].as_str(), Some("wss://here:9090"));
+    assert_eq!(stub["fingerprint"].as_str(), Some("SHA256:00"));
     assert_eq!(stub["service"].as_str(), Some("serves"));
     assert_eq!(stub["stateful"].as_bool(), Some(true));
     let revision: toml::Table = text(&files["share/p/revision.toml"]).parse().expect("TOML");
@@ -206,7 +210,7 @@ fn without_a_manifest_there_is_no_stub() {
         package: "p",
         revision: 1,
         image: "",
-        server: "",
+        portal: &Portal::default(),
         architecture: "x86_64",
         outsourced: &BTreeSet::new(),
         interface: &interface,
@@ -217,34 +221,58 @@ fn without_a_manifest_there_is_no_stub() {
     assert!(error.to_string().contains("no package.xml of p"), "{error}");
 }
 
-/// A stub as it lies on a robot, with a program that prints what it was called with.
+/// A program that prints what it was called with.
+const PROGRAM_OF_TESTS: &str = "#!/bin/sh\nfor word; do printf '%s\\n' \"$word\"; done\n";
+
+/// A stub as it lies on a robot, signed.
 fn unpacked(files: &Files) -> tempfile::TempDir {
-    use std::os::unix::fs::PermissionsExt;
+    unpacked_of(files, &sign::SigningKey::generate().expect("made").0)
+}
+
+fn unpacked_of(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir {
     let place = tempfile::tempdir().expect("a directory");
-    let write = |path: &str, bytes: &[u8], mode: u32| {
-        let path = place.path().join(path);
-        std::fs::create_dir_all(path.parent().expect("below")).expect("made");
-        std::fs::write(&path, bytes).expect("written");
-        std::fs::set_permissions(&path, PermissionsExt::from_mode(mode)).expect("set");
-    };
-    for (path, content) in files {
-        if let Content::File { bytes, executable } = content {
-            write(path, bytes, if *executable { 0o755 } else { 0o644 });
-        }
-    }
-    let program = b"#!/bin/sh\nfor word; do printf '%s\\n' \"$word\"; done\n";
-    write(&format!("lib/p/{PROGRAM}"), program, 0o755);
+    write_signed(files, key, place.path());
     place
 }
 
+/// Writes what an archive is unpacked to.
+fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) {
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    let mut files = files.clone();
+    files.insert(format!("lib/p/{PROGRAM}"), file(PROGRAM_OF_TESTS, true));
+    let signer = format!("{}\n", key.public().signer());
+    files.insert(SIGNER.into(), file(&signer, false));
+    let list = manifest(&files);
+    let digest = sign::digest(&mut list.as_bytes()).expect("read");
+    let signature = key.sign("cloudroid-stub", &digest);
+    files.insert(SIGNATURE.into(), file(&signature, false));
+    files.insert(MANIFEST.into(), file(&list, false));
+    for (path, content) in &files {
+        let path = place.join(path);
+        std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+        match content {
+            Content::File { bytes, executable } => {
+                std::fs::write(&path, bytes).expect("written");
+                let mode = if *executable { 0o755 } else { 0o644 };
+                std::fs::set_permissions(&path, PermissionsExt::from_mode(mode)).expect("set");
+            }
+            Content::Link(target) => symlink(target, &path).expect("linked"),
+        }
+    }
+}
+
 fn run(script: &std::path::Path, arguments: &[&str]) -> std::process::Output {
+    run_by(script, arguments, "/usr/bin:/bin")
+}
+
+fn run_by(script: &std::path::Path, arguments: &[&str], path: &str) -> std::process::Output {
     let mut shell = std::process::Command::new("sh");
     let directory = script.parent().expect("in a directory");
     shell
         .arg(script)
         .args(arguments)
         .current_dir(directory)
-        .env("PATH", "/usr/bin:/bin");
+        .env("PATH", path);
     shell.output().expect("a shell")
 }
 
@@ -258,13 +286,254 @@ fn a_launcher_gives_its_nodes_name_on_whatever_is_in_it() {
     assert!(!stub.path().join("lib/p/ran").exists(), "the name was run");
 }
 
+proptest::proptest! {
+    #![proptest_config(proptest::prelude::ProptestConfig::with_cases(24))]
+    /// Names that a shell could misunderstand, outsourced and not.
+    #[test]
+    fn launchers_quote_every_name(name in r#"[-a'"$`\\(){}\[\]*?~#!;&|<> @=%\.é]{1,12}"#, outsourced: bool) {
+        proptest::prop_assume!(name != "." && name != ".." && !name.starts_with('.'));
+        let files = match outsourced {
+            true => composed(&[&name]),
+            false => {
+                let mut contents = contents();
+                contents.executables.insert(name.clone());
+                composed_of(&["node"], contents)
+            }
+        };
+        let stub = unpacked(&files);
+        let before = std::fs::read_dir(stub.path().join("lib/p")).expect("there").count();
+        let output = run(&stub.path().join("lib/p").join(&name), &["a b", "$c"]);
+        let words = String::from_utf8(output.stdout).expect("text");
+        let verb = if outsourced { "run" } else { "exec-original" };
+        let said: Vec<&str> = words.lines().collect();
+        proptest::prop_assert_eq!(&said[..5], [verb, "--package", "p", "--node", name.as_str()]);
+        proptest::prop_assert_eq!(&said[7..], ["--", "a b", "$c"]);
+        let after = std::fs::read_dir(stub.path().join("lib/p")).expect("there").count();
+        proptest::prop_assert_eq!(before, after);
+    }
+}
+
+/// A directory in which `ssh-keygen` is of a version that verifies nothing, so that Python does.
+fn old_openssh() -> tempfile::TempDir {
+    use std::os::unix::fs::PermissionsExt;
+    let place = tempfile::tempdir().expect("a directory");
+    let path = place.path().join("ssh-keygen");
+    std::fs::write(&path, "#!/bin/sh\necho 'unknown option -- Y' >&2\nexit 1\n").expect("written");
+    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).expect("set");
+    place
+}
+
+/// What somebody does to an unpacked stub on its way.
+type Meddling = fn(&std::path::Path);
+
+#[test]
+fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
+    use std::os::unix::fs::PermissionsExt;
+    fn ran(place: &std::path::Path) -> String {
+        format!("#!/bin/sh\ntouch {}/ran\n", place.display())
+    }
+    let table: [(Meddling, &str); 11] = [
+        (
+            |at| std::fs::write(at.join(format!("lib/p/{PROGRAM}")), ran(at)).expect("written"),
+            "./lib/p/cloudroid-stub",
+        ),
+        (
+            |at| std::fs::write(at.join("share/p/launch/b.launch"), "").expect("written"),
+            "./share/p/launch/b.launch",
+        ),
+        (
+            |at| std::fs::remove_file(at.join("share/p/launch/a.launch")).expect("removed"),
+            "./share/p/launch/a.launch",
+        ),
+        (
+            |at| {
+                let path = at.join("share/p/launch/a.launch");
+                std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).expect("set");
+            },
+            "./share/p/launch/a.launch",
+        ),
+        (
+            |at| {
+                let path = at.join("share/p/launch/same");
+                std::fs::remove_file(&path).expect("removed");
+                std::os::unix::fs::symlink("/etc/shadow", path).expect("linked");
+            },
+            "./share/p/launch/same",
+        ),
+        (
+            |at| {
+                let status = std::process::Command::new("mkfifo")
+                    .arg(at.join("share/p/pipe"))
+                    .status();
+                assert!(status.expect("mkfifo").success());
+            },
+            "./share/p/pipe",
+        ),
+        (
+            |at| std::fs::remove_file(at.join(SIGNATURE)).expect("removed"),
+            "this archive is not signed: it has no MANIFEST.sig",
+        ),
+        (
+            |at| std::fs::remove_file(at.join(MANIFEST)).expect("removed"),
+            "this archive is not signed: it has no MANIFEST",
+        ),
+        (
+            |at| std::fs::write(at.join(SIGNATURE), "").expect("written"),
+            "the signature is not the server's",
+        ),
+        (
+            |at| {
+                let path = at.join(SIGNATURE);
+                let text = std::fs::read_to_string(&path).expect("read");
+                std::fs::write(path, &text[..text.len() / 2]).expect("written");
+            },
+            "the signature is not the server's",
+        ),
+        (
+            // The list changed with the file, and signed as nothing else.
+            |at| {
+                let path = at.join(MANIFEST);
+                let text = std::fs::read_to_string(&path).expect("read");
+                std::fs::write(path, text.replacen('0', "1", 1)).expect("written");
+            },
+            "the signature is not the server's",
+        ),
+    ];
+    let (old, prefix) = (old_openssh(), tempfile::tempdir().expect("a directory"));
+    let old = format!("{}:/usr/bin:/bin", old.path().display());
+    let target = prefix.path().join("overlay");
+    for (meddle, words) in table {
+        for path in ["/usr/bin:/bin", &old] {
+            let stub = unpacked(&composed(&["node"]));
+            meddle(stub.path());
+            let arguments = ["--prefix", target.to_str().expect("text")];
+            let output = run_by(&stub.path().join("install.sh"), &arguments, path);
+            let told = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(
+                !output.status.success() && told.contains(words),
+                "{words}: {told}"
+            );
+            assert!(!stub.path().join("ran").exists(), "{words}: it ran");
+            assert!(!target.exists(), "{words}: it was installed");
+        }
+    }
+}
+
+#[test]
+fn the_key_that_is_known_is_the_one_that_counts() {
+    let key = || sign::SigningKey::generate().expect("made").0;
+    let (server, other) = (key(), key());
+    let files = composed(&["node"]);
+    let (stub, strangers) = (unpacked_of(&files, &server), unpacked_of(&files, &other));
+    let old = old_openssh();
+    let old = format!("{}:/usr/bin:/bin", old.path().display());
+    for path in ["/usr/bin:/bin", &old] {
+        let prefix = tempfile::tempdir().expect("a directory");
+        let target = prefix.path().join("over & lay");
+        let target = target.to_str().expect("text");
+        let install = |stub: &tempfile::TempDir, more: &[&str]| {
+            let arguments = [&["--prefix", target], more].concat();
+            let output = run_by(&stub.path().join("install.sh"), &arguments, path);
+            let told = String::from_utf8_lossy(&output.stderr).into_owned();
+            (output.status.success(), told)
+        };
+        let refused = install(&strangers, &["--key", &server.public().to_string()]);
+        assert!(
+            !refused.0 && refused.1.contains("signed by another key"),
+            "{refused:?}"
+        );
+        let refused = install(&stub, &["--key", "/nowhere"]);
+        assert!(
+            !refused.0 && refused.1.contains("neither a key"),
+            "{refused:?}"
+        );
+        // Trusted at the first time, and said so; from then on it is that one.
+        let first = install(&stub, &[]);
+        assert!(
+            first.0 && first.1.contains(&server.public().to_string()),
+            "{first:?}"
+        );
+        assert_eq!(install(&stub, &[]), (true, String::new()));
+        let refused = install(&strangers, &[]);
+        assert!(
+            !refused.0 && refused.1.contains("if the server was set up anew"),
+            "{refused:?}"
+        );
+        assert!(
+            refused.1.contains(&other.public().to_string()),
+            "{refused:?}"
+        );
+        // Somebody who has asked the other server's operator.
+        assert!(install(&strangers, &["--key", &other.public().to_string()]).0);
+        assert!(
+            install(&strangers, &[]).0 && install(&stub, &[]).0,
+            "both are known"
+        );
+        let setup = std::fs::read_to_string(format!("{target}/setup.sh")).expect("there");
+        assert!(
+            setup.contains(&format!("_cloudroid_installed='{target}'")),
+            "{setup}"
+        );
+    }
+}
+
+#[test]
+fn what_is_installed_has_the_modes_that_it_must_have() {
+    use std::os::unix::fs::PermissionsExt;
+    let stub = unpacked(&composed(&["node"]));
+    // Unpacked by somebody who closes everything, and by a tool that opens everything.
+    for (path, mode) in [
+        ("lib/p/node", 0o700),
+        ("share/p/package.xml", 0o666),
+        ("share/p", 0o777),
+    ] {
+        let path = stub.path().join(path);
+        std::fs::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
+    }
+    let prefix = tempfile::tempdir().expect("a directory");
+    let target = prefix.path().join("overlay");
+    let arguments = [
+        "--prefix",
+        target.to_str().expect("text"),
+        "--token",
+        "secret",
+    ];
+    let output = run(&stub.path().join("install.sh"), &arguments);
+    assert!(output.status.success(), "{output:?}");
+    let mut left = vec![target.clone()];
+    while let Some(path) = left.pop() {
+        let about = path.symlink_metadata().expect("there");
+        if about.is_symlink() {
+            continue;
+        }
+        let name = path
+            .strip_prefix(&target)
+            .expect("below")
+            .display()
+            .to_string();
+        let mode = match &*name {
+            "share/p/token" => 0o600,
+            _ if about.is_dir() || name.starts_with("lib/p/") => 0o755,
+            "share/p/scripts/tool.py" | "share/p/scripts/other.py" | "share/p/bin/helper" => 0o755,
+            _ => 0o644,
+        };
+        assert_eq!(about.permissions().mode() & 0o7777, mode, "{name}");
+        if about.is_dir() {
+            left.extend(
+                std::fs::read_dir(&path)
+                    .expect("there")
+                    .map(|entry| entry.expect("one").path()),
+            );
+        }
+    }
+}
+
 #[test]
 fn a_robots_token_is_its_own_whatever_the_package_brings() {
     use std::os::unix::fs::PermissionsExt;
-    let stub = unpacked(&composed(&["node"]));
-    let brought = stub.path().join("share/p/token");
-    std::fs::write(&brought, "the package's").expect("written");
-    std::fs::set_permissions(&brought, PermissionsExt::from_mode(0o644)).expect("set");
+    let mut files = composed(&["node"]);
+    files.insert("share/p/token".into(), file("the package's", false));
+    let stub = unpacked(&files);
     let prefix = tempfile::tempdir().expect("a directory");
     let target = prefix.path().join("overlay");
     let target = target.to_str().expect("text");
@@ -297,4 +566,31 @@ fn a_package_brings_no_settings_and_no_token() {
         .filter(|path| path.contains("token") || path.contains("ca.pem"))
         .collect();
     assert_eq!(brought, ["share/p/launch/token"]);
+}
+
+#[test]
+fn a_robot_gets_no_sources_and_nothing_hidden() {
+    let mut contents = contents();
+    for name in [
+        "src/a.cpp",
+        ".git/config",
+        "launch/.env",
+        "launch/a\nb",
+        "back\\slash",
+    ] {
+        contents.share.insert(name.into(), file("", false));
+    }
+    contents.executables.insert("a\nb".into());
+    let files = composed_of(&["node"], contents);
+    let brought = ["src/", ".git", ".env", "\n"];
+    let found = files
+        .keys()
+        .find(|path| brought.iter().any(|part| path.contains(part)));
+    assert_eq!(found, None);
+    // Names that sha256sum writes in a way of its own are listed as it lists them.
+    let stub = unpacked(&files);
+    let prefix = tempfile::tempdir().expect("a directory");
+    let arguments = ["--prefix", prefix.path().to_str().expect("text")];
+    let output = run(&stub.path().join("install.sh"), &arguments);
+    assert!(output.status.success(), "{output:?}");
 }

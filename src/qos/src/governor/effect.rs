@@ -1,19 +1,9 @@
 //! What a governor wants done.
 
-use std::sync::Arc;
-
+use crate::channel::Channel;
 use crate::decider::Event;
 use crate::outcome::Outcome;
 use crate::request::{RequestId, Side};
-
-/// Where a message goes to or came from.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Channel {
-    /// A service or an action, by absolute name.
-    Call(Arc<str>),
-    /// A topic, by absolute name.
-    Topic(Arc<str>),
-}
 
 /// What is to be done, in this order.
 #[derive(Debug, Clone, PartialEq)]

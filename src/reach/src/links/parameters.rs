@@ -5,23 +5,20 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 use ros::bus::{BusError, ParamValue};
+use ros::ros1::own_parameters::is_of_master;
 use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
 use super::{Hub, RUNS};
 use link::control::{FromCloud, Hello, Node};
 
-/// Those of a Master itself.
-const OWN: [&str; 5] = [
-    "run_id",
-    "rosdistro",
-    "rosversion",
-    "roslaunch",
-    "cloudroid_runs",
-];
-
 /// Stamps are simulated time.
 const SIMULATED: &str = "use_sim_time";
+
+/// Whether the Master's side has it of itself, or keeps runs of nodes there.
+fn is_own(name: &str) -> bool {
+    is_of_master(name) || name == RUNS.trim_start_matches('/')
+}
 
 /// What was set here in the robot's name: it does not go back.
 #[derive(Default)]
@@ -54,7 +51,7 @@ impl Known {
         };
         for (name, value) in &hello.parameters {
             let value = translated(hub, &hello.node, value);
-            if !OWN.contains(&name.as_str()) && there.get(name) != Some(&value) {
+            if !is_own(name) && there.get(name) != Some(&value) {
                 self.set(hub, format!("/{name}"), value).await;
             }
         }

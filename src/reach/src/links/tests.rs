@@ -1,11 +1,13 @@
+use async_trait::async_trait;
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use tokio::io::{DuplexStream, duplex};
 use tokio::net::TcpListener;
+use tokio::sync::mpsc;
 
 use super::*;
-use link::control::{FromRobot, Input, Resume};
+use link::control::{Exit, FromRobot, Input, Node, Resume};
 use link::record::Record;
 
 /// A servant whose nodes run from when they are started, and say nothing.

@@ -1,14 +1,14 @@
 //! CBOR → ROS bytes (RFC 8949), typed arrays included (RFC 8746).
 
+use crate::cbor_head::{ARRAY, BYTES, MAP, NEGATIVE, SIMPLE, TAG, TEXT, UNSIGNED};
 use crate::codec::FillOptions;
 use crate::codec::cbor_item::{Head, INDEFINITE};
-use crate::codec::cbor_out::{ARRAY, BYTES, MAP, NEGATIVE, SIMPLE, TAG, TEXT, UNSIGNED};
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::fill::{Input, fill};
 use crate::codec::number::{Number, Wire};
-use crate::codec::plan::Members;
 use crate::codec::typed_array::{Layout, float_of_head};
 use crate::schema::MessageType;
+use crate::schema::plan::Members;
 
 /// Appends the message that the CBOR map describes.
 pub(crate) fn read(

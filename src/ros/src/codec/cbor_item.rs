@@ -1,6 +1,6 @@
 //! Heads of CBOR items, and where an item ends.
 
-use crate::codec::cbor_out::{ARRAY, BYTES, MAP, SIMPLE, TAG, TEXT};
+use crate::cbor_head::{ARRAY, BYTES, MAP, SIMPLE, TAG, TEXT};
 use crate::codec::fault::{CodecError, CodecErrorKind};
 
 /// Deepest nesting that is looked into where no message type bounds it.

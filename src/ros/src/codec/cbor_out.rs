@@ -1,43 +1,12 @@
 //! ROS bytes → CBOR (RFC 8949), numeric arrays as typed arrays (RFC 8746).
 
+use crate::cbor_head::{ARRAY, BYTES, MAP, NEGATIVE, SIMPLE, TAG, TEXT, UNSIGNED, head};
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::codec::plan::{Literal, Plan, Scalar};
 use crate::codec::typed_array::little_endian_tag;
 use crate::codec::walk::{Format, walk};
 use crate::codec::{CborOptions, InvalidUtf8};
 use crate::schema::MessageType;
-
-/// Major types, in place.
-pub(crate) const UNSIGNED: u8 = 0 << 5;
-pub(crate) const NEGATIVE: u8 = 1 << 5;
-pub(crate) const BYTES: u8 = 2 << 5;
-pub(crate) const TEXT: u8 = 3 << 5;
-pub(crate) const ARRAY: u8 = 4 << 5;
-pub(crate) const MAP: u8 = 5 << 5;
-pub(crate) const TAG: u8 = 6 << 5;
-/// Booleans, null, floats, and the end of what has no declared length.
-pub(crate) const SIMPLE: u8 = 7 << 5;
-
-/// Writes an item's head in its shortest form.
-#[inline]
-pub(crate) fn head(out: &mut Vec<u8>, major: u8, value: u64) {
-    match value {
-        0..=23 => out.push(major | value as u8),
-        24..=0xff => out.extend_from_slice(&[major | 24, value as u8]),
-        0x100..=0xffff => {
-            out.push(major | 25);
-            out.extend_from_slice(&(value as u16).to_be_bytes());
-        }
-        0x1_0000..=0xffff_ffff => {
-            out.push(major | 26);
-            out.extend_from_slice(&(value as u32).to_be_bytes());
-        }
-        _ => {
-            out.push(major | 27);
-            out.extend_from_slice(&value.to_be_bytes());
-        }
-    }
-}
+use crate::schema::plan::{Literal, Plan, Scalar};
 
 /// Appends the message as a CBOR map.
 pub(crate) fn write(

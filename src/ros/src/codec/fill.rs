@@ -8,9 +8,9 @@ use std::sync::LazyLock;
 
 use crate::codec::fault::{CodecErrorKind, Fault};
 use crate::codec::number::Wire;
-use crate::codec::plan::{Count, Kind, Member, Members, Scalar};
 use crate::codec::{FillOptions, Time};
 use crate::schema::MessageType;
+use crate::schema::plan::{Count, Kind, Member, Members, Scalar};
 
 /// Where values come from.
 pub(crate) trait Input {

@@ -8,8 +8,8 @@ use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::fill::{Input, fill};
 use crate::codec::json_text::{is_space, plain_prefix, unescape};
 use crate::codec::number::{Decimal, Wire};
-use crate::codec::plan::Members;
 use crate::schema::MessageType;
+use crate::schema::plan::Members;
 
 /// Appends the message that the JSON object describes.
 pub(crate) fn read(

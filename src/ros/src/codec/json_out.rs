@@ -2,10 +2,10 @@
 
 use crate::codec::fault::{CodecErrorKind, Fault};
 use crate::codec::json_text::{plain_prefix, push_escaped};
-use crate::codec::plan::{Literal, Plan, Scalar};
 use crate::codec::walk::{Format, walk};
 use crate::codec::{InvalidUtf8, JsonOptions, NonFinite};
 use crate::schema::MessageType;
+use crate::schema::plan::{Literal, Plan, Scalar};
 
 /// Appends the message as a JSON object.
 pub(crate) fn write(

@@ -2,7 +2,7 @@
 
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::float::{double, single};
-use crate::codec::plan::Scalar;
+use crate::schema::plan::Scalar;
 
 /// A number of CBOR.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -3,7 +3,7 @@
 use crate::codec::cbor_item::Head;
 use crate::codec::fault::Fault;
 use crate::codec::number::{Number, Wire};
-use crate::codec::plan::Scalar;
+use crate::schema::plan::Scalar;
 
 /// The tag under which the bytes of a ROS array can go as they are.
 pub(crate) fn little_endian_tag(scalar: Scalar) -> Option<u64> {

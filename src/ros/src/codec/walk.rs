@@ -2,8 +2,8 @@
 //! anything is done with it.
 
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::codec::plan::{Count, Kind, Literal, Plan, Scalar};
 use crate::schema::MessageType;
+use crate::schema::plan::{Count, Kind, Literal, Plan, Scalar};
 
 /// Elements without any bytes cost nothing on the wire, so their number is bounded here.
 const MAX_EMPTY_ELEMENTS: usize = 1 << 16;

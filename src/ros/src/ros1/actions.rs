@@ -1,19 +1,11 @@
 //! Actions of ROS 1: five topics below one name, as actionlib has them
 //! (<http://wiki.ros.org/actionlib/DetailedDescription>).
 
-mod client;
 pub mod messages;
-mod server;
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use super::bus::{End, Inner, publications, subscriptions};
-use crate::bus::{ActionNodes, BusError, Publisher, Qos, Subscription, TopicNodes, WireType};
-use crate::schema::{ActionDef, MessageType, Registry, SchemaError};
-
-pub(super) use client::Client;
-pub(super) use server::Server;
+use crate::bus::{ActionNodes, TopicNodes};
 
 /// What follows an action's name in the names of its topics.
 const PARTS: [&str; 5] = ["goal", "cancel", "status", "feedback", "result"];
@@ -54,60 +46,6 @@ pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<Strin
         found.insert(name.to_owned(), nodes);
     }
     found
-}
-
-/// Messages kept for a slow peer.
-const QUEUE: usize = 100;
-
-/// The topics of one action of this node.
-struct Topics<'a> {
-    bus: &'a Arc<Inner>,
-    name: &'a str,
-    of: &'a ActionDef,
-    goal_id: Arc<MessageType>,
-    states: Arc<MessageType>,
-}
-
-impl<'a> Topics<'a> {
-    fn of(bus: &'a Arc<Inner>, name: &'a str, of: &'a ActionDef) -> Result<Self, BusError> {
-        let known = Registry::new();
-        let unusable = |error: SchemaError| BusError::Protocol {
-            what: format!("action {name}"),
-            reason: error.to_string(),
-        };
-        Ok(Self {
-            bus,
-            name,
-            of,
-            goal_id: known.message("actionlib_msgs/GoalID").map_err(unusable)?,
-            states: known
-                .message("actionlib_msgs/GoalStatusArray")
-                .map_err(unusable)?,
-        })
-    }
-
-    fn topic(&self, part: &str) -> (String, WireType) {
-        let of = match part {
-            "goal" => &self.of.action_goal,
-            "cancel" => &self.goal_id,
-            "status" => &self.states,
-            "feedback" => &self.of.action_feedback,
-            _ => &self.of.action_result,
-        };
-        (format!("{}/{part}", self.name), WireType::of(of))
-    }
-
-    async fn subscribe(&self, part: &str) -> Result<Subscription, BusError> {
-        let (topic, of) = self.topic(part);
-        let qos = Qos::keep_last(QUEUE).latching(true);
-        subscriptions::subscribe(self.bus, &topic, of, qos, End::Action).await
-    }
-
-    async fn advertise(&self, part: &str, latch: bool) -> Result<Box<dyn Publisher>, BusError> {
-        let (topic, of) = self.topic(part);
-        let qos = Qos::keep_last(QUEUE).latching(latch);
-        publications::advertise(self.bus, &topic, of, qos, End::Action).await
-    }
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@
 //! What this side wants registered is kept by the registrar; the graph watcher compares it with what the Master
 //! has, so a Master that restarted, or forgot us, is told again.
 
+mod actions;
 mod calls;
 mod heard;
 mod lending;
@@ -48,7 +49,7 @@ use self::publications::TopicOut;
 use self::registrar::Registrar;
 use self::services::Served;
 use self::subscriptions::TopicIn;
-use super::{actions, names};
+use super::names;
 use crate::JoinOptions;
 use crate::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,

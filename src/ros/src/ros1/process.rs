@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use crate::bus::ParamValue;
-use crate::flavour::Identity;
+use crate::identity::Identity;
 
 /// Where every servant's Master listens, as seen from inside.
 pub const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);

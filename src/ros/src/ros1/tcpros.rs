@@ -14,10 +14,7 @@ pub use header::{Header, MAX_HEADER};
 pub use send_queue::{SendQueue, write_messages};
 pub use service::{CallError, ServiceConnection, serve_calls};
 
-/// A message longer than this ends its connection, unless set otherwise.
-pub const MAX_MESSAGE: usize = 256 << 20;
-/// A message that was begun and is not whole after this time ends its connection, unless set otherwise.
-pub const UNFINISHED: Duration = Duration::from_secs(300);
+pub use crate::join::{MAX_MESSAGE, UNFINISHED};
 
 /// A TCPROS connection that broke.
 #[derive(Debug, thiserror::Error)]

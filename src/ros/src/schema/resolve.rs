@@ -4,9 +4,9 @@ use std::sync::{Arc, OnceLock};
 
 use md5::{Digest, Md5};
 
-use crate::codec::plan::Plan;
 use crate::schema::limits::{MAX_DEPTH, MAX_MESSAGE_BYTES, MAX_VALUES};
 use crate::schema::parse::{Parsed, ParsedField, parse};
+use crate::schema::plan::Plan;
 use crate::schema::registry::State;
 use crate::schema::types::{ActionDef, Base, Field, MessageType, Primitive, ServiceDef};
 use crate::schema::{Arity, SchemaError};

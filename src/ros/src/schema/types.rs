@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::{Arc, OnceLock};
 
-use crate::codec::plan::Plan;
+use crate::schema::plan::Plan;
 use crate::schema::text::full_text;
 
 /// The types that need no definition. `byte` is [`Primitive::Int8`] and `char` is [`Primitive::Uint8`].

@@ -345,7 +345,8 @@ impl LocalServant {
     /// Pids on this host of the node processes and all their children (not of init).
     pub fn processes(&self) -> Result<Vec<i32>, Error> {
         let init = self.init()?;
-        let mut processes = self.cgroup.processes();
+        let cgroup = self.cgroup.clone();
+        let mut processes = privilege::now(move || cgroup.processes());
         processes.retain(|pid| *pid != init);
         Ok(processes)
     }
@@ -397,17 +398,21 @@ impl Servant for LocalServant {
 
     async fn usage(&self) -> Result<Usage, Error> {
         self.check_runs()?;
-        Ok(self.cgroup.usage())
+        let cgroup = self.cgroup.clone();
+        Ok(privilege::run(async move { cgroup.usage() }).await)
     }
 
     async fn waited(&self) -> Duration {
         if self.init().is_err() {
             return Duration::ZERO;
         }
-        let mut processes = self.cgroup.processes();
-        // Nodes go on only when their Master and whoever is connected to them do.
-        processes.extend(i32::try_from(std::process::id()));
-        let waited = tokio::task::spawn_blocking(move || processes.into_iter().map(waited).sum());
+        let cgroup = self.cgroup.clone();
+        let waited = privilege::blocking(move || {
+            let mut processes = cgroup.processes();
+            // Nodes go on only when their Master and whoever is connected to them do.
+            processes.extend(i32::try_from(std::process::id()));
+            processes.into_iter().map(waited).sum()
+        });
         waited.await.unwrap_or_default()
     }
 
@@ -482,7 +487,8 @@ impl Servant for LocalServant {
         let patience = self.grace.interrupt + self.grace.terminate + FINISH;
         if let Err(error) = wait_for_end(&self.shim, patience).await {
             tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
-            let _ = sys::pidfd_send_signal(self.shim.as_fd(), libc::SIGKILL);
+            let shim = self.shim.clone();
+            let _ = privilege::now(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
             let _ = wait_for_end(&self.shim, FINISH).await;
         }
         // Its last words are taken in, and its log opened by those who read it, before both are swept away.

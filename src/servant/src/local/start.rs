@@ -53,6 +53,7 @@ async fn start_in(
         uid_range: (first, uids::RANGE),
         parent: shared.parent.clone(),
         shim_limits: shared.config.shim_limits,
+        quotas: shared.config.quotas,
         isolation: shared.config.isolation,
         grace: shared.config.grace,
         init: shared.config.init.clone(),

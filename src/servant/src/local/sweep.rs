@@ -17,7 +17,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// Does everything that can be done, then tells the first thing that could not. Nothing to do is no error.
 pub(super) async fn sweep(id: &str, directory: &Path) -> Result<(), Error> {
     let (id, directory) = (id.to_owned(), directory.to_owned());
-    let work = tokio::task::spawn_blocking(move || sweep_now(&id, &directory));
+    let work = privilege::blocking(move || sweep_now(&id, &directory));
     work.await
         .unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
 }

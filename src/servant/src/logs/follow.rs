@@ -36,15 +36,19 @@ pub fn follow(
     let (files, opened) = mpsc::unbounded_channel();
     let changes = watch::Sender::new(());
     let changed = changes.subscribe();
-    // Opened here and not in the task: what is written after this function has returned is surely seen.
-    match Discovery::open(&path, from_start, files) {
-        Ok(discovery) => {
-            tokio::spawn(async move {
-                discovery.run(&changes, ended).await;
-                drop(guard);
-            });
-            tokio::spawn(read(opened, changed, sender));
-        }
+    // Opened here and not in the task: what is written after this function has returned is surely seen. Files are opened
+    // where that may be, and what servants printed is parsed elsewhere.
+    let log = path.clone();
+    let discovering = privilege::now(move || {
+        let discovery = Discovery::open(&log, from_start, files)?;
+        tokio::spawn(async move {
+            discovery.run(&changes, ended).await;
+            drop(guard);
+        });
+        Ok::<_, io::Error>(())
+    });
+    match discovering {
+        Ok(()) => drop(tokio::spawn(read(opened, changed, sender))),
         Err(error) => {
             // The channel is empty: there is room for the one line.
             let _ = sender.try_send(note(format!(
@@ -327,7 +331,7 @@ mod tests {
     async fn every_line_arrives_in_order_across_rotations() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 4000).unwrap();
+        let mut writer = Writer::create(&path, 4000, u64::MAX).unwrap();
         writer.append("/a", "stdout", "0");
         let (end, ended) = oneshot::channel::<()>();
         let lines = follow(path.clone(), true, async { drop(ended.await) }, ());
@@ -347,7 +351,7 @@ mod tests {
     async fn from_now_on_means_from_now_on_and_removal_loses_nothing() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 1 << 20).unwrap();
+        let mut writer = Writer::create(&path, 1 << 20, u64::MAX).unwrap();
         writer.append("/a", "stdout", "before");
         let (end, ended) = oneshot::channel::<()>();
         let lines = follow(path.clone(), false, async { drop(ended.await) }, ());
@@ -361,7 +365,7 @@ mod tests {
     async fn the_past_and_what_follows_come_once_each_by_their_place_and_not_by_their_time() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 1 << 20).unwrap();
+        let mut writer = Writer::create(&path, 1 << 20, u64::MAX).unwrap();
         for number in 0..3 {
             writer.append("/a", "stdout", &number.to_string());
         }
@@ -386,7 +390,7 @@ mod tests {
     async fn once_the_guard_is_dropped_the_log_may_go() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 200).unwrap();
+        let mut writer = Writer::create(&path, 200, u64::MAX).unwrap();
         writer.append("/a", "stdout", "first");
         let guards = watch::Sender::new(());
         let (end, ended) = oneshot::channel::<()>();
@@ -407,7 +411,7 @@ mod tests {
     async fn a_reader_too_slow_is_told_what_it_missed() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 400).unwrap();
+        let mut writer = Writer::create(&path, 400, u64::MAX).unwrap();
         writer.append("/a", "stdout", "0");
         let lines = follow(path.clone(), true, std::future::ready(()), ());
         for number in 1..100 {

@@ -13,21 +13,30 @@ const BLOCK: usize = 64 * 1024;
 
 /// [`read`], where nobody may wait for a disk.
 pub async fn last(path: PathBuf, count: usize, node: Option<String>) -> Vec<LogLine> {
-    let read = move || read(&path, count, node.as_deref());
+    // Files are opened where that may be, and what servants printed is parsed elsewhere.
+    let Ok(files) = privilege::blocking(move || open(&path)).await else {
+        return Vec::new();
+    };
+    let read = move || read(files, count, node.as_deref());
     tokio::task::spawn_blocking(read).await.unwrap_or_default()
 }
 
-/// The last `count` lines of the log at `path`, oldest first; of one node alone where one is named. Lines that
-/// cannot be read are passed over. Of the files no more is read than it takes.
-fn read(path: &Path, count: usize, node: Option<&str>) -> Vec<LogLine> {
+/// The files of the log at `path`, the newest first.
+fn open(path: &Path) -> Vec<File> {
     let current = File::open(path).ok();
     let inode = |file: &File| file.metadata().map(|data| (data.dev(), data.ino())).ok();
     // Where the log was rotated in between it is the same file once more.
     let same = current.as_ref().and_then(inode);
     let older = File::open(rotated(path)).ok();
     let older = older.filter(|older| same.is_none() || inode(older) != same);
+    current.into_iter().chain(older).collect()
+}
+
+/// The last `count` lines of a log, oldest first; of one node alone where one is named. Lines that cannot be read are
+/// passed over. Of the files no more is read than it takes.
+fn read(files: Vec<File>, count: usize, node: Option<&str>) -> Vec<LogLine> {
     let mut newest_first = Vec::new();
-    for file in current.into_iter().chain(older) {
+    for file in files {
         // What cannot be read any further ends there.
         let _ = backwards(file, |line| {
             if newest_first.len() >= count {
@@ -92,7 +101,7 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("log.jsonl");
         let texts = |count, node| -> Vec<String> {
-            read(&path, count, node)
+            read(open(&path), count, node)
                 .into_iter()
                 .map(|line| line.line)
                 .collect()
@@ -114,7 +123,9 @@ mod tests {
         let text: String = all.iter().map(|text| line("/a", text)).collect();
         std::fs::write(&path, &text).expect("written");
         for count in [1, 2, 7, 20, 30] {
-            let seen = read(&path, count, None).into_iter().map(|line| line.line);
+            let seen = read(open(&path), count, None)
+                .into_iter()
+                .map(|line| line.line);
             let expected = &all[20 - count.min(20)..];
             assert!(seen.eq(expected.iter().cloned()), "the last {count}");
         }

@@ -12,9 +12,9 @@ use nix::sys::socket::{AddressFamily, SockFlag, SockType, socketpair};
 use nix::sys::stat::{Mode, umask};
 
 use super::create::{self, Creator};
-use crate::cgroup::{self, Cgroup};
+use crate::cgroup::Cgroup;
 use crate::container::Opened;
-use crate::engine::{ContainerState, Enforced};
+use crate::engine::{self, ContainerState, Enforced};
 use crate::launch::{self, Exit, Launch, Runtime};
 use crate::local::Isolation;
 use crate::netns::NetNs;
@@ -227,11 +227,11 @@ fn confine(launch: &Launch, [cgroup, own]: [&Cgroup; 2], creator: u32) -> Result
         shim: of_shim,
         ..cgroup.set(&launch.spec.limits)
     };
-    let mut missing = cgroup::missing(&launch.spec.limits, &enforced.limits);
+    let mut missing = engine::missing(&launch.spec.limits, &enforced.limits);
     // Where a controller is lacking altogether, that is told of the host, once.
     let controllers = launch.parent.controllers();
     let has = |name: &str| controllers.iter().any(|known| known == name);
-    let of_shim = cgroup::missing(&asked, &of_shim).into_iter();
+    let of_shim = engine::missing(&asked, &of_shim).into_iter();
     missing.extend(of_shim.filter_map(|name| match name {
         "memory" if has("memory") => Some("the shim's memory"),
         "cpus" if has("cpu") => Some("the shim's cpus"),

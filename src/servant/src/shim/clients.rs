@@ -7,7 +7,7 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use super::driver::Input;
+use super::input::Input;
 use crate::protocol::{self, FromShim, Request};
 
 /// Everybody who listens.

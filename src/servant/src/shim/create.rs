@@ -158,8 +158,8 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
     rootfs
         .make_owned(&staged.root, &launch.spec.owned_directories)
         .map_err(|error| text(&error))?;
-    let config =
-        bundle::config(&launch.spec, &staged, launch.uid_range).map_err(|error| text(&error))?;
+    let config = bundle::config(&launch.spec, &staged, launch.uid_range, &launch.quotas())
+        .map_err(|error| text(&error))?;
     let file = directory.join("config.json");
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
     let mut options = File::options();

@@ -7,7 +7,6 @@ mod node_life;
 use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
 
-use init::Reply;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
 use tokio::net::{UnixListener, UnixStream};
@@ -15,38 +14,17 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 
-use self::ending::StopStage;
 use super::Resident;
 use super::begin::Begun;
 use super::clients::Clients;
+use super::input::{Input, StopStage};
 use super::link::Link;
 use super::nodes::Nodes;
 use super::streams::Streams;
 use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{Command, FromShim, Request, Snapshot};
+use crate::protocol::{Command, FromShim, Snapshot};
 use crate::spec::Limits;
-use crate::{Error, cgroup, logs};
-
-/// What happens.
-#[derive(Debug)]
-pub(super) enum Input {
-    /// A daemon connected.
-    Connected(UnixStream),
-    /// It asked.
-    Request(u64, Request),
-    /// It left.
-    Disconnected(u64),
-    /// Init said something.
-    Init(Reply, Option<OwnedFd>),
-    /// A child of ours was reaped: init, or what the creator left.
-    Reaped(i32, i32),
-    /// A node's delay is over.
-    Respawn(String),
-    /// A stage of the stop has lasted long enough.
-    Patience(StopStage),
-    /// We were asked to end.
-    Terminate,
-}
+use crate::{Error, logs};
 
 struct Driver {
     begun: Begun,
@@ -100,7 +78,9 @@ impl Driver {
         });
         let control = control.map_err(Error::call("talking to the daemon"))?;
         let log = begun.directory.join(logs::FILE);
-        let log = logs::Writer::create(&log, logs::ROTATE_AT).map_err(Error::file("make", &log))?;
+        let rate = begun.launch.quotas().log_rate;
+        let log =
+            logs::Writer::create(&log, logs::ROTATE_AT, rate).map_err(Error::file("make", &log))?;
         let init = begun
             .init
             .try_clone()
@@ -205,7 +185,7 @@ impl Driver {
                 self.clients.report(&FromShim::Enforced {
                     enforced: enforced.clone(),
                 });
-                Some(match cgroup::unmet(&limits, &enforced).as_slice() {
+                Some(match enforced.unmet(&limits).as_slice() {
                     [] => Ok(()),
                     unmet => Err(format!("cannot be set: {}", unmet.join(", "))),
                 })

@@ -39,10 +39,11 @@ impl Streams {
         Ok(write)
     }
 
-    /// Completes when every pipe has ended.
+    /// Completes when every pipe has ended, and the log says what is not in it.
     pub(super) async fn drained(&self) {
         // The sender lives in self, so that this cannot fail.
         let _ = self.open.subscribe().wait_for(|count| *count == 0).await;
+        self.log.borrow_mut().tell_dropped();
     }
 
     async fn copy(self, mut receiver: pipe::Receiver, node: String, stream: &'static str) {

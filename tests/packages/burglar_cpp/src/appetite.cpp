@@ -1,9 +1,12 @@
 // Taking as much as there is: processor time, memory, processes.
+#include <fcntl.h>
 #include <signal.h>
 #include <unistd.h>
 
 #include <atomic>
+#include <cerrno>
 #include <chrono>
+#include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <fstream>
@@ -95,6 +98,37 @@ Outcome environment(const std::string& name) {
   return {value != nullptr, value ? value : ""};
 }
 
+// Bytes that a directory takes, until it takes no more.
+Outcome fill(const std::string& directory) {
+  int fd = open((directory + "/filled").c_str(), O_CREAT | O_WRONLY | O_CLOEXEC, 0600);
+  if (fd < 0) return outcome(-1);
+  static const std::vector<char> block(1 << 16, 'x');
+  long total = 0, count;
+  while ((count = write(fd, block.data(), block.size())) > 0) total += count;
+  std::string why = std::strerror(errno);
+  close(fd);
+  return {true, std::to_string(total) + " " + why};
+}
+
+// Files that a directory takes, until it takes no more.
+Outcome crowd(const std::string& directory) {
+  long total = 0;
+  for (int fd;; ++total) {
+    fd = open((directory + "/one-of-many-" + std::to_string(total)).c_str(), O_CREAT | O_WRONLY | O_CLOEXEC, 0600);
+    if (fd < 0) break;
+    close(fd);
+  }
+  return {true, std::to_string(total) + " " + std::strerror(errno)};
+}
+
+// Prints so many megabytes in lines.
+Outcome shout(const std::string& megabytes) {
+  const std::string line(1023, 'x');
+  for (size_t i = std::stoul(megabytes) << 10; i > 0; --i) std::puts(line.c_str());
+  std::fflush(stdout);
+  return {true, "shouted"};
+}
+
 // Answers after so many milliseconds.
 Outcome waitFor(const std::string& milliseconds) {
   std::this_thread::sleep_for(std::chrono::milliseconds(std::stoi(milliseconds)));
@@ -106,6 +140,7 @@ Outcome waitFor(const std::string& milliseconds) {
 const Tries& appetite() {
   static const Tries all{{"burn", burn}, {"rest", rest}, {"work", work},    {"take", take},
                          {"bomb", bomb}, {"end", end},   {"wait", waitFor},
-                         {"write", leave}, {"read", readSome}, {"environment", environment}};
+                         {"write", leave}, {"read", readSome}, {"environment", environment},
+                         {"fill", fill}, {"crowd", crowd}, {"shout", shout}};
   return all;
 }

@@ -26,6 +26,8 @@ pub(super) struct Goal {
     /// As the client wrote it.
     pub(super) action: String,
     pub(super) id: Option<Id<'static>>,
+    /// What its server calls it; empty where it is refused.
+    pub(super) goal_id: String,
     pub(super) feedback: bool,
     pub(super) compression: Compression,
     pub(super) fragment_size: Option<usize>,
@@ -139,9 +141,7 @@ impl Goal {
     }
 
     fn answer(&self, client: &Client, frame: Frame) {
-        if let Some(id) = &self.id {
-            client.actions.lock().goals.remove(id);
-        }
+        client.actions.lock().goals.remove(&self.goal_id);
         client.send_as(frame, self.compression, self.fragment_size);
     }
 

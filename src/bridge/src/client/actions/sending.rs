@@ -38,7 +38,7 @@ impl Client {
             Format::Cbor => Compression::Cbor,
         });
         if let Some(id) = &reply.id
-            && self.actions.lock().goals.contains_key(id)
+            && self.actions.lock().goal_of(id).is_some()
         {
             return Err(format!("a goal with id {id} is under way already"));
         }
@@ -49,6 +49,7 @@ impl Client {
             feedback: op.feedback,
             compression,
             fragment_size: op.fragment_size,
+            goal_id: String::new(),
             begun: None,
             sent: OnceLock::new(),
         };
@@ -59,17 +60,18 @@ impl Client {
         match prepared {
             Ok((prepared, guard)) => {
                 let goal = Goal {
+                    goal_id: prepared.goal_id.clone(),
                     begun: Some((prepared.action.def.clone(), guard)),
                     ..goal
                 };
-                if let Some(id) = &goal.id {
-                    let known = UnderWayGoal {
-                        action: prepared.name.clone(),
-                        goal_id: prepared.goal_id.clone(),
-                        recalled: prepared.recalled.clone(),
-                    };
-                    self.actions.lock().goals.insert(id.clone(), known);
-                }
+                let known = UnderWayGoal {
+                    action: prepared.name.clone(),
+                    id: goal.id.clone(),
+                    recalled: prepared.recalled.clone(),
+                };
+                let mut actions = self.actions.lock();
+                actions.goals.insert(prepared.goal_id.clone(), known);
+                drop(actions);
                 tokio::spawn(run_goal(prepared, Arc::new(goal)));
             }
             Err(reason) => goal.fail(&reason),
@@ -130,20 +132,28 @@ impl Client {
         &self,
         op: &CancelActionGoal<'_>,
     ) -> Result<(), String> {
-        let id = op.id.clone().into_owned();
+        let goal_id = self.actions.lock().goal_of(&op.id);
+        match goal_id.is_some_and(|goal_id| self.cancel_goal(&goal_id)) {
+            true => Ok(()),
+            false => Err(format!("no goal with id {} is under way", op.id)),
+        }
+    }
+
+    /// Cancels a goal by its server's name for it; false where it is not under way.
+    pub(in crate::client) fn cancel_goal(&self, goal_id: &str) -> bool {
         let actions = self.actions.lock();
-        let Some(goal) = actions.goals.get(&id) else {
-            return Err(format!("no goal with id {id} is under way"));
+        let Some(goal) = actions.goals.get(goal_id) else {
+            return false;
         };
         let Some(action) = actions.used.get(&goal.action).cloned() else {
-            return Ok(());
+            return true;
         };
-        let (goal_id, recalled) = (goal.goal_id.clone(), goal.recalled.clone());
+        let recalled = goal.recalled.clone();
         drop(actions);
         // One that still waits for its server need not be sent at all; `run_goal` looks at this last of all.
         recalled.cancel();
-        action.bus.cancel(&goal_id);
-        Ok(())
+        action.bus.cancel(goal_id);
+        true
     }
 }
 

@@ -6,17 +6,13 @@ use std::time::Duration;
 use reach::Reach;
 use ros::bus::Graph;
 
-use crate::Error;
-use crate::handle::Handle;
+use ros::ros1::own_parameters::is_of_master;
 
-/// Those of a Master itself, and of links.
-const OWN: [&str; 5] = [
-    "/run_id",
-    "/rosdistro",
-    "/rosversion",
-    "/roslaunch/",
-    "/cloudroid_runs/",
-];
+use crate::Error;
+use crate::lives::handle::Handle;
+
+/// Where links keep runs of nodes.
+const RUNS: &str = "/cloudroid_runs/";
 /// For the nodes to be where those of the robot's servant are.
 const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -46,7 +42,7 @@ pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(),
         .await
         .map_err(failed)?
     {
-        let own = OWN.iter().any(|own| key.starts_with(own));
+        let own = is_of_master(&key) || key.starts_with(RUNS);
         if own || given.contains(key.as_str()) {
             continue;
         }

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 use super::exchanges::Exchanges;
 use super::topics::{self, Heard, Topics};
 use crate::decide::shadow::{Differing, Side, Tally, Tolerance, differences, verdict};
-use crate::handle::{Failure, Handle, Life};
+use crate::lives::handle::{Failure, Handle, Life};
 use crate::{Choreographer, Error, Measured};
 
 /// What is on its way when it ends has so long to come.

@@ -1,10 +1,14 @@
 #!/bin/sh
 # Installs the stub of @PACKAGE@ on this robot, as an overlay in front of its other ROS packages, or takes it away.
 #
-#   sh install.sh [--prefix DIR] [--server URL] [--ca FILE] [--token TOKEN] [--robot NAME] [--force]
+#   sh install.sh [--prefix DIR] [--key KEY] [--server URL] [--ca FILE] [--fingerprint SHA256:HEX] [--token TOKEN]
+#                 [--robot NAME] [--force]
 #   sh install.sh --uninstall [--prefix DIR]
 #
+# --key: the server's key ("ssh-ed25519 AAAA...", or a file that holds it), which this archive has to be signed by; later ones
+# too. Without it the key that is known in the overlay, or, where none is, the one that the archive brings.
 # --ca: for a server of wss://, the certificate of the authority to trust, where the system does not.
+# --fingerprint: for a server of wss://, its certificate, where no authority has signed it.
 # Without --prefix: /opt/cloudroid for root, ~/.cloudroid for anybody else. Several stubs share one overlay.
 set -eu
 
@@ -21,7 +25,7 @@ usage() {
   sed -n '2,/^set -eu/{/^#/s/^# \{0,1\}//p;}' "$here/install.sh"
 }
 
-uninstall=false force=false prefix='' server='' ca='' token='' robot=''
+uninstall=false force=false prefix='' key='' server='' ca='' fingerprint='' token='' robot=''
 # Installed, it stands in the overlay's share/PKG; in the archive, at its top.
 if [ ! -e "$here/.catkin" ]; then
   prefix=$(cd "$here/../.." && pwd)
@@ -30,12 +34,14 @@ while [ $# -gt 0 ]; do
   case $1 in
     --uninstall) uninstall=true ;;
     --force) force=true ;;
-    --prefix | --server | --ca | --token | --robot)
+    --prefix | --key | --server | --ca | --fingerprint | --token | --robot)
       [ $# -gt 1 ] || complain "$1 needs a value"
       case $1 in
         --prefix) prefix=$2 ;;
+        --key) key=$2 ;;
         --server) server=$2 ;;
         --ca) ca=$2 ;;
+        --fingerprint) fingerprint=$2 ;;
         --token) token=$2 ;;
         --robot) robot=$2 ;;
       esac
@@ -65,7 +71,7 @@ if $uninstall; then
   # The overlay itself goes with its last stub.
   if rmdir "$prefix/lib" 2> /dev/null; then
     rmdir "$prefix/share" 2> /dev/null || true
-    rm -f "$prefix/.catkin" "$prefix/setup.sh" "$prefix/setup.bash" "$prefix/setup.zsh"
+    rm -f "$prefix/.catkin" "$prefix/setup.sh" "$prefix/setup.bash" "$prefix/setup.zsh" "$prefix/servers.pub"
     rmdir "$prefix" 2> /dev/null || true
   fi
   refresh
@@ -77,6 +83,137 @@ fi
 if [ -e "$share" ] && [ ! -e "$share/revision.toml" ]; then
   complain "$share is there and is no stub: choose another --prefix"
 fi
+# What stands in this archive is what the server signed: before anything of it runs.
+umask 022
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+for file in MANIFEST MANIFEST.sig server.pub; do
+  [ -f "$here/$file" ] && [ ! -h "$here/$file" ] || complain "this archive is not signed: it has no $file; get the stub from the server again"
+done
+signers=$work/signers
+case $key in
+  '') if [ -s "$prefix/servers.pub" ]; then cat "$prefix/servers.pub"; else cat "$here/server.pub"; fi ;;
+  AAAA*) printf 'cloudroid ssh-ed25519 %s\n' "$key" ;;
+  ssh-ed25519\ *) printf 'cloudroid %s\n' "$key" ;;
+  *)
+    [ -r "$key" ] || complain "--key is neither a key (ssh-ed25519 AAAA...) nor a file: $key"
+    sed -n 's/^\(cloudroid \)\{0,1\}\(ssh-ed25519 AAAA[^ ]*\).*/cloudroid \2/p' "$key"
+    ;;
+esac > "$signers"
+[ -s "$signers" ] || complain "$key holds no key (ssh-ed25519 AAAA...)"
+
+# Verifies the list's signature: by OpenSSH 8.1 or later, else by Python, which every robot with roslaunch has.
+verify() {
+  if ssh-keygen -Y verify -f "$signers" -I cloudroid -n cloudroid-stub -s "$here/MANIFEST.sig" < "$here/MANIFEST" > /dev/null 2> "$work/said"; then
+    return 0
+  fi
+  # Older ones do not know -Y.
+  command -v python3 > /dev/null || {
+    if command -v ssh-keygen > /dev/null && ! grep -qi 'option' "$work/said"; then return 1; fi
+    complain "nothing here can verify a signature: sudo apt install openssh-client (8.1 or later) or python3"
+  }
+  python3 -I - "$signers" "$here/MANIFEST.sig" "$here/MANIFEST" << 'END'
+# Ed25519 (RFC 8032, section 5.1.7) over SSH's form of signatures (PROTOCOL.sshsig).
+import base64, hashlib, sys
+
+P = 2**255 - 19
+ORDER = 2**252 + 27742317777372353535851937790883648493
+D = -121665 * pow(121666, P - 2, P) % P
+
+
+def strings(blob):
+    found = []
+    while blob:
+        end = 4 + int.from_bytes(blob[:4], "big")
+        if end > len(blob):
+            sys.exit(1)
+        found.append(blob[4:end])
+        blob = blob[end:]
+    return found
+
+
+def point(encoded):
+    y = int.from_bytes(encoded, "little")
+    sign, y = y >> 255, y & (1 << 255) - 1
+    square = (y * y - 1) * pow(D * y * y + 1, P - 2, P) % P
+    x = pow(square, (P + 3) // 8, P)
+    if (x * x - square) % P:
+        x = x * pow(2, (P - 1) // 4, P) % P
+    if len(encoded) != 32 or y >= P or (x * x - square) % P or (x == 0 and sign):
+        sys.exit(1)
+    x = P - x if x & 1 != sign else x
+    return x, y, 1, x * y % P
+
+
+def add(p, q):
+    a, b = (p[1] - p[0]) * (q[1] - q[0]), (p[1] + p[0]) * (q[1] + q[0])
+    c, d = 2 * D * p[3] * q[3], 2 * p[2] * q[2]
+    e, f, g, h = b - a, d - c, d + c, b + a
+    return e * f % P, g * h % P, f * g % P, e * h % P
+
+
+def times(number, p):
+    product = (0, 1, 1, 0)
+    while number:
+        if number & 1:
+            product = add(product, p)
+        p, number = add(p, p), number >> 1
+    return product
+
+
+def verified(key, signature, message):
+    r, s = signature[:32], int.from_bytes(signature[32:], "little")
+    if len(signature) != 64 or s >= ORDER:
+        return False
+    h = int.from_bytes(hashlib.sha512(r + key + message).digest(), "little") % ORDER
+    base = point((4 * pow(5, P - 2, P) % P).to_bytes(32, "little"))
+    left, right = times(s, base), add(point(r), times(h, point(key)))
+    return all((left[i] * right[2] - right[i] * left[2]) % P == 0 for i in (0, 1))
+
+
+def packed(*fields):
+    return b"".join(len(field).to_bytes(4, "big") + field for field in fields)
+
+
+signers, signature, signed = (open(path, "rb").read() for path in sys.argv[1:])
+try:
+    blob = base64.b64decode(b"".join(line for line in signature.split(b"\n") if not line.startswith(b"-----")), validate=True)
+    keys = [base64.b64decode(line.split()[2], validate=True) for line in signers.splitlines()]
+except (ValueError, IndexError):
+    sys.exit(1)
+fields = strings(blob[10:]) if blob[:10] == b"SSHSIG\0\0\0\1" else []
+if len(fields) != 5 or fields[0] not in keys or fields[1] != b"cloudroid-stub" or fields[3] != b"sha512":
+    sys.exit(1)
+key, signature = strings(fields[0]), strings(fields[4])
+if len(key) != 2 or len(signature) != 2 or key[0] != b"ssh-ed25519" or signature[0] != b"ssh-ed25519":
+    sys.exit(1)
+message = b"SSHSIG" + packed(fields[1], fields[2], fields[3], hashlib.sha512(signed).digest())
+sys.exit(0 if verified(key[1], signature[1], message) else 1)
+END
+}
+
+if ! verify; then
+  if [ "$(sed -n 1p "$here/server.pub")" != "$(sed -n 1p "$signers")" ] && ! grep -qxF "$(sed -n 1p "$here/server.pub")" "$signers"; then
+    complain "this archive is signed by another key than this robot knows ($(cut -d ' ' -f 2- < "$here/server.pub")): if the server was set up anew, ask its operator for the key (cloudroidctl stub) and give it with --key"
+  fi
+  complain "the signature is not the server's: the archive was changed on its way; get it again"
+fi
+# All files (x: may be executed), links, and what is neither, as the server listed them.
+(
+  cd "$here"
+  find . -type f -perm -100 ! -path ./MANIFEST ! -path ./MANIFEST.sig -exec sha256sum {} + | sed 's/^/x /'
+  find . -type f ! -perm -100 ! -path ./MANIFEST ! -path ./MANIFEST.sig -exec sha256sum {} + | sed 's/^/- /'
+  find . -type l -exec sh -c 'for file; do printf "l %s -> " "$file"; readlink "$file"; done' sh {} +
+  find . ! -type f ! -type l ! -type d -exec printf '? %s\n' {} \;
+) | LC_ALL=C sort > "$work/found"
+if ! cmp -s "$work/found" "$here/MANIFEST"; then
+  LC_ALL=C comm -3 "$work/found" "$here/MANIFEST" | sed 's/^\t*\([^ ]*\) .* \(\.\/.*\)/  \2/; s/^\t*l /  /' | sort -u | head -n 10 >&2
+  complain "these files are not what the server signed: unpack the archive again into an empty directory"
+fi
+if [ -z "$key" ] && [ ! -s "$prefix/servers.pub" ]; then
+  echo "install.sh: trusting the key that came with the archive, $(cut -d ' ' -f 2- < "$here/server.pub"); compare it with what cloudroidctl stub prints, or give it with --key" >&2
+fi
+
 stub=$here/lib/$package/cloudroid-stub
 if ! "$stub" --version > /dev/null 2>&1; then
   complain "$stub does not run on this machine ($(uname -m)): get the stub for its architecture, ?arch= or cloudroidctl stub --arch"
@@ -85,7 +222,7 @@ fi
 # What the robot's owner has set in an earlier stub.toml is kept.
 settings=$(mktemp)
 secret=$(mktemp)
-trap 'rm -f "$settings" "$secret"' EXIT
+trap 'rm -rf "$work" "$settings" "$secret"' EXIT
 if [ -e "$share/stub.toml" ]; then cat "$share/stub.toml" > "$settings"; else cat "$here/share/$package/stub.toml" > "$settings"; fi
 # KEY VALUE: in place of the line that sets it or shows how to, else before all tables.
 set_key() {
@@ -106,6 +243,7 @@ set_key() {
 }
 if [ -n "$robot" ]; then set_key robot "$robot"; fi
 if [ -n "$server" ]; then set_key server "$server"; fi
+if [ -n "$fingerprint" ]; then set_key fingerprint "$fingerprint"; fi
 if [ -n "$ca" ]; then
   [ -r "$ca" ] || complain "cannot read $ca; --ca names a PEM file"
   set_key ca_file "$share/ca.pem"
@@ -121,7 +259,7 @@ fi
 
 # Address, token and clock, before anything is changed.
 trial=$(mktemp -d)
-trap 'rm -rf "$settings" "$secret" "$trial"' EXIT
+trap 'rm -rf "$work" "$settings" "$secret" "$trial"' EXIT
 cp "$here/share/$package/"*.toml "$trial/"
 cat "$settings" > "$trial/stub.toml"
 if [ -s "$secret" ]; then
@@ -145,6 +283,12 @@ cp -R "$here/lib/$package" "$lib"
 cp -R "$here/share/$package" "$share"
 cp "$here/install.sh" "$share/install.sh"
 cat "$settings" > "$share/stub.toml"
+# Whatever the archive was unpacked by: programs are 0755, files 0644, and nothing sets a user.
+for path in "$lib" "$share"; do
+  find "$path" -type d -exec chmod 0755 {} +
+  find "$path" -type f -perm -100 -exec chmod 0755 {} +
+  find "$path" -type f ! -perm -100 -exec chmod 0644 {} +
+done
 if [ -s "$secret" ]; then
   # A file of this name that came with the package would keep its rights.
   rm -rf "$share/token"
@@ -152,8 +296,11 @@ if [ -s "$secret" ]; then
 fi
 if [ -n "$ca" ]; then cat "$ca" > "$share/ca.pem"; fi
 rm -rf "$share.old"
+# Further ones may be known already: several servers' stubs share an overlay.
+if ! grep -qxF "$(cat "$here/server.pub")" "$prefix/servers.pub" 2> /dev/null; then cat "$here/server.pub" >> "$prefix/servers.pub"; fi
 for file in setup.bash setup.zsh .catkin; do cp "$here/$file" "$prefix/$file"; done
-sed "s|^_cloudroid_installed=.*|_cloudroid_installed='$prefix'|" "$here/setup.sh" > "$prefix/setup.sh.new"
+replacement=$(printf '%s\n' "$prefix" | sed 's/[&|]/\\&/g')
+sed "s|^_cloudroid_installed=.*|_cloudroid_installed='$replacement'|" "$here/setup.sh" > "$prefix/setup.sh.new"
 mv "$prefix/setup.sh.new" "$prefix/setup.sh"
 refresh
 

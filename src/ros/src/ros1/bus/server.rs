@@ -1,13 +1,10 @@
 //! The TCPROS server: subscribers of our topics and callers of our services connect here.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::BytesMut;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::publications::{Subscriber, TopicOut};
@@ -20,34 +17,11 @@ const MAX_CONNECTIONS: usize = 4000;
 
 /// Serves until dropped, which also ends every connection.
 pub(super) async fn serve(bus: Arc<Inner>, listener: TcpListener) {
-    let room = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-    let mut connections = JoinSet::new();
-    loop {
-        let Ok(permit) = room.clone().acquire_owned().await else {
-            return;
-        };
-        let stream = loop {
-            tokio::select! {
-                accepted = listener.accept() => match accepted {
-                    Ok((stream, _)) => break stream,
-                    Err(error) => {
-                        tracing::warn!(%error, "cannot accept a TCPROS connection");
-                        tokio::time::sleep(Duration::from_millis(100)).await;
-                    }
-                },
-                Some(_) = connections.join_next() => {}
-            }
-        };
+    let connected = |stream| {
         let bus = bus.clone();
-        connections.spawn(async move {
-            let _permit = permit;
-            let _ = stream.set_nodelay(true);
-            net::watch(&stream);
-            if let Err(error) = connection(&bus, stream).await {
-                tracing::debug!(%error, "a TCPROS connection broke");
-            }
-        });
-    }
+        async move { connection(&bus, stream).await }
+    };
+    net::serve_each(listener, MAX_CONNECTIONS, "TCPROS", connected).await;
 }
 
 async fn connection(bus: &Arc<Inner>, mut stream: TcpStream) -> Result<(), Error> {

@@ -12,8 +12,6 @@ use budget::{Budget, Permit};
 use bytes::Buf as _;
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::http::{Head, HttpError, Reader, SMALL};
@@ -67,36 +65,13 @@ const FORMS: usize = 3;
 
 /// Serves until dropped, which also ends every connection.
 pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, limits: Limits) {
-    let room = Arc::new(Semaphore::new(limits.connections));
+    let most = limits.connections;
     let server = Arc::new(Server { handler, limits });
-    let mut connections = JoinSet::new();
-    loop {
-        let Ok(permit) = room.clone().acquire_owned().await else {
-            return;
-        };
-        let stream = loop {
-            tokio::select! {
-                accepted = listener.accept() => match accepted {
-                    Ok((stream, _)) => break stream,
-                    Err(error) => {
-                        // Out of file descriptors, mostly: serving must go on once there are some again.
-                        tracing::warn!(%error, "cannot accept an XML-RPC connection");
-                        tokio::time::sleep(Duration::from_millis(100)).await;
-                    }
-                },
-                Some(_) = connections.join_next() => {}
-            }
-        };
+    let connected = |stream| {
         let server = server.clone();
-        connections.spawn(async move {
-            let _permit = permit;
-            let _ = stream.set_nodelay(true);
-            net::watch(&stream);
-            if let Err(error) = server.connection(stream).await {
-                tracing::debug!(%error, "an XML-RPC connection broke");
-            }
-        });
-    }
+        async move { server.connection(stream).await }
+    };
+    net::serve_each(listener, most, "XML-RPC", connected).await;
 }
 
 struct Server {

@@ -6,10 +6,11 @@ use init::Reply;
 use tokio::io::AsyncReadExt;
 use tokio::net::unix::pipe;
 
-use super::{Driver, Input};
+use super::Driver;
 use crate::engine::ContainerState;
 use crate::shim::create::Creator;
-use crate::shim::{ResidentContext, memory, privileges};
+use crate::shim::input::Input;
+use crate::shim::{ResidentContext, privileges};
 use crate::sys;
 
 /// How long libcontainer and init may take. Generous: a loaded machine is no failure.
@@ -57,7 +58,7 @@ impl Driver {
         self.begun.launch.spec.layers = Vec::new();
         self.begun.launch.spec.nodes = Vec::new();
         self.begun.launch.spec.resident = serde_json::Value::Null;
-        memory::give_back();
+        sys::give_back_memory();
         Ok(())
     }
 

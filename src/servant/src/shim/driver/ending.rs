@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use init::Scope;
 
-use super::{Driver, Input};
+use super::Driver;
 use crate::engine::{ContainerState, NodeExit};
 use crate::launch::{self, Exit};
+use crate::shim::input::{Input, StopStage};
 use crate::shim::nodes;
 use crate::{Error, sys};
 
@@ -17,16 +18,6 @@ const KILL_TIMEOUT: Duration = Duration::from_secs(5);
 const DRAIN: Duration = Duration::from_secs(2);
 /// How long a cgroup may take to become empty.
 const PATIENCE: Duration = Duration::from_secs(10);
-
-/// The stages of a stop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(in crate::shim) enum StopStage {
-    Interrupt,
-    Terminate,
-    Kill,
-    /// The kill timeout has passed, and something still runs: SIGKILL again.
-    KillAgain,
-}
 
 impl Driver {
     /// Begins to end the servant; a second call changes nothing.

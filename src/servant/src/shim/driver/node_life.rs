@@ -5,10 +5,11 @@ use std::time::Duration;
 
 use init::{Reply, Scope, Stage, StartRequest};
 
-use super::ending::StopStage;
-use super::{Driver, Input};
+use super::Driver;
 use crate::engine::{ContainerState, NodeEvent, NodeExit};
 use crate::process;
+use crate::shim::input::Input;
+use crate::shim::input::StopStage;
 use crate::shim::nodes::{self, Consequence};
 use crate::spec::NodeSpec;
 

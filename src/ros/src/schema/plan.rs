@@ -7,7 +7,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use crate::codec::cbor_out::{MAP, TEXT, head};
+use crate::cbor_head::{MAP, TEXT, head};
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// Nested messages with more steps than this are called, not flattened, as are all once the plan has grown to

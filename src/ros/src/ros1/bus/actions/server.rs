@@ -8,11 +8,11 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::task::AbortHandle;
 
-use super::messages::{self, GoalId, GoalState, Status};
 use crate::bus::{
     ActionHandler, ActionServer, BusError, GoalEnd, Outcome, Publisher, Subscription,
 };
 use crate::codec::Time;
+use crate::ros1::actions::messages::{self, GoalId, GoalState, Status};
 use crate::ros1::bus::Inner;
 use crate::schema::ActionDef;
 

@@ -11,12 +11,12 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-use super::messages::{self, GoalId, Status};
 use crate::bus::{
     ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Matched, Outcome, Publisher,
     Subscription,
 };
 use crate::codec::Time;
+use crate::ros1::actions::messages::{self, GoalId, Status};
 use crate::ros1::bus::Inner;
 use crate::schema::ActionDef;
 

@@ -1,6 +1,6 @@
 //! Limits that were asked for and are not in force, and why.
 
-use crate::engine::Enforced;
+use super::Enforced;
 use crate::spec::{Limits, UNLIMITED};
 
 /// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
@@ -48,27 +48,29 @@ fn none(asked: Option<u64>) -> Option<u64> {
     asked.filter(|limit| *limit == UNLIMITED)
 }
 
-/// The same in words, each with the reason.
-pub fn unmet(asked: &Limits, enforced: &Enforced) -> Vec<String> {
-    let why = |name| match (enforced.cgroup_version, name) {
-        (0, _) => "no cgroup controller can be used here",
-        (1, "memory_high") => {
-            "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes slows nobody down"
-        }
-        (1, "cpuset") => {
-            "the cpuset controller must be mounted, and cgroup v1 takes cores only of a servant that was given some at \
+impl Enforced {
+    /// Which of the limits asked for are not in force, each with the reason.
+    pub fn unmet(&self, asked: &Limits) -> Vec<String> {
+        let why = |name| match (self.cgroup_version, name) {
+            (0, _) => "no cgroup controller can be used here",
+            (1, "memory_high") => {
+                "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes slows nobody down"
+            }
+            (1, "cpuset") => {
+                "the cpuset controller must be mounted, and cgroup v1 takes cores only of a servant that was given some at \
              its start"
-        }
-        (1, "io_read" | "io_write") => {
-            "cgroup v1 takes it only of a servant that was given one at its start and whose layers lie on a disk"
-        }
-        (_, "io_read" | "io_write") => "its layers lie on no disk that can be limited",
-        _ => "the kernel did not take it",
-    };
-    missing(asked, &enforced.limits)
-        .into_iter()
-        .map(|name| format!("{name} ({})", why(name)))
-        .collect()
+            }
+            (1, "io_read" | "io_write") => {
+                "cgroup v1 takes it only of a servant that was given one at its start and whose layers lie on a disk"
+            }
+            (_, "io_read" | "io_write") => "its layers lie on no disk that can be limited",
+            _ => "the kernel did not take it",
+        };
+        missing(asked, &self.limits)
+            .into_iter()
+            .map(|name| format!("{name} ({})", why(name)))
+            .collect()
+    }
 }
 
 #[cfg(test)]
@@ -112,13 +114,13 @@ mod tests {
             cgroup_version,
             ..Enforced::default()
         };
-        let on_v1 = unmet(&asked, &enforced(1));
+        let on_v1 = enforced(1).unmet(&asked);
         assert!(
             on_v1[0].starts_with("memory_high (cgroup v1 has no memory.high"),
             "{on_v1:?}"
         );
         assert_eq!(
-            unmet(&asked, &enforced(2)),
+            enforced(2).unmet(&asked),
             ["memory_high (the kernel did not take it)"]
         );
     }

@@ -1,0 +1,43 @@
+//! Services that the bridge answers itself, where no node of the servant does: rosapi's and tf's.
+
+use std::sync::Arc;
+
+use access::Grants;
+use async_trait::async_trait;
+use ros::schema::{Registry, ServiceDef};
+
+use crate::shared::Shared;
+use crate::{rosapi, tf};
+
+/// A service of the bridge's own.
+#[async_trait]
+pub(crate) trait OwnService: Send + Sync {
+    /// Whether anybody may call it: it tells of names and types alone, and of those names alone that its caller may use.
+    fn is_filtered(&self) -> bool {
+        false
+    }
+
+    /// Whether its answer is about what nodes have registered.
+    fn shows_graph(&self) -> bool {
+        false
+    }
+
+    /// Its definition; `registry` has the servant's types.
+    fn definition(&self, registry: &Registry) -> Result<Arc<ServiceDef>, String>;
+
+    /// The response, as JSON, to a request in JSON: what a client with these grants is shown.
+    async fn answer(
+        &self,
+        shared: &Arc<Shared>,
+        args: &[u8],
+        grants: &Grants,
+    ) -> Result<Vec<u8>, String>;
+}
+
+/// The one of this absolute name.
+pub(crate) fn find(name: &str) -> Option<Box<dyn OwnService>> {
+    if let Some(service) = rosapi::Service::find(name) {
+        return Some(Box::new(service));
+    }
+    (name == tf::SERVICE).then(|| Box::new(tf::RepublishTfs) as Box<dyn OwnService>)
+}

@@ -1,0 +1,56 @@
+//! Auxiliary parameters, as a robot's configuration states them.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// A number or a text.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "a number or a text")]
+pub enum Scalar {
+    /// A number.
+    Number(f64),
+    /// A text.
+    Text(String),
+}
+
+impl std::fmt::Display for Scalar {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Number(number) => write!(out, "{number}"),
+            Self::Text(text) => out.write_str(text.trim()),
+        }
+    }
+}
+
+/// Auxiliary parameters: a table, or text such as `width=640 model=big`, as the environment gives it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "a table such as { width = 640 }, or text such as \"width=640\""
+)]
+pub enum Aux {
+    /// By name.
+    Table(BTreeMap<String, Scalar>),
+    /// Pairs with spaces between them.
+    Text(String),
+}
+
+impl Aux {
+    /// Names and values; why it is not such a list.
+    pub fn pairs(&self) -> Result<Vec<(String, String)>, String> {
+        match self {
+            Self::Table(table) => Ok(table
+                .iter()
+                .map(|(key, value)| (key.clone(), value.to_string()))
+                .collect()),
+            Self::Text(text) => text
+                .split_whitespace()
+                .map(|pair| match pair.split_once('=') {
+                    Some((key, value)) => Ok((key.to_owned(), value.to_owned())),
+                    None => Err(format!("is {text:?}; write KEY=VALUE, such as width=640")),
+                })
+                .collect(),
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! `[tls]`: where TLS is spoken, and with which certificate.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use anyhow::bail;
+use serde::Deserialize;
+
+/// TLS of the portal.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tls {
+    /// Where it is spoken.
+    pub serve: Serve,
+    /// PEM file of the certificate, followed by those that lead from it to an authority. Without one the daemon makes its own.
+    pub certificate: Option<PathBuf>,
+    /// PEM file of its key.
+    pub key: Option<PathBuf>,
+    /// Names and addresses of this machine that the certificate which the daemon makes is to have, besides those that it knows.
+    pub names: Vec<String>,
+}
+
+/// Where TLS is spoken.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Serve {
+    /// Beyond loopback, and wherever a certificate is named.
+    #[default]
+    Auto,
+    /// On loopback, too.
+    Tls,
+    /// Nowhere: everybody on the way reads what is sent.
+    PlainTextBeyondLoopback,
+}
+
+impl Tls {
+    /// Whether a portal that listens at an address speaks it.
+    pub fn is_spoken(&self, listen: SocketAddr) -> bool {
+        match self.serve {
+            Serve::Auto => self.certificate.is_some() || !listen.ip().is_loopback(),
+            Serve::Tls => true,
+            Serve::PlainTextBeyondLoopback => false,
+        }
+    }
+
+    /// The files of the operator's own certificate and key.
+    pub fn files(&self) -> Option<(PathBuf, PathBuf)> {
+        self.certificate.clone().zip(self.key.clone())
+    }
+
+    pub(super) fn check(&self) -> anyhow::Result<()> {
+        match (&self.certificate, &self.key) {
+            (Some(_), None) => {
+                bail!("certificate is of no use without key; name the file of its key, too")
+            }
+            (None, Some(_)) => {
+                bail!("key is of no use without certificate; name the file of its certificate, too")
+            }
+            _ => {}
+        }
+        if self.serve == Serve::PlainTextBeyondLoopback && self.certificate.is_some() {
+            bail!(
+                "serve = \"plain-text-beyond-loopback\" shows nobody the certificate; remove one of both"
+            );
+        }
+        if self.certificate.is_some() && !self.names.is_empty() {
+            bail!(
+                "names are for the certificate that the daemon makes, and certificate names another; remove one of both"
+            );
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Tls {
+        toml::from_str(text).expect("well-formed")
+    }
+
+    #[test]
+    fn beyond_loopback_plain_text_needs_words() {
+        let own = "certificate = \"c\"\nkey = \"k\"";
+        for (text, loopback, beyond) in [
+            ("", false, true),
+            ("serve = \"auto\"", false, true),
+            (own, true, true),
+            ("serve = \"tls\"", true, true),
+            ("serve = \"plain-text-beyond-loopback\"", false, false),
+        ] {
+            let tls = read(text);
+            for (listen, spoken) in [
+                ("127.0.0.1:1", loopback),
+                ("[::1]:1", loopback),
+                ("0.0.0.0:1", beyond),
+                ("[::]:1", beyond),
+                ("192.0.2.1:1", beyond),
+            ] {
+                let listen = listen.parse().expect("an address");
+                assert_eq!(tls.is_spoken(listen), spoken, "{text:?} at {listen}");
+            }
+            tls.check().expect(text);
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_together_is_refused() {
+        for (text, words) in [
+            ("certificate = \"c\"", "file of its key"),
+            ("key = \"k\"", "file of its certificate"),
+            (
+                "serve = \"plain-text-beyond-loopback\"\ncertificate = \"c\"\nkey = \"k\"",
+                "remove one",
+            ),
+            (
+                "names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"",
+                "remove one",
+            ),
+        ] {
+            let refused = read(text).check().expect_err(text).to_string();
+            assert!(refused.contains(words), "{refused}");
+        }
+    }
+}

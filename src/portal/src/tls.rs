@@ -1,0 +1,153 @@
+//! TLS of the TCP listener, by rustls (TLS 1.2 and 1.3; docs/adr/080).
+
+use std::fmt;
+use std::io;
+use std::sync::Arc;
+
+use ::tls::Fingerprint;
+use axum::Router;
+use axum::http::{HeaderMap, HeaderValue, Uri, header};
+use axum::response::{IntoResponse, Response};
+use parking_lot::RwLock;
+use tokio::net::TcpStream;
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert};
+use tokio_rustls::rustls::sign::CertifiedKey;
+use tokio_rustls::rustls::{self, ServerConfig};
+use tokio_rustls::server::TlsStream;
+
+use crate::errors::Error;
+
+/// The first byte of a TLS connection: a record with a handshake message (RFC 8446, section 5.1).
+const HANDSHAKE: u8 = 22;
+/// What is spoken through TLS (RFC 7301).
+const HTTP_1_1: &[u8] = b"http/1.1";
+
+/// Why a certificate and a key cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("the certificate and its key cannot be used: {0}")]
+pub struct TlsError(#[from] rustls::Error);
+
+/// TLS as the portal speaks it. What it shows can be replaced while it listens.
+pub struct Tls {
+    config: Arc<ServerConfig>,
+    shown: Arc<Shown>,
+}
+
+/// The certificate that is shown, and its key.
+#[derive(Debug)]
+struct Shown(RwLock<Arc<CertifiedKey>>);
+
+impl ResolvesServerCert for Shown {
+    fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        Some(Arc::clone(&self.0.read()))
+    }
+}
+
+impl fmt::Debug for Tls {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.debug_tuple("Tls").field(&self.fingerprint()).finish()
+    }
+}
+
+/// What came of a connection to a port where TLS is spoken.
+pub enum Accepted {
+    /// TLS.
+    Tls(Box<TlsStream<TcpStream>>),
+    /// Something else: nothing has been read of it.
+    Plain(TcpStream),
+}
+
+fn checked(
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+) -> Result<Arc<CertifiedKey>, TlsError> {
+    let key = CertifiedKey::from_der(chain, key, &ring::default_provider())?;
+    Ok(Arc::new(key))
+}
+
+impl Tls {
+    /// Shows a certificate, followed by those that lead from it to an authority.
+    pub fn new(
+        chain: Vec<CertificateDer<'static>>,
+        key: PrivateKeyDer<'static>,
+    ) -> Result<Tls, TlsError> {
+        let shown = Arc::new(Shown(RwLock::new(checked(chain, key)?)));
+        let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_safe_default_protocol_versions()?;
+        let mut config = builder
+            .with_no_client_auth()
+            .with_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesServerCert>);
+        config.alpn_protocols = vec![HTTP_1_1.to_vec()];
+        Ok(Tls {
+            config: Arc::new(config),
+            shown,
+        })
+    }
+
+    /// Shows another from now on. Connections that stand go on.
+    pub fn show(
+        &self,
+        chain: Vec<CertificateDer<'static>>,
+        key: PrivateKeyDer<'static>,
+    ) -> Result<(), TlsError> {
+        *self.shown.0.write() = checked(chain, key)?;
+        Ok(())
+    }
+
+    /// The fingerprint of what is shown.
+    pub fn fingerprint(&self) -> Fingerprint {
+        let shown = self.shown.0.read();
+        // rustls takes no key without a certificate.
+        Fingerprint::of(shown.cert.first().unwrap_or(&CertificateDer::from(&[][..])))
+    }
+
+    /// Whether no authority has signed what is shown.
+    pub(crate) fn signs_itself(&self) -> bool {
+        let shown = self.shown.0.read();
+        shown.cert.first().is_some_and(::tls::signs_itself)
+    }
+
+    /// Makes a TLS connection of a TCP one.
+    pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<Accepted> {
+        let mut first = [0];
+        if stream.peek(&mut first).await? == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        if first[0] != HANDSHAKE {
+            return Ok(Accepted::Plain(stream));
+        }
+        let acceptor = TlsAcceptor::from(Arc::clone(&self.config));
+        Ok(Accepted::Tls(Box::new(acceptor.accept(stream).await?)))
+    }
+}
+
+/// What the client has shown.
+pub(crate) fn certificates(stream: &TlsStream<TcpStream>) -> Arc<[CertificateDer<'static>]> {
+    let (_, connection) = stream.get_ref();
+    let shown = connection.peer_certificates().unwrap_or_default();
+    shown.iter().map(|one| one.clone().into_owned()).collect()
+}
+
+/// Answers each request that comes in plain text with what is spoken here.
+pub(crate) fn refusing() -> Router {
+    Router::new().fallback(refuse)
+}
+
+async fn refuse(uri: Uri, headers: HeaderMap) -> Response {
+    let host = headers
+        .get(header::HOST)
+        .and_then(|host| host.to_str().ok())
+        .unwrap_or("HOST:PORT");
+    let scheme = match crate::guard::is_upgrade(&headers) {
+        true => "wss",
+        false => "https",
+    };
+    let instead = format!("{scheme}://{host}{}", uri.path());
+    let mut response = Error::PlainText { instead }.into_response();
+    let close = HeaderValue::from_static("close");
+    response.headers_mut().insert(header::CONNECTION, close);
+    response
+}

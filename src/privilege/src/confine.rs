@@ -1,0 +1,200 @@
+//! Giving up rights, for the calling thread alone and for good.
+
+use std::io;
+
+use caps::{CapSet, Capability, CapsHashSet};
+use nix::unistd::User;
+
+use crate::Error;
+
+/// The user and group of threads without capabilities, where no other is configured. Of the numbers that systemd's list of
+/// user ids (UIDS-GIDS.md) gives to nobody; servants have theirs from 0x70000000 on.
+pub const DEFAULT_USER: u32 = 65521;
+
+/// What the daemon keeps for the engine's threads and the programs that these start.
+pub const KEPT: [Capability; 16] = [
+    // Trees of builds and layers: owners, modes, set-user-id bits and file capabilities that packages have.
+    Capability::CAP_CHOWN,
+    Capability::CAP_DAC_OVERRIDE,
+    Capability::CAP_DAC_READ_SEARCH,
+    Capability::CAP_FOWNER,
+    Capability::CAP_FSETID,
+    Capability::CAP_SETFCAP,
+    // Whiteouts of overlays, devices of bases.
+    Capability::CAP_MKNOD,
+    // Ending containers, and finding the namespaces of shims.
+    Capability::CAP_KILL,
+    Capability::CAP_SYS_PTRACE,
+    // User ids of containers and of apt's downloads; giving up capabilities.
+    Capability::CAP_SETUID,
+    Capability::CAP_SETGID,
+    Capability::CAP_SETPCAP,
+    // Namespaces, mounts, device filters of cgroups; lo inside; ports below 1024.
+    Capability::CAP_SYS_ADMIN,
+    Capability::CAP_SYS_CHROOT,
+    Capability::CAP_NET_ADMIN,
+    Capability::CAP_NET_BIND_SERVICE,
+];
+
+/// Held where the process has it, and not missed where it has not: limits of open files of servants.
+const KEPT_IF_THERE: Capability = Capability::CAP_SYS_RESOURCE;
+
+/// Whose rights to files a thread has that has no capabilities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Account {
+    /// The user's number; never root's.
+    pub user: u32,
+    /// The group's number; never root's.
+    pub group: u32,
+}
+
+impl Default for Account {
+    fn default() -> Self {
+        Self {
+            user: DEFAULT_USER,
+            group: DEFAULT_USER,
+        }
+    }
+}
+
+impl Account {
+    /// A user by name or number. A number need not have a name.
+    pub fn find(written: &str) -> Result<Self, Error> {
+        let unknown = || Error::Unknown {
+            written: written.to_owned(),
+        };
+        let account = match written.parse::<u32>() {
+            Ok(number) => Self {
+                user: number,
+                group: number,
+            },
+            Err(_) => {
+                let found = User::from_name(written).ok().flatten();
+                let found = found.ok_or_else(unknown)?;
+                Self {
+                    user: found.uid.as_raw(),
+                    group: found.gid.as_raw(),
+                }
+            }
+        };
+        // The greatest number means "unchanged" to setresuid(2).
+        let real = |number| number != 0 && number != u32::MAX;
+        match real(account.user) && real(account.group) {
+            true => Ok(account),
+            false => Err(unknown()),
+        }
+    }
+}
+
+fn failed(action: &'static str) -> impl FnOnce(caps::errors::CapsError) -> Error {
+    move |source| Error::Capabilities { action, source }
+}
+
+/// Takes from the calling thread, and those it starts, every capability but [`KEPT`]; programs that they execute get no
+/// others either. To be called before the process has other threads.
+pub fn limit() -> Result<(), Error> {
+    let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
+    hold(&kept)
+}
+
+/// Leaves the calling thread `capabilities` alone.
+pub fn only(capabilities: &[Capability]) -> Result<(), Error> {
+    hold(&capabilities.iter().copied().collect())
+}
+
+fn hold(kept: &CapsHashSet) -> Result<(), Error> {
+    let bounding = caps::read(None, CapSet::Bounding).map_err(failed("read the bounding set"))?;
+    // Without this capability nothing can be taken from the bounding set; nor can a program that is executed gain from
+    // it what this thread has not.
+    let may = caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP);
+    if may.map_err(failed("read the effective capabilities"))? {
+        for capability in bounding.difference(kept) {
+            caps::drop(None, CapSet::Bounding, *capability)
+                .map_err(failed("give up a capability for good"))?;
+        }
+    }
+    let held = caps::read(None, CapSet::Permitted).map_err(failed("read the capabilities"))?;
+    let kept: CapsHashSet = held.intersection(kept).copied().collect();
+    caps::clear(None, CapSet::Ambient).map_err(failed("clear the ambient capabilities"))?;
+    caps::clear(None, CapSet::Inheritable).map_err(failed("clear the inheritable capabilities"))?;
+    caps::set(None, CapSet::Effective, &kept).map_err(failed("give up capabilities"))?;
+    caps::set(None, CapSet::Permitted, &kept).map_err(failed("give up capabilities"))
+}
+
+/// Takes every right from the calling thread, for good: no capability, no group but `account`'s, all user ids (real,
+/// effective, saved, of files) `account`'s, and no program that it executes gains anything. Checked by reading it back.
+/// Does nothing more to a thread that is confined already.
+pub fn confine(account: Account) -> Result<(), Error> {
+    let user = nix::unistd::geteuid().as_raw();
+    if user != account.user {
+        // The bounding set goes first: it takes a capability to empty it.
+        let bounding =
+            caps::read(None, CapSet::Bounding).map_err(failed("read the bounding set"))?;
+        for capability in bounding {
+            caps::drop(None, CapSet::Bounding, capability)
+                .map_err(failed("give up a capability for good"))?;
+        }
+        become_account(account).map_err(|source| Error::Account {
+            user: account.user,
+            group: account.group,
+            source,
+        })?;
+    }
+    hold(&CapsHashSet::new())?;
+    nix::sys::prctl::set_no_new_privs().map_err(|errno| Error::Account {
+        user: account.user,
+        group: account.group,
+        source: errno.into(),
+    })?;
+    check(account)
+}
+
+/// The C library's functions of these names change all threads of the process; the system calls change this one.
+fn become_account(account: Account) -> io::Result<()> {
+    let Account { user, group } = account;
+    let done = |outcome: libc::c_long| match outcome {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    };
+    // SAFETY: a list of no groups, which is not read.
+    done(unsafe { libc::syscall(libc::SYS_setgroups, 0_usize, std::ptr::null::<u32>()) })?;
+    // SAFETY: no pointers.
+    done(unsafe { libc::syscall(libc::SYS_setresgid, group, group, group) })?;
+    // SAFETY: no pointers.
+    done(unsafe { libc::syscall(libc::SYS_setresuid, user, user, user) })
+}
+
+/// What the kernel says that the calling thread has.
+fn check(account: Account) -> Result<(), Error> {
+    let left = |left: String| Err(Error::Left { left });
+    for set in [
+        CapSet::Effective,
+        CapSet::Permitted,
+        CapSet::Inheritable,
+        CapSet::Ambient,
+        CapSet::Bounding,
+    ] {
+        let held = caps::read(None, set).map_err(failed("read the capabilities"))?;
+        if !held.is_empty() {
+            return left(format!("{} capabilities ({set:?})", held.len()));
+        }
+    }
+    let users = nix::unistd::getresuid().map_err(io::Error::from);
+    let groups = nix::unistd::getresgid().map_err(io::Error::from);
+    if let (Ok(users), Ok(groups)) = (users, groups) {
+        let users = [users.real, users.effective, users.saved];
+        let groups = [groups.real, groups.effective, groups.saved];
+        if users.iter().any(|user| user.as_raw() != account.user)
+            || groups.iter().any(|group| group.as_raw() != account.group)
+        {
+            return left("another user".to_owned());
+        }
+    }
+    match nix::unistd::getgroups() {
+        Ok(groups) if groups.is_empty() => Ok(()),
+        _ => left("supplementary groups".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,42 @@
+//! How to join a ROS system.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use budget::Budget;
+
+/// A message longer than this ends its connection, unless set otherwise.
+pub const MAX_MESSAGE: usize = 256 << 20;
+/// A message that was begun and is not whole after this time ends its connection, unless set otherwise.
+pub const UNFINISHED: Duration = Duration::from_secs(300);
+
+/// How to join a ROS system.
+#[derive(Debug, Clone)]
+pub struct JoinOptions {
+    /// Where the Master listens, as seen from the sockets' place (ROS 1).
+    pub master: SocketAddr,
+    /// The node's absolute name.
+    pub node: String,
+    /// The host that other nodes reach this one under; the address used towards the Master where `None`.
+    pub host: Option<String>,
+    /// A message longer than this ends its connection.
+    pub max_message: usize,
+    /// Where what is read from nodes counts until it is whole; what does not fit ends its connection.
+    pub budget: Budget,
+    /// A message that was begun and is not whole after this time ends its connection.
+    pub unfinished: Duration,
+}
+
+impl JoinOptions {
+    /// A node of this name at this Master.
+    pub fn new(master: SocketAddr, node: &str) -> Self {
+        Self {
+            master,
+            node: node.to_owned(),
+            host: None,
+            max_message: MAX_MESSAGE,
+            budget: Budget::unlimited(),
+            unfinished: UNFINISHED,
+        }
+    }
+}

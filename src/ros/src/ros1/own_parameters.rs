@@ -1,0 +1,51 @@
+//! Parameters that a ROS 1 system has of itself, whatever runs in it.
+
+/// Names that the Master or roslaunch sets, without what is below them.
+const OF_MASTER: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
+
+/// Names that every node of roscpp or rospy asks for.
+const OF_NODES: [&str; 4] = [
+    "use_sim_time",
+    "tcp_keepalive",
+    "enable_statistics",
+    "rosout_disable_topics_generation",
+];
+
+/// Whether the Master or roslaunch sets this parameter, or one above it. `name` may be absolute or not.
+pub fn is_of_master(name: &str) -> bool {
+    let first = name.trim_start_matches('/').split('/').next();
+    first.is_some_and(|first| OF_MASTER.contains(&first))
+}
+
+/// Whether every node asks for the parameter of this absolute name, so that it says nothing of a node.
+pub fn every_node_asks_for(name: &str) -> bool {
+    let Some(name) = name.strip_prefix('/') else {
+        return false;
+    };
+    is_of_master(name) || OF_NODES.contains(&name) || name.starts_with("statistics_window_")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_system_has_of_itself_is_told_from_what_nodes_are_given() {
+        for (name, master, node) in [
+            ("/run_id", true, true),
+            ("run_id", true, false),
+            ("/roslaunch/uris/host__1", true, true),
+            ("/run_id_of_mine", false, false),
+            ("/use_sim_time", false, true),
+            ("/statistics_window_min_elements", false, true),
+            ("/detector/run_id", false, false),
+            ("/detector/use_sim_time", false, false),
+        ] {
+            assert_eq!(
+                (is_of_master(name), every_node_asks_for(name)),
+                (master, node),
+                "{name}"
+            );
+        }
+    }
+}

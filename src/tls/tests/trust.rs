@@ -1,0 +1,178 @@
+//! Whom a client trusts, told by handshakes with servers that show what each case says.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use tls::{Fingerprint, KnownServers, Trust};
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::ServerConfig;
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivatePkcs8KeyDer};
+
+struct Server {
+    certificate: CertificateDer<'static>,
+    config: Arc<ServerConfig>,
+}
+
+impl Server {
+    fn showing(certificate: CertificateDer<'static>, key: &KeyPair) -> Self {
+        let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
+        let key = PrivatePkcs8KeyDer::from(key.serialize_der());
+        let config = builder
+            .with_safe_default_protocol_versions()
+            .unwrap()
+            .with_no_client_auth()
+            .with_single_cert(vec![certificate.clone()], key.into())
+            .unwrap();
+        Self {
+            certificate,
+            config: Arc::new(config),
+        }
+    }
+
+    /// One that signs itself, as the daemon makes them, or as openssl does (an authority's).
+    fn alone(name: &str, is_ca: bool) -> Self {
+        let key = KeyPair::generate().unwrap();
+        let mut params = CertificateParams::new([name.to_owned()]).unwrap();
+        if is_ca {
+            params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        }
+        let certificate = params.self_signed(&key).unwrap();
+        Self::showing(certificate.der().clone(), &key)
+    }
+
+    /// One that an authority has signed, whose certificate is written to a file.
+    fn signed(name: &str, authority: &Path) -> Self {
+        let mut params = CertificateParams::new([]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let common = rcgen::DnType::CommonName;
+        params.distinguished_name.push(common, "authority");
+        let issuer = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
+        std::fs::write(authority, issuer.pem()).unwrap();
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new([name.to_owned()]).unwrap();
+        let certificate = params.signed_by(&key, &issuer).unwrap();
+        Self::showing(certificate.der().clone(), &key)
+    }
+
+    fn fingerprint(&self) -> Fingerprint {
+        Fingerprint::of(&self.certificate)
+    }
+
+    /// What a client says of it: the certificate that it saw first, if any.
+    async fn met_by(&self, trust: &Trust) -> Result<Option<Fingerprint>, String> {
+        let (here, there) = tokio::io::duplex(1 << 16);
+        let acceptor = TlsAcceptor::from(Arc::clone(&self.config));
+        let serving = tokio::spawn(async move { acceptor.accept(there).await.map(|_| ()) });
+        let connected = trust.connect(here, "localhost", "localhost:1").await;
+        let _ = serving.await;
+        match connected {
+            Ok(connected) => Ok(connected.first),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+}
+
+fn trust(known: Option<&Path>) -> Trust {
+    Trust {
+        authorities: None,
+        fingerprint: None,
+        known: known.map(|path| KnownServers::at(path.to_owned())),
+        accept: "accept it".to_owned(),
+        advice: "nobody is trusted",
+    }
+}
+
+#[tokio::test]
+async fn what_signs_itself_is_remembered_and_no_other_is_taken_for_it() {
+    for is_ca in [false, true] {
+        let place = tempfile::tempdir().unwrap();
+        let file = place.path().join("known_servers");
+        let (server, other) = (
+            Server::alone("localhost", is_ca),
+            Server::alone("localhost", is_ca),
+        );
+        let client = trust(Some(&file));
+        let shown = server.fingerprint();
+        assert_eq!(server.met_by(&client).await, Ok(Some(shown)), "first seen");
+        assert_eq!(server.met_by(&client).await, Ok(None), "known");
+        let refused = other.met_by(&client).await.expect_err("another");
+        for words in [
+            shown.to_string(),
+            other.fingerprint().to_string(),
+            format!("accept it {}", other.fingerprint()),
+        ] {
+            assert!(refused.contains(&words), "{words}: {refused}");
+        }
+        assert_eq!(server.met_by(&client).await, Ok(None), "still known");
+        let known = KnownServers::at(file);
+        known.remember("localhost:1", other.fingerprint()).unwrap();
+        assert_eq!(other.met_by(&client).await, Ok(None), "accepted");
+        server.met_by(&client).await.expect_err("the one before");
+    }
+}
+
+#[tokio::test]
+async fn a_fingerprint_that_was_named_is_needed() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("known_servers");
+    // The name does not matter: who has the key is whom the fingerprint names.
+    let server = Server::alone("elsewhere", false);
+    let named = |fingerprint| Trust {
+        fingerprint: Some(fingerprint),
+        ..trust(Some(&file))
+    };
+    let right = named(server.fingerprint());
+    assert_eq!(server.met_by(&right).await, Ok(None));
+    let other = Server::alone("elsewhere", false);
+    other.met_by(&right).await.expect_err("another server");
+    assert!(!file.exists(), "nothing was to be remembered");
+}
+
+#[tokio::test]
+async fn what_an_authority_has_signed_is_never_remembered() {
+    let place = tempfile::tempdir().unwrap();
+    let (file, pem) = (
+        place.path().join("known_servers"),
+        place.path().join("ca.pem"),
+    );
+    let server = Server::signed("localhost", &pem);
+    server
+        .met_by(&trust(Some(&file)))
+        .await
+        .expect_err("whose?");
+    let client = Trust {
+        authorities: Some(pem.clone()),
+        ..trust(Some(&file))
+    };
+    assert_eq!(server.met_by(&client).await, Ok(None));
+    // With the authority's word it may change, whatever was known before.
+    let known = KnownServers::at(file.clone());
+    let alone = Server::alone("localhost", false);
+    known.remember("localhost:1", alone.fingerprint()).unwrap();
+    assert_eq!(server.met_by(&client).await, Ok(None));
+    std::fs::remove_file(&file).unwrap();
+    // Where authorities are named, one that signs itself is none of theirs.
+    alone.met_by(&client).await.expect_err("signs itself");
+    assert!(!file.exists());
+    let elsewhere = Server::signed("elsewhere", &pem);
+    let refused = elsewhere.met_by(&client).await.expect_err("another name");
+    assert!(refused.contains("not valid for name"), "{refused}");
+}
+
+#[tokio::test]
+async fn what_cannot_be_remembered_is_not_trusted() {
+    let place = tempfile::tempdir().unwrap();
+    let blocked = place.path().join("file");
+    std::fs::write(&blocked, "").unwrap();
+    let server = Server::alone("localhost", false);
+    let client = trust(Some(&blocked.join("known_servers")));
+    server.met_by(&client).await.expect_err("no directory");
+    server.met_by(&trust(None)).await.expect_err("no file");
+    let damaged = place.path().join("damaged");
+    std::fs::write(&damaged, "localhost:1\n").unwrap();
+    let refused = server.met_by(&trust(Some(&damaged))).await;
+    let refused = refused.expect_err("damaged");
+    assert!(refused.contains("line 1"), "{refused}");
+}
