@@ -143,6 +143,9 @@ pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
         "{shown}: {}",
         daemon.last_words()
     );
+    let status = daemon.deployer().types(&["status"])?.succeeded()?;
+    let words = format!("certificate {shown}");
+    ensure!(status.stdout.contains(&words), "{}", status.said());
     // Who says nothing, or something else than both, is let go.
     let connects = || -> anyhow::Result<TcpStream> {
         let stream = TcpStream::connect(("127.0.0.1", port.parse()?))?;
@@ -195,11 +198,41 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
     .succeeded()?;
     let server = format!("server = \"wss://localhost:{port}\"");
     let fingerprint = format!("fingerprint = \"{}\"", fingerprint(&own)?);
-    for line in [server, fingerprint] {
+    for line in [&server, &fingerprint] {
         ensure!(
-            settings.stdout.contains(&line),
+            settings.stdout.contains(line),
             "{line}: {}",
             settings.said()
+        );
+    }
+    // A robot that had installed it before the server spoke TLS, and one that knew another certificate, follow.
+    let machine = Machine::new()?;
+    machine.unpacks(&archive)?;
+    let name = ADDER.name;
+    let share = format!("/opt/cloudroid/share/{name}");
+    let other = format!("SHA256:{}", "0".repeat(64));
+    for (before, words) in [
+        (
+            "server = \"ws://localhost:9090\"\nmax = 0.4".to_owned(),
+            format!("wss://localhost:{port} in place of ws://localhost:9090"),
+        ),
+        (
+            format!("server = \"wss://localhost:{port}\"\nfingerprint = \"{other}\"\nmax = 0.4"),
+            format!("in place of {other}"),
+        ),
+    ] {
+        let script = format!(
+            "set -e\nmkdir -p {share}\ntouch {share}/revision.toml\necho '{before}' > {share}/stub.toml\n\
+             sh {name}-stub/install.sh\ncat {share}/stub.toml"
+        );
+        let outcome = machine.runs("sh", &script)?.succeeded()?;
+        for line in [&server, &fingerprint, "max = 0.4"] {
+            ensure!(outcome.stdout.contains(line), "{line}: {}", outcome.said());
+        }
+        ensure!(
+            outcome.stderr.contains(&words),
+            "{words}: {}",
+            outcome.said()
         );
     }
     Ok(())

@@ -17,6 +17,10 @@ pub struct Status {
     pub home: String,
     /// Where it listens.
     pub listen: String,
+    /// The fingerprint of the certificate that it shows there, `SHA256:` with hexadecimal digits; none where it speaks plain
+    /// text.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub certificate: Option<String>,
     /// Where plain connections go.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_service: Option<String>,

@@ -1,8 +1,10 @@
 //! HTTP to the daemon, over TCP or its Unix socket.
 
 use std::fmt;
+use std::io;
 use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail};
 use api::Problem;
@@ -18,9 +20,12 @@ use serde::de::DeserializeOwned;
 use tls::{KnownServers, Trust};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
+use tokio::time::timeout;
 use tokio_rustls::client::TlsStream;
 
 const FALLBACK: &str = "127.0.0.1:9090";
+/// How long a server may take to accept a connection, and then to show its certificate.
+const CONNECTING: Duration = Duration::from_secs(10);
 
 /// What to do about a 401.
 const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root and the group \
@@ -216,13 +221,11 @@ impl Client {
         };
         match &self.server {
             Server::Tcp(authority) => {
-                let stream = TcpStream::connect(authority).await.map_err(unreachable)?;
-                let _ = stream.set_nodelay(true);
+                let stream = dial(authority).await.map_err(unreachable)?;
                 self.exchange(stream, authority, method, path, body).await
             }
             Server::Tls(authority) => {
-                let stream = TcpStream::connect(authority).await.map_err(unreachable)?;
-                let _ = stream.set_nodelay(true);
+                let stream = dial(authority).await.map_err(unreachable)?;
                 let stream = self.secured(stream, authority).await?;
                 self.exchange(stream, authority, method, path, body).await
             }
@@ -246,9 +249,10 @@ impl Client {
             accept: format!("cloudroidctl trust {}", self.server),
             advice: NOBODY_TRUSTED,
         };
-        let connected = trust
-            .connect(stream, host.trim_matches(['[', ']']), authority)
+        let connecting = trust.connect(stream, host.trim_matches(['[', ']']), authority);
+        let connected = timeout(CONNECTING, connecting)
             .await
+            .unwrap_or_else(|_| Err(silent()))
             .with_context(|| format!("no TLS with {}", self.server))?;
         if let (Some(first), Some(known)) = (connected.first, &trust.known) {
             eprintln!(
@@ -295,8 +299,21 @@ impl Client {
     }
 }
 
+/// A server that is switched off answers nothing at all.
+async fn dial(authority: &str) -> io::Result<TcpStream> {
+    let dialled = timeout(CONNECTING, TcpStream::connect(authority)).await;
+    let stream = dialled.unwrap_or_else(|_| Err(silent()))?;
+    let _ = stream.set_nodelay(true);
+    Ok(stream)
+}
+
+fn silent() -> io::Error {
+    let words = format!("nothing answered within {} s", CONNECTING.as_secs());
+    io::Error::new(io::ErrorKind::TimedOut, words)
+}
+
 /// Through a descriptor of its directory, because the path itself may be longer than an address can be.
-async fn connect(socket: &Path) -> std::io::Result<UnixStream> {
+async fn connect(socket: &Path) -> io::Result<UnixStream> {
     let (Some(directory), Some(name)) = (socket.parent(), socket.file_name()) else {
         return UnixStream::connect(socket).await;
     };

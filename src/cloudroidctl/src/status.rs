@@ -36,6 +36,14 @@ impl Status {
     }
 }
 
+/// Where it listens, and what it shows there.
+fn address(status: &api::Status) -> String {
+    match &status.certificate {
+        Some(fingerprint) => format!("https://{}, certificate {fingerprint}", status.listen),
+        None => format!("http://{}", status.listen),
+    }
+}
+
 fn show(status: &api::Status) -> anyhow::Result<()> {
     let room = &status.capacity;
     let isolation = match status.isolation.cgroup_version {
@@ -52,7 +60,7 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
                 output::age(status.started)
             ),
         ),
-        ("address", format!("http://{}", status.listen)),
+        ("address", address(status)),
         ("home", status.home.clone()),
         (
             "default service",

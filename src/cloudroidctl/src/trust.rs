@@ -2,7 +2,7 @@
 
 use anyhow::{Context, bail};
 use clap::Args;
-use tls::{Fingerprint, KnownServers};
+use tls::{Fingerprint, Known, KnownServers};
 
 use crate::client::Server;
 
@@ -31,7 +31,7 @@ impl TrustServer {
         let known = KnownServers::of_user()
             .context("neither XDG_CONFIG_HOME nor HOME is set; set one of them")?;
         known
-            .remember(&server, self.fingerprint)
+            .remember(&server, Known::Certificate(self.fingerprint))
             .context("cannot remember the certificate")?;
         println!("{server} is trusted with {}", self.fingerprint);
         Ok(())

@@ -108,7 +108,27 @@ pub fn tls(
         path: certificate,
         source,
     };
-    Ok(Some(Arc::new(Tls::new(chain, key).map_err(unusable)?)))
+    let tls = Tls::new(chain, key).map_err(unusable)?;
+    warn_of_other_names(&tls, &config.names);
+    Ok(Some(Arc::new(tls)))
+}
+
+/// The daemon's certificate is made once, since clients have its fingerprint: names that are configured later are not in it.
+fn warn_of_other_names(tls: &Tls, configured: &[String]) {
+    let is_other = |name: &&str| !tls.speaks_for(name);
+    let others: Vec<&str> = configured
+        .iter()
+        .map(String::as_str)
+        .filter(is_other)
+        .collect();
+    if !others.is_empty() {
+        tracing::warn!(
+            "the daemon's certificate was made before names in [tls] had {}: clients that know its fingerprint do not mind; \
+             for those that look at names, stop the daemon, remove tls/{OWN} of its home and start it (every client then has \
+             to accept the new one, with cloudroidctl trust)",
+            others.join(", ")
+        );
+    }
 }
 
 /// By which names and addresses this machine may be reached.

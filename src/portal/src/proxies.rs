@@ -125,8 +125,16 @@ impl Proxies {
         if !self.has(proxy.ip()) {
             return Ok(connection.clone());
         }
-        let (written, listed) = (values(headers, FORWARDED), values(headers, FORWARDED_FOR));
-        let protocols = values(headers, FORWARDED_PROTO);
+        let written = quoted(headers).map_err(|why| {
+            let proxy = proxy.ip();
+            Error::BadRequest(format!(
+                "the header Forwarded, as the proxy {proxy} passed it on, {why}; have it remove what its clients send"
+            ))
+        })?;
+        let (listed, protocols) = (
+            values(headers, FORWARDED_FOR),
+            values(headers, FORWARDED_PROTO),
+        );
         let by_standard = (!written.is_empty()).then(|| self.client(written.iter().map(element)));
         let by_list = (!listed.is_empty()).then(|| {
             // One value is of the client's own connection; of several, each is of the address beside it.
@@ -194,15 +202,31 @@ impl Proxies {
     }
 }
 
-/// All values of a header that is a list, in their order; commas within quotes do not count.
+/// All values of a header that is a list, in their order. None of those that proxies write has a comma or a quote in it.
 fn values<'a>(headers: &'a HeaderMap, name: &str) -> Vec<&'a str> {
-    let mut values = Vec::new();
-    for line in headers.get_all(name) {
-        // What is no text is no address either.
-        let line = line.to_str().unwrap_or("?");
-        values.extend(unquoted(line, ',').map(str::trim));
+    let lines = headers.get_all(name).into_iter();
+    // What is no text is no address either.
+    let lines = lines.map(|line| line.to_str().unwrap_or("?"));
+    lines
+        .flat_map(|line| line.split(',').map(str::trim))
+        .collect()
+}
+
+/// All elements of `Forwarded`, in their order; commas within quotes do not count. A client that could leave a quote open
+/// would take what the proxy writes behind it for its own value.
+fn quoted(headers: &HeaderMap) -> Result<Vec<&str>, &'static str> {
+    let mut elements = Vec::new();
+    for line in headers.get_all(FORWARDED) {
+        let line = line.to_str().map_err(|_| "is no text")?;
+        if line.matches('"').count() % 2 == 1 {
+            return Err("has a quote that is not closed");
+        }
+        if line.contains('\\') {
+            return Err("has a backslash, which no address needs");
+        }
+        elements.extend(unquoted(line, ',').map(str::trim));
     }
-    values
+    Ok(elements)
 }
 
 /// Splits a text where a character stands outside of quotes.
@@ -403,6 +427,27 @@ mod tests {
         ];
         let seen = seen("127.0.0.1", &alike).expect("one client");
         assert_eq!(seen, ("192.0.2.1".to_owned(), true));
+    }
+
+    #[test]
+    fn a_client_cannot_swallow_what_the_proxy_writes() {
+        // The proxy has appended 192.0.2.1 to what its client sent.
+        for sent in ["\"", "198.51.100.7, \"", "\"198.51.100.7", "\"a\"\""] {
+            let listed = format!("{sent}, 192.0.2.1");
+            let seen = seen("127.0.0.1", &[("x-forwarded-for", &listed)]).expect(&listed);
+            assert_eq!(seen.0, "192.0.2.1", "{listed}");
+        }
+        for sent in [
+            "for=\"198.51.100.7",
+            "for=\"\\\"\"",
+            "for=198.51.100.7;by=\"",
+        ] {
+            let written = format!("{sent}, for=192.0.2.1");
+            let refused = seen("127.0.0.1", &[("forwarded", &written)]).expect_err(&written);
+            let refused = refused.problem();
+            assert_eq!(refused.status, 400, "{written}");
+            assert!(refused.detail.contains("127.0.0.1"), "{refused:?}");
+        }
     }
 
     #[test]

@@ -12,6 +12,7 @@ use axum::{Extension, Json};
 use catalogue::stubs::{self, Programs};
 use package::stub::Portal;
 use serde::Deserialize;
+use tokio::sync::Semaphore;
 use tokio_util::io::ReaderStream;
 
 use super::guard::{Caller, Peer};
@@ -20,6 +21,8 @@ use crate::errors::Error;
 
 /// Read from the archive at a time.
 const CHUNK: usize = 64 << 10;
+/// Archives that are packed at the same time: each holds its files in memory meanwhile, and takes a core.
+static PACKING: Semaphore = Semaphore::const_new(2);
 
 /// `/stubs`: services, and for which architectures.
 pub async fn list(
@@ -77,9 +80,11 @@ pub async fn archive(
     let architecture = program.architecture;
     let key = Arc::clone(&app.signing);
     let packing = move || stubs::archive(&store, &revision, &inventory, &program, &portal, &key);
-    let archive = privilege::blocking(packing)
-        .await
-        .map_err(|_| Error::Internal("packing a stub"))??;
+    // It is never closed.
+    let turn = PACKING.acquire().await;
+    let archive = privilege::blocking(packing).await;
+    drop(turn);
+    let archive = archive.map_err(|_| Error::Internal("packing a stub"))??;
     if is_signature {
         let kind = [(header::CONTENT_TYPE, "application/x-ssh-signature")];
         return Ok((kind, archive.signature).into_response());
@@ -103,12 +108,19 @@ pub async fn archive(
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 
-/// Where the robot reaches this portal: as whoever asks for the stub reached it.
+/// Where the robot reaches this portal: as whoever asks for the stub reached it, if nobody else can be meant by that: the
+/// archive is signed, and robots send their tokens there. What signs itself is pinned by its fingerprint whatever the name
+/// is; what an authority has signed speaks for the names in it alone. Of a proxy that is named, the operator has said to
+/// believe it.
 fn portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
     let host = headers
         .get(header::HOST)
         .and_then(|host| host.to_str().ok())
-        .filter(|host| stubs::is_authority(host));
+        .filter(|host| stubs::is_authority(host))
+        .filter(|host| match &app.tls {
+            Some(tls) if !caller.forwarded => tls.signs_itself() || tls.speaks_for(host),
+            _ => true,
+        });
     let scheme = if caller.secure { "wss" } else { "ws" };
     let address = match (caller.peer, host) {
         (Peer::Tcp(_), Some(host)) => format!("{scheme}://{host}"),

@@ -110,6 +110,15 @@ impl Tls {
         shown.cert.first().is_some_and(::tls::signs_itself)
     }
 
+    /// Whether what is shown is valid for a host, which may have a port behind it.
+    pub fn speaks_for(&self, authority: &str) -> bool {
+        let shown = self.shown.0.read();
+        shown
+            .cert
+            .first()
+            .is_some_and(|certificate| ::tls::speaks_for(certificate, authority))
+    }
+
     /// Makes a TLS connection of a TCP one.
     pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<Accepted> {
         let mut first = [0];

@@ -129,6 +129,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
         pid: std::process::id(),
         home: app.home.display().to_string(),
         listen: app.listen.to_string(),
+        certificate: app.tls.as_ref().map(|tls| tls.fingerprint().to_string()),
         default_service: app.options.default_service.clone(),
         started: app.started,
         isolation: Isolation {

@@ -1,6 +1,6 @@
 //! The client's side: whom it trusts. A certificate is accepted whose fingerprint is known, or which an authority has signed that
-//! the client trusts. One that signs itself, of a server of which nothing is known, is remembered (trust on first use, as
-//! ssh(1) does).
+//! the client trusts; that one has is remembered. One that signs itself, of a server of which nothing is known, is
+//! remembered (trust on first use, as ssh(1) does).
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ use tokio_rustls::rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, SignatureScheme,
 };
 
-use crate::{Fingerprint, KnownServers};
+use crate::{Fingerprint, Known, KnownServers};
 
 /// Whom a client trusts.
 #[derive(Debug, Clone)]
@@ -31,7 +31,7 @@ pub struct Trust {
     pub authorities: Option<PathBuf>,
     /// The certificate that was named to the client.
     pub fingerprint: Option<Fingerprint>,
-    /// Those that it has seen.
+    /// Those that it has seen; of no account where `authorities` are named.
     pub known: Option<KnownServers>,
     /// The command that accepts another certificate, up to its fingerprint.
     pub accept: String,
@@ -57,14 +57,18 @@ impl Trust {
     ) -> io::Result<Connected<S>> {
         let name = ServerName::try_from(host.to_owned()).map_err(io::Error::other)?;
         let provider = Arc::new(ring::default_provider());
-        let seen = match (&self.fingerprint, &self.known) {
-            (None, Some(known)) => known.find(server)?,
-            _ => None,
+        // Who names a certificate or authorities has said whom to trust.
+        let known = self.known.as_ref().filter(|_| self.fingerprint.is_none());
+        let seen = known.map(|known| known.find(server)).transpose()?.flatten();
+        let expected = match self.fingerprint {
+            Some(named) => Some(Known::Certificate(named)),
+            None if self.authorities.is_none() => seen,
+            None => None,
         };
         let authorities = self.authorities.as_deref().map(read).transpose()?;
         let verifier = Arc::new(Verifier {
             provider: Arc::clone(&provider),
-            expected: self.fingerprint.or(seen),
+            expected,
             first_use: self.known.is_some() && self.authorities.is_none(),
             authorities,
             accept: self.accept.clone(),
@@ -85,11 +89,17 @@ impl Trust {
             Some(words) => io::Error::other(words),
             None => error,
         })?;
-        if let (Some(first), Some(known)) = (outcome.first, &self.known) {
-            let kept = known.remember_first(server, first)?;
-            if kept != first {
+        if let (Some(first), Some(known)) = (outcome.first, known) {
+            let kept = known.remember_first(server, Known::Certificate(first))?;
+            if kept != Known::Certificate(first) {
                 return Err(io::Error::other(changed(first, kept, &self.accept)));
             }
+        }
+        if let (true, Some(known)) = (outcome.by_authority, known)
+            && seen != Some(Known::ByAuthority)
+        {
+            // A home that cannot be written is no reason to refuse a server that an authority speaks for.
+            let _ = known.remember(server, Known::ByAuthority);
         }
         Ok(Connected {
             stream,
@@ -98,10 +108,16 @@ impl Trust {
     }
 }
 
-fn changed(shown: Fingerprint, expected: Fingerprint, accept: &str) -> String {
+fn changed(shown: Fingerprint, expected: Known, accept: &str) -> String {
+    let known = match expected {
+        Known::Certificate(expected) => format!("{expected} is the one that is known of it"),
+        Known::ByAuthority => {
+            "an authority spoke for the one that it had, and none does for this".to_owned()
+        }
+    };
     format!(
-        "the server shows the certificate {shown}, and {expected} is the one that is known of it: somebody may stand between; \
-         if its operator has replaced it, accept it with: {accept} {shown}"
+        "the server shows the certificate {shown}, and {known}: somebody may stand between; if its operator has replaced \
+         it, accept it with: {accept} {shown}"
     )
 }
 
@@ -138,7 +154,7 @@ fn of_system() -> RootCertStore {
 struct Verifier {
     provider: Arc<CryptoProvider>,
     /// What is known of the server.
-    expected: Option<Fingerprint>,
+    expected: Option<Known>,
     /// Whether one that signs itself is accepted where nothing is known.
     first_use: bool,
     /// The system's where absent.
@@ -151,6 +167,7 @@ struct Verifier {
 #[derive(Debug, Clone, Default)]
 struct Outcome {
     first: Option<Fingerprint>,
+    by_authority: bool,
     refused: Option<String>,
 }
 
@@ -208,24 +225,32 @@ impl ServerCertVerifier for Verifier {
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
         let shown = Fingerprint::of(certificate);
-        if self.expected == Some(shown) {
+        if self.expected == Some(Known::Certificate(shown)) {
             return Ok(ServerCertVerified::assertion());
         }
         let refused = match self.by_authorities(certificate, intermediates, name, ocsp, now) {
-            Ok(()) => return Ok(ServerCertVerified::assertion()),
+            Ok(()) => {
+                self.note(Outcome {
+                    by_authority: true,
+                    ..Outcome::default()
+                });
+                return Ok(ServerCertVerified::assertion());
+            }
             Err(refused) => refused,
         };
-        if let Some(expected) = self.expected {
+        // Of one that was signed and has expired, say, its authority's reason says more.
+        let about_itself = self.expected != Some(Known::ByAuthority) || signs_itself(certificate);
+        if let Some(expected) = self.expected.filter(|_| about_itself) {
             self.note(Outcome {
                 refused: Some(changed(shown, expected, &self.accept)),
-                first: None,
+                ..Outcome::default()
             });
             return Err(CertificateError::ApplicationVerificationFailure.into());
         }
         if self.first_use && signs_itself(certificate) {
             self.note(Outcome {
                 first: Some(shown),
-                refused: None,
+                ..Outcome::default()
             });
             return Ok(ServerCertVerified::assertion());
         }
@@ -238,7 +263,7 @@ impl ServerCertVerifier for Verifier {
         };
         self.note(Outcome {
             refused: words,
-            first: None,
+            ..Outcome::default()
         });
         Err(error)
     }
@@ -276,4 +301,20 @@ pub fn signs_itself(certificate: &CertificateDer<'_>) -> bool {
         Ok(read) => read.issuer() == read.subject(),
         Err(_) => false,
     }
+}
+
+/// Whether a certificate is valid for the host of `HOST` or `HOST:PORT` (RFC 9525, section 6), by whomever it is signed.
+pub fn speaks_for(certificate: &CertificateDer<'_>, authority: &str) -> bool {
+    let host = match authority.rsplit_once(':') {
+        Some((host, port)) if port.bytes().all(|digit| digit.is_ascii_digit()) => host,
+        _ => authority,
+    };
+    let host = host.trim_matches(['[', ']']);
+    let (Ok(read), Ok(name)) = (
+        webpki::EndEntityCert::try_from(certificate),
+        ServerName::try_from(host),
+    ) else {
+        return false;
+    };
+    read.verify_is_valid_for_subject_name(&name).is_ok()
 }

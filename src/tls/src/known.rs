@@ -1,13 +1,49 @@
-//! Servers whose certificates were seen, as `known_hosts` of ssh(1): a line each, `HOST:PORT SHA256:…`.
+//! Servers whose certificates were seen, as `known_hosts` of ssh(1): a line each, `HOST:PORT SHA256:…`, or
+//! `HOST:PORT authority` where an authority speaks for the certificate.
 
+use std::fmt;
 use std::fs::{DirBuilder, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use nix::fcntl::{Flock, FlockArg};
 
-use crate::Fingerprint;
+use crate::{Fingerprint, NoFingerprint};
+
+/// What is remembered of a server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Known {
+    /// Its certificate.
+    Certificate(Fingerprint),
+    /// An authority that the client trusts has signed its certificate, which may change, but not to one that nobody has
+    /// signed.
+    ByAuthority,
+}
+
+/// The word of [`Known::ByAuthority`].
+const AUTHORITY: &str = "authority";
+
+impl fmt::Display for Known {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Known::Certificate(fingerprint) => fingerprint.fmt(out),
+            Known::ByAuthority => out.write_str(AUTHORITY),
+        }
+    }
+}
+
+impl FromStr for Known {
+    type Err = NoFingerprint;
+
+    fn from_str(written: &str) -> Result<Known, NoFingerprint> {
+        if written == AUTHORITY {
+            return Ok(Known::ByAuthority);
+        }
+        written.parse().map(Known::Certificate)
+    }
+}
 
 /// The file of one user.
 #[derive(Debug, Clone)]
@@ -36,39 +72,35 @@ impl KnownServers {
         &self.0
     }
 
-    /// What a server showed, by its host and port.
-    pub fn find(&self, server: &str) -> io::Result<Option<Fingerprint>> {
+    /// What is remembered of a server, by its host and port.
+    pub fn find(&self, server: &str) -> io::Result<Option<Known>> {
         let known = self.read()?;
         Ok(known
             .into_iter()
             .find(|(name, _)| name == server)
-            .map(|(_, fingerprint)| fingerprint))
+            .map(|(_, known)| known))
     }
 
-    /// Remembers what a server shows, in place of what it showed before.
-    pub fn remember(&self, server: &str, fingerprint: Fingerprint) -> io::Result<()> {
-        self.change(server, |_| Some(fingerprint)).map(|_| ())
+    /// Remembers this of a server, in place of what was remembered.
+    pub fn remember(&self, server: &str, new: Known) -> io::Result<()> {
+        self.change(server, |_| Some(new)).map(|_| ())
     }
 
-    /// The same where nothing is known of the server; gives what is known of it then.
-    pub fn remember_first(
-        &self,
-        server: &str,
-        fingerprint: Fingerprint,
-    ) -> io::Result<Fingerprint> {
+    /// The same where nothing is remembered of the server; gives what is remembered then.
+    pub fn remember_first(&self, server: &str, new: Known) -> io::Result<Known> {
         let known = self.change(server, |known| match known {
             Some(_) => None,
-            None => Some(fingerprint),
+            None => Some(new),
         })?;
-        Ok(known.unwrap_or(fingerprint))
+        Ok(known.unwrap_or(new))
     }
 
     /// Writes what `decide` makes of what is known of a server; gives what was known.
     fn change(
         &self,
         server: &str,
-        decide: impl FnOnce(Option<Fingerprint>) -> Option<Fingerprint>,
-    ) -> io::Result<Option<Fingerprint>> {
+        decide: impl FnOnce(Option<Known>) -> Option<Known>,
+    ) -> io::Result<Option<Known>> {
         let named = |error| about(&self.0, error);
         if let Some(directory) = self.0.parent() {
             let mut making = DirBuilder::new();
@@ -100,7 +132,7 @@ impl KnownServers {
         self.0.with_extension(extension)
     }
 
-    fn read(&self) -> io::Result<Vec<(String, Fingerprint)>> {
+    fn read(&self) -> io::Result<Vec<(String, Known)>> {
         let text = match std::fs::read_to_string(&self.0) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -117,7 +149,7 @@ impl KnownServers {
                 .and_then(|(server, shown)| Some((server.to_owned(), shown.trim().parse().ok()?)));
             let Some(read) = read else {
                 let words = format!(
-                    "line {} is no HOST:PORT with a fingerprint; correct or remove it",
+                    "line {} is no HOST:PORT with a fingerprint or the word \"{AUTHORITY}\"; correct or remove it",
                     at + 1
                 );
                 return Err(about(&self.0, io::Error::other(words)));
@@ -127,12 +159,12 @@ impl KnownServers {
         Ok(known)
     }
 
-    fn write(&self, known: &[(String, Fingerprint)]) -> io::Result<()> {
+    fn write(&self, known: &[(String, Known)]) -> io::Result<()> {
         let begun = self.beside("begun");
         let mut file = private(&begun)?;
         file.set_len(0)?;
-        for (server, fingerprint) in known {
-            writeln!(file, "{server} {fingerprint}")?;
+        for (server, known) in known {
+            writeln!(file, "{server} {known}")?;
         }
         file.sync_all()?;
         std::fs::rename(&begun, &self.0)
@@ -159,7 +191,7 @@ mod tests {
 
     use super::*;
 
-    fn fingerprint(digit: char) -> Fingerprint {
+    fn shown(digit: char) -> Known {
         let digits = digit.to_string().repeat(64);
         format!("SHA256:{digits}").parse().unwrap()
     }
@@ -168,7 +200,7 @@ mod tests {
     fn the_first_is_remembered_until_another_is_accepted() {
         let place = tempfile::tempdir().unwrap();
         let known = KnownServers::at(place.path().join("new/cloudroid/known_servers"));
-        let (one, other) = (fingerprint('1'), fingerprint('2'));
+        let (one, other) = (shown('1'), shown('2'));
         assert_eq!(known.find("a:1").unwrap(), None);
         assert_eq!(known.remember_first("a:1", one).unwrap(), one);
         assert_eq!(known.remember_first("b:1", other).unwrap(), other);
@@ -178,6 +210,9 @@ mod tests {
         assert_eq!(known.find("a:1").unwrap(), Some(other));
         assert_eq!(known.find("b:1").unwrap(), Some(other));
         assert_eq!(known.find("a:11").unwrap(), None);
+        known.remember("b:1", Known::ByAuthority).unwrap();
+        assert_eq!(known.find("b:1").unwrap(), Some(Known::ByAuthority));
+        assert_eq!(known.find("a:1").unwrap(), Some(other));
         let mode = known.path().metadata().unwrap().permissions().mode();
         assert_eq!(mode & 0o777, 0o600);
     }
@@ -189,12 +224,12 @@ mod tests {
         std::thread::scope(|scope| {
             for at in 0..16 {
                 let known = &known;
-                scope.spawn(move || known.remember(&format!("s:{at}"), fingerprint('a')));
+                scope.spawn(move || known.remember(&format!("s:{at}"), shown('a')));
             }
         });
         for at in 0..16 {
             let found = known.find(&format!("s:{at}")).unwrap();
-            assert_eq!(found, Some(fingerprint('a')), "{at}");
+            assert_eq!(found, Some(shown('a')), "{at}");
         }
     }
 
@@ -203,11 +238,17 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("known_servers");
         let known = KnownServers::at(path.clone());
-        for text in ["a:1", "a:1 SHA256:00", "# fine\n\na:1\tx", "\u{fffd} "] {
+        for text in [
+            "a:1",
+            "a:1 SHA256:00",
+            "a:1 Authority",
+            "# fine\n\na:1\tx",
+            "\u{fffd} ",
+        ] {
             std::fs::write(&path, text).unwrap();
             for refused in [
                 known.find("b:1").map(|_| ()),
-                known.remember_first("b:1", fingerprint('1')).map(|_| ()),
+                known.remember_first("b:1", shown('1')).map(|_| ()),
             ] {
                 let words = refused.expect_err(text).to_string();
                 assert!(words.contains("known_servers: line"), "{words}");

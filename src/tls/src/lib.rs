@@ -7,6 +7,6 @@ mod client;
 mod fingerprint;
 mod known;
 
-pub use client::{Connected, Trust, signs_itself};
+pub use client::{Connected, Trust, signs_itself, speaks_for};
 pub use fingerprint::{Fingerprint, NoFingerprint};
-pub use known::KnownServers;
+pub use known::{Known, KnownServers};

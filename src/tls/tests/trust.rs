@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
-use tls::{Fingerprint, KnownServers, Trust};
+use tls::{Fingerprint, Known, KnownServers, Trust};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tokio_rustls::rustls::crypto::ring;
@@ -107,7 +107,8 @@ async fn what_signs_itself_is_remembered_and_no_other_is_taken_for_it() {
         }
         assert_eq!(server.met_by(&client).await, Ok(None), "still known");
         let known = KnownServers::at(file);
-        known.remember("localhost:1", other.fingerprint()).unwrap();
+        let other_one = Known::Certificate(other.fingerprint());
+        known.remember("localhost:1", other_one).unwrap();
         assert_eq!(other.met_by(&client).await, Ok(None), "accepted");
         server.met_by(&client).await.expect_err("the one before");
     }
@@ -131,34 +132,46 @@ async fn a_fingerprint_that_was_named_is_needed() {
 }
 
 #[tokio::test]
-async fn what_an_authority_has_signed_is_never_remembered() {
+async fn what_an_authority_has_signed_may_change_but_not_to_what_signs_itself() {
     let place = tempfile::tempdir().unwrap();
     let (file, pem) = (
         place.path().join("known_servers"),
         place.path().join("ca.pem"),
     );
     let server = Server::signed("localhost", &pem);
-    server
-        .met_by(&trust(Some(&file)))
-        .await
-        .expect_err("whose?");
+    let alone = Server::alone("localhost", false);
+    let by_chance = trust(Some(&file));
+    server.met_by(&by_chance).await.expect_err("whose?");
     let client = Trust {
         authorities: Some(pem.clone()),
-        ..trust(Some(&file))
+        ..by_chance.clone()
     };
-    assert_eq!(server.met_by(&client).await, Ok(None));
-    // With the authority's word it may change, whatever was known before.
+    // With the authority's word it may change, whatever was known before; one that was accepted is none of theirs.
     let known = KnownServers::at(file.clone());
-    let alone = Server::alone("localhost", false);
-    known.remember("localhost:1", alone.fingerprint()).unwrap();
-    assert_eq!(server.met_by(&client).await, Ok(None));
-    std::fs::remove_file(&file).unwrap();
-    // Where authorities are named, one that signs itself is none of theirs.
+    let accepted = Known::Certificate(alone.fingerprint());
+    known.remember("localhost:1", accepted).unwrap();
     alone.met_by(&client).await.expect_err("signs itself");
-    assert!(!file.exists());
+    assert_eq!(known.find("localhost:1").unwrap(), Some(accepted));
+    assert_eq!(server.met_by(&client).await, Ok(None));
+    assert_eq!(known.find("localhost:1").unwrap(), Some(Known::ByAuthority));
+    // Whoever stands between later shows one that signs itself: that is no first use.
+    let refused = alone.met_by(&by_chance).await.expect_err("stands between");
+    assert!(refused.contains("an authority spoke"), "{refused}");
+    assert_eq!(known.find("localhost:1").unwrap(), Some(Known::ByAuthority));
+    known.remember("localhost:1", accepted).unwrap();
+    assert_eq!(alone.met_by(&by_chance).await, Ok(None), "accepted");
     let elsewhere = Server::signed("elsewhere", &pem);
     let refused = elsewhere.met_by(&client).await.expect_err("another name");
     assert!(refused.contains("not valid for name"), "{refused}");
+    // A home that cannot be written is no reason to refuse it.
+    let unwritable = Trust {
+        known: Some(KnownServers::at("/proc/nowhere/known_servers".into())),
+        ..client
+    };
+    assert_eq!(
+        Server::signed("localhost", &pem).met_by(&unwritable).await,
+        Ok(None)
+    );
 }
 
 #[tokio::test]
@@ -175,4 +188,29 @@ async fn what_cannot_be_remembered_is_not_trusted() {
     let refused = server.met_by(&trust(Some(&damaged))).await;
     let refused = refused.expect_err("damaged");
     assert!(refused.contains("line 1"), "{refused}");
+}
+
+#[test]
+fn a_certificate_speaks_for_its_names_alone() {
+    let params =
+        CertificateParams::new(["cloud.lab", "192.0.2.7", "2001:db8::7"].map(str::to_owned));
+    let key = KeyPair::generate().unwrap();
+    let certificate = params.unwrap().self_signed(&key).unwrap();
+    for (authority, is_spoken_for) in [
+        ("cloud.lab", true),
+        ("cloud.lab:9090", true),
+        ("CLOUD.lab:9090", true),
+        ("192.0.2.7:9090", true),
+        ("[2001:db8::7]:9090", true),
+        ("[2001:db8::7]", true),
+        ("192.0.2.8:9090", false),
+        ("other.lab:9090", false),
+        ("cloud.lab.other", false),
+        ("cloud.lab:x", false),
+        ("", false),
+        (":9090", false),
+    ] {
+        let spoken = tls::speaks_for(certificate.der(), authority);
+        assert_eq!(spoken, is_spoken_for, "{authority}");
+    }
 }

@@ -241,6 +241,27 @@ set_key() {
   cat "$settings.new" > "$settings"
   rm -f "$settings.new"
 }
+# KEY FILE: the value that a file sets.
+key_of() {
+  sed -n "s/^$1 *= *\"\(.*\)\"[^\"]*\$/\1/p" "$2" | head -n 1
+}
+# The server signs where it is reached and what it shows: an earlier address in plain text, and a certificate that it has
+# shown before, are not kept.
+offered=$here/share/$package/stub.toml
+if [ -z "$server" ] && [ -e "$share/stub.toml" ]; then
+  now=$(key_of server "$offered") before=$(key_of server "$settings")
+  case $before,$now in
+    ws://*,wss://*)
+      echo "install.sh: the server speaks TLS now: $now in place of $before" >&2
+      server=$now
+      ;;
+  esac
+  now=$(key_of fingerprint "$offered") before=$(key_of fingerprint "$settings")
+  if [ -z "$fingerprint" ] && [ -n "$now" ] && [ "$now" != "$before" ]; then
+    echo "install.sh: the server's certificate is $now now${before:+, in place of $before}" >&2
+    fingerprint=$now
+  fi
+fi
 if [ -n "$robot" ]; then set_key robot "$robot"; fi
 if [ -n "$server" ]; then set_key server "$server"; fi
 if [ -n "$fingerprint" ]; then set_key fingerprint "$fingerprint"; fi

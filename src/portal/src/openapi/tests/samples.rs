@@ -382,6 +382,7 @@ fn status() -> Status {
         pid: 1,
         home: "/h".into(),
         listen: "127.0.0.1:9090".into(),
+        certificate: some("x"),
         default_service: some("x"),
         started: 1,
         isolation: Isolation::default(),
