@@ -368,7 +368,7 @@ impl Look<'_> {
             latched: self.latched.clone(),
             eager: self.eager.clone(),
             graph: self.graph(),
-            own_name: &self.options.own_name,
+            options: self.options,
             asked: feed.asked(),
             any: feed.any().clone(),
         };

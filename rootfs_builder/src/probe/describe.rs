@@ -8,11 +8,10 @@ use package::interface::{Action, Direction, Interface, Need, Parameter, Service,
 use ros::bus::{Bus, BusError, Graph, ParamValue, WireType};
 use ros::ros1::own_parameters::every_node_asks_for;
 use ros::schema::{Base, MessageType, Registry};
-use tokio::time::timeout;
 
-use super::{Found, ProbeError, inputs, outputs};
+use super::{Found, ProbeError, ProbeOptions, inputs, outputs, settle};
 
-/// A node that does not say its type in this time is left out with a warning.
+/// What does not say its type in this time of its node's own is left out with a warning.
 const ANSWER: Duration = Duration::from_secs(5);
 
 /// What looking gave.
@@ -23,8 +22,8 @@ pub(super) struct Seen<'a> {
     pub(super) eager: BTreeSet<String>,
     /// The graph at the end.
     pub(super) graph: Arc<Graph>,
-    /// The looking node.
-    pub(super) own_name: &'a str,
+    /// Who looked, and how long answers are waited for.
+    pub(super) options: &'a ProbeOptions,
     /// Services that were looked for and lent, with the nodes that did.
     pub(super) asked: BTreeMap<String, BTreeSet<String>>,
     /// Inputs of any type.
@@ -46,11 +45,11 @@ pub(super) async fn describe(
     let graph = &*seen.graph;
     let mut topics = Vec::new();
     for (direction, names) in [
-        (Direction::Input, inputs(graph, seen.own_name)),
-        (Direction::Output, outputs(graph, seen.own_name)),
+        (Direction::Input, inputs(graph, &seen.options.own_name)),
+        (Direction::Output, outputs(graph, &seen.options.own_name)),
     ] {
         for name in names {
-            match ask(&name, bus.topic_type(&name)).await {
+            match ask(&name, seen, bus.topic_type(&name)).await {
                 Ok(wire) => {
                     let wire = if follows_any(seen, &name, direction, &wire) {
                         WireType::any()
@@ -72,12 +71,12 @@ pub(super) async fn describe(
     for (name, node) in graph
         .services
         .iter()
-        .filter(|(_, node)| *node != seen.own_name)
+        .filter(|(_, node)| **node != seen.options.own_name)
     {
         if name.ends_with("/get_loggers") || name.ends_with("/set_logger_level") {
             continue;
         }
-        match ask(name, bus.service_type(name)).await {
+        match ask(name, seen, bus.service_type(name)).await {
             Ok(wire) => {
                 let service =
                     registry
@@ -103,7 +102,7 @@ pub(super) async fn describe(
             Err(problem) => found.warnings.push(problem),
         }
     }
-    let parameters = parameters(bus, graph, seen.own_name).await;
+    let parameters = parameters(bus, graph, &seen.options.own_name).await;
     found.interface = Interface {
         topics,
         services,
@@ -139,7 +138,7 @@ pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
 
 /// Those, and the services that were lent.
 fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
-    let mut needs = needs(&seen.graph, seen.own_name);
+    let mut needs = needs(&seen.graph, &seen.options.own_name);
     for (name, nodes) in &seen.asked {
         if seen.graph.services.contains_key(name) {
             continue;
@@ -170,7 +169,7 @@ fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireTyp
         output
             .publishers
             .iter()
-            .any(|node| node != seen.own_name && input.subscribers.contains(node))
+            .any(|node| *node != seen.options.own_name && input.subscribers.contains(node))
     };
     match direction {
         Direction::Input => seen.any.contains(name),
@@ -180,12 +179,13 @@ fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireTyp
 
 async fn ask<T>(
     name: &str,
+    seen: &Seen<'_>,
     answer: impl Future<Output = Result<T, BusError>>,
 ) -> Result<T, String> {
-    match timeout(ANSWER, answer).await {
-        Ok(Ok(value)) => Ok(value),
-        Ok(Err(error)) => Err(format!("{name} does not tell its type: {error}")),
-        Err(_) => Err(format!("{name} does not tell its type within {ANSWER:?}")),
+    match settle::answered(ANSWER, seen.options, answer).await {
+        Some(Ok(value)) => Ok(value),
+        Some(Err(error)) => Err(format!("{name} does not tell its type: {error}")),
+        None => Err(format!("{name} does not tell its type within {ANSWER:?}")),
     }
 }
 
@@ -235,7 +235,7 @@ fn topic(
     let nodes = nodes
         .into_iter()
         .flatten()
-        .filter(|node| *node != seen.own_name)
+        .filter(|node| **node != seen.options.own_name)
         .cloned()
         .collect();
     Ok(Topic {
@@ -270,7 +270,10 @@ fn take_actions(
 ) -> Result<Vec<Action>, ProbeError> {
     let mut actions = Vec::new();
     for (name, ends) in &seen.graph.actions {
-        let mut servers = ends.servers.iter().filter(|node| *node != seen.own_name);
+        let mut servers = ends
+            .servers
+            .iter()
+            .filter(|node| **node != seen.options.own_name);
         let Some(node) = servers.next().filter(|_| ends.type_name != "*") else {
             continue;
         };

@@ -19,13 +19,13 @@ use ros::bus::{Bus, Graph, ParamValue, Publisher, Qos, Subscription, WireType, r
 use ros::codec::{self, FillOptions, JsonOptions, Time};
 use ros::schema::{MessageType, Registry};
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, timeout};
+use tokio::time::Instant;
 
 use super::frames::{self, Frames};
 use super::lender::AnyService;
-use super::{ProbeOptions, is_plumbing, plausible};
+use super::{ProbeOptions, is_plumbing, plausible, settle};
 
-/// How long a node may take to tell the type of an input.
+/// How long a node may take to tell the type of an input, and to connect: of its own time.
 const ANSWER: Duration = Duration::from_secs(5);
 /// Time between two messages of transforms, and of `/clock`.
 const BEAT: Duration = Duration::from_millis(50);
@@ -221,7 +221,7 @@ impl<'a> Feed<'a> {
             }
         };
         // How long that takes on a busy machine tells how long the nodes will take.
-        let _ = timeout(ANSWER, reaches(publisher.matched(), 1)).await;
+        let _ = self.answered(reaches(publisher.matched(), 1)).await;
         let frames = self.frames.clone();
         let beating = tokio::spawn(async move {
             let mut beats = tokio::time::interval(BEAT);
@@ -268,7 +268,7 @@ impl<'a> Feed<'a> {
                 Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
                     Ok(bytes) => {
                         // Not latched, which would reach whoever is late, too: relays latch what was latched.
-                        let _ = timeout(ANSWER, reaches(publisher.matched(), 1)).await;
+                        let _ = self.answered(reaches(publisher.matched(), 1)).await;
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
                         longest = longest.max(Some(began.elapsed()));
@@ -288,6 +288,10 @@ impl<'a> Feed<'a> {
         longest
     }
 
+    async fn answered<T>(&self, answer: impl Future<Output = T>) -> Option<T> {
+        settle::answered(ANSWER, self.options, answer).await
+    }
+
     /// Advertises a topic with the type that its subscribers ask for, or `usual` where they ask for none; nothing
     /// where that would begin an action.
     async fn advertise(
@@ -295,10 +299,10 @@ impl<'a> Feed<'a> {
         topic: &str,
         usual: Option<&str>,
     ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
-        let asked = match timeout(ANSWER, self.bus.topic_type(topic)).await {
-            Ok(Ok(wire)) => wire.name,
-            Ok(Err(error)) => return Err(error.to_string()),
-            Err(_) => return Err(format!("its type was not told within {ANSWER:?}")),
+        let asked = match self.answered(self.bus.topic_type(topic)).await {
+            Some(Ok(wire)) => wire.name,
+            Some(Err(error)) => return Err(error.to_string()),
+            None => return Err(format!("its type was not told within {ANSWER:?}")),
         };
         let stated = self.options.types.get(topic).map(String::as_str);
         let name = match asked.as_str() {

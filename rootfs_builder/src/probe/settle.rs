@@ -92,6 +92,28 @@ impl Clock {
     }
 }
 
+/// What a node answers; none where it does not within `limit` of its own time, or within `patience`.
+pub(super) async fn answered<T>(
+    limit: Duration,
+    options: &ProbeOptions,
+    answer: impl Future<Output = T>,
+) -> Option<T> {
+    let latest = Instant::now() + options.patience.max(limit);
+    let mut clock = Clock::begin(options).await;
+    let mut left = limit;
+    tokio::pin!(answer);
+    loop {
+        let until = Instant::now() + left.max(options.settle / LEAST);
+        if let Ok(answer) = timeout_at(until.min(latest), answer.as_mut()).await {
+            return Some(answer);
+        }
+        left = left.saturating_sub(clock.read(options).await.time);
+        if left.is_zero() || Instant::now() >= latest {
+            return None;
+        }
+    }
+}
+
 /// Waits until nothing changes any more; false when it did not come to rest in time.
 ///
 /// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to. A node

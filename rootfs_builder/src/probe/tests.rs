@@ -264,6 +264,32 @@ async fn a_node_that_waits_for_a_core_is_waited_for() {
     );
 }
 
+#[tokio::test(start_paused = true)]
+async fn an_answer_is_waited_for_in_the_nodes_own_time() {
+    let options = ProbeOptions::new(Vec::new(), "/looker");
+    let limit = Duration::from_secs(5);
+    let late = || tokio::time::sleep(2 * limit);
+    assert!(settle::answered(limit, &options, late()).await.is_none());
+    // It waits for a core for nine of ten seconds.
+    let begun = Instant::now();
+    let work = Work::new(move || async move {
+        Some(Worked {
+            ran: Duration::ZERO,
+            waited: begun.elapsed().mul_f64(0.9),
+        })
+    });
+    let crowded = ProbeOptions {
+        work: Some(work),
+        ..options
+    };
+    assert!(settle::answered(limit, &crowded, late()).await.is_some());
+    let began = Instant::now();
+    let never = std::future::pending::<()>();
+    assert!(settle::answered(limit, &crowded, never).await.is_none());
+    let took = began.elapsed();
+    assert!(took > 9 * limit && took <= crowded.patience, "{took:?}");
+}
+
 #[tokio::test]
 async fn a_node_that_still_works_is_waited_for() {
     let lab = Lab::new().await;
