@@ -54,6 +54,8 @@ mod memory;
 mod mishaps;
 #[path = "stories/names.rs"]
 mod names;
+#[path = "stories/operations.rs"]
+mod operations;
 #[path = "stories/patience.rs"]
 mod patience;
 #[path = "stories/portal.rs"]
@@ -232,6 +234,10 @@ fn main() -> ExitCode {
             a_missing_original_is_said_once_and_the_cloud_goes_on,
             a_local_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
+        ],
+        stories![operations:
+            every_operation_is_done_where_the_table_says,
+            without_a_good_token_no_operation_is_heard
         ],
         stories![access:
             every_route_answers_those_whom_the_table_allows,

@@ -116,7 +116,7 @@ fn matrix() -> anyhow::Result<Vec<Row>> {
 }
 
 /// A token that has expired.
-fn expired(daemon: &Daemon) -> anyhow::Result<String> {
+pub fn expired(daemon: &Daemon) -> anyhow::Result<String> {
     let short = token(daemon, &["short", "--role", "admin", "--expires", "1s"])?;
     let bearer = format!("Bearer {short}");
     support::until("the token's end", || {

@@ -222,6 +222,17 @@ pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
 pub(crate) mod tests {
     use super::*;
 
+    #[test]
+    fn the_document_says_what_each_operation_needs() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/access.md");
+        let document = std::fs::read_to_string(path).expect("docs/access.md");
+        let table = document.split_once("| operation | needs |\n");
+        let (_, table) = table.expect("the table of operations");
+        let rows = table.lines().skip(1).take_while(|line| !line.is_empty());
+        let named: Vec<&str> = rows.filter_map(|row| row.split('`').nth(1)).collect();
+        assert_eq!(named, KNOWN);
+    }
+
     /// Checks that `json` is read as `op` and that `op` survives printing and reading in both formats.
     #[track_caller]
     pub(crate) fn reads(json: &str, op: impl Into<Op<'static>>) {
