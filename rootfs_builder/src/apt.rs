@@ -309,6 +309,11 @@ impl Apt {
         &self,
         names: impl IntoIterator<Item = String>,
     ) -> Result<BTreeMap<String, Relations>, Error> {
+        let mut names = names.into_iter().peekable();
+        // Asked about nothing, apt-cache fails.
+        if names.peek().is_none() {
+            return Ok(BTreeMap::new());
+        }
         let mut query = self.command("apt-cache");
         query.args(["--no-all-versions", "show", "--"]).args(names);
         let text = process::output(query, "apt").await?;
