@@ -14,6 +14,8 @@ mod answer;
 mod audit;
 #[path = "stories/bounds.rs"]
 mod bounds;
+#[path = "stories/browser.rs"]
+mod browser;
 #[path = "stories/burglary.rs"]
 mod burglary;
 #[path = "stories/calibration.rs"]
@@ -158,6 +160,7 @@ fn main() -> ExitCode {
             roslibpy_finds_nothing_missing,
             roslib_finds_nothing_missing,
             roslibrust_finds_nothing_missing,
+            clients_with_tokens_find_nothing_missing,
         ],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,
@@ -235,12 +238,14 @@ fn main() -> ExitCode {
             a_local_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
         ],
+        stories![browser: a_page_with_roslib_shows_its_token],
         stories![operations:
             every_operation_is_done_where_the_table_says,
             without_a_good_token_no_operation_is_heard
         ],
         stories![access:
             every_route_answers_those_whom_the_table_allows,
+            what_is_asked_badly_is_refused_in_words,
             a_deployer_changes_its_own_services_alone,
             what_robots_may_changes_while_they_are_connected,
             what_was_begun_with_a_token_ends_with_it,

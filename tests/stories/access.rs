@@ -276,6 +276,70 @@ pub fn pushes_adder(daemon: &Daemon, token: &str, more: &[&str]) -> anyhow::Resu
     with_token(daemon, token, &push)
 }
 
+pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
+    let daemon = daemon("badly")?;
+    let admin = token(&daemon, &["root", "--role", "admin"])?;
+    let bearer = format!("Bearer {admin}");
+    for (path, words) in [
+        ("/api/v1/audit?limit=x", "limit: invalid digit"),
+        ("/api/v1/audit?limit=-1", "limit: invalid digit"),
+        ("/api/v1/audit?limit=99999999999", "limit: number too large"),
+        ("/api/v1/audit?since=yesterday", "since: invalid digit"),
+        ("/api/v1/events?since=", "since: cannot parse integer"),
+        ("/api/v1/events?follow=perhaps", "follow: "),
+        ("/api/v1/events?limit=1&limit=2", "duplicate field `limit`"),
+    ] {
+        let (status, body) = daemon.request("GET", path, &[("Authorization", &bearer)])?;
+        let problem: serde_json::Value =
+            serde_json::from_str(&body).with_context(|| format!("{path}: {body}"))?;
+        let detail = problem["detail"].as_str().unwrap_or_default();
+        ensure!(
+            status == 400 && detail.contains("the query cannot be read") && detail.contains(words),
+            "{path}: {status} {body}"
+        );
+    }
+    for (typed, words) in [
+        (&["policy", "rm", "9999"][..], "no rule \"9999\""),
+        (
+            &["policy", "allow", "role:fool", "call:/x"],
+            "no role \"fool\"",
+        ),
+        (
+            &["policy", "allow", "rover", "fly:/x"],
+            "\"fly:/x\" is no grant",
+        ),
+        (&["policy", "allow", "rover", "call:[/x"], "is no grant"),
+        (&["token", "revoke", "nobody"], "no token \"nobody\""),
+        (&["token", "rotate", "nobody"], "no token \"nobody\""),
+        (
+            &["token", "create", "a b", "--role", "viewer"],
+            "no name of a principal",
+        ),
+        (&["token", "create", "r", "--role", "robot"], "--service"),
+        (&["token", "create", "k", "--role", "king"], "king"),
+        (
+            &[
+                "token",
+                "create",
+                "root",
+                "--role",
+                "viewer",
+                "--service",
+                "*",
+            ],
+            "root",
+        ),
+    ] {
+        daemon.deployer().types(typed)?.failed_saying(&[words])?;
+    }
+    let rules = daemon.deployer().asks(&["policy", "list"])?;
+    ensure!(
+        rules.as_array().is_some_and(|rules| rules.len() == 2),
+        "{rules}"
+    );
+    Ok(())
+}
+
 pub fn a_deployer_changes_its_own_services_alone() -> Verdict {
     let daemon = daemon("owners")?;
     let alice = token(

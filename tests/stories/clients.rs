@@ -6,38 +6,81 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
-use support::world::{FIXTURE, world};
+use support::daemon::Daemon;
+use support::deployer::path_str;
+use support::world::{FIXTURE, Service, world};
 use support::{Verdict, binaries};
 
+use crate::access::{daemon, token};
+
 pub fn roslibpy_finds_nothing_missing() -> Verdict {
-    let mut command = Command::new(binaries::python());
-    command.arg(program("with_roslibpy.py"));
-    finds_nothing_missing(command, "roslibpy")
+    finds_nothing_missing(roslibpy(), "roslibpy")
 }
 
 pub fn roslib_finds_nothing_missing() -> Verdict {
-    let mut command = Command::new("node");
-    command.arg(program("with_roslib.cjs"));
-    command.env("NODE_PATH", binaries::node_modules());
-    finds_nothing_missing(command, "roslib")
+    finds_nothing_missing(roslib(), "roslib")
 }
 
 pub fn roslibrust_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(
-        Command::new(binaries::path("robot-with-roslibrust")),
-        "roslibrust",
-    )
+    finds_nothing_missing(roslibrust(), "roslibrust")
+}
+
+pub fn clients_with_tokens_find_nothing_missing() -> Verdict {
+    let daemon = daemon("clients")?;
+    let package = package_of(FIXTURE)?;
+    let push = [&["push", package.as_str()], FIXTURE.arguments].concat();
+    daemon.deployer().types(&push)?.succeeded()?;
+    for (command, name) in [
+        (roslibpy(), "roslibpy"),
+        (roslib(), "roslib"),
+        (roslibrust(), "roslibrust"),
+    ] {
+        let scope = ["--role", "robot", "--service", FIXTURE.name, "--robot"];
+        let token = token(&daemon, &[&[name], &scope[..], &[name]].concat())?;
+        let path = format!("{}?token={token}", FIXTURE.name);
+        does_all(&daemon, command, name, &path)?;
+    }
+    Ok(())
+}
+
+/// Where its sources are.
+fn package_of(service: Service) -> anyhow::Result<String> {
+    let package = binaries::package(service.package.context("a package of the repository")?);
+    Ok(path_str(&package).to_owned())
+}
+
+fn roslibpy() -> Command {
+    let mut command = Command::new(binaries::python());
+    command.arg(program("with_roslibpy.py"));
+    command
+}
+
+fn roslib() -> Command {
+    let mut command = Command::new("node");
+    command.arg(program("with_roslib.cjs"));
+    command.env("NODE_PATH", binaries::node_modules());
+    command
+}
+
+fn roslibrust() -> Command {
+    Command::new(binaries::path("robot-with-roslibrust"))
 }
 
 fn program(name: &str) -> PathBuf {
     binaries::checkout().join("tests/robots").join(name)
 }
 
-/// Runs a client's program for a robot of this name; when the program asks for it, ends the robot's servant.
-fn finds_nothing_missing(mut command: Command, robot: &str) -> Verdict {
+/// Runs a client's program for a robot of this name.
+fn finds_nothing_missing(command: Command, robot: &str) -> Verdict {
     let daemon = world().with(FIXTURE)?;
+    let path = format!("{}?robot={robot}", FIXTURE.name);
+    does_all(&daemon, command, robot, &path)
+}
+
+/// Runs a client's program; when it asks for it, ends the robot's servant.
+fn does_all(daemon: &Daemon, mut command: Command, robot: &str, path: &str) -> Verdict {
     let mut child = command
-        .arg(daemon.url(&format!("{}?robot={robot}", FIXTURE.name)))
+        .arg(daemon.url(path))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .spawn()

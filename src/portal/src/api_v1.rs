@@ -6,7 +6,7 @@ use std::sync::Arc;
 use access::{Action, Object};
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
-use axum::extract::{Path, Query, State};
+use axum::extract::{Path, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -23,6 +23,7 @@ use super::body::{self, Held};
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
+use crate::query::Query;
 use crate::views;
 
 pub(super) type Answer<T> = Result<Json<T>, Error>;

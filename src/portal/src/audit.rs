@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use access::{Action, Sparing};
 use axum::Extension;
-use axum::extract::{Query, State as AxumState};
+use axum::extract::State as AxumState;
 use axum::http::Method;
 use axum::response::Response;
 use futures_util::StreamExt;
@@ -20,6 +20,7 @@ use super::api_v1::lines;
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
+use crate::query::Query;
 
 /// Longest text of an object: some hold names that a client chose.
 const LONGEST: usize = 300;

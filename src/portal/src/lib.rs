@@ -32,6 +32,7 @@ mod policy;
 mod principals;
 mod proxies;
 mod push;
+mod query;
 mod robots;
 mod routes;
 mod shadow;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use api::Stubs;
 use api::stub::{ARCHITECTURE, SIGNATURE};
 use axum::body::Body;
-use axum::extract::{OriginalUri, Path, Query, State};
+use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -18,6 +18,7 @@ use tokio_util::io::ReaderStream;
 use super::guard::{Caller, Peer};
 use crate::app::App;
 use crate::errors::Error;
+use crate::query::Query;
 
 /// Read from the archive at a time.
 const CHUNK: usize = 64 << 10;

@@ -1,0 +1,168 @@
+//! A page in a real browser (Chromium), with roslib in it, that shows a token in each way that a page can.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::robot::PATIENCE;
+use support::world::world;
+use support::{Verdict, binaries};
+
+use crate::access::{daemon, pushes_adder, token};
+
+/// Adds two numbers over connections that show the token in the way that each is named by, and tells what came of it.
+const PAGE: &str = r#"<!doctype html>
+<title>A robot's page</title>
+<script src="/roslib.js"></script>
+<script>
+const Native = window.WebSocket;
+const adds = (url, prepare, protocols) => new Promise((resolve) => {
+  window.WebSocket = function (address) {
+    return protocols ? new Native(address, protocols) : new Native(address);
+  };
+  const ros = new ROSLIB.Ros();
+  ros.on('error', () => resolve('refused'));
+  ros.on('close', () => resolve('closed'));
+  ros.on('connection', () => {
+    prepare(ros);
+    const adder = new ROSLIB.Service({ ros, name: '/add_two', serviceType: 'adder_py/AddTwo' });
+    adder.callService({ a: 40, b: 2 }, (answer) => { resolve(answer.sum); ros.close(); }, resolve);
+  });
+  ros.connect(url);
+});
+(async () => {
+  const asked = await (await fetch('/asked')).json();
+  const said = {};
+  for (const [whose, token] of Object.entries(asked.tokens)) {
+    const { url } = asked;
+    said[whose] = {
+      query: await adds(`${url}&token=${token}`, () => {}),
+      auth: await adds(url, (ros) => ros.authenticate(token, 'page', 'portal', 'x', 0, 'robot', 0)),
+      subprotocol: await adds(url, () => {}, ['rosbridge', `bearer.${token}`]),
+    };
+  }
+  await fetch('/said', { method: 'POST', body: JSON.stringify(said) });
+})().catch((error) => fetch('/said', { method: 'POST', body: JSON.stringify(String(error)) }));
+</script>
+"#;
+
+/// A browser, which ends with this value.
+struct Browser(Child);
+
+impl Browser {
+    fn opens(url: &str, profile: &std::path::Path) -> anyhow::Result<Browser> {
+        let child = Command::new("chromium")
+            .args([
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--disable-dev-shm-usage",
+            ])
+            .args([
+                "--no-first-run",
+                "--disable-background-networking",
+                "--disable-component-update",
+            ])
+            .arg(format!("--user-data-dir={}", profile.display()))
+            .arg(url)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .context("chromium, which make deps installs")?;
+        Ok(Browser(child))
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Gives the page, roslib and what is asked of it, until the page has said what came of it.
+fn serve(listener: &TcpListener, asked: &Value, said: &mpsc::Sender<Value>) -> anyhow::Result<()> {
+    let roslib = std::fs::read(binaries::node_modules().join("roslib/build/roslib.min.js"))?;
+    let asked = asked.to_string();
+    for stream in listener.incoming() {
+        let mut stream: TcpStream = stream?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        let mut reader = BufReader::new(stream.try_clone()?);
+        let (mut head, mut length) = (String::new(), 0);
+        while reader.read_line(&mut head)? > 2 {
+            let line = head.lines().last().unwrap_or_default().to_lowercase();
+            if let Some(value) = line.strip_prefix("content-length:") {
+                length = value.trim().parse()?;
+            }
+        }
+        let mut body = vec![0; length];
+        reader.read_exact(&mut body)?;
+        let path = head.split(' ').nth(1).unwrap_or_default();
+        let (kind, answer) = match path {
+            "/" => ("text/html", PAGE.as_bytes()),
+            "/roslib.js" => ("text/javascript", &*roslib),
+            "/asked" => ("application/json", asked.as_bytes()),
+            _ => ("text/plain", &[][..]),
+        };
+        write!(
+            stream,
+            "HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
+            answer.len()
+        )?;
+        stream.write_all(answer)?;
+        if path == "/said" {
+            said.send(serde_json::from_slice(&body)?)?;
+            return Ok(());
+        }
+    }
+    Ok(())
+}
+
+pub fn a_page_with_roslib_shows_its_token() -> Verdict {
+    let daemon = daemon("browser")?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    pushes_adder(&daemon, &admin, &[])?.succeeded()?;
+    let robot = |name: &str, service: &str| {
+        let words = [
+            name,
+            "--role",
+            "robot",
+            "--robot",
+            name,
+            "--service",
+            service,
+        ];
+        token(&daemon, &words)
+    };
+    let (page, other) = (robot("page", "adder_py")?, robot("other", "other_*")?);
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let port = listener.local_addr()?.port();
+    let (sender, said) = mpsc::channel();
+    let asked = json!({
+        "url": daemon.url("adder_py?robot=page"),
+        "tokens": {"own": page, "another's": other, "unknown": "0".repeat(52)},
+    });
+    let serving = std::thread::spawn(move || serve(&listener, &asked, &sender));
+    let profile = world().directory("profile")?;
+    let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path())?;
+    let said = said.recv_timeout(PATIENCE + Duration::from_secs(60));
+    drop(browser);
+    let said = said.context("the page said nothing")?;
+    serving.join().expect("the server of the page")?;
+    for way in ["query", "auth", "subprotocol"] {
+        ensure!(said["own"][way] == 42, "{way}: {said}");
+        for whose in ["another's", "unknown"] {
+            let came = &said[whose][way];
+            ensure!(
+                came == "refused" || came == "closed",
+                "{whose} {way}: {said}"
+            );
+        }
+    }
+    Ok(())
+}
