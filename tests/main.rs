@@ -58,6 +58,8 @@ mod mishaps;
 mod names;
 #[path = "stories/operations.rs"]
 mod operations;
+#[path = "stories/pairing.rs"]
+mod pairing;
 #[path = "stories/patience.rs"]
 mod patience;
 #[path = "stories/portal.rs"]
@@ -210,6 +212,13 @@ fn main() -> ExitCode {
             explain_names_a_clock_and_a_queue,
             settings_are_changed_through_dynamic_reconfigure,
             pictures_are_made_smaller_where_the_link_is_slow,
+        ],
+        stories![pairing:
+            a_robot_is_paired_by_a_line_and_gone_at_a_word,
+            certificates_renew_themselves_and_end_while_the_robot_is_off,
+            what_cannot_be_paired_is_said,
+            a_labs_own_authority_speaks_for_its_robots,
+            a_stub_is_installed_and_paired_by_one_line,
         ],
         stories![patience: a_node_that_waits_is_seen_whole_and_driven_by_its_robot],
         stories![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],

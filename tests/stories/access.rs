@@ -131,7 +131,9 @@ pub fn expired(daemon: &Daemon) -> anyhow::Result<String> {
 
 pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
     let daemon = daemon("matrix")?;
-    let rows = matrix()?;
+    let mut rows = matrix()?;
+    // Who shows a code is told by the stories of pairing.
+    rows.retain(|row| row.path != "/api/v1/pair");
     let asks = |row: &Row, address: &str, token: Option<&str>| {
         let bearer = token.map(|token| format!("Bearer {token}"));
         let headers = bearer.as_deref().map(|bearer| ("Authorization", bearer));

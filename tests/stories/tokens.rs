@@ -86,6 +86,8 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         ("HEAD", "/healthz", false, 200),
         ("GET", "/assets/x", false, 404),
         ("HEAD", "/assets/x", false, 404),
+        // Who shows a pairing code needs no token, but TLS.
+        ("POST", "/api/v1/pair", false, 400),
         ("GET", "/no_such_service", true, 400),
         ("GET", "/no_such_service/", true, 400),
     ];

@@ -24,13 +24,15 @@ pub enum Action {
     Operate,
     /// Be a robot at a service.
     Connect,
+    /// Pair robots, and end that.
+    Pair,
     /// Tokens and policy.
     Administer,
 }
 
 impl Action {
     /// All of them.
-    pub const ALL: [Action; 9] = [
+    pub const ALL: [Action; 10] = [
         Action::Enter,
         Action::Look,
         Action::See,
@@ -39,6 +41,7 @@ impl Action {
         Action::Deploy,
         Action::Operate,
         Action::Connect,
+        Action::Pair,
         Action::Administer,
     ];
 
@@ -53,6 +56,7 @@ impl Action {
             Action::Deploy => "deploy",
             Action::Operate => "operate",
             Action::Connect => "connect",
+            Action::Pair => "pair",
             Action::Administer => "administer",
         }
     }
@@ -67,6 +71,7 @@ impl Action {
             Action::Deploy => "deploy",
             Action::Operate => "operate",
             Action::Connect => "connect to",
+            Action::Pair => "pair robots with",
             Action::Administer => "administer",
         }
     }
@@ -157,7 +162,7 @@ fn allows(role: Role, principal: &Principal, action: Action, object: &Object<'_>
     match (role, action) {
         (Role::Admin, _) => true,
         (Role::Operator, action) => action != Action::Administer,
-        (_, Action::Administer) => false,
+        (_, Action::Pair | Action::Administer) => false,
         (_, Action::Enter) => true,
         (Role::Viewer, Action::Look) => principal.scope.has_all(),
         (_, Action::Look) => false,
@@ -395,6 +400,9 @@ mod tests {
             }
             if action == Action::Administer {
                 prop_assert_eq!(allowed, principal.is(Role::Admin));
+            }
+            if action == Action::Pair {
+                prop_assert_eq!(allowed, principal.is_unscoped());
             }
             let changes = matches!(action, Action::Deploy | Action::Operate | Action::Logs | Action::Try);
             if changes && allowed && !principal.is_unscoped() {

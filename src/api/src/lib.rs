@@ -16,6 +16,7 @@ pub mod grants;
 pub mod group;
 pub mod interface;
 pub mod limits;
+pub mod machines;
 pub mod problem;
 pub mod push;
 pub mod rollout;

@@ -1,4 +1,4 @@
-//! The command line. Launchers write it, people only type `doctor`.
+//! The command line. Launchers write it, people only type `doctor` and `pair`.
 
 use std::path::PathBuf;
 
@@ -22,6 +22,8 @@ pub enum Verb {
     ExecOriginal(ExecOriginal),
     /// Say of each thing the stub needs whether it is there.
     Doctor(Doctor),
+    /// Pair this robot with a server: make its own key, and have a certificate of it.
+    Pair(Pair),
 }
 
 /// Which executable is meant.
@@ -58,6 +60,17 @@ pub struct ExecOriginal {
     /// Passed on as it is.
     #[arg(last = true, allow_hyphen_values = true)]
     pub argv: Vec<String>,
+}
+
+/// Pair.
+#[derive(Debug, Args)]
+pub struct Pair {
+    /// What cloudroidctl pair ROBOT printed on the server, between single quotes.
+    #[arg(value_name = "LINE")]
+    pub line: String,
+    /// Directory of the robot's key and certificates; ~/.config/cloudroid by default.
+    #[arg(long, value_name = "DIR", env = "CLOUDROID_IDENTITY")]
+    pub identity: Option<PathBuf>,
 }
 
 /// Check.

@@ -8,6 +8,7 @@
 //! # signs itself is remembered when it is first seen, in the file that known_servers names.
 //! fingerprint = "SHA256:5d215d215d215d215d215d215d215d215d215d215d215d215d215d215d215d21"
 //! known_servers = "~/.config/cloudroid/known_servers"
+//! identity = "~/.config/cloudroid"    # for wss://: where this robot's key and certificates are, once it is paired
 //! token_file = "~/.config/cloudroid/token"   # holds the bearer token; none is needed where the portal asks for none
 //! robot = "rover1"                     # this robot's id; by default its host name
 //!
@@ -70,6 +71,7 @@ use serde::{Deserialize, Serialize};
 use tls::{Fingerprint, KnownServers, Trust};
 
 use crate::address::Address;
+use crate::pairing;
 use crate::revision::Defaults;
 
 pub use parameters::{Group, groups};
@@ -105,7 +107,10 @@ pub struct Config {
     /// For `wss://`: where certificates are remembered that were seen first; below the user's configuration where absent.
     #[serde(default)]
     pub known_servers: Option<PathBuf>,
-    /// This robot's id; its host name where absent.
+    /// For `wss://`: directory of the robot's own key and certificates; below the user's configuration where absent.
+    #[serde(default)]
+    pub identity: Option<PathBuf>,
+    /// This robot's id; where absent, the one that it is paired as, or else its host name.
     #[serde(default)]
     pub robot: Option<String>,
     /// T_desire in seconds.
@@ -241,8 +246,10 @@ impl Config {
                 .ok()
                 .and_then(|name| name.into_string().ok())
         };
+        let paired = || pairing::robot(self);
         self.robot
             .clone()
+            .or_else(paired)
             .or_else(host)
             .unwrap_or_else(|| "robot".to_owned())
     }
@@ -252,16 +259,23 @@ impl Config {
         Address::parse(&self.server)
     }
 
-    /// Whom to trust where TLS is spoken.
-    pub fn trust(&self) -> Trust {
+    /// Whom to trust where TLS is spoken, and what to show there.
+    pub fn trust(&self) -> anyhow::Result<Trust> {
         let named = self.known_servers.as_deref().map(at_home);
-        Trust {
+        // Where a robot's certificates are, there pairing has left what it knows of servers.
+        let beside = self.identity.as_deref().map(at_home);
+        let beside = beside.map(|directory| directory.join("known_servers"));
+        Ok(Trust {
             authorities: self.ca_file.as_deref().map(at_home),
             fingerprint: self.fingerprint,
-            known: named.map(KnownServers::at).or_else(KnownServers::of_user),
+            known: named
+                .or(beside)
+                .map(KnownServers::at)
+                .or_else(KnownServers::of_user),
             accept: "install.sh --fingerprint".to_owned(),
             advice: NOBODY_TRUSTED,
-        }
+            identity: pairing::identity(self)?,
+        })
     }
 
     /// The bearer token.
@@ -280,7 +294,7 @@ impl Config {
 }
 
 /// A path with `~` for the user's own directory.
-fn at_home(path: &Path) -> PathBuf {
+pub fn at_home(path: &Path) -> PathBuf {
     let home = std::env::var_os("HOME").map(PathBuf::from);
     match (path.strip_prefix("~"), home) {
         (Ok(below), Some(home)) => home.join(below),

@@ -13,7 +13,7 @@ use ws::WebSocket;
 use crate::address::Address;
 use crate::config::Config;
 use crate::resolver;
-use crate::stream::Stream;
+use crate::stream::{Stream, refused_certificate};
 
 /// For TCP's own handshake.
 const TCP: Duration = Duration::from_secs(2);
@@ -45,7 +45,9 @@ pub async fn open(
     patience: Duration,
 ) -> Result<WebSocket<Stream>, Error> {
     let address = config.address().map_err(Error::Refused)?;
-    let trust = config.trust();
+    let trust = config
+        .trust()
+        .map_err(|error| Error::Refused(format!("{error:#}")))?;
     let opening = handshake(&address, &trust, path, token);
     match timeout(patience, opening).await {
         Ok(opened) => opened,
@@ -63,8 +65,9 @@ async fn handshake(
     token: Option<&str>,
 ) -> Result<WebSocket<Stream>, Error> {
     let authority = &address.authority;
-    let unreachable = |what: &str, error: std::io::Error| {
-        Error::Unreachable(format!("{what} {authority}: {error}"))
+    let unreachable = |what: &str, error: std::io::Error| match refused_certificate(&error) {
+        Some(words) => Error::Refused(format!("{authority} refuses this robot: {words}")),
+        None => Error::Unreachable(format!("{what} {authority}: {error}")),
     };
     let ip = resolver::resolve(&address.host)
         .await
@@ -93,8 +96,13 @@ async fn handshake(
     }
     request.push_str("\r\n");
     let sent = stream.write_all(request.as_bytes()).await;
-    sent.map_err(|error| unreachable("cannot write to", error))?;
     let mut answer = Vec::new();
+    if let Err(error) = sent {
+        // What the server has said before it closed says more.
+        let said = stream.read_buf(&mut answer).await.err();
+        let said = said.filter(|said| refused_certificate(said).is_some());
+        return Err(unreachable("cannot write to", said.unwrap_or(error)));
+    }
     let end = loop {
         if let Some(end) = find(&answer, b"\r\n\r\n") {
             break end + 4;
@@ -123,7 +131,7 @@ async fn handshake(
     if status != 101 {
         let problem = body(&mut stream, &head, answer.split_off(end)).await;
         let mut text = format!("{authority} answers {status}: {problem}");
-        if status == 401 {
+        if status == 401 && trust.identity.is_none() {
             text.push_str("; on this robot: install.sh --token TOKEN, or token_file in stub.toml");
         }
         // No room and the like pass; what this stub is does not.

@@ -1,6 +1,5 @@
 //! `cloudroid-stub doctor`: each thing that a stub needs, whether it is there, and the command that fixes it.
 
-mod http;
 mod overlay;
 mod server;
 

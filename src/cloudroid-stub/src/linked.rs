@@ -233,9 +233,12 @@ impl Link<'_> {
 async fn open(config: &Config, node: &str) -> Result<WebSocket<Stream>, connect::Error> {
     let stated = terms::query(config, node);
     let path = format!("/{}?robot={}{stated}", config.service, config.robot());
-    let token = config
-        .token()
-        .map_err(|error| connect::Error::Refused(format!("{error:#}")))?;
+    let refused = |error: anyhow::Error| connect::Error::Refused(format!("{error:#}"));
+    // Who is paired shows its certificate, and an older token says nothing that counts.
+    let token = match config.trust().map_err(refused)?.identity {
+        Some(_) => None,
+        None => config.token().map_err(refused)?,
+    };
     connect::open(config, &path, token.as_deref(), CONNECT).await
 }
 

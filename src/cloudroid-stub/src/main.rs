@@ -18,11 +18,13 @@ mod arguments;
 mod config;
 mod connect;
 mod doctor;
+mod http;
 mod linked;
 mod local;
 mod machine;
 mod mirror;
 mod original;
+mod pairing;
 mod parameters;
 mod resolver;
 mod revision;
@@ -55,6 +57,7 @@ fn main() -> ExitCode {
         Verb::Run(asked) => run::run(&asked),
         Verb::ExecOriginal(asked) => original::exec(&asked.node, &asked.argv),
         Verb::Doctor(asked) => doctor::examine(&asked),
+        Verb::Pair(asked) => pairing::pair(&asked),
     };
     outcome.unwrap_or_else(|error| {
         eprintln!("cloudroid-stub: {error:#}");

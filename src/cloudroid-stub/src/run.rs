@@ -30,6 +30,7 @@ use crate::machine;
 use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::{Mirror, promise};
 use crate::original;
+use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
 use crate::robot::{Robot, usual_name};
@@ -121,6 +122,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         parameters,
         ..Hello::default()
     };
+    let renewing = tokio::spawn(pairing::keep_renewed(config.clone()));
     let mut exit = mirror.exit();
     let end = {
         let linked = linked::keep(&config, &mirror, &mut hello);
@@ -148,6 +150,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
             }
         }
     };
+    renewing.abort();
     // In good order: the cloud ends what is left of the node at once.
     mirror.session().end(1000, "the robot's node ended");
     bus.close().await;

@@ -4,7 +4,7 @@ use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
-use tls::Trust;
+use tls::{Fingerprint, Trust};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio_rustls::client::TlsStream;
@@ -36,6 +36,17 @@ impl Stream {
             );
         }
         Ok(Self::Tls(Box::new(connected.stream)))
+    }
+
+    /// The fingerprint of the certificate that the portal has shown.
+    pub fn fingerprint(&self) -> Option<Fingerprint> {
+        match self {
+            Self::Plain(_) => None,
+            Self::Tls(tls) => {
+                let shown = tls.get_ref().1.peer_certificates()?;
+                shown.first().map(Fingerprint::of)
+            }
+        }
     }
 
     /// What it goes over.
@@ -79,6 +90,29 @@ fn explained(error: io::Error) -> io::Error {
         _ => return error,
     };
     io::Error::other(format!("{error}: {next}"))
+}
+
+/// Why a server refused the certificate that this robot shows, and what to do, where it said so by an alert (RFC 8446, section 6.2).
+/// It comes with the first bytes that are read: in TLS 1.3 a client has done with the handshake before its certificate is looked at.
+pub fn refused_certificate(error: &io::Error) -> Option<&'static str> {
+    use rustls::AlertDescription as Alert;
+    let rustls::Error::AlertReceived(alert) = error.get_ref()?.downcast_ref()? else {
+        return None;
+    };
+    match alert {
+        Alert::CertificateExpired => Some(
+            "its certificate has expired, because it was off, or the server away, for longer than that is good; pair it again: on the \
+             server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
+        ),
+        Alert::UnknownCA
+        | Alert::BadCertificate
+        | Alert::CertificateUnknown
+        | Alert::DecryptError => Some(
+            "no authority that the server trusts has signed its certificate, as when the server was set up anew; pair it again: on the \
+             server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
+        ),
+        _ => None,
+    }
 }
 
 impl AsyncRead for Stream {

@@ -248,6 +248,7 @@ impl Client {
             known: KnownServers::of_user(),
             accept: format!("cloudroidctl trust {}", self.server),
             advice: NOBODY_TRUSTED,
+            identity: None,
         };
         let connecting = trust.connect(stream, host.trim_matches(['[', ']']), authority);
         let connected = timeout(CONNECTING, connecting)

@@ -13,6 +13,7 @@ mod fit;
 mod limits;
 mod logs;
 mod output;
+mod pair;
 mod policy;
 mod push;
 mod rm;
@@ -89,6 +90,8 @@ enum Verb {
     Explain(explain::Explain),
     Fit(fit::Fit),
     Token(token::Tokens),
+    Pair(pair::Pair),
+    Unpair(pair::Unpair),
     Audit(audit::Audit),
     Policy(policy::Policy),
     Trust(trust::TrustServer),
@@ -142,6 +145,8 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Calibrate(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Fit(verb) => verb.run(&client, format).await,
+        Verb::Pair(verb) => verb.run(&client, format).await,
+        Verb::Unpair(verb) => verb.run(&client, format).await,
         Verb::Token(verb) => verb.run(&client, format).await,
         Verb::Audit(verb) => verb.run(&client, format).await,
         Verb::Policy(verb) => verb.run(&client, format).await,

@@ -64,7 +64,7 @@ struct Rotate {
 }
 
 /// `90s`, `30m`, `12h`, `30d`.
-fn lifetime(text: &str) -> Result<Duration, String> {
+pub fn lifetime(text: &str) -> Result<Duration, String> {
     let bad = || "write a whole number with s, m, h or d, such as 30d".to_owned();
     let (number, unit) = text.split_at(text.len() - text.chars().last().map_or(0, char::len_utf8));
     let seconds: u64 = match unit {
@@ -79,7 +79,7 @@ fn lifetime(text: &str) -> Result<Duration, String> {
     length.map(Duration::from_secs).ok_or_else(bad)
 }
 
-fn patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
+pub fn patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
     Ok(texts
         .iter()
         .map(|text| text.parse())

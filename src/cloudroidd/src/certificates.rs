@@ -8,10 +8,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use portal::{App, Tls};
+use anyhow::Context;
+use authority::Authority;
+use portal::{App, Robots, Tls};
 use rcgen::{CertificateParams, DnType, KeyPair};
 use store::{Journal, NewEvent, private};
-use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 
 use crate::config;
@@ -21,6 +23,8 @@ use crate::home::Home;
 const LOOK: Duration = Duration::from_secs(1);
 /// The daemon's own certificate and its key.
 const OWN: &str = "own.pem";
+/// The authority of robots' certificates and its key.
+const AUTHORITY: &str = "authority.pem";
 
 /// Why there is no certificate.
 #[derive(Debug, thiserror::Error)]
@@ -33,7 +37,7 @@ pub enum Error {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: tokio_rustls::rustls::pki_types::pem::Error,
+        source: pem::Error,
     },
     /// A file without one.
     #[error("{0} holds no certificate; it should be a PEM file with BEGIN CERTIFICATE")]
@@ -69,19 +73,43 @@ pub enum Error {
 /// A certificate with those that lead from it to an authority, and its key.
 type Pair = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
 
-fn read(certificate: &Path, key: &Path) -> Result<Pair, Error> {
-    let unreadable = |what, path: &Path| {
-        let path = path.to_owned();
-        move |source| Error::Unreadable { what, path, source }
-    };
-    let chain = CertificateDer::pem_file_iter(certificate)
+fn unreadable(what: &'static str, path: &Path) -> impl FnOnce(pem::Error) -> Error {
+    let path = path.to_owned();
+    move |source| Error::Unreadable { what, path, source }
+}
+
+fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error> {
+    let read = CertificateDer::pem_file_iter(path)
         .and_then(Iterator::collect::<Result<Vec<_>, _>>)
-        .map_err(unreadable("certificate", certificate))?;
-    if chain.is_empty() {
-        return Err(Error::None(certificate.to_owned()));
+        .map_err(unreadable("certificate", path))?;
+    match read.is_empty() {
+        true => Err(Error::None(path.to_owned())),
+        false => Ok(read),
     }
+}
+
+fn read(certificate: &Path, key: &Path) -> Result<Pair, Error> {
+    let chain = certificates(certificate)?;
     let key = PrivateKeyDer::from_pem_file(key).map_err(unreadable("key", key))?;
     Ok((chain, key))
+}
+
+/// The authority of robots' certificates, where TLS is spoken: made at the first time.
+pub fn robots(
+    config: &config::Tls,
+    home: &Home,
+    listen: SocketAddr,
+) -> anyhow::Result<Option<Robots>> {
+    if !config.is_spoken(listen) {
+        return Ok(None);
+    }
+    let directory = home.path().join("tls");
+    private::make_directory(&directory)
+        .with_context(|| format!("cannot make {}", directory.display()))?;
+    Ok(Some(Robots {
+        authority: Authority::of_file(&directory.join(AUTHORITY))?,
+        lifetime: config.robot_certificates.0,
+    }))
 }
 
 /// TLS for a portal that listens at `listen`, where it is spoken there.
@@ -89,10 +117,11 @@ pub fn tls(
     config: &config::Tls,
     home: &Home,
     listen: SocketAddr,
+    robots: Option<&Robots>,
 ) -> Result<Option<Arc<Tls>>, Error> {
-    if !config.is_spoken(listen) {
+    let Some(robots) = robots else {
         return Ok(None);
-    }
+    };
     let (certificate, key) = match config.files() {
         Some(files) => files,
         None => {
@@ -108,7 +137,11 @@ pub fn tls(
         path: certificate,
         source,
     };
-    let tls = Tls::new(chain, key).map_err(unusable)?;
+    let others = match &config.client_authorities {
+        Some(path) => certificates(path)?,
+        None => Vec::new(),
+    };
+    let tls = Tls::new(chain, key, robots.authority.certificate(), others).map_err(unusable)?;
     warn_of_other_names(&tls, &config.names);
     Ok(Some(Arc::new(tls)))
 }

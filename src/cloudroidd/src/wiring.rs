@@ -77,11 +77,13 @@ pub fn build(
     let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
     let doubts = config.doubts(machine::has());
+    let robots = certificates::robots(&config.tls, home, listen)?;
     Ok(Arc::new(App {
         principals,
         audit: Audit::new(Arc::clone(&state)),
         listen,
-        tls: certificates::tls(&config.tls, home, listen)?,
+        tls: certificates::tls(&config.tls, home, listen, robots.as_ref())?,
+        robots,
         signing: Arc::new(sign::SigningKey::of_file(&home.signing_key())?),
         home: home.path().to_owned(),
         state,

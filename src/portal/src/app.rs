@@ -58,6 +58,8 @@ pub struct App {
     pub listen: std::net::SocketAddr,
     /// TLS of the TCP listener; none: plain text.
     pub tls: Option<Arc<Tls>>,
+    /// What signs robots' certificates, where TLS is spoken.
+    pub robots: Option<crate::machines::Robots>,
     /// What stubs are signed by.
     pub signing: Arc<sign::SigningKey>,
     /// The state directory.

@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
 use choreographer::{Refused, Unchanged, Untenable, with_last_words};
 
-use crate::principals::Unrecognised;
+use crate::principals::{Uncertified, Uncoded, Unrecognised};
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +51,23 @@ pub enum Error {
     /// A token that lets nobody in.
     #[error(transparent)]
     Unrecognised(#[from] Unrecognised),
+    /// A certificate that lets nobody in.
+    #[error(transparent)]
+    Uncertified(#[from] Uncertified),
+    /// A pairing code that pairs nobody.
+    #[error(transparent)]
+    Uncoded(#[from] Uncoded),
+    /// A certificate that is not made.
+    #[error(transparent)]
+    Uncertifiable(authority::Error),
+    /// The robot is not paired, and no code waits for it.
+    #[error("no robot {name:?} is paired, and no pairing code waits for one")]
+    UnknownPairing {
+        /// Asked for.
+        name: String,
+        /// Those that there are.
+        exists: Vec<String>,
+    },
     /// HTTP without TLS, where TLS is spoken.
     #[error("this port speaks https, and this request came as plain text")]
     PlainText {
@@ -204,6 +221,7 @@ impl Error {
         if let Error::UnknownRobot { exists, .. }
         | Error::UnknownRow { exists, .. }
         | Error::UnknownToken { exists, .. }
+        | Error::UnknownPairing { exists, .. }
         | Error::UnknownRule { exists, .. } = self
         {
             problem.exists = exists.clone();
@@ -297,6 +315,18 @@ impl Error {
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 (S::UNAUTHORIZED, "unauthorised", "token needed")
             }
+            Error::Uncertified(_) => (S::UNAUTHORIZED, "unpaired", "robot not paired"),
+            Error::Uncoded(_) => (S::UNAUTHORIZED, "pairing-code", "no pairing"),
+            Error::Uncertifiable(authority::Error::Unmade { .. } | authority::Error::Io { .. }) => {
+                INTERNAL
+            }
+            Error::Uncertifiable(authority::Error::TooLong(_)) => {
+                (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
+            }
+            Error::Uncertifiable(_) => {
+                (S::BAD_REQUEST, "no-request", "no request for a certificate")
+            }
+            Error::UnknownPairing { .. } => (S::NOT_FOUND, "unknown-pairing", "unknown robot"),
             Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https is spoken here"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
@@ -335,6 +365,10 @@ impl Error {
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }
+            Error::Uncertified(_) | Error::Uncoded(_) => {
+                "have it paired: on the server cloudroidctl pair ROBOT, on the robot cloudroid-stub pair 'LINE'".into()
+            }
+            Error::UnknownPairing { .. } => "see those that there are with: cloudroidctl pair --list".into(),
             Error::PlainText { instead } => format!(
                 "use {instead}; what was sent, such as a token, could be read by anybody on the way"
             ),

@@ -27,7 +27,7 @@ use tokio_rustls::rustls::pki_types::CertificateDer;
 
 use crate::app::App;
 use crate::errors::Error;
-use crate::principals::{Identity, Recognising, Shown};
+use crate::principals::{Identity, Recognising, Shown, Uncertified};
 use crate::routes::{self, Access};
 use crate::tokens;
 
@@ -93,10 +93,6 @@ pub struct Connection {
     /// Whether a proxy that the operator named asks for somebody else, whose address the peer is then.
     pub forwarded: bool,
     /// The certificates that the client has shown in TLS, its own first; none where it showed none.
-    #[cfg_attr(
-        not(test),
-        expect(dead_code, reason = "no certificate of a client is asked for")
-    )]
     pub certificates: Arc<[CertificateDer<'static>]>,
 }
 
@@ -131,7 +127,7 @@ impl Caller {
         !self.who.principal.roles.is_empty()
     }
 
-    fn new(connection: &Connection, principal: Principal, shown: Shown) -> Caller {
+    pub(crate) fn new(connection: &Connection, principal: Principal, shown: Shown) -> Caller {
         let who = Identity {
             principal: Arc::new(principal),
             shown,
@@ -177,12 +173,15 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
             known,
             origins: &app.options.origins,
         };
-        rules.admit(
-            &connection,
-            request.method(),
-            request.uri(),
-            request.headers(),
-        )
+        let (uri, headers) = (request.uri(), request.headers());
+        if let Some(certified) = certified(&app, &connection, known) {
+            // A token that is shown beside it says who asks; and no page uses a browser's certificate.
+            if token_in(uri, headers).is_none() {
+                rules.check_origin(headers)?;
+                return Ok(Caller::by(&connection, certified?));
+            }
+        }
+        rules.admit(&connection, request.method(), uri, headers)
     });
     match admitted {
         Ok(caller) => {
@@ -199,9 +198,28 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
                 app.audit
                     .record_sparingly(&nobody, Action::Enter, &did, what, status);
             }
+            if let Error::Uncertified(why) = &error {
+                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
+                let did = format!("{} {}", request.method(), request.uri().path());
+                let (object, status) = (why.to_string(), error.problem().status);
+                app.audit
+                    .record_sparingly(&nobody, Action::Enter, &did, &object, status);
+            }
             error.into_response()
         }
     }
+}
+
+/// Whose robot's certificate a connection has shown, if any.
+pub fn certified(
+    app: &App,
+    connection: &Connection,
+    known: Recognising<'_>,
+) -> Option<Result<Identity, Uncertified>> {
+    let own = connection.certificates.first()?;
+    let authority = &app.robots.as_ref()?.authority;
+    let shown = authority::read(own).map_err(|error| Uncertified::Nameless(error.to_string()));
+    Some(shown.and_then(|shown| known.certified(authority, &shown, store::now())))
 }
 
 /// Logs a refusal, so that the operator can allow it; at most once a minute, because pages repeat their requests.
@@ -342,6 +360,7 @@ fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
         (Access::Connect | Access::ReadOrConnect, true) => {
             *method == Method::GET && (path == "/" || is_service(path))
         }
+        (Access::Code, false) => *method == Method::POST,
         (Access::Read | Access::ReadOrConnect, false) => {
             matches!(*method, Method::GET | Method::HEAD)
         }

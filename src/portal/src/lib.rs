@@ -23,6 +23,7 @@ mod errors;
 mod explain;
 mod guard;
 mod handshake;
+mod machines;
 mod metrics;
 mod oci;
 mod openapi;
@@ -59,12 +60,15 @@ use tokio_util::task::TaskTracker;
 pub use ::tls::Fingerprint;
 pub use app::{App, Machine, Options};
 pub use audit::Audit;
+pub use machines::Robots;
 pub use principals::Principals;
 pub use proxies::{Network, NoNetwork, Proxies};
 pub use tls::{Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
 
-use guard::{Connection, Peer, User};
+use access::{Action, Principal};
+use guard::{Caller, Connection, Peer, User};
+use principals::Shown;
 use tls::Accepted;
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
@@ -175,13 +179,48 @@ async fn secured(app: Arc<App>, router: Router, stream: TcpStream, peer: Peer) {
                 certificates: tls::certificates(&stream),
                 ..Connection::plain(peer)
             };
-            serve(app, router, *stream, connection).await;
+            let ended = unpaired(&app, &connection);
+            tokio::select! {
+                // A connection that became a WebSocket goes on in its session, which is told the same.
+                () = ended => {}
+                () = serve(Arc::clone(&app), router, *stream, connection) => {}
+            }
         }
         Ok(Ok(Accepted::Plain(stream))) => {
             serve(app, tls::refusing(), stream, Connection::plain(peer)).await;
         }
-        Ok(Err(error)) => tracing::debug!("no TLS with {peer}: {error}"),
+        Ok(Err(error)) => {
+            tracing::debug!("no TLS with {peer}: {error}");
+            if let Some(refused) = tls::refused_certificate(&error) {
+                let nobody = Caller::new(
+                    &Connection::plain(peer),
+                    Principal::nobody(),
+                    Shown::Nothing,
+                );
+                let did = format!("showed a certificate that was refused: {refused}");
+                let status = axum::http::StatusCode::UNAUTHORIZED.as_u16();
+                app.audit
+                    .record_sparingly(&nobody, Action::Enter, &did, "the server", status);
+            }
+        }
         Err(_) => tracing::debug!("no TLS with {peer}: its handshake did not end in time"),
+    }
+}
+
+/// Comes back when the pairing ends of the robot whose certificate a connection has shown.
+fn unpaired(app: &Arc<App>, connection: &Connection) -> impl Future<Output = ()> + use<> {
+    let who = app
+        .principals
+        .with(|known| guard::certified(app, connection, known));
+    let app = Arc::clone(app);
+    async move {
+        match who {
+            Some(Ok(who)) => {
+                app.principals.ended(&who, "", false).await;
+            }
+            // Who shows none, or one that is refused, is answered so.
+            _ => std::future::pending().await,
+        }
     }
 }
 

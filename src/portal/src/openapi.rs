@@ -24,7 +24,7 @@ use utoipa::openapi::{
 use utoipa::{IntoParams, ToSchema};
 
 use crate::errors::Error;
-use crate::routes::{ROUTES, Route};
+use crate::routes::{Access, ROUTES, Route};
 
 /// What all addresses that are described begin with.
 const BASE: &str = "/api/v1";
@@ -164,6 +164,10 @@ fn document(routes: &[Route]) -> OpenApi {
         let Operation { mut built, schemas } = operation();
         for parameter in named_in(path) {
             built = built.parameter(parameter);
+        }
+        if route.access == Access::Code {
+            // Its body says who asks.
+            built = built.security(SecurityRequirement::default());
         }
         paths.add_path_operation(path, vec![method], built);
         components.schemas.extend(schemas);

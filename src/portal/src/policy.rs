@@ -17,7 +17,7 @@ use crate::errors::Error;
 /// The longest body.
 const LARGEST: usize = 64 << 10;
 
-async fn read<T: DeserializeOwned>(
+pub(super) async fn read<T: DeserializeOwned>(
     app: &App,
     caller: &Caller,
     body: Body,

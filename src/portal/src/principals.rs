@@ -1,6 +1,8 @@
 //! Who shows which token, and what it may do: the tokens of the configuration and of the database, and the policy. Changes
 //! hold at once, for open connections as for requests.
 
+mod pairings;
+
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -17,6 +19,9 @@ use tokio::sync::watch;
 
 use crate::errors::Error;
 use crate::tokens::{self, AuthMessage, Tokens};
+
+use pairings::Paired;
+pub use pairings::{Uncertified, Uncoded};
 
 /// Characters of a token: of 36 letters and digits each, that is 268 bits.
 const SECRET: usize = 52;
@@ -42,6 +47,15 @@ pub enum Shown {
         /// The secret's hash: after a rotation it is another.
         hash: TokenHash,
     },
+    /// By a certificate in TLS.
+    Certificate {
+        /// The number of the robot's pairing.
+        pairing: i64,
+        /// SHA-256 of the key that was paired; none where another authority than the daemon's signs the robot's certificates.
+        key: Option<String>,
+        /// The certificate's end.
+        until: Millis,
+    },
     /// By the kernel, at the daemon's socket.
     User,
 }
@@ -64,6 +78,7 @@ impl Identity {
     pub fn bound_by(&self) -> Option<String> {
         match &self.shown {
             Shown::Stored { id, .. } => Some(format!("token {id}")),
+            Shown::Certificate { pairing, .. } => Some(format!("pairing {pairing}")),
             _ => self.token.clone(),
         }
     }
@@ -146,6 +161,7 @@ impl Known {
 #[derive(Default)]
 pub struct Stored {
     tokens: Vec<Known>,
+    pairings: Vec<Paired>,
     /// Places in `tokens`.
     by_hash: HashMap<TokenHash, usize>,
     rules: Vec<(i64, Rule)>,
@@ -206,6 +222,11 @@ impl Stored {
             .into_iter()
             .map(read_token)
             .collect::<Result<Vec<_>, _>>()?;
+        let pairings = state
+            .pairings()?
+            .into_iter()
+            .map(pairings::read)
+            .collect::<Result<Vec<_>, _>>()?;
         let rules = state
             .rules()?
             .into_iter()
@@ -221,13 +242,14 @@ impl Stored {
                 rules: rules.iter().map(|(_, rule)| rule.clone()).collect(),
             },
             tokens,
+            pairings,
             rules,
         })
     }
 
-    /// Whether there never was a token.
+    /// Whether there never was a token, nor a robot that is paired.
     pub fn is_empty(&self) -> bool {
-        self.tokens.is_empty()
+        self.tokens.is_empty() && self.pairings.is_empty()
     }
 
     /// Whose token it is, by its hash.
@@ -343,6 +365,7 @@ impl Principals {
         let stored = self.stored.read();
         let live = stored.tokens.iter().filter(|known| known.revoked.is_none());
         owners.extend(live.map(Known::owner));
+        owners.extend(stored.paired_owners());
         drop(stored);
         self.state.release_robots(&owners).map(|_| ())
     }
@@ -393,8 +416,10 @@ impl Principals {
 
     /// Remembers that a token was shown, to the minute.
     pub fn note_use(&self, identity: &Identity, now: Millis) {
-        let Shown::Stored { id, .. } = identity.shown else {
-            return;
+        let id = match identity.shown {
+            Shown::Stored { id, .. } => id,
+            Shown::Certificate { pairing, .. } => return self.note_pairing(pairing, now),
+            _ => return,
         };
         let stored = self.stored.read();
         let due = stored.of_id(id).is_some_and(|known| {
@@ -424,6 +449,10 @@ impl Principals {
                 }
                 _ => Some("this token was replaced by another".to_owned()),
             },
+            Shown::Certificate { pairing, until, .. } => {
+                let over = stored.pairing_over(*pairing, *until, store::now());
+                over.map(|over| over.to_string())
+            }
             Shown::Nothing | Shown::Configured | Shown::User => None,
         };
         match over {
@@ -434,10 +463,13 @@ impl Principals {
 
     /// Until when somebody's token is good.
     fn expiry(&self, who: &Identity) -> Option<Millis> {
-        let Shown::Stored { id, .. } = who.shown else {
-            return None;
-        };
-        self.stored.read().of_id(id)?.expires
+        match who.shown {
+            Shown::Stored { id, .. } => self.stored.read().of_id(id)?.expires,
+            Shown::Certificate { pairing, until, .. } => {
+                self.stored.read().pairing_end(pairing, until)
+            }
+            _ => None,
+        }
     }
 
     /// Tells `standing` whenever that of a connection changes; never comes back.
@@ -506,6 +538,7 @@ impl Principals {
                     .fetch_max(before.last_used.load(Ordering::Relaxed), Ordering::Relaxed);
             }
         }
+        fresh.keep_uses(&stored);
         *stored = fresh;
         drop(stored);
         self.changed.send_modify(|number| *number += 1);

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, metrics, oci, openapi, page, policy, push, robots,
-    shadow, stubs,
+    App, api_v1, audit, calibration, dictionary, machines, metrics, oci, openapi, page, policy,
+    push, robots, shadow, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -28,6 +28,8 @@ pub enum Access {
     May(Action, Of),
     /// Anyone who reads.
     Read,
+    /// Who shows a pairing code.
+    Code,
     /// Any robot that connects: its first message must be rosbridge's `auth`.
     Connect,
     /// Anyone who reads, and any robot that connects.
@@ -51,13 +53,15 @@ pub enum Of {
     Handler,
 }
 
-use Access::{Connect, May, Read, ReadOrConnect};
+use Access::{Code, Connect, May, Read, ReadOrConnect};
 use Action::{Deploy, Enter, Logs, Look, Operate, See, Try};
 
 /// What each principal is told, as far as it may see it.
 const ENTER: Access = May(Enter, Of::Machine);
 /// The whole machine.
 const LOOK: Access = May(Look, Of::Machine);
+/// Pairings of robots.
+const PAIR: Access = May(Action::Pair, Of::Machine);
 /// Tokens and policy.
 const ADMINISTER: Access = May(Action::Administer, Of::Machine);
 
@@ -412,6 +416,33 @@ pub const ROUTES: &[Route] = &[
     at("DELETE", "/api/v1/policy/{id}", ADMINISTER, || delete(policy::remove_rule)).described(|| {
         operation("removeRule", "Removes a rule; that holds at once. Gives those that are left.")
             .lists::<access::Rule>()
+    }),
+    at("GET", "/api/v1/pairings", PAIR, || get(machines::list)).described(|| {
+        operation("pairings", "Robots that are paired, and those for which a pairing code waits.")
+            .lists::<api::machines::Pairing>()
+    }),
+    at("POST", "/api/v1/pairings", PAIR, || post(machines::begin)).described(|| {
+        operation("beginPairing", "Makes a pairing code for a robot. It is told here and never again.")
+            .takes::<api::machines::NewPairing>(Required::True)
+            .answers::<api::machines::PairingMade>()
+    }),
+    at("DELETE", "/api/v1/pairings/{name}", PAIR, || delete(machines::unpair)).described(|| {
+        operation("unpair", "Ends a robot's pairing and its connections; gives those that are left.")
+            .lists::<api::machines::Pairing>()
+    }),
+    at("DELETE", "/api/v1/pairings/{name}/code", PAIR, || delete(machines::cancel)).described(|| {
+        operation("cancelPairing", "Takes a robot's pairing code back; gives those that are left.")
+            .lists::<api::machines::Pairing>()
+    }),
+    at("POST", "/api/v1/pair", Code, || post(machines::pair)).described(|| {
+        operation("pair", "Gives a robot that shows its pairing code a certificate of its key.")
+            .takes::<api::machines::Pair>(Required::True)
+            .answers::<api::machines::RobotCertificate>()
+    }),
+    at("POST", "/api/v1/renew", ENTER, || post(machines::renew)).described(|| {
+        operation("renew", "Gives the paired robot that asks another certificate of its key.")
+            .takes::<api::machines::Renew>(Required::True)
+            .answers::<api::machines::RobotCertificate>()
     }),
     at("POST", "/api/v1/push", May(Deploy, Of::Handler), || {
         post(push::push).layer(DefaultBodyLimit::disable())

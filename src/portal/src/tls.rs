@@ -3,25 +3,30 @@
 use std::fmt;
 use std::io;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ::tls::Fingerprint;
 use axum::Router;
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use axum::response::{IntoResponse, Response};
 use parking_lot::RwLock;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert};
+use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert, WebPkiClientVerifier};
 use tokio_rustls::rustls::sign::CertifiedKey;
-use tokio_rustls::rustls::{self, ServerConfig};
+use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
 use tokio_rustls::server::TlsStream;
 
 use crate::errors::Error;
 
 /// The first byte of a TLS connection: a record with a handshake message (RFC 8446, section 5.1).
 const HANDSHAKE: u8 = 22;
+/// How long a client may take to read why its certificate is refused, and how many bytes it may send meanwhile.
+const LINGER: Duration = Duration::from_secs(1);
+const UNREAD: u64 = 64 << 10;
 /// What is spoken through TLS (RFC 7301).
 const HTTP_1_1: &[u8] = b"http/1.1";
 
@@ -34,6 +39,7 @@ pub struct TlsError(#[from] rustls::Error);
 pub struct Tls {
     config: Arc<ServerConfig>,
     shown: Arc<Shown>,
+    trusts_others: bool,
 }
 
 /// The certificate that is shown, and its key.
@@ -69,21 +75,36 @@ fn checked(
 }
 
 impl Tls {
-    /// Shows a certificate, followed by those that lead from it to an authority.
+    /// Shows a certificate, followed by those that lead from it to an authority. Asks clients for one, and takes those that the
+    /// daemon's authority for robots has signed, or one of `others`; who has none is let in without.
     pub fn new(
         chain: Vec<CertificateDer<'static>>,
         key: PrivateKeyDer<'static>,
+        robots: &CertificateDer<'static>,
+        others: Vec<CertificateDer<'static>>,
     ) -> Result<Tls, TlsError> {
+        let trusts_others = !others.is_empty();
+        let mut roots = RootCertStore::empty();
+        for root in others.into_iter().chain([robots.clone()]) {
+            roots.add(root)?;
+        }
+        let provider = Arc::new(ring::default_provider());
+        let clients =
+            WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+                .allow_unauthenticated()
+                .build()
+                .map_err(|error| rustls::Error::General(error.to_string()))?;
         let shown = Arc::new(Shown(RwLock::new(checked(chain, key)?)));
-        let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
-            .with_safe_default_protocol_versions()?;
+        let builder =
+            ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
         let mut config = builder
-            .with_no_client_auth()
+            .with_client_cert_verifier(clients)
             .with_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesServerCert>);
         config.alpn_protocols = vec![HTTP_1_1.to_vec()];
         Ok(Tls {
             config: Arc::new(config),
             shown,
+            trusts_others,
         })
     }
 
@@ -119,6 +140,11 @@ impl Tls {
             .is_some_and(|certificate| ::tls::speaks_for(certificate, authority))
     }
 
+    /// Whether another authority than the daemon's signs robots' certificates, too.
+    pub(crate) fn trusts_others(&self) -> bool {
+        self.trusts_others
+    }
+
     /// Makes a TLS connection of a TCP one.
     pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<Accepted> {
         let mut first = [0];
@@ -129,7 +155,23 @@ impl Tls {
             return Ok(Accepted::Plain(stream));
         }
         let acceptor = TlsAcceptor::from(Arc::clone(&self.config));
-        Ok(Accepted::Tls(Box::new(acceptor.accept(stream).await?)))
+        match acceptor.accept(stream).into_fallible().await {
+            Ok(stream) => Ok(Accepted::Tls(Box::new(stream))),
+            Err((error, stream)) => {
+                if refused_certificate(&error).is_some() {
+                    let _ = tokio::time::timeout(LINGER, linger(stream)).await;
+                }
+                Err(error)
+            }
+        }
+    }
+}
+
+/// Lets a client read the alert that it was sent: it has gone on to its request, and closing the connection before that is read would
+/// reset it (RFC 1122, section 4.2.2.13).
+async fn linger(mut stream: TcpStream) {
+    if stream.shutdown().await.is_ok() {
+        let _ = tokio::io::copy(&mut stream.take(UNREAD), &mut tokio::io::sink()).await;
     }
 }
 
@@ -138,6 +180,15 @@ pub(crate) fn certificates(stream: &TlsStream<TcpStream>) -> Arc<[CertificateDer
     let (_, connection) = stream.get_ref();
     let shown = connection.peer_certificates().unwrap_or_default();
     shown.iter().map(|one| one.clone().into_owned()).collect()
+}
+
+/// Why a client's certificate was refused, where that ended a handshake; the client is told the same by an alert (RFC 8446, section
+/// 6.2).
+pub(crate) fn refused_certificate(error: &io::Error) -> Option<String> {
+    match error.get_ref()?.downcast_ref()? {
+        rustls::Error::InvalidCertificate(why) => Some(why.to_string()),
+        _ => None,
+    }
 }
 
 /// Answers each request that comes in plain text with what is spoken here.

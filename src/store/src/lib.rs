@@ -1,5 +1,5 @@
 //! What must survive: services, their revisions, dictionaries and rollouts, who owns a robot's name, which servant is whose,
-//! tokens, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
+//! tokens, pairings, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
 //! writes, and one that only reads, which no writer holds up.
 //!
 //! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
@@ -11,6 +11,7 @@ mod backlog;
 mod dictionary;
 mod events;
 mod journal;
+mod pairings;
 pub mod private;
 mod robots;
 mod rollouts;
@@ -34,6 +35,7 @@ use backlog::Backlog;
 pub use backlog::watch;
 pub use events::{EventFilter, NewEvent};
 pub use journal::Journal;
+pub use pairings::{CodeRecord, PairingRecord};
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
@@ -41,7 +43,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 8] = [
+const MIGRATIONS: [&str; 9] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -50,6 +52,7 @@ const MIGRATIONS: [&str; 8] = [
     include_str!("006-rollouts.sql"),
     include_str!("007-access.sql"),
     include_str!("008-audit.sql"),
+    include_str!("009-pairings.sql"),
 ];
 
 /// What can go wrong.

@@ -17,7 +17,7 @@ use tokio_rustls::rustls::crypto::{
     CryptoProvider, ring, verify_tls12_signature, verify_tls13_signature,
 };
 use tokio_rustls::rustls::pki_types::pem::PemObject;
-use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
 use tokio_rustls::rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, SignatureScheme,
 };
@@ -37,6 +37,23 @@ pub struct Trust {
     pub accept: String,
     /// Where nobody is trusted yet: what to do.
     pub advice: &'static str,
+    /// What the client shows of itself to a server that asks for it.
+    pub identity: Option<Arc<Identity>>,
+}
+
+/// A certificate of the client, followed by those that lead from it to an authority, and its key.
+pub struct Identity {
+    /// The certificates.
+    pub chain: Vec<CertificateDer<'static>>,
+    /// The key of the first one.
+    pub key: PrivateKeyDer<'static>,
+}
+
+impl std::fmt::Debug for Identity {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let shown = self.chain.first().map(Fingerprint::of);
+        out.debug_tuple("Identity").field(&shown).finish()
+    }
 }
 
 /// A connection whose other end is trusted.
@@ -75,12 +92,17 @@ impl Trust {
             advice: self.advice,
             outcome: Mutex::default(),
         });
-        let config = ClientConfig::builder_with_provider(provider)
+        let builder = ClientConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()
             .map_err(io::Error::other)?
             .dangerous()
-            .with_custom_certificate_verifier(Arc::clone(&verifier) as Arc<dyn ServerCertVerifier>)
-            .with_no_client_auth();
+            .with_custom_certificate_verifier(Arc::clone(&verifier) as Arc<dyn ServerCertVerifier>);
+        let config = match &self.identity {
+            None => builder.with_no_client_auth(),
+            Some(own) => builder
+                .with_client_auth_cert(own.chain.clone(), own.key.clone_key())
+                .map_err(io::Error::other)?,
+        };
         let connected = TlsConnector::from(Arc::new(config))
             .connect(name, stream)
             .await;

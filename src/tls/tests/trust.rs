@@ -81,6 +81,7 @@ fn trust(known: Option<&Path>) -> Trust {
         known: known.map(|path| KnownServers::at(path.to_owned())),
         accept: "accept it".to_owned(),
         advice: "nobody is trusted",
+        identity: None,
     }
 }
 

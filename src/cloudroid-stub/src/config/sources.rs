@@ -35,7 +35,7 @@ pub(super) fn key_of(variable: &str) -> Option<String> {
 }
 
 /// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
-const KEYS: [&str; 32] = [
+const KEYS: [&str; 33] = [
     "server",
     "service",
     "token",
@@ -43,6 +43,7 @@ const KEYS: [&str; 32] = [
     "ca_file",
     "fingerprint",
     "known_servers",
+    "identity",
     "robot",
     "desire",
     "max",

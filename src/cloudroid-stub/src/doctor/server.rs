@@ -5,9 +5,10 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde_json::Value;
 
+use super::Check;
 use super::overlay::ExaminedStub;
-use super::{Check, http};
 use crate::config::Config;
+use crate::http;
 use crate::resolver;
 
 /// The clock is asked so often; the quickest answer counts.
@@ -64,13 +65,19 @@ impl Portal {
             let fix = format!("{installer} --token TOKEN");
             Box::new(Check::bad("token", format!("{error:#}"), fix))
         })?;
-        let token = token.filter(|token| !token.is_empty());
+        let trust = config.trust().map_err(|error| {
+            let fix = format!("{installer} --pair 'LINE'");
+            Box::new(Check::bad("pairing", format!("{error:#}"), fix))
+        })?;
+        // Who is paired shows its certificate.
+        let token = token.filter(|token| !token.is_empty() && trust.identity.is_none());
         match resolver::resolve(&address.host).await {
             Ok(ip) => Ok(Portal {
                 server: http::Server {
                     address,
                     ip,
-                    trust: config.trust(),
+                    trust,
+                    only: None,
                 },
                 token,
                 installer,
@@ -108,6 +115,10 @@ impl Portal {
         let words = body["detail"].as_str().unwrap_or_default();
         match answer.status {
             200 => {}
+            401 if self.server.trust.identity.is_some() => {
+                let fix = format!("{} --pair 'LINE' of cloudroidctl pair", self.installer);
+                return Check::bad("pairing", words, fix);
+            }
             401 | 403 => {
                 let given = match self.token {
                     Some(_) => "the token is refused",
@@ -136,7 +147,13 @@ impl Portal {
                     self.link(&format!("/stubs/{name}.tar.gz"))
                 ),
             ),
-            _ => Check::good("service", format!("{name} is published, the token is good")),
+            _ => {
+                let by = match self.server.trust.identity {
+                    Some(_) => format!("this robot is paired as {}", config.robot()),
+                    None => "the token is good".to_owned(),
+                };
+                Check::good("service", format!("{name} is published, {by}"))
+            }
         }
     }
 

@@ -25,6 +25,7 @@ impl Time {
             "s" | "" => 1.0,
             "m" | "min" => 60.0,
             "h" => 3600.0,
+            "d" => 86_400.0,
             _ => return None,
         };
         Duration::try_from_secs_f64(number * factor).ok().map(Time)

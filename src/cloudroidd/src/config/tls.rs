@@ -2,12 +2,15 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::bail;
 use serde::Deserialize;
 
+use super::time::Time;
+
 /// TLS of the portal.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tls {
     /// Where it is spoken.
@@ -18,7 +21,27 @@ pub struct Tls {
     pub key: Option<PathBuf>,
     /// Names and addresses of this machine that the certificate which the daemon makes is to have, besides those that it knows.
     pub names: Vec<String>,
+    /// How long robots' certificates are good that the daemon signs; the robots renew them in time.
+    pub robot_certificates: Time,
+    /// PEM file of authorities of the lab's own that sign robots' certificates, besides the daemon's.
+    pub client_authorities: Option<PathBuf>,
 }
+
+impl Default for Tls {
+    fn default() -> Self {
+        Tls {
+            serve: Serve::default(),
+            certificate: None,
+            key: None,
+            names: Vec::new(),
+            robot_certificates: Time::seconds(7 * 86_400),
+            client_authorities: None,
+        }
+    }
+}
+
+/// Certificates have whole seconds.
+const SHORTEST: Duration = Duration::from_secs(1);
 
 /// Where TLS is spoken.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
@@ -66,6 +89,12 @@ impl Tls {
         if self.certificate.is_some() && !self.names.is_empty() {
             bail!(
                 "names are for the certificate that the daemon makes, and certificate names another; remove one of both"
+            );
+        }
+        if self.robot_certificates.0 < SHORTEST {
+            bail!(
+                "robot_certificates is {:?}, and robots have to renew them in time; make it 1s at least, 168h is usual",
+                self.robot_certificates.0
             );
         }
         Ok(())
@@ -118,6 +147,7 @@ mod tests {
                 "names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"",
                 "remove one",
             ),
+            ("robot_certificates = \"500ms\"", "1s at least"),
         ] {
             let refused = read(text).check().expect_err(text).to_string();
             assert!(refused.contains(words), "{refused}");

@@ -1,10 +1,12 @@
 #!/bin/sh
 # Installs the stub of @PACKAGE@ on this robot, as an overlay in front of its other ROS packages, or takes it away.
 #
-#   sh install.sh [--prefix DIR] [--key KEY] [--server URL] [--ca FILE] [--fingerprint SHA256:HEX] [--token TOKEN]
+#   sh install.sh [--prefix DIR] [--pair LINE] [--key KEY] [--server URL] [--ca FILE] [--fingerprint SHA256:HEX] [--token TOKEN]
 #                 [--robot NAME] [--force]
 #   sh install.sh --uninstall [--prefix DIR]
 #
+# --pair: what cloudroidctl pair ROBOT printed on the server, between single quotes: this robot makes a key of its own and gets a
+# certificate. It names the server, its key and the robot, too.
 # --key: the server's key ("ssh-ed25519 AAAA...", or a file that holds it), which this archive has to be signed by; later ones
 # too. Without it the key that is known in the overlay, or, where none is, the one that the archive brings.
 # --ca: for a server of wss://, the certificate of the authority to trust, where the system does not.
@@ -25,7 +27,7 @@ usage() {
   sed -n '2,/^set -eu/{/^#/s/^# \{0,1\}//p;}' "$here/install.sh"
 }
 
-uninstall=false force=false prefix='' key='' server='' ca='' fingerprint='' token='' robot=''
+uninstall=false force=false prefix='' line='' key='' server='' ca='' fingerprint='' token='' robot=''
 # Installed, it stands in the overlay's share/PKG; in the archive, at its top.
 if [ ! -e "$here/.catkin" ]; then
   prefix=$(cd "$here/../.." && pwd)
@@ -34,10 +36,11 @@ while [ $# -gt 0 ]; do
   case $1 in
     --uninstall) uninstall=true ;;
     --force) force=true ;;
-    --prefix | --key | --server | --ca | --fingerprint | --token | --robot)
+    --prefix | --pair | --key | --server | --ca | --fingerprint | --token | --robot)
       [ $# -gt 1 ] || complain "$1 needs a value"
       case $1 in
         --prefix) prefix=$2 ;;
+        --pair) line=$2 ;;
         --key) key=$2 ;;
         --server) server=$2 ;;
         --ca) ca=$2 ;;
@@ -83,6 +86,20 @@ fi
 if [ -e "$share" ] && [ ! -e "$share/revision.toml" ]; then
   complain "$share is there and is no stub: choose another --prefix"
 fi
+# KEY of the line; cloudroid-stub pair looks at all of it.
+of_line() {
+  printf '%s\n' "$line" | sed -n "s/^cloudroid:.*[?&]$1=\([A-Za-z0-9_.:-]*\).*/\1/p"
+}
+if [ -n "$line" ]; then
+  case $line in
+    cloudroid://*/?*robot=*code=*) ;;
+    *) complain "--pair needs the line that cloudroidctl pair ROBOT prints, which begins with cloudroid://, between single quotes" ;;
+  esac
+  if [ -z "$key" ]; then key=$(of_line key | tr '_-' '/+'); fi
+  if [ -z "$server" ]; then server=${line#cloudroid://} server=wss://${server%%/*}; fi
+  if [ -z "$robot" ]; then robot=$(of_line robot); fi
+fi
+known=${XDG_CONFIG_HOME:-${HOME:-/nowhere}/.config}/cloudroid/servers.pub
 # What stands in this archive is what the server signed: before anything of it runs.
 umask 022
 work=$(mktemp -d)
@@ -92,7 +109,7 @@ for file in MANIFEST MANIFEST.sig server.pub; do
 done
 signers=$work/signers
 case $key in
-  '') if [ -s "$prefix/servers.pub" ]; then cat "$prefix/servers.pub"; else cat "$here/server.pub"; fi ;;
+  '') if [ -s "$prefix/servers.pub" ]; then cat "$prefix/servers.pub"; elif [ -s "$known" ]; then cat "$known"; else cat "$here/server.pub"; fi ;;
   AAAA*) printf 'cloudroid ssh-ed25519 %s\n' "$key" ;;
   ssh-ed25519\ *) printf 'cloudroid %s\n' "$key" ;;
   *)
@@ -210,13 +227,17 @@ if ! cmp -s "$work/found" "$here/MANIFEST"; then
   LC_ALL=C comm -3 "$work/found" "$here/MANIFEST" | sed 's/^\t*\([^ ]*\) .* \(\.\/.*\)/  \2/; s/^\t*l /  /' | sort -u | head -n 10 >&2
   complain "these files are not what the server signed: unpack the archive again into an empty directory"
 fi
-if [ -z "$key" ] && [ ! -s "$prefix/servers.pub" ]; then
+if [ -z "$key" ] && [ ! -s "$prefix/servers.pub" ] && [ ! -s "$known" ]; then
   echo "install.sh: trusting the key that came with the archive, $(cut -d ' ' -f 2- < "$here/server.pub"); compare it with what cloudroidctl stub prints, or give it with --key" >&2
 fi
 
 stub=$here/lib/$package/cloudroid-stub
 if ! "$stub" --version > /dev/null 2>&1; then
   complain "$stub does not run on this machine ($(uname -m)): get the stub for its architecture, ?arch= or cloudroidctl stub --arch"
+fi
+
+if [ -n "$line" ]; then
+  "$stub" pair "$line" || complain "nothing was installed: this robot could not be paired"
 fi
 
 # What the robot's owner has set in an earlier stub.toml is kept.
@@ -261,6 +282,10 @@ if [ -z "$server" ] && [ -e "$share/stub.toml" ]; then
     echo "install.sh: the server's certificate is $now now${before:+, in place of $before}" >&2
     fingerprint=$now
   fi
+fi
+# The line says which certificate counts now.
+if [ -n "$line" ] && [ -z "$fingerprint" ] && [ -n "$(key_of fingerprint "$settings")" ]; then
+  fingerprint=$(of_line fingerprint)
 fi
 if [ -n "$robot" ]; then set_key robot "$robot"; fi
 if [ -n "$server" ]; then set_key server "$server"; fi

@@ -1,5 +1,7 @@
 //! One value or more of every type that the document describes.
 
+mod machines;
+
 use api::access::{Audited, NewRule, NewToken, Rule, Secret, Token, Whoami};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
@@ -729,5 +731,6 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     ] {
         samples.push(sample("PushEvent", event));
     }
+    samples.extend(machines::samples());
     samples
 }

@@ -1,16 +1,16 @@
-//! One GET over a connection of its own: what the doctor asks the portal, before there is a link.
+//! One request over a connection of its own: what the doctor asks the portal before there is a link, and pairing.
 
 use std::io;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 use nix::sys::socket::{getsockopt, sockopt::IpMtu};
-use tls::Trust;
+use tls::{Fingerprint, Trust};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use crate::address::Address;
-use crate::stream::Stream;
+use crate::stream::{self, Stream};
 
 /// For all of one answer.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -37,34 +37,77 @@ pub struct Server {
     pub ip: IpAddr,
     /// Whom to trust where TLS is spoken.
     pub trust: Trust,
+    /// The one certificate that the server must show, whoever has signed it.
+    pub only: Option<Fingerprint>,
 }
 
 /// `GET path`.
 pub async fn get(server: &Server, path: &str, token: Option<&str>) -> io::Result<Answer> {
-    tokio::time::timeout(PATIENCE, exchange(server, path, token))
+    in_time(server, path, token, None).await
+}
+
+/// `POST path` with JSON.
+pub async fn post(server: &Server, path: &str, body: &serde_json::Value) -> io::Result<Answer> {
+    in_time(server, path, None, Some(body.to_string())).await
+}
+
+async fn in_time(
+    server: &Server,
+    path: &str,
+    token: Option<&str>,
+    body: Option<String>,
+) -> io::Result<Answer> {
+    tokio::time::timeout(PATIENCE, exchange(server, path, token, body))
         .await
         .unwrap_or_else(|_| {
-            let words = format!("no whole answer to GET {path} within {PATIENCE:?}");
+            let words = format!("no whole answer to {path} within {PATIENCE:?}");
             Err(io::Error::new(io::ErrorKind::TimedOut, words))
         })
 }
 
-async fn exchange(server: &Server, path: &str, token: Option<&str>) -> io::Result<Answer> {
+async fn exchange(
+    server: &Server,
+    path: &str,
+    token: Option<&str>,
+    body: Option<String>,
+) -> io::Result<Answer> {
     let authority = &server.address.authority;
     let stream = TcpStream::connect((server.ip, server.address.port)).await?;
     stream.set_nodelay(true)?;
     let mut stream = Stream::over(stream, &server.address, &server.trust).await?;
+    if let (Some(only), shown) = (server.only, stream.fingerprint())
+        && shown != Some(only)
+    {
+        let shown = shown.map_or_else(|| "none".to_owned(), |shown| shown.to_string());
+        return Err(io::Error::other(format!(
+            "the server shows the certificate {shown}, and the one that was told is {only}: somebody may stand between"
+        )));
+    }
+    let method = if body.is_some() { "POST" } else { "GET" };
     let mut request = format!(
-        "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\nUser-Agent: cloudroid-stub/{}\r\n",
+        "{method} {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\nUser-Agent: cloudroid-stub/{}\r\n",
         env!("CARGO_PKG_VERSION")
     );
     if let Some(token) = token {
         request.push_str(&format!("Authorization: Bearer {token}\r\n"));
     }
+    if let Some(body) = &body {
+        let length = body.len();
+        request.push_str(&format!(
+            "Content-Type: application/json\r\nContent-Length: {length}\r\n"
+        ));
+    }
     request.push_str("\r\n");
+    request.push_str(body.as_deref().unwrap_or_default());
     let began = Instant::now();
-    stream.write_all(request.as_bytes()).await?;
+    let sent = stream.write_all(request.as_bytes()).await;
     let mut first = [0; 1];
+    if let Err(error) = sent {
+        // What the server has said before it closed says more.
+        let said = stream.read_exact(&mut first).await.err();
+        let said = said.filter(|said| stream::refused_certificate(said).is_some());
+        return Err(said.unwrap_or(error));
+    }
     stream.read_exact(&mut first).await?;
     let waited = began.elapsed();
     let mtu = getsockopt(stream.tcp(), IpMtu).ok();
@@ -83,6 +126,19 @@ async fn exchange(server: &Server, path: &str, token: Option<&str>) -> io::Resul
         waited,
         mtu,
     })
+}
+
+impl Answer {
+    /// What a problem document says (RFC 9457), or the text as it is.
+    pub fn words(&self) -> String {
+        let document: serde_json::Value = serde_json::from_slice(&self.body).unwrap_or_default();
+        let said = ["detail", "next"].iter();
+        let said: Vec<&str> = said.filter_map(|key| document[key].as_str()).collect();
+        match said.is_empty() {
+            true => String::from_utf8_lossy(&self.body).trim().to_owned(),
+            false => said.join("; "),
+        }
+    }
 }
 
 /// Status and body. (RFC 9112; the portal sends bodies with a length or in chunks.)

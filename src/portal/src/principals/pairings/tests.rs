@@ -1,0 +1,336 @@
+use access::{Operation, Standing};
+use store::State;
+
+use super::*;
+use crate::tokens::Tokens;
+
+struct World {
+    _home: tempfile::TempDir,
+    principals: Principals,
+    authority: Authority,
+    /// Of a lab.
+    other: Authority,
+}
+
+const WEEK: Duration = Duration::from_secs(7 * 86_400);
+const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
+
+fn world() -> World {
+    let home = tempfile::tempdir().expect("a directory");
+    let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+    let authority = |name| Authority::of_file(&home.path().join(name)).expect("made");
+    World {
+        principals: Principals::new(Tokens::default(), Arc::new(state)).expect("readable"),
+        authority: authority("own.pem"),
+        other: authority("lab.pem"),
+        _home: home,
+    }
+}
+
+fn new(robot: &str) -> NewPairing {
+    NewPairing {
+        robot: robot.into(),
+        services: vec!["det*".parse().expect("a pattern")],
+        classes: Vec::new(),
+        lifetime: None,
+        address: None,
+        own_certificate: false,
+    }
+}
+
+fn request(robot: &str) -> Request {
+    let key = rcgen::KeyPair::generate().expect("a key");
+    let mut params = rcgen::CertificateParams::default();
+    params.distinguished_name = rcgen::DistinguishedName::new();
+    let made = params.serialize_request(&key).expect("made");
+    Request::read(&made.pem().expect("PEM"), robot).expect("a request")
+}
+
+impl World {
+    fn pairs(&self, robot: &str) -> (Request, Certificate) {
+        let (code, _) = self.principals.begin_pairing(&new(robot)).expect("made");
+        let code = self.code(robot, &code).expect("good");
+        let request = request(robot);
+        let issued = self.principals.pair(&code, &request, &self.authority, WEEK);
+        (request, shown(&issued.expect("paired")))
+    }
+
+    fn code(&self, robot: &str, code: &str) -> Result<CodeRecord, String> {
+        self.code_at(robot, code, store::now())
+    }
+
+    fn code_at(&self, robot: &str, code: &str, now: Millis) -> Result<CodeRecord, String> {
+        let known = self.principals.code(robot, code, HERE, now);
+        known.map_err(|error| error.to_string())
+    }
+
+    fn certified(&self, shown: &Certificate, now: Millis) -> Result<Identity, Uncertified> {
+        let principals = &self.principals;
+        principals.with(|known| known.certified(&self.authority, shown, now))
+    }
+
+    fn ended(&self, who: &Identity) -> Option<String> {
+        match self.principals.standing(who, "detector") {
+            Standing::Ended(reason) => Some(reason),
+            Standing::Granted(grants) => {
+                assert!(grants.permits(Operation::Publish, "/x"));
+                None
+            }
+        }
+    }
+}
+
+fn shown(issued: &Issued) -> Certificate {
+    use tokio_rustls::rustls::pki_types::CertificateDer;
+    use tokio_rustls::rustls::pki_types::pem::PemObject;
+    let der = CertificateDer::from_pem_slice(issued.certificate.as_bytes()).expect("PEM");
+    authority::read(&der).expect("a robot's")
+}
+
+#[test]
+fn a_robot_is_paired_until_it_is_unpaired() {
+    let world = world();
+    assert!(world.principals.names_nobody());
+    let (_, shown) = world.pairs("r1");
+    assert!(!world.principals.names_nobody());
+    let who = world.certified(&shown, store::now()).expect("paired");
+    assert!(who.principal.is(Role::Robot) && !who.principal.is(Role::Viewer));
+    assert_eq!(
+        (who.principal.scope.robot.as_deref(), who.owner.as_deref()),
+        (Some("r1"), Some("robot:r1"))
+    );
+    world.principals.note_use(&who, store::now());
+    let listed = world.principals.pairings().expect("listed");
+    assert!(
+        listed.len() == 1 && listed[0].last_used.is_some(),
+        "{listed:?}"
+    );
+    assert_eq!(world.ended(&who), None);
+    world.principals.unpair("r1").expect("there");
+    assert_eq!(world.ended(&who).as_deref(), Some("robot r1 was unpaired"));
+    let refused = world.certified(&shown, store::now());
+    assert_eq!(refused, Err(Uncertified::Unpaired("r1".into())));
+    let request = request("r1");
+    let Shown::Certificate { pairing, .. } = who.shown else {
+        panic!("{who:?}")
+    };
+    let renewed = world
+        .principals
+        .renew((pairing, "r1"), &request, &world.authority, WEEK);
+    assert_eq!(renewed.expect_err("over").problem().status, 401);
+    assert_eq!(
+        world
+            .principals
+            .unpair("r1")
+            .expect_err("once")
+            .problem()
+            .status,
+        404
+    );
+    assert!(
+        !world.principals.names_nobody(),
+        "the door does not open again"
+    );
+}
+
+#[test]
+fn a_code_is_good_once_for_its_robot_and_until_its_end() {
+    let world = world();
+    let principals = &world.principals;
+    let begin = |robot: &str| principals.begin_pairing(&new(robot)).expect("made");
+    let (first, _) = begin("r1");
+    let (code, end) = begin("r1");
+    let words = |code: &str, robot: &str| world.code(robot, code).expect_err(code);
+    assert!(words(&first, "r1").contains("a newer one took its place"));
+    assert!(words(&code, "r2").contains("for another robot"));
+    assert!(world.code_at("r1", &code, end - 1).is_ok());
+    assert!(
+        world
+            .code_at("r1", &code, end)
+            .expect_err("over")
+            .contains("has expired")
+    );
+    let known = world.code("r1", &code).expect("good");
+    principals
+        .pair(&known, &request("r1"), &world.authority, WEEK)
+        .expect("paired");
+    assert!(words(&code, "r1").contains("used already"));
+    // Two who showed it at the same time.
+    let late = principals.pair(&known, &request("r1"), &world.authority, WEEK);
+    assert!(late.expect_err("late").to_string().contains("used already"));
+    let (code, _) = begin("r3");
+    principals.cancel_pairing("r3").expect("there");
+    assert!(words(&code, "r3").contains("was cancelled"));
+    assert_eq!(
+        principals
+            .cancel_pairing("r3")
+            .expect_err("once")
+            .problem()
+            .status,
+        404
+    );
+    // Who unpairs a robot does not leave it a way back in.
+    let (code, _) = begin("r1");
+    principals.unpair("r1").expect("there");
+    assert!(words(&code, "r1").contains("was cancelled"));
+}
+
+#[test]
+fn who_guesses_codes_is_slowed_and_whoever_has_one_is_not() {
+    let world = world();
+    let (code, _) = world.principals.begin_pairing(&new("r1")).expect("made");
+    for number in 0..access::guesses::FREE {
+        // Of the right length, or not.
+        for guess in [format!("{number:026}"), format!("{number}")] {
+            let refused = world.code_at("r1", &guess, 5_000).expect_err("a guess");
+            assert!(
+                refused.contains("not known") || refused.contains("none is looked at"),
+                "{refused}"
+            );
+        }
+    }
+    let refused = world.code_at("r1", "guess", 5_000).expect_err("slowed");
+    assert!(refused.contains("none is looked at"), "{refused}");
+    world.code_at("r1", &code, 5_000).expect("looked up always");
+}
+
+#[test]
+fn a_certificate_is_of_the_key_that_was_paired_last() {
+    let world = world();
+    let (_, first) = world.pairs("r1");
+    let who = world.certified(&first, store::now()).expect("paired");
+    let (_, second) = world.pairs("r1");
+    world.certified(&second, store::now()).expect("paired anew");
+    let replaced = Uncertified::Replaced("r1".into());
+    assert_eq!(world.certified(&first, store::now()), Err(replaced.clone()));
+    assert_eq!(world.ended(&who), Some(replaced.to_string()));
+    let nobody = world
+        .authority
+        .issue(&request("r9"), "r9", store::now(), WEEK)
+        .expect("made");
+    let refused = world.certified(&shown(&nobody), store::now());
+    assert_eq!(refused, Err(Uncertified::NotPaired("r9".into())));
+}
+
+#[test]
+fn a_connection_lasts_as_long_as_the_newest_certificate() {
+    let world = world();
+    let (request, old) = world.pairs("r1");
+    let who = world.certified(&old, store::now()).expect("paired");
+    let Shown::Certificate { pairing, .. } = who.shown else {
+        panic!("{who:?}")
+    };
+    let month = 4 * WEEK;
+    let renewed = world
+        .principals
+        .renew((pairing, "r1"), &request, &world.authority, month);
+    let end = renewed.expect("renewed").expires;
+    assert!(end > old.until);
+    assert_eq!(world.principals.expiry(&who), Some(end));
+    // Both are of one key: the older one counts to its own end, which the handshake looks at.
+    world.certified(&old, end - 1).expect("of the key");
+    assert_eq!(
+        world.certified(&old, end),
+        Err(Uncertified::Expired("r1".into()))
+    );
+}
+
+#[test]
+fn a_labs_own_authority_names_robots_that_were_paired_for_it() {
+    let world = world();
+    let made = |authority: &Authority, robot: &str| {
+        let issued = authority.issue(&request(robot), robot, store::now(), WEEK);
+        shown(&issued.expect("made"))
+    };
+    let own = made(&world.other, "r1");
+    assert_eq!(
+        world.certified(&own, store::now()),
+        Err(Uncertified::NotPaired("r1".into()))
+    );
+    world.principals.pair_own(&new("r1")).expect("paired");
+    let who = world.certified(&own, store::now()).expect("paired");
+    assert_eq!(
+        world.certified(&own, own.until),
+        Err(Uncertified::Expired("r1".into()))
+    );
+    // What the daemon's authority signed for an earlier pairing is none of it, and the other way about.
+    let replaced = Err(Uncertified::Replaced("r1".into()));
+    assert_eq!(
+        world.certified(&made(&world.authority, "r1"), store::now()),
+        replaced
+    );
+    let (_, paired) = world.pairs("r1");
+    world.certified(&paired, store::now()).expect("paired");
+    assert_eq!(world.certified(&own, store::now()), replaced);
+    assert!(world.ended(&who).is_some());
+}
+
+#[test]
+fn what_cannot_be_a_pairing_is_refused_with_words() {
+    let world = world();
+    let table = [
+        (
+            NewPairing {
+                robot: "a b".into(),
+                ..new("x")
+            },
+            "robot",
+        ),
+        (
+            NewPairing {
+                robot: "root".into(),
+                ..new("x")
+            },
+            "uses itself",
+        ),
+        (
+            NewPairing {
+                services: Vec::new(),
+                ..new("x")
+            },
+            "--services",
+        ),
+        (
+            NewPairing {
+                lifetime: Some(0),
+                ..new("x")
+            },
+            "ends at once",
+        ),
+        (
+            NewPairing {
+                lifetime: Some(u64::MAX),
+                ..new("x")
+            },
+            "7d at most",
+        ),
+    ];
+    for (new, words) in table {
+        let refused = world
+            .principals
+            .begin_pairing(&new)
+            .expect_err(words)
+            .problem();
+        assert!(
+            refused.status == 400 && refused.detail.contains(words),
+            "{words}: {refused:?}"
+        );
+    }
+    assert!(world.principals.pairings().expect("listed").is_empty());
+}
+
+/// What was paired is there after a restart, and so is what was ended.
+#[test]
+fn pairings_are_kept() {
+    let home = tempfile::tempdir().expect("a directory");
+    let open = || Arc::new(State::open(&home.path().join("cloudroid.db")).expect("a database"));
+    let principals = Principals::new(Tokens::default(), open()).expect("readable");
+    principals.pair_own(&new("r1")).expect("paired");
+    principals.pair_own(&new("r2")).expect("paired");
+    principals.unpair("r2").expect("there");
+    let before = principals.pairings().expect("listed");
+    drop(principals);
+    let principals = Principals::new(Tokens::default(), open()).expect("readable");
+    assert_eq!(principals.pairings().expect("listed"), before);
+    assert_eq!((before.len(), &*before[0].robot), (1, "r1"));
+}
