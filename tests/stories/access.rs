@@ -280,7 +280,7 @@ pub fn pushes_adder(daemon: &Daemon, token: &str, more: &[&str]) -> anyhow::Resu
 
 pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
     let daemon = daemon("badly")?;
-    let admin = token(&daemon, &["root", "--role", "admin"])?;
+    let admin = token(&daemon, &["chief", "--role", "admin"])?;
     let bearer = format!("Bearer {admin}");
     for (path, words) in [
         ("/api/v1/audit?limit=x", "limit: invalid digit"),
@@ -323,13 +323,13 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
             &[
                 "token",
                 "create",
-                "root",
+                "chief",
                 "--role",
                 "viewer",
                 "--service",
                 "*",
             ],
-            "root",
+            "chief",
         ),
     ] {
         daemon.deployer().types(typed)?.failed_saying(&[words])?;

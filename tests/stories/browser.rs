@@ -17,13 +17,17 @@ use crate::access::{daemon, pushes_adder, token};
 /// Adds two numbers over connections that show the token in the way that each is named by, and tells what came of it.
 const PAGE: &str = r#"<!doctype html>
 <title>A robot's page</title>
+<script>
+// roslib cannot be told of subprotocols: those that are offered next.
+let offered;
+window.WebSocket = new Proxy(window.WebSocket, {
+  construct: (Native, [url]) => offered ? new Native(url, offered) : new Native(url),
+});
+</script>
 <script src="/roslib.js"></script>
 <script>
-const Native = window.WebSocket;
 const adds = (url, prepare, protocols) => new Promise((resolve) => {
-  window.WebSocket = function (address) {
-    return protocols ? new Native(address, protocols) : new Native(address);
-  };
+  offered = protocols;
   const ros = new ROSLIB.Ros();
   ros.on('error', () => resolve('refused'));
   ros.on('close', () => resolve('closed'));
