@@ -13,10 +13,9 @@ use authority::{Authority, Issued, Request, Shown as Certificate};
 use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
-use super::{
-    Identity, Principals, RESERVED, Recognising, Shown, Stored, StoredScope, USED, Unrecognised,
-    damaged,
-};
+use super::changing::RESERVED;
+use super::stored::{StoredScope, damaged};
+use super::{Identity, Principals, Recognising, Shown, Stored, USED, Unrecognised};
 use crate::errors::Error;
 use crate::tokens;
 

@@ -1,0 +1,106 @@
+//! How connections stand: whether what they were begun with still holds, and what they may do. Whoever follows hears of changes
+//! at once.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use access::Standing;
+use api::Millis;
+use tokio::sync::watch;
+
+use super::{Identity, Principals, Shown};
+
+/// How often it is looked whether a token has expired: no more, and no less, often.
+const SOONEST: Duration = Duration::from_millis(10);
+const LATEST: Duration = Duration::from_secs(60);
+
+impl Principals {
+    /// How a connection of somebody to a service stands.
+    pub fn standing(&self, who: &Identity, service: &str) -> Standing {
+        let stored = self.stored.read();
+        let over = match &who.shown {
+            Shown::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
+                Some("a token is needed since the first was made".to_owned())
+            }
+            Shown::Stored { id, hash } => match stored.of_id(*id) {
+                Some(known) if known.hash == *hash => {
+                    known.over(store::now()).map(|over| over.to_string())
+                }
+                _ => Some("this token was replaced by another".to_owned()),
+            },
+            Shown::Certificate { pairing, until, .. } => {
+                let over = stored.pairing_over(*pairing, *until, store::now());
+                over.map(|over| over.to_string())
+            }
+            Shown::Nothing | Shown::Configured | Shown::User => None,
+        };
+        match over {
+            Some(reason) => Standing::Ended(reason),
+            None => Standing::Granted(Arc::new(stored.policy.grants(&who.principal, service))),
+        }
+    }
+
+    /// Until when somebody's token is good.
+    fn expiry(&self, who: &Identity) -> Option<Millis> {
+        match who.shown {
+            Shown::Stored { id, .. } => self.stored.read().of_id(id)?.expires,
+            Shown::Certificate { pairing, until, .. } => {
+                self.stored.read().pairing_end(pairing, until)
+            }
+            _ => None,
+        }
+    }
+
+    /// Tells `standing` whenever that of a connection changes; never comes back.
+    pub async fn follow(&self, who: &Identity, service: &str, standing: &watch::Sender<Standing>) {
+        let mut changed = self.changed.subscribe();
+        loop {
+            changed.borrow_and_update();
+            let now = self.standing(who, service);
+            standing.send_if_modified(|known| {
+                let new = *known != now;
+                known.clone_from(&now);
+                new
+            });
+            let expires = async {
+                let ends = self
+                    .expiry(who)
+                    .filter(|_| matches!(now, Standing::Granted(_)));
+                let Some(end) = ends else {
+                    return std::future::pending().await;
+                };
+                // The clock may be set meanwhile, or the machine have slept: it is looked at again.
+                let left = Duration::from_millis(end.saturating_sub(store::now()));
+                tokio::time::sleep(left.clamp(SOONEST, LATEST)).await;
+            };
+            tokio::select! {
+                _ = changed.changed() => {}
+                () = expires => {}
+            }
+        }
+    }
+
+    /// Comes back with the reason when a connection of somebody to a service is to end. `whole`: what serves it needs
+    /// everything granted.
+    pub async fn ended(&self, who: &Identity, service: &str, whole: bool) -> String {
+        let (standing, mut told) = watch::channel(self.standing(who, service));
+        let reason = async {
+            loop {
+                match &*told.borrow_and_update() {
+                    Standing::Ended(reason) => return reason.clone(),
+                    Standing::Granted(grants) if whole && !grants.is_everything() => {
+                        return format!("a stub needs all of {service}, and is granted {grants}");
+                    }
+                    Standing::Granted(_) => {}
+                }
+                if told.changed().await.is_err() {
+                    std::future::pending().await
+                }
+            }
+        };
+        tokio::select! {
+            reason = reason => reason,
+            () = self.follow(who, service, &standing) => std::future::pending().await,
+        }
+    }
+}
