@@ -213,11 +213,13 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
     let other = format!("SHA256:{}", "0".repeat(64));
     for (before, words) in [
         (
-            "server = \"ws://localhost:9090\"\nmax = 0.4".to_owned(),
+            format!("server = \"ws://localhost:9090\"\nservice = \"{name}\"\nmax = 0.4"),
             format!("wss://localhost:{port} in place of ws://localhost:9090"),
         ),
         (
-            format!("server = \"wss://localhost:{port}\"\nfingerprint = \"{other}\"\nmax = 0.4"),
+            format!(
+                "server = \"wss://localhost:{port}\"\nservice = \"{name}\"\nfingerprint = \"{other}\"\nmax = 0.4"
+            ),
             format!("in place of {other}"),
         ),
     ] {

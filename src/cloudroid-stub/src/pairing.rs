@@ -10,6 +10,7 @@
 mod key;
 mod own;
 mod renewal;
+mod request;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -4,14 +4,20 @@ use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use anyhow::Context;
-use rcgen::{CertificateParams, DistinguishedName, DnType, KeyPair};
+use anyhow::anyhow;
+use ring::rand::SystemRandom;
+use ring::signature::{ECDSA_P256_SHA256_ASN1_SIGNING, EcdsaKeyPair};
+use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
 
-use super::{about, write_whole};
+use super::{about, request, write_whole};
 
 /// The key.
-pub struct Key(KeyPair);
+pub struct Key {
+    pair: EcdsaKeyPair,
+    /// PKCS #8 (RFC 5958).
+    written: PrivatePkcs8KeyDer<'static>,
+}
 
 impl Key {
     /// Reads a key that nobody else can.
@@ -41,34 +47,40 @@ impl Key {
         let mut text = String::new();
         file.read_to_string(&mut text)
             .map_err(|error| about(path, error))?;
-        let pair = KeyPair::from_pem(&text).map_err(|error| {
+        let read = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes());
+        let key = read.map_err(|error| error.to_string()).and_then(Key::of);
+        key.map_err(|error| {
             about(path, format!("this is no key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"))
-        })?;
-        Ok(Key(pair))
+        })
+    }
+
+    fn of(written: PrivatePkcs8KeyDer<'static>) -> Result<Key, String> {
+        let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
+        let pair = EcdsaKeyPair::from_pkcs8(kind, written.secret_pkcs8_der(), &random)
+            .map_err(|error| error.to_string())?;
+        Ok(Key { pair, written })
     }
 
     /// Makes one.
     pub fn make(path: &Path) -> anyhow::Result<Key> {
-        let pair = KeyPair::generate().context("cannot make a key")?;
-        write_whole(path, &pair.serialize_pem())?;
-        Ok(Key(pair))
+        let unmade = |error: &dyn std::fmt::Display| anyhow!("cannot make a key: {error}");
+        let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
+        let made = EcdsaKeyPair::generate_pkcs8(kind, &random).map_err(|error| unmade(&error))?;
+        let written = PrivatePkcs8KeyDer::from(made.as_ref().to_vec());
+        let key = Key::of(written).map_err(|error| unmade(&error))?;
+        let text = request::pem("PRIVATE KEY", key.written.secret_pkcs8_der());
+        write_whole(path, &text)?;
+        Ok(key)
     }
 
-    /// A request for a certificate (PKCS #10, RFC 2986), in PEM.
+    /// A request for a certificate, in PEM.
     pub fn request(&self, robot: &str) -> anyhow::Result<String> {
-        let mut params = CertificateParams::default();
-        params.distinguished_name = DistinguishedName::new();
-        params
-            .distinguished_name
-            .push(DnType::CommonName, format!("robot:{robot}"));
-        let request = params.serialize_request(&self.0);
-        request
-            .and_then(|request| request.pem())
-            .context("cannot make a request for a certificate")
+        request::request(&self.pair, &format!("robot:{robot}"))
+            .map_err(|error| anyhow!("cannot make a request for a certificate: {error}"))
     }
 
     /// For TLS.
     pub fn to_show(&self) -> PrivateKeyDer<'static> {
-        PrivatePkcs8KeyDer::from(self.0.serialize_der()).into()
+        self.written.clone_key().into()
     }
 }
