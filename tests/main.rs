@@ -62,6 +62,8 @@ mod operations;
 mod pairing;
 #[path = "stories/patience.rs"]
 mod patience;
+#[path = "stories/people.rs"]
+mod people;
 #[path = "stories/portal.rs"]
 mod portal;
 #[path = "stories/privileges.rs"]
@@ -138,6 +140,13 @@ fn main() -> ExitCode {
             a_cpp_node_waits_for_the_robot_and_calls_it,
             a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link,
             siblings_come_first_and_other_robots_are_not_asked,
+        ],
+        stories![people:
+            people_sign_in_and_out,
+            whoever_cannot_sign_in_is_told_no_more_than_that,
+            who_guesses_passwords_is_slowed,
+            other_sites_pages_do_nothing_in_a_persons_browser,
+            through_tls_the_cookie_is_shown_through_tls_alone,
         ],
         stories![failover:
             a_slow_network_costs_few_requests,

@@ -5,16 +5,43 @@ const PERIOD = 1500;
 const byId = (id) => document.getElementById(id);
 let token = sessionStorage.getItem("token") || "";
 let chosen = null;
+let csrf = ""; // of the session that the browser shows by its cookie
 let earlier = new Map(); // servant → {time, cpu} of the last poll
 
-async function ask(path) {
-  const headers = token ? { Authorization: `Bearer ${token}` } : {};
-  const answer = await fetch(`/api/v1${path}`, { headers, cache: "no-store" });
+async function ask(path, options = {}) {
+  const headers = { ...options.headers };
+  if (token) headers.Authorization = `Bearer ${token}`;
+  else if (csrf) headers["X-CSRF-Token"] = csrf;
+  const answer = await fetch(`/api/v1${path}`, { ...options, headers, cache: "no-store" });
   if (!answer.ok) {
     const problem = await answer.json().catch(() => ({}));
     throw Object.assign(new Error(problem.detail || answer.statusText), { status: answer.status });
   }
-  return answer.json();
+  return answer.status === 204 ? null : answer.json();
+}
+
+// Who is signed in, and by what somebody could sign in.
+function showPerson(session) {
+  csrf = session.csrf || "";
+  byId("person").hidden = !csrf;
+  byId("name").textContent = csrf ? `${session.name} (${session.role})` : "";
+  const asked = session.needed && !session.name;
+  byId("sign-in").hidden = !(asked && session.accounts);
+  byId("login").hidden = !asked;
+}
+
+async function recognise() {
+  const wrong = (error) => { if (error.status !== 401) throw error; };
+  try {
+    showPerson(await ask("/session"));
+  } catch (error) {
+    wrong(error);
+    // The token that was given is not good: without it the daemon says by what somebody could sign in.
+    token = "";
+    sessionStorage.removeItem("token");
+    showPerson(await ask("/session"));
+    throw error;
+  }
 }
 
 function element(name, content, className) {
@@ -134,20 +161,25 @@ function showEvents(events) {
 
 async function look() {
   try {
+    const ofAll = ask("/status").catch((error) => { if (error.status !== 403) throw error; return null; });
     const [status, services, servants, events] = await Promise.all(
-      ["/status", "/services", "/servants", "/events?limit=30"].map(ask));
+      [ofAll, ...["/services", "/servants", "/events?limit=30"].map((path) => ask(path))]);
     if (!services.some((service) => service.name === chosen)) chosen = null;
     const detail = chosen ? await ask(`/services/${encodeURIComponent(chosen)}`) : null;
-    byId("trouble").hidden = byId("login").hidden = true;
-    showMachine(status);
+    byId("trouble").hidden = byId("login").hidden = byId("sign-in").hidden = true;
+    // Who is for some services is not told of the machine.
+    if (status) showMachine(status);
+    else byId("daemon").textContent = "";
     showServices(services);
     showDetail(detail);
     showServants(servants);
     showEvents(events);
   } catch (error) {
+    // Who is about to sign in reads what was wrong with it.
+    if (error.status === 401 && !byId("sign-in").hidden) return;
     byId("trouble").hidden = false;
     byId("trouble").textContent = error.status ? error.message : "the daemon does not answer";
-    byId("login").hidden = error.status !== 401;
+    if (error.status === 401) await recognise().catch(() => {});
   }
 }
 
@@ -158,8 +190,27 @@ byId("login").addEventListener("submit", (event) => {
   look();
 });
 
+byId("sign-in").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const body = JSON.stringify({ name: byId("account").value, password: byId("password").value });
+  byId("password").value = "";
+  try {
+    showPerson(await ask("/session", { method: "POST", body, headers: { "Content-Type": "application/json" } }));
+    await look();
+  } catch (error) {
+    byId("trouble").hidden = false;
+    byId("trouble").textContent = error.message;
+  }
+});
+
+byId("sign-out").addEventListener("click", async () => {
+  await ask("/session", { method: "DELETE" }).catch(() => {});
+  // What was shown to one is not left for the next.
+  location.reload();
+});
+
 async function poll() {
   if (!document.hidden) await look();
   setTimeout(poll, PERIOD);
 }
-poll();
+recognise().catch(() => {}).finally(poll);

@@ -84,6 +84,9 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         ("HEAD", "/", false, 200),
         ("GET", "/healthz", false, 200),
         ("HEAD", "/healthz", false, 200),
+        ("GET", "/api/v1/session", false, 200),
+        ("HEAD", "/api/v1/session", false, 200),
+        ("POST", "/api/v1/session", false, 400),
         ("GET", "/assets/x", false, 404),
         ("HEAD", "/assets/x", false, 404),
         // Who shows a pairing code needs no token, but TLS.

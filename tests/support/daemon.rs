@@ -264,6 +264,39 @@ impl Daemon {
         self.exchange(stream, method, path, headers)
     }
 
+    /// The same with a body; also the answer's header lines.
+    pub fn sends(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &str,
+    ) -> anyhow::Result<(u16, String, String)> {
+        let mut stream = TcpStream::connect(&self.address)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        let given = |usual: &str| {
+            headers
+                .iter()
+                .any(|(name, _)| name.eq_ignore_ascii_case(usual))
+        };
+        let host = if given("host") {
+            String::new()
+        } else {
+            format!("Host: {}\r\n", self.address)
+        };
+        let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n{host}");
+        for (name, value) in headers {
+            text.push_str(&format!("{name}: {value}\r\n"));
+        }
+        text.push_str(&format!("Content-Length: {}\r\n\r\n{body}", body.len()));
+        stream.write_all(text.as_bytes())?;
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer)?;
+        let (head, body) = answer.split_once("\r\n\r\n").context("an HTTP answer")?;
+        let status = head.split(' ').nth(1).context("a status line")?.parse()?;
+        Ok((status, head.to_owned(), body.to_owned()))
+    }
+
     /// What the API answers to `GET PATH` over the daemon's own socket, where the caller is its operator.
     pub fn api(&self, path: &str) -> anyhow::Result<Value> {
         let stream = UnixStream::connect(self.home.join("run/daemon.sock"))?;

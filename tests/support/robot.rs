@@ -47,10 +47,23 @@ impl Robot {
         Robot::try_connect_offering(url, &[]).map(|(robot, _)| robot)
     }
 
+    /// The same with these headers, such as a browser's.
+    pub fn try_connect_showing(url: &str, headers: &[(&str, &str)]) -> Result<Robot, Refusal> {
+        Robot::try_connect_with(url, &[], headers).map(|(robot, _)| robot)
+    }
+
     /// The same with WebSocket subprotocols on offer; gives also the one that was chosen.
     pub fn try_connect_offering(
         url: &str,
         protocols: &[&str],
+    ) -> Result<(Robot, Option<String>), Refusal> {
+        Robot::try_connect_with(url, protocols, &[])
+    }
+
+    fn try_connect_with(
+        url: &str,
+        protocols: &[&str],
+        headers: &[(&str, &str)],
     ) -> Result<(Robot, Option<String>), Refusal> {
         let address = url
             .strip_prefix("ws://")
@@ -67,6 +80,9 @@ impl Robot {
             .fold(ClientRequestBuilder::new(uri), |request, protocol| {
                 request.with_sub_protocol(*protocol)
             });
+        let request = headers.iter().fold(request, |request, (name, value)| {
+            request.with_header(*name, *value)
+        });
         match tungstenite::client(request, stream) {
             Ok((socket, response)) => {
                 let chosen = response.headers().get("sec-websocket-protocol");

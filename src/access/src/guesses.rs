@@ -1,9 +1,10 @@
-//! Guesses at tokens: counted by address, and slowed. Pure: the time is given.
+//! Guesses at tokens and passwords: counted by address, or by account, and slowed. Pure: the time is given.
 //!
 //! An address may send some tokens that are not known; after each further one it waits, twice as long each time up to a bound,
 //! and what it sends meanwhile is not looked at. A good token makes nobody a better guesser: only time forgets.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::net::{IpAddr, Ipv6Addr};
 
 /// Milliseconds since any beginning.
@@ -51,31 +52,47 @@ impl Guessed {
     }
 }
 
-/// What came from all addresses.
-#[derive(Debug, Default)]
-pub struct Guesses {
-    by_address: HashMap<IpAddr, Guessed>,
+/// What came from all addresses, or at all accounts.
+#[derive(Debug)]
+pub struct Guesses<Of: Eq + Hash = Host> {
+    by_address: HashMap<Of, Guessed>,
     /// From addresses for which there was no room.
     others: Guessed,
     unknown: u64,
     slowed: u64,
 }
 
-/// What one host has: an IPv4 address, or a network of IPv6, of which it can choose any.
-fn host(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V6(address) => {
-            let network = u128::from(address) & (u128::MAX << 64);
-            IpAddr::V6(Ipv6Addr::from(network))
+impl<Of: Eq + Hash> Default for Guesses<Of> {
+    fn default() -> Self {
+        Guesses {
+            by_address: HashMap::new(),
+            others: Guessed::default(),
+            unknown: 0,
+            slowed: 0,
         }
-        address => address,
     }
 }
 
-impl Guesses {
+/// What one host has: an IPv4 address, or a network of IPv6, of which it can choose any.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Host(IpAddr);
+
+impl From<IpAddr> for Host {
+    fn from(address: IpAddr) -> Host {
+        Host(match address.to_canonical() {
+            IpAddr::V6(address) => {
+                let network = u128::from(address) & (u128::MAX << 64);
+                IpAddr::V6(Ipv6Addr::from(network))
+            }
+            address => address,
+        })
+    }
+}
+
+impl<Of: Eq + Hash> Guesses<Of> {
     /// Whether a token from `address` may be looked at; else for how many milliseconds not, and it is counted as slowed.
-    pub fn ask(&mut self, address: IpAddr, now: Millis) -> Result<(), Millis> {
-        let known = self.by_address.get(&host(address));
+    pub fn ask(&mut self, address: impl Into<Of>, now: Millis) -> Result<(), Millis> {
+        let known = self.by_address.get(&address.into());
         let full = self.by_address.len() >= ADDRESSES;
         let guessed = match known {
             Some(guessed) => Some(guessed),
@@ -91,9 +108,9 @@ impl Guesses {
     }
 
     /// Counts a token from `address` that was looked at and is not known; how long the address waits now.
-    pub fn failed(&mut self, address: IpAddr, now: Millis) -> Option<Millis> {
+    pub fn failed(&mut self, address: impl Into<Of>, now: Millis) -> Option<Millis> {
         self.unknown += 1;
-        let host = host(address);
+        let host = address.into();
         if self.by_address.len() >= ADDRESSES && !self.by_address.contains_key(&host) {
             self.by_address
                 .retain(|_, guessed| !guessed.is_forgotten(now));
@@ -133,7 +150,7 @@ mod tests {
 
     #[test]
     fn waits_grow_up_to_a_bound_and_are_forgotten() {
-        let mut guesses = Guesses::default();
+        let mut guesses = Guesses::<Host>::default();
         let from = address("10.0.0.7");
         guess_freely(&mut guesses, "10.0.0.7", 0);
         let mut now = 0;
@@ -158,7 +175,7 @@ mod tests {
             ("2001:db8::1", "2001:db8::ffff:1", true),
             ("2001:db8::1", "2001:db8:0:1::1", false),
         ] {
-            let mut guesses = Guesses::default();
+            let mut guesses = Guesses::<Host>::default();
             guess_freely(&mut guesses, one, 0);
             guesses.failed(address(one), 0);
             let waits = guesses.ask(address(other), 0).is_err();
@@ -168,7 +185,7 @@ mod tests {
 
     #[test]
     fn many_addresses_make_none_forgotten_and_are_slowed_as_one() {
-        let mut guesses = Guesses::default();
+        let mut guesses = Guesses::<Host>::default();
         guess_freely(&mut guesses, "10.0.0.7", 0);
         guesses.failed(address("10.0.0.7"), 0);
         let many = |number: u32| IpAddr::V4((0x0b00_0000 + number).into());
@@ -189,7 +206,7 @@ mod tests {
         /// the bound.
         #[test]
         fn no_address_has_more_looked_at_than_its_waits_leave(steps in prop::collection::vec(0u64..5_000, 1..300)) {
-            let mut guesses = Guesses::default();
+            let mut guesses = Guesses::<Host>::default();
             let (mut now, mut looked_at) = (0, 0);
             for step in &steps {
                 now += step;

@@ -17,6 +17,7 @@ pub mod group;
 pub mod interface;
 pub mod limits;
 pub mod machines;
+pub mod people;
 pub mod problem;
 pub mod push;
 pub mod rollout;

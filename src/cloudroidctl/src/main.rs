@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+mod account;
 mod audit;
 mod calibrate;
 mod client;
@@ -89,6 +90,7 @@ enum Verb {
     Calibrate(Box<calibrate::Calibrate>),
     Explain(explain::Explain),
     Fit(fit::Fit),
+    Account(account::Accounts),
     Token(token::Tokens),
     Pair(pair::Pair),
     Unpair(pair::Unpair),
@@ -147,6 +149,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Fit(verb) => verb.run(&client, format).await,
         Verb::Pair(verb) => verb.run(&client, format).await,
         Verb::Unpair(verb) => verb.run(&client, format).await,
+        Verb::Account(verb) => verb.run(&client, format).await,
         Verb::Token(verb) => verb.run(&client, format).await,
         Verb::Audit(verb) => verb.run(&client, format).await,
         Verb::Policy(verb) => verb.run(&client, format).await,

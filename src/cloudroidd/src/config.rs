@@ -4,6 +4,7 @@
 mod class;
 mod doubts;
 mod options;
+mod people;
 mod time;
 mod tls;
 mod words;
@@ -24,6 +25,7 @@ use servant::quotas::Quotas;
 use crate::machine;
 
 pub use class::Class;
+pub use people::People;
 pub use time::Time;
 pub use tls::Tls;
 
@@ -66,6 +68,8 @@ pub struct Config {
     pub servant: Servant,
     /// Where TLS is spoken.
     pub tls: Tls,
+    /// How people's sessions last.
+    pub people: People,
     /// What clients may do.
     pub portal: Portal,
     /// Limits of memory outside of servants' containers.
@@ -280,6 +284,7 @@ impl Default for Config {
             capacity: Capacity::default(),
             servant: Servant::default(),
             tls: Tls::default(),
+            people: People::default(),
             portal: Portal::default(),
             memory: Memory::default(),
             push: Push::default(),
@@ -454,6 +459,9 @@ impl Config {
         self.proxies()
             .context("trusted_proxies of the configuration")?;
         self.tls.check().context("[tls] of the configuration")?;
+        self.people
+            .check()
+            .context("[people] of the configuration")?;
         check_limits(&self.limits).context("[limits] of the configuration")?;
         if !(self.servant.hung_after >= 1.0 && self.servant.hung_after <= 1e6) {
             bail!(

@@ -8,7 +8,7 @@ use anyhow::Context;
 use async_trait::async_trait;
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
-use portal::{App, Audit, Machine, Principals, Tokens};
+use portal::{App, Audit, Machine, Passwords, Principals, Tokens};
 use push::Pusher;
 use reach::{LocalOpener, Opener};
 use rootfs_builder::Builder;
@@ -35,7 +35,8 @@ pub fn build(
 ) -> anyhow::Result<Arc<App>> {
     let state = Arc::new(State::open(&home.database())?);
     tokio::spawn(store::watch(Arc::clone(&state)));
-    let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?;
+    let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?
+        .lasting(config.people.lasting());
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
     let resources = Resources {
@@ -80,6 +81,7 @@ pub fn build(
     let robots = certificates::robots(&config.tls, home, listen)?;
     Ok(Arc::new(App {
         principals,
+        passwords: Passwords::default(),
         audit: Audit::new(Arc::clone(&state)),
         listen,
         tls: certificates::tls(&config.tls, home, listen, robots.as_ref())?,

@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
+use crate::people::passwords::Passwords;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
 use crate::tls::Tls;
@@ -52,6 +53,8 @@ pub struct App {
     pub options: Options,
     /// Who may do what.
     pub principals: Principals,
+    /// Hashes of people's passwords.
+    pub passwords: Passwords,
     /// What was done.
     pub audit: Audit,
     /// Where the portal listens, as bound.

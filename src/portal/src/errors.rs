@@ -99,6 +99,23 @@ pub enum Error {
     /// The name is another token's.
     #[error("there is a token {0:?} already")]
     TokenExists(String),
+    /// No account of that name.
+    #[error("there is no account {name:?}")]
+    UnknownAccount {
+        /// Asked for.
+        name: String,
+        /// Those that there are.
+        exists: Vec<String>,
+    },
+    /// The name is another account's.
+    #[error("there is an account {0:?} already")]
+    AccountExists(String),
+    /// The password is wrong, or there is no such account: which of both is not said.
+    #[error("name or password is wrong")]
+    WrongPassword,
+    /// Too many sign in at once.
+    #[error("too many people sign in at once")]
+    SignInBusy,
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
@@ -222,6 +239,7 @@ impl Error {
         | Error::UnknownRow { exists, .. }
         | Error::UnknownToken { exists, .. }
         | Error::UnknownPairing { exists, .. }
+        | Error::UnknownAccount { exists, .. }
         | Error::UnknownRule { exists, .. } = self
         {
             problem.exists = exists.clone();
@@ -249,7 +267,10 @@ impl Error {
             StatusCode::TOO_MANY_REQUESTS,
         ];
         let after = match (self, self.of_choreographer()) {
-            (Error::Unrecognised(Unrecognised::Slowed(left)), _) => left.div_ceil(1000),
+            (
+                Error::Unrecognised(Unrecognised::Slowed(left) | Unrecognised::SlowedSignIn(left)),
+                _,
+            ) => left.div_ceil(1000),
             (_, Some(choreographer::Error::BackOff { again, .. })) => {
                 choreographer::seconds(*again)
             }
@@ -312,6 +333,14 @@ impl Error {
             Error::Unrecognised(Unrecognised::Slowed(_)) => {
                 (S::TOO_MANY_REQUESTS, "guessing", "too many unknown tokens")
             }
+            Error::Unrecognised(Unrecognised::SlowedSignIn(_)) => {
+                (S::TOO_MANY_REQUESTS, "guessing", "too many wrong passwords")
+            }
+            Error::Unrecognised(Unrecognised::SessionOver) => {
+                (S::UNAUTHORIZED, "unauthorised", "session over")
+            }
+            Error::WrongPassword => (S::UNAUTHORIZED, "wrong-password", "not signed in"),
+            Error::SignInBusy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign in"),
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 (S::UNAUTHORIZED, "unauthorised", "token needed")
             }
@@ -327,6 +356,8 @@ impl Error {
                 (S::BAD_REQUEST, "no-request", "no request for a certificate")
             }
             Error::UnknownPairing { .. } => (S::NOT_FOUND, "unknown-pairing", "unknown robot"),
+            Error::UnknownAccount { .. } => (S::NOT_FOUND, "unknown-account", "unknown account"),
+            Error::AccountExists(_) => (S::CONFLICT, "account-exists", "name taken"),
             Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https is spoken here"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
@@ -357,11 +388,23 @@ impl Error {
             Error::TokenExists(name) => format!(
                 "choose another name, give it another secret with: cloudroidctl token rotate {name}, or end it with: cloudroidctl token revoke {name}"
             ),
+            Error::UnknownAccount { .. } => "see those that exist with: cloudroidctl account list".into(),
+            Error::AccountExists(name) => format!(
+                "choose another name, or remove it with: cloudroidctl account remove {name}"
+            ),
+            Error::WrongPassword => {
+                "try again, or have an admin set another password with: cloudroidctl account passwd NAME".into()
+            }
+            Error::SignInBusy => "try again later".into(),
             Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unrecognised(Unrecognised::Slowed(_)) => {
                 "ask again then; tokens made by cloudroidctl token create are looked at always".into()
             }
+            Error::Unrecognised(Unrecognised::SlowedSignIn(_)) => {
+                "try again then; who is signed in stays so, and root and the group cloudroid need no password at the daemon's sockets".into()
+            }
+            Error::Unrecognised(Unrecognised::SessionOver) => "sign in again".into(),
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
             }

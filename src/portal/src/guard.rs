@@ -2,7 +2,8 @@
 //! ([`crate::allowed`]).
 //!
 //! Where there are tokens, each TCP request needs one, also from this machine, because requests of a web server in front
-//! of the portal come from this machine, too. Without a token only the page (which asks for one), its assets, `/healthz`
+//! of the portal come from this machine, too. People show a session in its place, by a cookie
+//! ([`crate::people::cookies`]). Without either only the page (which asks for one), its assets, `/healthz`
 //! and a robot's WebSocket handshake (whose first message must be rosbridge's `auth`) are answered.
 //!
 //! Where there never was a token the portal listens on loopback only, and requests need none: this machine's users see
@@ -27,6 +28,7 @@ use tokio_rustls::rustls::pki_types::CertificateDer;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::people::cookies;
 use crate::principals::{Identity, Recognising, Shown, Uncertified};
 use crate::routes::{self, Access};
 use crate::tokens;
@@ -262,11 +264,39 @@ impl Rules<'_> {
                 let who = self.known.recognise(&token, from, store::now())?;
                 Ok(Caller::by(connection, who))
             }
-            None if is_open(method, uri, headers) => {
+            None => self.admit_session(connection, method, uri, headers),
+        }
+    }
+
+    /// Who shows no token may show a session, by a cookie; and some requests need neither.
+    fn admit_session(
+        &self,
+        connection: &Connection,
+        method: &Method,
+        uri: &Uri,
+        headers: &HeaderMap,
+    ) -> Result<Caller, Error> {
+        let open = is_open(method, uri, headers);
+        // Who signs in may show a session that it was given by another: it counts for nothing.
+        let signs_in = *method == Method::POST && routes::access(uri.path()) == Access::SignIn;
+        let shown = match signs_in {
+            true => None,
+            false => cookies::shown(connection, headers)?,
+        };
+        let session = shown.map(|secret| {
+            let who = self.known.recognise_session(&secret, store::now())?;
+            cookies::check(connection, method, headers, &secret)?;
+            Ok::<_, Error>(Caller::by(connection, who))
+        });
+        match session {
+            Some(Ok(caller)) => Ok(caller),
+            Some(Err(error @ Error::Foreign { .. })) => Err(error),
+            Some(Err(error)) if !open => Err(error),
+            _ if open => {
                 let nobody = Principal::nobody();
                 Ok(Caller::new(connection, nobody, Shown::Nothing))
             }
-            None => Err(Error::Unauthorised("a token is needed")),
+            _ => Err(Error::Unauthorised("a token is needed")),
         }
     }
 
@@ -364,6 +394,7 @@ fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
         (Access::Read | Access::ReadOrConnect, false) => {
             matches!(*method, Method::GET | Method::HEAD)
         }
+        (Access::SignIn, false) => matches!(*method, Method::GET | Method::HEAD | Method::POST),
         _ => false,
     }
 }
@@ -449,7 +480,7 @@ mod tests {
     use access::Guesses;
 
     use super::*;
-    use crate::principals::Stored;
+    use crate::principals::{Lasting, Stored};
     use crate::tokens::Tokens;
 
     struct Ask<'a> {
@@ -505,6 +536,7 @@ mod tests {
                 tokens: &none,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &[],
         };
@@ -536,6 +568,7 @@ mod tests {
                 tokens: &none,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &origins,
         };
@@ -572,6 +605,7 @@ mod tests {
                 tokens: &none,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &[],
         };
@@ -601,6 +635,7 @@ mod tests {
                 tokens: &none,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &[],
         };
@@ -630,6 +665,7 @@ mod tests {
                 tokens: &none,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &[],
         };
@@ -647,6 +683,7 @@ mod tests {
                     tokens: &some,
                     stored: &Stored::default(),
                     guesses: &Mutex::new(Guesses::default()),
+                    lasting: Lasting::default(),
                 },
                 origins: &[],
             };
@@ -688,6 +725,7 @@ mod tests {
                 tokens: &some,
                 stored: &Stored::default(),
                 guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
             },
             origins: &[],
         };

@@ -57,6 +57,17 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
             (labels(&[("why", "slowed")]), slowed as f64),
         ],
     );
+    let (wrong, slowed) = app.principals.mistaken();
+    family(
+        &mut out,
+        "cloudroid_refused_passwords_total",
+        "counter",
+        "Passwords that let nobody in: wrong ones, and those not looked at because too many came for their account.",
+        [
+            (labels(&[("why", "wrong")]), wrong as f64),
+            (labels(&[("why", "slowed")]), slowed as f64),
+        ],
+    );
     capacity(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
     gauge(

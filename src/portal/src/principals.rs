@@ -3,6 +3,7 @@
 
 mod changing;
 mod pairings;
+mod people;
 mod recognising;
 mod standing;
 mod stored;
@@ -20,6 +21,8 @@ use tokio::sync::watch;
 use crate::tokens::{AuthMessage, Tokens};
 
 pub use pairings::{Uncertified, Uncoded};
+pub use people::{Begun, Lasting};
+use people::{KnownAccount, KnownSession};
 pub use recognising::Recognising;
 use stored::Known;
 pub use stored::Stored;
@@ -50,6 +53,11 @@ pub enum Shown {
         /// The certificate's end.
         until: Millis,
     },
+    /// By a session of the page.
+    Session {
+        /// Its number.
+        id: i64,
+    },
     /// By the kernel, at the daemon's socket.
     User,
 }
@@ -73,6 +81,8 @@ impl Identity {
         match &self.shown {
             Shown::Stored { id, .. } => Some(format!("token {id}")),
             Shown::Certificate { pairing, .. } => Some(format!("pairing {pairing}")),
+            // Also by that person's next session.
+            Shown::Session { .. } => Some(format!("person {}", self.principal.name)),
             _ => self.token.clone(),
         }
     }
@@ -93,6 +103,15 @@ pub enum Unrecognised {
     /// It was not looked at.
     #[error("too many tokens that are not known came from this address; none is looked at for {} s", .0.div_ceil(1000))]
     Slowed(Millis),
+    /// A password was not looked at.
+    #[error(
+        "too many wrong passwords came from this address, or for this account; none is looked at for {} s",
+        .0.div_ceil(1000)
+    )]
+    SlowedSignIn(Millis),
+    /// It was somebody's session, perhaps.
+    #[error("this session is over")]
+    SessionOver,
 }
 
 /// All who are known, and what they may do.
@@ -101,6 +120,10 @@ pub struct Principals {
     state: Arc<State>,
     stored: RwLock<Stored>,
     guesses: Mutex<Guesses>,
+    /// Wrong passwords, by account; those of names that are no account's, too.
+    wrong: Mutex<Guesses<String>>,
+    /// How long sessions last.
+    lasting: Lasting,
     /// Grows by one with every change.
     changed: watch::Sender<u64>,
 }
@@ -113,10 +136,17 @@ impl Principals {
             configured,
             state,
             guesses: Mutex::default(),
+            wrong: Mutex::default(),
+            lasting: Lasting::default(),
             changed: watch::Sender::new(0),
         };
         principals.release_robots()?;
         Ok(principals)
+    }
+
+    /// With sessions that last so long.
+    pub fn lasting(self, lasting: Lasting) -> Principals {
+        Principals { lasting, ..self }
     }
 
     /// Names of robots that are bound to nobody who is left would be nobody's for ever.
@@ -126,6 +156,9 @@ impl Principals {
         let live = stored.tokens.iter().filter(|known| known.revoked.is_none());
         owners.extend(live.map(Known::owner));
         owners.extend(stored.paired_owners());
+        let people = stored.accounts.iter().filter(|known| known.is_live());
+        owners.extend(people.map(KnownAccount::owner));
+        owners.extend(stored.sessions.values().map(KnownSession::owner));
         drop(stored);
         self.state.release_robots(&owners).map(|_| ())
     }
@@ -136,7 +169,30 @@ impl Principals {
             tokens: &self.configured,
             stored: &self.stored.read(),
             guesses: &self.guesses,
+            lasting: self.lasting,
         })
+    }
+
+    /// Whether a password may be looked at that came from an address, for an account of that name.
+    pub fn may_try(&self, account: &str, from: IpAddr, now: Millis) -> Result<(), Unrecognised> {
+        let by_account = self.wrong.lock().ask(account, now);
+        let by_address = by_account.and_then(|()| self.guesses.lock().ask(from, now));
+        by_address.map_err(Unrecognised::SlowedSignIn)
+    }
+
+    /// Counts a password that was looked at and is wrong.
+    pub fn wrong_password(&self, account: &str, from: IpAddr, now: Millis) {
+        let by_account = self.wrong.lock().failed(account, now);
+        let by_address = self.guesses.lock().failed(from, now);
+        if let Some(wait) = by_account.max(by_address) {
+            let seconds = wait.div_ceil(1000);
+            tracing::warn!("wrong passwords come from {from}: for {seconds} s none is looked at");
+        }
+    }
+
+    /// Passwords since the daemon started that were wrong, and those that were not looked at for their account's sake.
+    pub fn mistaken(&self) -> (u64, u64) {
+        self.wrong.lock().counts()
     }
 
     /// Tokens since the daemon started that were not known, and those that were not looked at.
@@ -179,6 +235,7 @@ impl Principals {
         let id = match identity.shown {
             Shown::Stored { id, .. } => id,
             Shown::Certificate { pairing, .. } => return self.note_pairing(pairing, now),
+            Shown::Session { id } => return self.note_session(id, now),
             _ => return,
         };
         let stored = self.stored.read();
@@ -193,6 +250,24 @@ impl Principals {
         drop(stored);
         if due && let Err(error) = self.state.token_used(id, now) {
             tracing::warn!("when a token was used last cannot be written: {error}");
+        }
+    }
+
+    /// Remembers that a session was shown; on the disk, to the minute.
+    fn note_session(&self, id: i64, now: Millis) {
+        let stored = self.stored.read();
+        let due = stored.session_of_id(id).is_some_and(|known| {
+            known.last_used.fetch_max(now, Ordering::Relaxed);
+            let last = known.written.load(Ordering::Relaxed);
+            now.saturating_sub(last) >= USED
+                && known
+                    .written
+                    .compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed)
+                    .is_ok()
+        });
+        drop(stored);
+        if due && let Err(error) = self.state.session_used(id, now) {
+            tracing::warn!("when a session was used last cannot be written: {error}");
         }
     }
 }

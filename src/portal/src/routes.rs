@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, machines, metrics, oci, openapi, page, policy,
-    push, robots, shadow, stubs,
+    App, api_v1, audit, calibration, dictionary, machines, metrics, oci, openapi, page, people,
+    policy, push, robots, shadow, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -30,6 +30,8 @@ pub enum Access {
     Read,
     /// Who shows a pairing code.
     Code,
+    /// Anyone who reads who is signed in, or signs in.
+    SignIn,
     /// Any robot that connects: its first message must be rosbridge's `auth`.
     Connect,
     /// Anyone who reads, and any robot that connects.
@@ -53,7 +55,7 @@ pub enum Of {
     Handler,
 }
 
-use Access::{Code, Connect, May, Read, ReadOrConnect};
+use Access::{Code, Connect, May, Read, ReadOrConnect, SignIn};
 use Action::{Deploy, Enter, Logs, Look, Operate, See, Try};
 
 /// What each principal is told, as far as it may see it.
@@ -390,6 +392,42 @@ pub const ROUTES: &[Route] = &[
     }),
     at("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
         .described(|| operation("whoami", "Who asks, as the daemon knows it.").answers::<access::Whoami>()),
+    at("GET", "/api/v1/session", SignIn, || get(people::session)).described(|| {
+        operation("session", "Who is signed in, if anybody is.").answers::<api::people::Session>()
+    }),
+    at("POST", "/api/v1/session", SignIn, || post(people::sign_in)).described(|| {
+        operation("signIn", "Signs in by a password. The session is told by a cookie.")
+            .takes::<api::people::SignIn>(Required::True)
+            .answers::<api::people::Session>()
+    }),
+    at("DELETE", "/api/v1/session", ENTER, || delete(people::sign_out)).described(|| {
+        operation("signOut", "Ends the session that is shown, or all of that person; answers 204.")
+            .asks::<people::Ending>()
+    }),
+    at("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions)).described(|| {
+        operation("sessions", "All sessions of people.").lists::<api::people::SessionLine>()
+    }),
+    at("GET", "/api/v1/accounts", ADMINISTER, || get(people::accounts)).described(|| {
+        operation("accounts", "All accounts of people.").lists::<api::people::Account>()
+    }),
+    at("POST", "/api/v1/accounts", ADMINISTER, || post(people::create)).described(|| {
+        operation("createAccount", "Makes an account; gives all there are.")
+            .takes::<api::people::NewAccount>(Required::True)
+            .lists::<api::people::Account>()
+    }),
+    at("PATCH", "/api/v1/accounts/{name}", ADMINISTER, || patch(people::change)).described(|| {
+        operation("changeAccount", "Changes an account and ends its sessions; gives all there are.")
+            .takes::<api::people::AccountChange>(Required::True)
+            .lists::<api::people::Account>()
+    }),
+    at("DELETE", "/api/v1/accounts/{name}", ADMINISTER, || delete(people::remove)).described(|| {
+        operation("removeAccount", "Removes an account and ends its sessions; gives those that are left.")
+            .lists::<api::people::Account>()
+    }),
+    at("DELETE", "/api/v1/accounts/{name}/sessions", ADMINISTER, || delete(people::end_sessions)).described(|| {
+        operation("endSessions", "Ends all sessions of a person; gives those of others.")
+            .lists::<api::people::SessionLine>()
+    }),
     at("GET", "/api/v1/tokens", ADMINISTER, || get(policy::tokens)).described(|| {
         operation("tokens", "All tokens there ever were, without their secrets.").lists::<access::Token>()
     }),

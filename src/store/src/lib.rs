@@ -1,5 +1,5 @@
 //! What must survive: services, their revisions, dictionaries and rollouts, who owns a robot's name, which servant is whose,
-//! tokens, pairings, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
+//! tokens, pairings, people and their sessions, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
 //! writes, and one that only reads, which no writer holds up.
 //!
 //! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
@@ -12,6 +12,7 @@ mod dictionary;
 mod events;
 mod journal;
 mod pairings;
+mod people;
 pub mod private;
 mod robots;
 mod rollouts;
@@ -36,6 +37,7 @@ pub use backlog::watch;
 pub use events::{EventFilter, NewEvent};
 pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
+pub use people::{AccountRecord, NewSession, SessionRecord};
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
@@ -43,7 +45,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 9] = [
+const MIGRATIONS: [&str; 10] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -53,6 +55,7 @@ const MIGRATIONS: [&str; 9] = [
     include_str!("007-access.sql"),
     include_str!("008-audit.sql"),
     include_str!("009-pairings.sql"),
+    include_str!("010-people.sql"),
 ];
 
 /// What can go wrong.

@@ -31,6 +31,14 @@ impl Principals {
             }
         }
         fresh.keep_uses(&stored);
+        for known in fresh.sessions.values() {
+            if let Some(before) = stored.session_of_id(known.record.id) {
+                let last = before.last_used.load(Ordering::Relaxed);
+                known.last_used.fetch_max(last, Ordering::Relaxed);
+                let written = before.written.load(Ordering::Relaxed);
+                known.written.fetch_max(written, Ordering::Relaxed);
+            }
+        }
         *stored = fresh;
         drop(stored);
         self.changed.send_modify(|number| *number += 1);
@@ -64,6 +72,10 @@ impl Principals {
     /// Makes a token; its secret is told once.
     pub fn create(&self, new: &api::access::NewToken) -> Result<api::access::Secret, Error> {
         check(new).map_err(Error::BadRequest)?;
+        // Rules and records know both by their names.
+        if self.accounts().iter().any(|known| known.name == new.name) {
+            return Err(Error::AccountExists(new.name.clone()));
+        }
         let end = |seconds: u64| {
             let end = seconds
                 .checked_mul(1000)

@@ -8,6 +8,7 @@ use api::Millis;
 use parking_lot::Mutex;
 use store::TokenHash;
 
+use super::people::Lasting;
 use super::{Identity, Shown, Stored, Unrecognised};
 use crate::tokens::{self, Tokens};
 
@@ -20,6 +21,8 @@ pub struct Recognising<'a> {
     pub stored: &'a Stored,
     /// What was guessed, by address.
     pub guesses: &'a Mutex<Guesses>,
+    /// How long sessions last.
+    pub lasting: Lasting,
 }
 
 impl Recognising<'_> {
@@ -31,6 +34,12 @@ impl Recognising<'_> {
         now: Millis,
     ) -> Result<Identity, Unrecognised> {
         self.by(token, from, now, || self.tokens.recognise(token))
+    }
+
+    /// Whose session it is that a browser shows. Nobody guesses one: they are looked for always.
+    pub fn recognise_session(&self, secret: &str, now: Millis) -> Result<Identity, Unrecognised> {
+        let hash = tokens::hash(secret);
+        self.stored.recognise_session(&hash, now, self.lasting)
     }
 
     /// Looks for a token in the database and then, with `configured`, among those of the configuration. The former cannot be

@@ -32,6 +32,12 @@ impl Principals {
                 let over = stored.pairing_over(*pairing, *until, store::now());
                 over.map(|over| over.to_string())
             }
+            // A connection is no request: it stays for as long as the session may last at most.
+            Shown::Session { id } => match stored.session_of_id(*id) {
+                Some(known) if known.record.expires > store::now() => None,
+                Some(_) => Some("this session is over".to_owned()),
+                None => Some("this session was ended".to_owned()),
+            },
             Shown::Nothing | Shown::Configured | Shown::User => None,
         };
         match over {
@@ -40,13 +46,13 @@ impl Principals {
         }
     }
 
-    /// Until when somebody's token is good.
-    fn expiry(&self, who: &Identity) -> Option<Millis> {
+    /// Until when somebody's token or session is good.
+    pub(super) fn expiry(&self, who: &Identity) -> Option<Millis> {
+        let stored = self.stored.read();
         match who.shown {
-            Shown::Stored { id, .. } => self.stored.read().of_id(id)?.expires,
-            Shown::Certificate { pairing, until, .. } => {
-                self.stored.read().pairing_end(pairing, until)
-            }
+            Shown::Stored { id, .. } => stored.of_id(id)?.expires,
+            Shown::Session { id } => Some(stored.session_of_id(id)?.record.expires),
+            Shown::Certificate { pairing, until, .. } => stored.pairing_end(pairing, until),
             _ => None,
         }
     }

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use store::{Owner, RuleRecord, State, TokenHash, TokenRecord};
 
 use super::pairings::{self, Paired};
+use super::people::{KnownAccount, KnownSession, Lasting};
 use super::{Identity, Shown, Unrecognised};
 
 /// What the store keeps of a token beside its role.
@@ -68,13 +69,16 @@ impl Known {
     }
 }
 
-/// The tokens of the database, and the policy.
+/// The tokens, accounts and sessions of the database, and the policy.
 #[derive(Default)]
 pub struct Stored {
     pub(super) tokens: Vec<Known>,
     pub(super) pairings: Vec<Paired>,
     /// Places in `tokens`.
     by_hash: HashMap<TokenHash, usize>,
+    pub(super) accounts: Vec<KnownAccount>,
+    /// By the hash of what their browsers show.
+    pub(super) sessions: HashMap<TokenHash, KnownSession>,
     pub(super) rules: Vec<(i64, Rule)>,
     pub(super) policy: Policy,
 }
@@ -88,10 +92,16 @@ fn read_text<T: serde::de::DeserializeOwned>(text: &str, what: &str) -> Result<T
     serde_json::from_value(value).map_err(damaged(what.to_owned()))
 }
 
-pub(super) fn read_token(record: TokenRecord) -> Result<Known, store::Error> {
-    let what = format!("token {}", record.name);
-    let role: Role = read_text(&record.role, &what)?;
-    let scope: StoredScope = serde_json::from_str(&record.scope).map_err(damaged(what))?;
+/// Whose record it is.
+pub(super) fn read_principal(
+    name: &str,
+    role: &str,
+    scope: &str,
+    kind: &str,
+) -> Result<Principal, store::Error> {
+    let what = format!("{kind} {name}");
+    let role: Role = read_text(role, &what)?;
+    let scope: StoredScope = serde_json::from_str(scope).map_err(damaged(what))?;
     let scope = match role.is_scoped() {
         true => Scope {
             services: scope.services,
@@ -100,14 +110,19 @@ pub(super) fn read_token(record: TokenRecord) -> Result<Known, store::Error> {
         },
         false => Scope::everything(),
     };
+    Ok(Principal {
+        name: name.to_owned(),
+        roles: vec![role],
+        scope,
+    })
+}
+
+pub(super) fn read_token(record: TokenRecord) -> Result<Known, store::Error> {
+    let principal = read_principal(&record.name, &record.role, &record.scope, "token")?;
     Ok(Known {
         id: record.id,
         hash: record.hash,
-        principal: Arc::new(Principal {
-            name: record.name,
-            roles: vec![role],
-            scope,
-        }),
+        principal: Arc::new(principal),
         created: record.created,
         expires: record.expires,
         last_used: AtomicU64::new(record.last_used.unwrap_or_default()),
@@ -138,6 +153,11 @@ impl Stored {
             .into_iter()
             .map(pairings::read)
             .collect::<Result<Vec<_>, _>>()?;
+        let accounts = state.accounts()?.into_iter().map(KnownAccount::read);
+        let sessions = state.sessions()?.into_iter().map(|record| {
+            let hash = record.hash.clone();
+            Ok((hash, KnownSession::read(record)?))
+        });
         let rules = state
             .rules()?
             .into_iter()
@@ -152,15 +172,34 @@ impl Stored {
             policy: Policy {
                 rules: rules.iter().map(|(_, rule)| rule.clone()).collect(),
             },
+            accounts: accounts.collect::<Result<_, store::Error>>()?,
+            sessions: sessions.collect::<Result<_, store::Error>>()?,
             tokens,
             pairings,
             rules,
         })
     }
 
-    /// Whether there never was a token, nor a robot that is paired.
+    /// Whether there never was a token, nor an account, nor a robot that is paired.
     pub fn is_empty(&self) -> bool {
-        self.tokens.is_empty() && self.pairings.is_empty()
+        self.tokens.is_empty() && self.accounts.is_empty() && self.pairings.is_empty()
+    }
+
+    /// Whose session it is, by the hash of what is shown.
+    pub(super) fn recognise_session(
+        &self,
+        hash: &str,
+        now: Millis,
+        lasting: Lasting,
+    ) -> Result<Identity, Unrecognised> {
+        let known = self.sessions.get(hash);
+        known.map_or(Err(Unrecognised::SessionOver), |known| {
+            known.recognise(now, lasting)
+        })
+    }
+
+    pub(super) fn session_of_id(&self, id: i64) -> Option<&KnownSession> {
+        self.sessions.values().find(|known| known.record.id == id)
     }
 
     /// Whose token it is, by its hash.

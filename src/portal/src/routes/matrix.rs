@@ -53,7 +53,7 @@ fn at_services(principal: &Principal, action: Action) -> &'static str {
 
 fn cell(route: &Route, principal: &Principal) -> &'static str {
     match route.access {
-        Access::Read | Access::ReadOrConnect => "yes",
+        Access::Read | Access::ReadOrConnect | Access::SignIn => "yes",
         Access::Code => "code",
         Access::Connect if principal.roles.is_empty() => "auth",
         Access::Connect => at_services(principal, Action::Connect),

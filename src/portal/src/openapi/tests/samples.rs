@@ -7,6 +7,7 @@ use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
+use api::people::{Account, AccountChange, NewAccount, Session, SessionLine, SignIn};
 use api::push::Layer;
 use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share};
 use api::shadow::{Compared, FieldDifference, NotCompared};
@@ -624,6 +625,68 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 roles: vec![access::Role::Robot],
                 services: token().services,
                 robot: some("r1"),
+            },
+        ),
+        sample(
+            "SignIn",
+            SignIn {
+                name: "alice".into(),
+                password: "x".into(),
+            },
+        ),
+        sample(
+            "Session",
+            Session {
+                name: some("alice"),
+                role: Some(access::Role::Viewer),
+                csrf: some("x"),
+                expires: Some(1),
+                needed: true,
+                accounts: true,
+            },
+        ),
+        sample("Session", Session::default()),
+        sample(
+            "SessionLine",
+            SessionLine {
+                id: 1,
+                name: "alice".into(),
+                role: access::Role::Viewer,
+                from: "127.0.0.1:1".into(),
+                created: 1,
+                last_used: 1,
+                expires: 1,
+            },
+        ),
+        sample(
+            "NewAccount",
+            NewAccount {
+                name: "alice".into(),
+                password: "x".into(),
+                role: access::Role::Viewer,
+                services: token().services,
+            },
+        ),
+        sample(
+            "AccountChange",
+            AccountChange {
+                password: some("x"),
+                role: Some(access::Role::Viewer),
+                services: token().services,
+                disabled: Some(true),
+            },
+        ),
+        sample("AccountChange", AccountChange::default()),
+        sample(
+            "Account",
+            Account {
+                name: "alice".into(),
+                role: access::Role::Viewer,
+                services: token().services,
+                created: 1,
+                last_login: Some(1),
+                disabled: Some(1),
+                sessions: 1,
             },
         ),
         sample("BackOff", back_off()),

@@ -1,0 +1,399 @@
+//! People: their accounts, and their sessions.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use access::{Glob, Principal, Role};
+use api::Millis;
+use api::people::{Account, AccountChange, NewAccount, SessionLine};
+use catalogue::names;
+use store::{AccountRecord, NewSession, Owner, SessionRecord};
+
+use super::changing::{RESERVED, SECRET};
+use super::stored::{StoredScope, damaged, read_principal};
+use super::{Identity, Principals, Shown, Unrecognised};
+use crate::errors::Error;
+use crate::tokens;
+
+/// How long sessions last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Lasting {
+    /// At most, whatever is done.
+    pub most: Duration,
+    /// Without a request.
+    pub idle: Duration,
+}
+
+impl Default for Lasting {
+    fn default() -> Self {
+        Lasting {
+            most: Duration::from_secs(12 * 3600),
+            idle: Duration::from_secs(3600),
+        }
+    }
+}
+
+fn milliseconds(time: Duration) -> Millis {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
+/// Whose robots' names are that a person uses.
+fn owner(name: &str) -> Owner {
+    format!("person:{name}")
+}
+
+/// An account, in memory.
+pub struct KnownAccount {
+    pub(super) record: AccountRecord,
+    pub(super) principal: Arc<Principal>,
+}
+
+impl KnownAccount {
+    pub(super) fn read(record: AccountRecord) -> Result<KnownAccount, store::Error> {
+        let principal = read_principal(&record.name, &record.role, &record.scope, "account")?;
+        Ok(KnownAccount {
+            principal: Arc::new(principal),
+            record,
+        })
+    }
+
+    pub(super) fn is_live(&self) -> bool {
+        self.record.removed.is_none()
+    }
+
+    pub(super) fn owner(&self) -> Owner {
+        owner(&self.record.name)
+    }
+}
+
+/// A session, in memory.
+pub struct KnownSession {
+    pub(super) record: SessionRecord,
+    pub(super) principal: Arc<Principal>,
+    pub(super) last_used: AtomicU64,
+    /// When that was last written.
+    pub(super) written: AtomicU64,
+}
+
+impl KnownSession {
+    pub(super) fn read(record: SessionRecord) -> Result<KnownSession, store::Error> {
+        let principal = read_principal(&record.name, &record.role, &record.scope, "session")?;
+        Ok(KnownSession {
+            principal: Arc::new(principal),
+            last_used: AtomicU64::new(record.last_used),
+            written: AtomicU64::new(record.last_used),
+            record,
+        })
+    }
+
+    pub(super) fn owner(&self) -> Owner {
+        owner(&self.record.name)
+    }
+
+    pub(super) fn recognise(
+        &self,
+        now: Millis,
+        lasting: Lasting,
+    ) -> Result<Identity, Unrecognised> {
+        let last = self.last_used.load(Ordering::Relaxed);
+        let idle = last.saturating_add(milliseconds(lasting.idle));
+        if self.record.expires.min(idle) <= now {
+            return Err(Unrecognised::SessionOver);
+        }
+        Ok(Identity {
+            principal: Arc::clone(&self.principal),
+            shown: Shown::Session { id: self.record.id },
+            token: None,
+            owner: Some(self.owner()),
+        })
+    }
+}
+
+/// A session that has just begun.
+pub struct Begun {
+    /// What its browser shows. It is kept nowhere.
+    pub secret: String,
+    /// Whose it is.
+    pub identity: Identity,
+    /// When it ends at the latest.
+    pub expires: Millis,
+}
+
+/// An account whose password is to be looked at.
+#[derive(Clone)]
+pub struct Candidate {
+    id: i64,
+    name: String,
+    /// The password's hash.
+    pub password: String,
+    role: String,
+    scope: String,
+}
+
+fn check_role(role: Role, services: &[Glob]) -> Result<(), String> {
+    if role == Role::Robot {
+        return Err("people are no robots; make a token for a robot: cloudroidctl token create NAME --role robot".into());
+    }
+    match (role.is_scoped(), services.is_empty()) {
+        (true, true) => Err(format!(
+            "a {role} is for services that are named; name them with --service, or all with --service '*'"
+        )),
+        (false, false) => Err(format!(
+            "an {role} is for all services; leave out --service, or choose another role"
+        )),
+        _ => Ok(()),
+    }
+}
+
+fn scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
+    let scope = StoredScope {
+        services: services.to_vec(),
+        robot: None,
+        classes: Vec::new(),
+    };
+    serde_json::to_string(&scope).map_err(damaged(format!("account {name}")))
+}
+
+impl Principals {
+    /// Whether anybody can sign in by a password.
+    pub fn has_accounts(&self) -> bool {
+        let stored = self.stored.read();
+        stored.accounts.iter().any(KnownAccount::is_live)
+    }
+
+    /// All accounts that there are.
+    pub fn accounts(&self) -> Vec<Account> {
+        let stored = self.stored.read();
+        let live = stored.accounts.iter().filter(|known| known.is_live());
+        live.map(|known| {
+            let record = &known.record;
+            let sessions = stored.sessions.values();
+            Account {
+                name: record.name.clone(),
+                role: known
+                    .principal
+                    .roles
+                    .first()
+                    .copied()
+                    .unwrap_or(Role::Viewer),
+                services: known.principal.scope.services.clone(),
+                created: record.created,
+                last_login: record.last_login,
+                disabled: record.disabled,
+                sessions: sessions
+                    .filter(|session| session.record.account == Some(record.id))
+                    .count(),
+            }
+        })
+        .collect()
+    }
+
+    /// The account by which somebody may sign in.
+    pub fn candidate(&self, name: &str) -> Option<Candidate> {
+        let stored = self.stored.read();
+        let mut live = stored.accounts.iter().filter(|known| known.is_live());
+        let record = &live.find(|known| known.record.name == name)?.record;
+        record.disabled.is_none().then(|| Candidate {
+            id: record.id,
+            name: record.name.clone(),
+            password: record.password.clone(),
+            role: record.role.clone(),
+            scope: record.scope.clone(),
+        })
+    }
+
+    /// Keeps the hash of the same password that was made anew.
+    pub fn rehash(&self, candidate: &mut Candidate, password: String) -> Result<(), Error> {
+        self.state
+            .rehash_password(candidate.id, &candidate.password, &password)?;
+        candidate.password = password;
+        Ok(self.reload()?)
+    }
+
+    /// Begins a session of whose password was right; none where the account has changed since it was looked at.
+    pub fn begin(&self, candidate: &Candidate, peer: &str) -> Result<Option<Begun>, Error> {
+        let secret = names::random(SECRET);
+        let hash = tokens::hash(&secret);
+        let made = self.state.add_session(
+            &NewSession {
+                hash: &hash,
+                account: Some(candidate.id),
+                name: &candidate.name,
+                role: &candidate.role,
+                scope: &candidate.scope,
+                peer,
+                expires: store::now().saturating_add(milliseconds(self.lasting.most)),
+            },
+            Some(&candidate.password),
+        )?;
+        let Some(made) = made else {
+            return Ok(None);
+        };
+        self.reload()?;
+        let expires = made.expires;
+        let identity = KnownSession::read(made)?.recognise(store::now(), self.lasting)?;
+        Ok(Some(Begun {
+            secret,
+            identity,
+            expires,
+        }))
+    }
+
+    /// When a session ends at the latest.
+    pub fn session_end(&self, id: i64) -> Option<Millis> {
+        let stored = self.stored.read();
+        stored.session_of_id(id).map(|known| known.record.expires)
+    }
+
+    /// All sessions that are not over.
+    pub fn sessions(&self) -> Vec<SessionLine> {
+        let now = store::now();
+        let stored = self.stored.read();
+        let good = stored
+            .sessions
+            .values()
+            .filter(|known| known.recognise(now, self.lasting).is_ok());
+        let mut lines: Vec<SessionLine> = good
+            .map(|known| SessionLine {
+                id: known.record.id,
+                name: known.record.name.clone(),
+                role: known
+                    .principal
+                    .roles
+                    .first()
+                    .copied()
+                    .unwrap_or(Role::Viewer),
+                from: known.record.peer.clone(),
+                created: known.record.created,
+                last_used: known.last_used.load(Ordering::Relaxed),
+                expires: known.record.expires,
+            })
+            .collect();
+        lines.sort_by_key(|line| line.id);
+        lines
+    }
+
+    /// Ends a session, and connections that were begun with it.
+    pub fn end_session(&self, id: i64) -> Result<(), Error> {
+        self.state.end_session(id)?;
+        Ok(self.reload()?)
+    }
+
+    /// Ends that which a browser shows, if it is one.
+    pub fn end_shown(&self, secret: &str) -> Result<(), Error> {
+        let hash = tokens::hash(secret);
+        let id = self
+            .stored
+            .read()
+            .sessions
+            .get(&hash)
+            .map(|known| known.record.id);
+        id.map_or(Ok(()), |id| self.end_session(id))
+    }
+
+    /// Ends all sessions of a person.
+    pub fn end_sessions_of(&self, name: &str) -> Result<(), Error> {
+        self.state.end_sessions_of(name)?;
+        Ok(self.reload()?)
+    }
+
+    /// Refuses what cannot be an account.
+    pub fn check_account(&self, new: &NewAccount) -> Result<(), Error> {
+        access::principal::check_name(&new.name)
+            .map_err(|error| Error::BadRequest(error.to_string()))?;
+        if RESERVED.contains(&&*new.name) {
+            return Err(Error::BadRequest(format!(
+                "{} is a name that the daemon uses itself; choose another",
+                new.name
+            )));
+        }
+        check_role(new.role, &new.services).map_err(Error::BadRequest)?;
+        // Rules and records know both by their names.
+        let mut tokens = self.tokens().into_iter();
+        match tokens.any(|token| token.name == new.name && token.revoked.is_none()) {
+            true => Err(Error::TokenExists(new.name.clone())),
+            false => Ok(()),
+        }
+    }
+
+    /// Makes an account, by its password's hash.
+    pub fn create_account(&self, new: &NewAccount, password: &str) -> Result<(), Error> {
+        self.check_account(new)?;
+        let scope = scope(&new.services, &new.name)?;
+        let made = self
+            .state
+            .add_account(&new.name, password, new.role.name(), &scope)?;
+        self.reload()?;
+        match made {
+            true => Ok(()),
+            false => Err(Error::AccountExists(new.name.clone())),
+        }
+    }
+
+    fn unknown_account(&self, name: &str) -> Error {
+        Error::UnknownAccount {
+            name: name.to_owned(),
+            exists: self
+                .accounts()
+                .into_iter()
+                .map(|known| known.name)
+                .collect(),
+        }
+    }
+
+    /// Refuses a name that is no account's.
+    pub fn check_known(&self, name: &str) -> Result<(), Error> {
+        match self.accounts().iter().any(|known| known.name == name) {
+            true => Ok(()),
+            false => Err(self.unknown_account(name)),
+        }
+    }
+
+    /// Changes an account, with the hash of its new password if there is one. All its sessions end.
+    pub fn change_account(
+        &self,
+        name: &str,
+        change: &AccountChange,
+        password: Option<&str>,
+    ) -> Result<(), Error> {
+        self.check_known(name)?;
+        if change.role.is_none() && !change.services.is_empty() {
+            return Err(Error::BadRequest(
+                "services are given with a role; name the role, too".into(),
+            ));
+        }
+        if let Some(role) = change.role {
+            check_role(role, &change.services).map_err(Error::BadRequest)?;
+        }
+        let mut known = true;
+        if let Some(password) = password {
+            known &= self.state.set_password(name, password)?;
+        }
+        if let Some(role) = change.role {
+            let scope = scope(&change.services, name)?;
+            known &= self.state.set_account_role(name, role.name(), &scope)?;
+        }
+        if let Some(disabled) = change.disabled {
+            known &= self.state.disable_account(name, disabled)?;
+        }
+        self.reload()?;
+        match known {
+            true => Ok(()),
+            false => Err(self.unknown_account(name)),
+        }
+    }
+
+    /// Removes an account.
+    pub fn remove_account(&self, name: &str) -> Result<(), Error> {
+        let removed = self.state.remove_account(name)?;
+        self.reload()?;
+        if !removed {
+            return Err(self.unknown_account(name));
+        }
+        Ok(self.release_robots()?)
+    }
+}
+
+#[cfg(test)]
+mod tests;

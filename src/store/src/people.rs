@@ -1,0 +1,299 @@
+//! People: accounts with passwords, and sessions of the page. Of a password and of what a session shows only hashes are kept.
+
+use rusqlite::{OptionalExtension, Row, params};
+
+use super::{Error, State, TokenHash, now};
+
+/// An account.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AccountRecord {
+    /// Its number, never given twice.
+    pub id: i64,
+    /// The person's name.
+    pub name: String,
+    /// The password's hash, in the PHC string format.
+    pub password: String,
+    /// The person's role, in the words of whoever decides by it.
+    pub role: String,
+    /// What it is for, likewise.
+    pub scope: String,
+    /// When it was made, in milliseconds since 1970, as are all times here.
+    pub created: u64,
+    /// When somebody last signed in by it.
+    pub last_login: Option<u64>,
+    /// Since when nobody may sign in by it.
+    pub disabled: Option<u64>,
+    /// When it was removed.
+    pub removed: Option<u64>,
+}
+
+/// A session of the page.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SessionRecord {
+    /// Its number, never given twice.
+    pub id: i64,
+    /// SHA-256 of what its browser shows.
+    pub hash: TokenHash,
+    /// The account by which it was begun; none where a provider said who it is.
+    pub account: Option<i64>,
+    /// The person's name.
+    pub name: String,
+    /// Its role.
+    pub role: String,
+    /// What it is for.
+    pub scope: String,
+    /// From where it was begun.
+    pub peer: String,
+    /// When it was begun.
+    pub created: u64,
+    /// When it was shown last, to the minute.
+    pub last_used: u64,
+    /// When it ends at the latest.
+    pub expires: u64,
+}
+
+/// A session to begin.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewSession<'a> {
+    /// SHA-256 of what its browser shows.
+    pub hash: &'a str,
+    /// The account by which it is begun.
+    pub account: Option<i64>,
+    /// The person's name.
+    pub name: &'a str,
+    /// Its role.
+    pub role: &'a str,
+    /// What it is for.
+    pub scope: &'a str,
+    /// From where.
+    pub peer: &'a str,
+    /// When it ends at the latest.
+    pub expires: u64,
+}
+
+/// Sessions that a person may have at once; the oldest end for newer ones.
+const MOST_SESSIONS: u32 = 32;
+
+const ACCOUNT: &str = "id, name, password, role, scope, created, last_login, disabled, removed";
+const SESSION: &str = "id, hash, account, name, role, scope, peer, created, last_used, expires";
+
+fn read_account(row: &Row<'_>) -> rusqlite::Result<AccountRecord> {
+    Ok(AccountRecord {
+        id: row.get(0)?,
+        name: row.get(1)?,
+        password: row.get(2)?,
+        role: row.get(3)?,
+        scope: row.get(4)?,
+        created: row.get(5)?,
+        last_login: row.get(6)?,
+        disabled: row.get(7)?,
+        removed: row.get(8)?,
+    })
+}
+
+fn read_session(row: &Row<'_>) -> rusqlite::Result<SessionRecord> {
+    Ok(SessionRecord {
+        id: row.get(0)?,
+        hash: row.get(1)?,
+        account: row.get(2)?,
+        name: row.get(3)?,
+        role: row.get(4)?,
+        scope: row.get(5)?,
+        peer: row.get(6)?,
+        created: row.get(7)?,
+        last_used: row.get(8)?,
+        expires: row.get(9)?,
+    })
+}
+
+impl State {
+    /// All accounts there ever were, oldest first.
+    pub fn accounts(&self) -> Result<Vec<AccountRecord>, Error> {
+        self.read(|connection| {
+            connection
+                .prepare_cached(&format!("SELECT {ACCOUNT} FROM accounts ORDER BY id"))?
+                .query_map([], read_account)?
+                .collect()
+        })
+    }
+
+    /// Records an account, on disk when this returns; false where its name is another account's.
+    pub fn add_account(
+        &self,
+        name: &str,
+        password: &str,
+        role: &str,
+        scope: &str,
+    ) -> Result<bool, Error> {
+        self.durably(|connection| {
+            connection.execute(
+                "INSERT INTO accounts (name, password, role, scope, created) VALUES (?1, ?2, ?3, ?4, ?5)
+                 ON CONFLICT (name) WHERE removed IS NULL DO NOTHING",
+                params![name, password, role, scope, now() as i64],
+            )
+        })
+        .map(|changed| changed > 0)
+    }
+
+    /// Changes an account and ends all its sessions, both or none; false where there is no such account.
+    fn change_account(
+        &self,
+        name: &str,
+        change: impl FnOnce(&rusqlite::Transaction<'_>, i64) -> rusqlite::Result<usize>,
+    ) -> Result<bool, Error> {
+        self.durably(|connection| {
+            let transaction = connection.transaction()?;
+            let id: Option<i64> = transaction
+                .prepare_cached("SELECT id FROM accounts WHERE name = ?1 AND removed IS NULL")?
+                .query_row([name], |row| row.get(0))
+                .optional()?;
+            let Some(id) = id else {
+                return Ok(false);
+            };
+            change(&transaction, id)?;
+            transaction.execute("DELETE FROM sessions WHERE account = ?1", [id])?;
+            transaction.commit()?;
+            Ok(true)
+        })
+    }
+
+    /// Gives an account another password.
+    pub fn set_password(&self, name: &str, password: &str) -> Result<bool, Error> {
+        self.change_account(name, |transaction, id| {
+            transaction.execute(
+                "UPDATE accounts SET password = ?2 WHERE id = ?1",
+                params![id, password],
+            )
+        })
+    }
+
+    /// Hashes the same password anew: sessions go on.
+    pub fn rehash_password(&self, id: i64, before: &str, password: &str) -> Result<(), Error> {
+        self.run(|connection| {
+            connection.execute(
+                "UPDATE accounts SET password = ?3 WHERE id = ?1 AND password = ?2",
+                params![id, before, password],
+            )
+        })
+        .map(|_| ())
+    }
+
+    /// Gives an account another role and scope.
+    pub fn set_account_role(&self, name: &str, role: &str, scope: &str) -> Result<bool, Error> {
+        self.change_account(name, |transaction, id| {
+            transaction.execute(
+                "UPDATE accounts SET role = ?2, scope = ?3 WHERE id = ?1",
+                params![id, role, scope],
+            )
+        })
+    }
+
+    /// Lets nobody sign in by an account, or somebody again.
+    pub fn disable_account(&self, name: &str, disabled: bool) -> Result<bool, Error> {
+        let at = disabled.then(|| now() as i64);
+        self.change_account(name, |transaction, id| {
+            transaction.execute(
+                "UPDATE accounts SET disabled = ?2 WHERE id = ?1",
+                params![id, at],
+            )
+        })
+    }
+
+    /// Removes an account. That there was one is kept, its password is not.
+    pub fn remove_account(&self, name: &str) -> Result<bool, Error> {
+        self.change_account(name, |transaction, id| {
+            transaction.execute(
+                "UPDATE accounts SET removed = ?2, password = '' WHERE id = ?1",
+                params![id, now() as i64],
+            )
+        })
+    }
+
+    /// All sessions.
+    pub fn sessions(&self) -> Result<Vec<SessionRecord>, Error> {
+        self.read(|connection| {
+            connection
+                .prepare_cached(&format!("SELECT {SESSION} FROM sessions ORDER BY id"))?
+                .query_map([], read_session)?
+                .collect()
+        })
+    }
+
+    /// Begins a session, and forgets those that are over; none where its account is not what it was when its password was
+    /// checked (`password`: that hash).
+    pub fn add_session(
+        &self,
+        new: &NewSession<'_>,
+        password: Option<&str>,
+    ) -> Result<Option<SessionRecord>, Error> {
+        let at = now() as i64;
+        self.durably(|connection| {
+            let transaction = connection.transaction()?;
+            let good = match new.account {
+                None => true,
+                // The password may have been changed, or the account disabled, while it was hashed.
+                Some(id) => transaction
+                    .prepare_cached(
+                        "SELECT 1 FROM accounts WHERE id = ?1 AND password = ?2 AND role = ?3 AND scope = ?4
+                         AND disabled IS NULL AND removed IS NULL",
+                    )?
+                    .exists(params![id, password, new.role, new.scope])?,
+            };
+            if !good {
+                return Ok(None);
+            }
+            transaction.execute("DELETE FROM sessions WHERE expires <= ?1", [at])?;
+            let made = transaction
+                .prepare_cached(&format!(
+                    "INSERT INTO sessions (hash, account, name, role, scope, peer, created, last_used, expires)
+                     VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?7, ?8) RETURNING {SESSION}"
+                ))?
+                .query_row(
+                    params![
+                        new.hash, new.account, new.name, new.role, new.scope, new.peer, at, new.expires
+                    ],
+                    read_session,
+                )?;
+            transaction.execute(
+                "DELETE FROM sessions WHERE name = ?1 AND id NOT IN
+                 (SELECT id FROM sessions WHERE name = ?1 ORDER BY id DESC LIMIT ?2)",
+                params![new.name, MOST_SESSIONS],
+            )?;
+            if let Some(id) = new.account {
+                transaction.execute(
+                    "UPDATE accounts SET last_login = ?2 WHERE id = ?1",
+                    params![id, at],
+                )?;
+            }
+            transaction.commit()?;
+            Ok(Some(made))
+        })
+    }
+
+    /// Remembers that a session was shown.
+    pub fn session_used(&self, id: i64, at: u64) -> Result<(), Error> {
+        self.run(|connection| {
+            connection.execute(
+                "UPDATE sessions SET last_used = ?2 WHERE id = ?1",
+                params![id, at],
+            )
+        })
+        .map(|_| ())
+    }
+
+    /// Ends a session; false where there is none of that number.
+    pub fn end_session(&self, id: i64) -> Result<bool, Error> {
+        self.durably(|connection| connection.execute("DELETE FROM sessions WHERE id = ?1", [id]))
+            .map(|ended| ended > 0)
+    }
+
+    /// Ends all sessions of a person; how many there were.
+    pub fn end_sessions_of(&self, name: &str) -> Result<usize, Error> {
+        self.durably(|connection| {
+            connection.execute("DELETE FROM sessions WHERE name = ?1", [name])
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests;
