@@ -736,6 +736,19 @@ mod tests {
             ask(&rules).by(Method::HEAD).at(path).expect(path);
             assert_eq!(ask(&rules).by(Method::POST).at(path), Err(401), "{path}");
         }
+        // Who shows a pairing code is nobody until then.
+        let caller = ask(&rules).by(Method::POST).at("/api/v1/pair");
+        assert!(!caller.expect("may show a code").is_known());
+        for method in [Method::GET, Method::HEAD, Method::PUT, Method::DELETE] {
+            let refused = ask(&rules).by(method.clone()).at("/api/v1/pair");
+            assert_eq!(refused, Err(401), "{method}");
+        }
+        assert_eq!(handshake(Method::POST).at("/api/v1/pair"), Err(401));
+        assert_eq!(
+            ask(&rules).by(Method::POST).at("/api/v1/renew"),
+            Err(401),
+            "needs its certificate"
+        );
         for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
             let caller = handshake(Method::GET).at(path).expect("may send auth");
             assert!(!caller.is_known(), "{path}");
