@@ -75,9 +75,8 @@ async fn exchange(
     let stream = TcpStream::connect((server.ip, server.address.port)).await?;
     stream.set_nodelay(true)?;
     let mut stream = Stream::over(stream, &server.address, &server.trust).await?;
-    if let (Some(only), shown) = (server.only, stream.fingerprint())
-        && shown != Some(only)
-    {
+    let shown = stream.fingerprint();
+    if let Some(only) = server.only.filter(|only| shown != Some(*only)) {
         let shown = shown.map_or_else(|| "none".to_owned(), |shown| shown.to_string());
         return Err(io::Error::other(format!(
             "the server shows the certificate {shown}, and the one that was told is {only}: somebody may stand between"

@@ -117,9 +117,8 @@ impl Trust {
                 return Err(io::Error::other(changed(first, kept, &self.accept)));
             }
         }
-        if let (true, Some(known)) = (outcome.by_authority, known)
-            && seen != Some(Known::ByAuthority)
-        {
+        let is_new = outcome.by_authority && seen != Some(Known::ByAuthority);
+        if let Some(known) = known.filter(|_| is_new) {
             // A home that cannot be written is no reason to refuse a server that an authority speaks for.
             let _ = known.remember(server, Known::ByAuthority);
         }
