@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -89,12 +89,26 @@ impl Drop for Browser {
     }
 }
 
-/// Gives the page, roslib and what is asked of it, until the page has said what came of it.
-fn serve(listener: &TcpListener, asked: &Value, said: &mpsc::Sender<Value>) -> anyhow::Result<()> {
-    let roslib = std::fs::read(binaries::node_modules().join("roslib/build/roslib.min.js"))?;
-    let asked = asked.to_string();
-    for stream in listener.incoming() {
-        let mut stream: TcpStream = stream?;
+/// What the page asks for, and where what it says goes.
+struct Site {
+    roslib: Vec<u8>,
+    asked: String,
+    said: mpsc::Sender<Value>,
+}
+
+impl Site {
+    /// Answers every connection by a thread of its own: browsers open some that they may not use.
+    fn serve(self, listener: TcpListener) {
+        let site = Arc::new(self);
+        std::thread::spawn(move || {
+            for stream in listener.incoming().flatten() {
+                let site = Arc::clone(&site);
+                std::thread::spawn(move || site.answer(stream));
+            }
+        });
+    }
+
+    fn answer(&self, mut stream: TcpStream) -> anyhow::Result<()> {
         stream.set_read_timeout(Some(PATIENCE))?;
         let mut reader = BufReader::new(stream.try_clone()?);
         let (mut head, mut length) = (String::new(), 0);
@@ -109,22 +123,20 @@ fn serve(listener: &TcpListener, asked: &Value, said: &mpsc::Sender<Value>) -> a
         let path = head.split(' ').nth(1).unwrap_or_default();
         let (kind, answer) = match path {
             "/" => ("text/html", PAGE.as_bytes()),
-            "/roslib.js" => ("text/javascript", &*roslib),
-            "/asked" => ("application/json", asked.as_bytes()),
+            "/roslib.js" => ("text/javascript", &*self.roslib),
+            "/asked" => ("application/json", self.asked.as_bytes()),
             _ => ("text/plain", &[][..]),
         };
+        if path == "/said" {
+            self.said.send(serde_json::from_slice(&body)?)?;
+        }
         write!(
             stream,
             "HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
             answer.len()
         )?;
-        stream.write_all(answer)?;
-        if path == "/said" {
-            said.send(serde_json::from_slice(&body)?)?;
-            return Ok(());
-        }
+        Ok(stream.write_all(answer)?)
     }
-    Ok(())
 }
 
 pub fn a_page_with_roslib_shows_its_token() -> Verdict {
@@ -151,13 +163,17 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
         "url": daemon.url("adder_py?robot=page"),
         "tokens": {"own": page, "another's": other, "unknown": "0".repeat(52)},
     });
-    let serving = std::thread::spawn(move || serve(&listener, &asked, &sender));
+    let site = Site {
+        roslib: std::fs::read(binaries::node_modules().join("roslib/build/roslib.min.js"))?,
+        asked: asked.to_string(),
+        said: sender,
+    };
+    site.serve(listener);
     let profile = world().directory("profile")?;
     let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path())?;
     let said = said.recv_timeout(PATIENCE + Duration::from_secs(60));
     drop(browser);
     let said = said.context("the page said nothing")?;
-    serving.join().expect("the server of the page")?;
     for way in ["query", "auth", "subprotocol"] {
         ensure!(said["own"][way] == 42, "{way}: {said}");
         for whose in ["another's", "unknown"] {
