@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
-use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::{PATIENCE, Robot};
 use support::site::Site;
 use support::world::world;
+use support::{Verdict, until};
 
 /// A message that will come is nearly always there by then.
 const SOON: Duration = Duration::from_millis(200);
@@ -219,7 +219,18 @@ pub fn what_a_robot_says_is_said_to_a_candidate_too() -> Verdict {
         ensure!(said["data"] == word, "{said}");
         Ok(())
     };
-    says(&mut robot, "before")?;
+    // What a node says before its publisher knows of the subscription is lost, as in every ROS.
+    let is_said = |message: &Value| message["topic"] == "/teller/said";
+    let before = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "before"}});
+    until("what the node says", || {
+        robot.says(before.clone())?;
+        Ok(match robot.has_not_heard(is_said)? {
+            true => Err("nothing came".to_owned()),
+            false => Ok(()),
+        })
+    })?;
+    robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "heard"}}))?;
+    while robot.hears_on("/teller/said")?["data"] != "heard" {}
     let changed = [&arguments[..], &["--param", "word=another"]].concat();
     daemon
         .deployer()

@@ -96,6 +96,7 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
         .collect::<Result<_, _>>()?;
     // Traffic, and a call that its node is still at.
     let url = first.url("greeter_cpp?robot=r1");
+    let (flowing, flows) = std::sync::mpsc::channel();
     let traffic = std::thread::spawn(move || {
         let Ok(mut robot) = Robot::connect(&url) else {
             return 0;
@@ -108,6 +109,7 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
             .is_ok()
         {
             sent += 1;
+            let _ = flowing.send(());
         }
         sent
     });
@@ -119,6 +121,7 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
         tries(&mut caller, "write", "/tmp/called yes")?.succeeded,
         "another is answered meanwhile"
     );
+    flows.recv_timeout(PATIENCE).context("no traffic")?;
     first.is_killed()?;
     ensure!(
         traffic.join().is_ok_and(|sent| sent > 0),
