@@ -8,6 +8,8 @@ use support::Verdict;
 
 #[path = "stories/access.rs"]
 mod access;
+#[path = "stories/acme.rs"]
+mod acme;
 #[path = "stories/answer.rs"]
 mod answer;
 #[path = "stories/audit.rs"]
@@ -376,6 +378,11 @@ fn main() -> ExitCode {
             nodes_end_as_ros_users_know_it,
             a_locked_database_is_named_and_waited_for,
             a_full_disk_is_named_and_robots_at_work_stay,
+        ],
+        stories![acme:
+            a_certificate_is_asked_for_and_renewed,
+            who_comes_for_something_else_is_answered_no_challenge,
+            what_cannot_be_asked_for_is_said_at_the_start,
         ],
         stories![tls:
             a_robot_works_through_tls,

@@ -1,6 +1,7 @@
 //! What stories are told with: a daemon of their own or the one they share, a deployer who types commands, a
 //! robot on a WebSocket, and an eye for what is left behind.
 
+pub mod acme;
 pub mod binaries;
 pub mod burglar;
 pub mod burglary;

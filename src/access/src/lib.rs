@@ -22,7 +22,7 @@ pub mod sparing;
 pub use decide::{Action, Object, Refusal, decide};
 pub use glob::Glob;
 pub use grant::{Grant, Operation};
-pub use guesses::Guesses;
+pub use guesses::{Guesses, Host};
 pub use policy::{Grants, Policy, Rule, Standing, Who};
 pub use principal::{Principal, Role, Scope};
 pub use sparing::Sparing;

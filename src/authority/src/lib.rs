@@ -18,7 +18,7 @@ use std::path::PathBuf;
 
 pub use issue::{Authority, Issued};
 pub use request::{LONGEST, Request};
-pub use shown::{Shown, read};
+pub use shown::{Period, Shown, period, read};
 
 /// Milliseconds since 1970.
 pub type Millis = u64;

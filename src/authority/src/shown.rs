@@ -15,7 +15,7 @@ pub struct Shown {
     pub robot: String,
     /// SHA-256 of its key, in hexadecimal digits.
     pub key: String,
-    /// The certificate's end: that of the last second in which it is good (RFC 5280, section 4.1.2.5, counts that in).
+    /// The certificate's end.
     pub until: Millis,
     /// Who signed it, by name (DER).
     pub(crate) issuer: Vec<u8>,
@@ -35,6 +35,29 @@ fn parsed<'a>(certificate: &'a CertificateDer<'_>) -> Result<X509Certificate<'a>
 /// The name of whom a certificate is (DER).
 pub(crate) fn subject(certificate: &CertificateDer<'_>) -> Result<Vec<u8>, String> {
     Ok(parsed(certificate)?.subject().as_raw().to_vec())
+}
+
+/// From when to when a certificate is good.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Period {
+    /// Its beginning.
+    pub from: Millis,
+    /// Its end: that of the last second in which it is good (RFC 5280, section 4.1.2.5, counts that in).
+    pub until: Millis,
+}
+
+/// Reads from when to when any certificate is good. Times before 1970 are 1970.
+pub fn period(certificate: &CertificateDer<'_>) -> Result<Period, String> {
+    Ok(period_of(&parsed(certificate)?))
+}
+
+fn period_of(parsed: &X509Certificate<'_>) -> Period {
+    let validity = parsed.validity();
+    let millis = |seconds: i64| Millis::try_from(seconds).unwrap_or(0).saturating_mul(1000);
+    Period {
+        from: millis(validity.not_before.timestamp()),
+        until: millis(validity.not_after.timestamp().saturating_add(1)),
+    }
 }
 
 /// Reads a robot's certificate: its name is `robot:NAME` as URI among the subject alternative names or, where there is none, as
@@ -62,14 +85,10 @@ pub fn read(certificate: &CertificateDer<'_>) -> Result<Shown, Error> {
             _ => "it names several".to_owned(),
         }));
     };
-    let end = parsed.validity().not_after.timestamp();
     Ok(Shown {
         robot: (*robot).to_owned(),
         key: hex::encode(hash(&parsed.public_key().subject_public_key.data)),
-        until: Millis::try_from(end)
-            .unwrap_or(0)
-            .saturating_add(1)
-            .saturating_mul(1000),
+        until: period_of(&parsed).until,
         issuer: parsed.issuer().as_raw().to_vec(),
     })
 }

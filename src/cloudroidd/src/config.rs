@@ -1,6 +1,7 @@
 //! The configuration file: TOML, every key optional, unknown keys refused by name.
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
+mod acme;
 mod class;
 mod doubts;
 mod options;
@@ -24,6 +25,7 @@ use servant::quotas::Quotas;
 
 use crate::machine;
 
+pub use acme::Acme;
 pub use class::Class;
 pub use people::People;
 pub use time::Time;

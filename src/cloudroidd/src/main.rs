@@ -221,6 +221,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         let _ = privilege::now(move || std::fs::remove_file(socket));
     })?;
     let listener = listen(config.listen).await?;
+    let looked_at = certificates::listen_for_challenges(config.tls.acme.as_ref()).await?;
     let socket = home.listen()?;
     let runtime = std::env::var_os("RUNTIME_DIRECTORY").map(PathBuf::from);
     let admins = admins::Admins::of(&config, runtime)?;
@@ -259,6 +260,13 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         // The key is root's.
         let keeping = certificates::keep(Arc::clone(&app), certificate, key);
         tokio::spawn(privilege::run(keeping));
+    }
+    if let Some(acme) = config.tls.acme.clone() {
+        if let Some(looked_at) = looked_at {
+            tokio::spawn(portal::serve_challenges(Arc::clone(&app), looked_at));
+        }
+        let renewal = certificates::Renewal::new(Arc::clone(&app), acme, &home, app.listen);
+        tokio::spawn(renewal.keep());
     }
     let (scheme, shown) = match &app.tls {
         Some(tls) => ("https", format!(" (certificate {})", tls.fingerprint())),

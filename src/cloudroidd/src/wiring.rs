@@ -83,6 +83,7 @@ pub fn build(
         principals,
         passwords: Passwords::default(),
         audit: Audit::new(Arc::clone(&state)),
+        handshakes: Arc::default(),
         listen,
         tls: certificates::tls(&config.tls, home, listen, robots.as_ref())?,
         robots,

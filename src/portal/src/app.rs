@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
+use crate::handshakes::Handshakes;
 use crate::people::passwords::Passwords;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
@@ -57,6 +58,8 @@ pub struct App {
     pub passwords: Passwords,
     /// What was done.
     pub audit: Audit,
+    /// Handshakes of TLS that are under way.
+    pub handshakes: Arc<Handshakes>,
     /// Where the portal listens, as bound.
     pub listen: std::net::SocketAddr,
     /// TLS of the TCP listener; none: plain text.

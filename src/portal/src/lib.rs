@@ -18,11 +18,13 @@ mod audit;
 mod auth;
 mod body;
 mod calibration;
+mod connections;
 mod dictionary;
 mod errors;
 mod explain;
 mod guard;
 mod handshake;
+mod handshakes;
 mod machines;
 mod metrics;
 mod oci;
@@ -43,40 +45,22 @@ mod tls;
 mod tokens;
 mod views;
 
-use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
 
 pub use axum::Router;
-use hyper::Request;
-use hyper::body::Incoming;
-use hyper::service::service_fn;
-use hyper_util::rt::{TokioIo, TokioTimer};
-use hyper_util::service::TowerToHyperService;
-use socket2::SockRef;
-use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
-use tokio_util::task::TaskTracker;
+pub use axum::http::Uri;
 
 pub use ::tls::Fingerprint;
 pub use app::{App, Machine, Options};
 pub use audit::Audit;
+pub use connections::{serve_challenges, serve_tcp, serve_unix};
+pub use handshakes::Handshakes;
 pub use machines::Robots;
 pub use people::passwords::Passwords;
 pub use principals::{Lasting, Principals};
 pub use proxies::{Network, NoNetwork, Proxies};
-pub use tls::{Tls, TlsError};
+pub use tls::{Challenge, Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
-
-use access::{Action, Principal};
-use guard::{Caller, Connection, Peer, User};
-use principals::Shown;
-use tls::Accepted;
-
-/// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
-const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
-/// Bytes that the kernel takes for a connection beyond those that are on their way.
-const UNSENT: u32 = 128 * 1024;
 
 /// The routes, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
@@ -92,167 +76,4 @@ pub fn router(app: Arc<App>) -> Router {
             guard::guard,
         ))
         .with_state(app)
-}
-
-/// Accepts TCP connections until the daemon ends.
-pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
-    let connections = TaskTracker::new();
-    loop {
-        let accepted = tokio::select! {
-            accepted = listener.accept() => accepted,
-            () = app.ending.cancelled() => break,
-        };
-        match accepted {
-            Ok((stream, address)) => {
-                tune(&stream);
-                let peer = Peer::Tcp(address);
-                connections.spawn(secured(Arc::clone(&app), router.clone(), stream, peer));
-            }
-            Err(error) => {
-                tracing::warn!("no connection can be accepted: {error}");
-                tokio::time::sleep(ACCEPT_AGAIN).await;
-            }
-        }
-    }
-    drain(&app, connections).await;
-}
-
-/// Makes a connection fit for many small messages beside big ones. What cannot be set is not needed to go on.
-fn tune(stream: &TcpStream) {
-    // None of them waits for the next.
-    let _ = stream.set_nodelay(true);
-    // The kernel would take megabytes for a client that reads slowly, and an answer would wait behind all of them.
-    let _ = SockRef::from(stream).set_tcp_notsent_lowat(UNSENT);
-}
-
-/// Accepts connections on a Unix socket until the daemon ends. Members of `group` are admins there.
-pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, group: Option<u32>) {
-    let connections = TaskTracker::new();
-    loop {
-        let accepted = tokio::select! {
-            accepted = listener.accept() => accepted,
-            () = app.ending.cancelled() => break,
-        };
-        match accepted.and_then(|(stream, _)| Ok((user(&stream, group)?, stream))) {
-            Ok((user, stream)) => {
-                let connection = Connection::plain(Peer::Unix(user));
-                connections.spawn(serve(Arc::clone(&app), router.clone(), stream, connection));
-            }
-            Err(error) => {
-                tracing::warn!("no connection can be accepted on the socket: {error}");
-                tokio::time::sleep(ACCEPT_AGAIN).await;
-            }
-        }
-    }
-    drain(&app, connections).await;
-}
-
-/// Who is at the other end.
-fn user(stream: &UnixStream, group: Option<u32>) -> std::io::Result<User> {
-    let peer = stream.peer_cred()?;
-    let is_member = match group {
-        None => false,
-        Some(group) => peer.gid() == group || peer_groups::of(stream)?.contains(&group),
-    };
-    Ok(User {
-        uid: peer.uid(),
-        is_member,
-    })
-}
-
-async fn drain(app: &App, connections: TaskTracker) {
-    connections.close();
-    let _ = tokio::time::timeout(app.options.drain, connections.wait()).await;
-}
-
-/// Serves a TCP connection, through TLS where the portal speaks it.
-async fn secured(app: Arc<App>, router: Router, stream: TcpStream, peer: Peer) {
-    let Some(tls) = &app.tls else {
-        return serve(app, router, stream, Connection::plain(peer)).await;
-    };
-    let accepted = tokio::select! {
-        accepted = tokio::time::timeout(app.options.handshake, tls.accept(stream)) => accepted,
-        () = app.ending.cancelled() => return,
-    };
-    match accepted {
-        Ok(Ok(Accepted::Tls(stream))) => {
-            let connection = Connection {
-                secure: true,
-                certificates: tls::certificates(&stream),
-                ..Connection::plain(peer)
-            };
-            let ended = unpaired(&app, &connection);
-            tokio::select! {
-                // A connection that became a WebSocket goes on in its session, which is told the same.
-                () = ended => {}
-                () = serve(Arc::clone(&app), router, *stream, connection) => {}
-            }
-        }
-        Ok(Ok(Accepted::Plain(stream))) => {
-            serve(app, tls::refusing(), stream, Connection::plain(peer)).await;
-        }
-        Ok(Err(error)) => {
-            tracing::debug!("no TLS with {peer}: {error}");
-            if let Some(refused) = tls::refused_certificate(&error) {
-                let nobody = Caller::new(
-                    &Connection::plain(peer),
-                    Principal::nobody(),
-                    Shown::Nothing,
-                );
-                let did = format!("showed a certificate that was refused: {refused}");
-                let status = axum::http::StatusCode::UNAUTHORIZED.as_u16();
-                app.audit
-                    .record_sparingly(&nobody, Action::Enter, &did, "the server", status);
-            }
-        }
-        Err(_) => tracing::debug!("no TLS with {peer}: its handshake did not end in time"),
-    }
-}
-
-/// Comes back when the pairing ends of the robot whose certificate a connection has shown.
-fn unpaired(app: &Arc<App>, connection: &Connection) -> impl Future<Output = ()> + use<> {
-    let who = app
-        .principals
-        .with(|known| guard::certified(app, connection, known));
-    let app = Arc::clone(app);
-    async move {
-        match who {
-            Some(Ok(who)) => {
-                app.principals.ended(&who, "", false).await;
-            }
-            // Who shows none, or one that is refused, is answered so.
-            _ => std::future::pending().await,
-        }
-    }
-}
-
-async fn serve(
-    app: Arc<App>,
-    router: Router,
-    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    connection: Connection,
-) {
-    let peer = connection.peer;
-    let router = TowerToHyperService::new(router);
-    let service = service_fn(move |mut request: Request<Incoming>| {
-        request.extensions_mut().insert(connection.clone());
-        let answer = hyper::service::Service::call(&router, request);
-        async move { Ok::<_, Infallible>(answer.await.unwrap_or_else(|never| match never {})) }
-    });
-    let served = hyper::server::conn::http1::Builder::new()
-        .timer(TokioTimer::new())
-        .header_read_timeout(app.options.handshake)
-        .serve_connection(TokioIo::new(stream), service)
-        .with_upgrades();
-    tokio::pin!(served);
-    let outcome = tokio::select! {
-        outcome = served.as_mut() => outcome,
-        () = app.ending.cancelled() => {
-            served.as_mut().graceful_shutdown();
-            served.await
-        }
-    };
-    if let Err(error) = outcome {
-        tracing::debug!("a connection from {peer:?} ended: {error}");
-    }
 }

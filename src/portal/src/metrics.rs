@@ -12,6 +12,7 @@ use bridge::Metrics;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::tls::Tls;
 use choreographer::{Choreographer, Handle};
 
 const PHASES: [Phase; 6] = [
@@ -68,6 +69,9 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
             (labels(&[("why", "slowed")]), slowed as f64),
         ],
     );
+    if let Some(tls) = &app.tls {
+        transport(&mut out, &app, tls);
+    }
     capacity(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
     gauge(
@@ -207,6 +211,25 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     Metrics::prometheus_help(out);
     for (of, reach) in &bridges {
         reach.metrics().prometheus(out, of);
+    }
+}
+
+/// TLS.
+fn transport(out: &mut String, app: &App, tls: &Tls) {
+    family(
+        out,
+        "cloudroid_refused_handshakes_total",
+        "counter",
+        "Handshakes of TLS that were not begun because too many were under way.",
+        [(String::new(), app.handshakes.refused() as f64)],
+    );
+    if let Some(end) = tls.end() {
+        gauge(
+            out,
+            "cloudroid_certificate_end_seconds",
+            "When the portal's certificate ends, in seconds since 1970.",
+            [(String::new(), end as f64 / 1000.0)],
+        );
     }
 }
 

@@ -109,7 +109,7 @@ struct Client {
 pub struct Proxies(pub Vec<Network>);
 
 impl Proxies {
-    fn has(&self, address: IpAddr) -> bool {
+    pub(crate) fn has(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.has(address))
     }
 

@@ -1,11 +1,13 @@
 //! TLS of the TCP listener, by rustls (TLS 1.2 and 1.3; docs/adr/080).
 
+use std::collections::HashMap;
 use std::fmt;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ::tls::Fingerprint;
+use api::Millis;
 use axum::Router;
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use axum::response::{IntoResponse, Response};
@@ -29,6 +31,8 @@ const LINGER: Duration = Duration::from_secs(1);
 const UNREAD: u64 = 64 << 10;
 /// What is spoken through TLS (RFC 7301).
 const HTTP_1_1: &[u8] = b"http/1.1";
+/// What an authority says that looks whether a name leads here (RFC 8737).
+const ACME_TLS_1: &[u8] = b"acme-tls/1";
 
 /// Why a certificate and a key cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -44,12 +48,36 @@ pub struct Tls {
 
 /// The certificate that is shown, and its key.
 #[derive(Debug)]
-struct Shown(RwLock<Arc<CertifiedKey>>);
+struct Shown {
+    current: RwLock<Arc<CertifiedKey>>,
+    /// What authorities are shown instead, by name in lower case.
+    challenges: RwLock<HashMap<String, Arc<CertifiedKey>>>,
+}
 
 impl ResolvesServerCert for Shown {
-    fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        Some(Arc::clone(&self.0.read()))
+    fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        if is_challenge(hello.alpn()) {
+            let name = hello.server_name()?.to_ascii_lowercase();
+            return self.challenges.read().get(&name).map(Arc::clone);
+        }
+        Some(Arc::clone(&self.current.read()))
     }
+}
+
+/// Whether the protocols that are offered are those of an authority's look (RFC 8737, section 3: that one alone).
+fn is_challenge<'a>(offered: Option<impl Iterator<Item = &'a [u8]>>) -> bool {
+    offered
+        .is_some_and(|mut offered| offered.next() == Some(ACME_TLS_1) && offered.next().is_none())
+}
+
+/// What an authority is shown that looks whether a name leads here.
+pub struct Challenge {
+    /// The name.
+    pub name: String,
+    /// The certificate (RFC 8737, section 3).
+    pub certificate: CertificateDer<'static>,
+    /// Its key.
+    pub key: PrivateKeyDer<'static>,
 }
 
 impl fmt::Debug for Tls {
@@ -64,6 +92,8 @@ pub enum Accepted {
     Tls(Box<TlsStream<TcpStream>>),
     /// Something else: nothing has been read of it.
     Plain(TcpStream),
+    /// An authority that has seen what it looked for. Nothing else is said to it (RFC 8737, section 3).
+    Challenge,
 }
 
 fn checked(
@@ -94,13 +124,16 @@ impl Tls {
                 .allow_unauthenticated()
                 .build()
                 .map_err(|error| rustls::Error::General(error.to_string()))?;
-        let shown = Arc::new(Shown(RwLock::new(checked(chain, key)?)));
+        let shown = Arc::new(Shown {
+            current: RwLock::new(checked(chain, key)?),
+            challenges: RwLock::default(),
+        });
         let builder =
             ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
         let mut config = builder
             .with_client_cert_verifier(clients)
             .with_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesServerCert>);
-        config.alpn_protocols = vec![HTTP_1_1.to_vec()];
+        config.alpn_protocols = vec![HTTP_1_1.to_vec(), ACME_TLS_1.to_vec()];
         Ok(Tls {
             config: Arc::new(config),
             shown,
@@ -114,26 +147,48 @@ impl Tls {
         chain: Vec<CertificateDer<'static>>,
         key: PrivateKeyDer<'static>,
     ) -> Result<(), TlsError> {
-        *self.shown.0.write() = checked(chain, key)?;
+        *self.shown.current.write() = checked(chain, key)?;
+        Ok(())
+    }
+
+    /// Shows these to authorities that look for them, and no others any more.
+    pub fn answer(&self, challenges: Vec<Challenge>) -> Result<(), TlsError> {
+        let answers = challenges.into_iter().map(|challenge| {
+            // Its extension, which only an authority understands, is critical: checked it would be refused.
+            let key = ring::default_provider()
+                .key_provider
+                .load_private_key(challenge.key)?;
+            let shown = CertifiedKey::new(vec![challenge.certificate], key);
+            Ok((challenge.name.to_ascii_lowercase(), Arc::new(shown)))
+        });
+        let answers = answers.collect::<Result<HashMap<_, _>, TlsError>>()?;
+        *self.shown.challenges.write() = answers;
         Ok(())
     }
 
     /// The fingerprint of what is shown.
     pub fn fingerprint(&self) -> Fingerprint {
-        let shown = self.shown.0.read();
+        let shown = self.shown.current.read();
         // rustls takes no key without a certificate.
         Fingerprint::of(shown.cert.first().unwrap_or(&CertificateDer::from(&[][..])))
     }
 
+    /// When what is shown ends.
+    pub(crate) fn end(&self) -> Option<Millis> {
+        let shown = self.shown.current.read();
+        let period = shown.cert.first().map(authority::period)?;
+        period.ok().map(|period| period.until)
+    }
+
     /// Whether no authority has signed what is shown.
     pub(crate) fn signs_itself(&self) -> bool {
-        let shown = self.shown.0.read();
+        let shown = self.shown.current.read();
         shown.cert.first().is_some_and(::tls::signs_itself)
     }
 
     /// Whether what is shown is valid for a host, which may have a port behind it.
     pub fn speaks_for(&self, authority: &str) -> bool {
-        let shown = self.shown.0.read();
+        let shown = self.shown.current.read();
         shown
             .cert
             .first()
@@ -156,6 +211,10 @@ impl Tls {
         }
         let acceptor = TlsAcceptor::from(Arc::clone(&self.config));
         match acceptor.accept(stream).into_fallible().await {
+            Ok(mut stream) if stream.get_ref().1.alpn_protocol() == Some(ACME_TLS_1) => {
+                let _ = tokio::time::timeout(LINGER, stream.shutdown()).await;
+                Ok(Accepted::Challenge)
+            }
             Ok(stream) => Ok(Accepted::Tls(Box::new(stream))),
             Err((error, stream)) => {
                 if refused_certificate(&error).is_some() {

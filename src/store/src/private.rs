@@ -2,7 +2,7 @@
 //! builds (docs/adr/033).
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions};
-use std::io;
+use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
@@ -25,6 +25,19 @@ pub fn open(path: &Path) -> io::Result<File> {
         .open(path)?;
     close(path)?;
     Ok(file)
+}
+
+/// Writes a file, whole or not at all, with the directory that it is in.
+pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    if let Some(directory) = path.parent() {
+        make_directory(directory)?;
+    }
+    let begun = path.with_extension("begun");
+    let mut file = open(&begun)?;
+    file.set_len(0)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    std::fs::rename(&begun, path)
 }
 
 /// Removes the rights of group and others on a file or directory. Links, and paths that do not exist, are skipped.
@@ -91,6 +104,21 @@ mod tests {
         assert_eq!(mode(&path("a/b/c")), 0o755, "left alone");
         assert_eq!(mode(&path("outside")), 0o644, "behind a link");
         close(&path("gone")).expect("nothing to do");
+    }
+
+    #[test]
+    fn a_file_is_replaced_whole_and_is_its_owners_alone() {
+        let place = tempfile::tempdir().expect("a directory");
+        let path = place.path().join("a/file.pem");
+        // What a daemon left that was ended meanwhile.
+        std::fs::create_dir(place.path().join("a")).expect("made");
+        std::fs::write(path.with_extension("begun"), "much longer").expect("made");
+        for text in ["first", "2nd"] {
+            replace(&path, text.as_bytes()).expect("replaced");
+            assert_eq!(std::fs::read_to_string(&path).expect("there"), text);
+            assert_eq!(mode(&path), 0o600);
+        }
+        assert!(!path.with_extension("begun").exists());
     }
 
     #[test]

@@ -4,9 +4,10 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use serde::Deserialize;
 
+use super::Acme;
 use super::time::Time;
 
 /// TLS of the portal.
@@ -25,6 +26,8 @@ pub struct Tls {
     pub robot_certificates: Time,
     /// PEM file of authorities of the lab's own that sign robots' certificates, besides the daemon's.
     pub client_authorities: Option<PathBuf>,
+    /// Whom the daemon asks for its certificate.
+    pub acme: Option<Acme>,
 }
 
 impl Default for Tls {
@@ -36,6 +39,7 @@ impl Default for Tls {
             names: Vec::new(),
             robot_certificates: Time::seconds(7 * 86_400),
             client_authorities: None,
+            acme: None,
         }
     }
 }
@@ -60,10 +64,15 @@ impl Tls {
     /// Whether a portal that listens at an address speaks it.
     pub fn is_spoken(&self, listen: SocketAddr) -> bool {
         match self.serve {
-            Serve::Auto => self.certificate.is_some() || !listen.ip().is_loopback(),
+            Serve::Auto => self.is_named() || !listen.ip().is_loopback(),
             Serve::Tls => true,
             Serve::PlainTextBeyondLoopback => false,
         }
+    }
+
+    /// Whether there is a certificate that is not the daemon's own.
+    fn is_named(&self) -> bool {
+        self.certificate.is_some() || self.acme.is_some()
     }
 
     /// The files of the operator's own certificate and key.
@@ -81,14 +90,22 @@ impl Tls {
             }
             _ => {}
         }
-        if self.serve == Serve::PlainTextBeyondLoopback && self.certificate.is_some() {
+        if let Some(acme) = &self.acme {
+            acme.check().context("[tls.acme]")?;
+            if self.certificate.is_some() {
+                bail!(
+                    "certificate names one that is there, and [tls.acme] asks for another; remove one of both"
+                );
+            }
+        }
+        if self.serve == Serve::PlainTextBeyondLoopback && self.is_named() {
             bail!(
                 "serve = \"plain-text-beyond-loopback\" shows nobody the certificate; remove one of both"
             );
         }
-        if self.certificate.is_some() && !self.names.is_empty() {
+        if self.is_named() && !self.names.is_empty() {
             bail!(
-                "names are for the certificate that the daemon makes, and certificate names another; remove one of both"
+                "names are for the certificate that the daemon makes, and another is named; remove one of both"
             );
         }
         if self.robot_certificates.0 < SHORTEST {
@@ -116,6 +133,7 @@ mod tests {
             ("", false, true),
             ("serve = \"auto\"", false, true),
             (own, true, true),
+            ("[acme]\nnames = [\"a.b\"]\naccept_terms = true", true, true),
             ("serve = \"tls\"", true, true),
             ("serve = \"plain-text-beyond-loopback\"", false, false),
         ] {
@@ -144,12 +162,21 @@ mod tests {
                 "remove one",
             ),
             (
+                "certificate = \"c\"\nkey = \"k\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true",
+                "remove one",
+            ),
+            (
+                "serve = \"plain-text-beyond-loopback\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true",
+                "remove one",
+            ),
+            ("[acme]\nnames = [\"a.b\"]", "[tls.acme]"),
+            (
                 "names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"",
                 "remove one",
             ),
             ("robot_certificates = \"500ms\"", "1s at least"),
         ] {
-            let refused = read(text).check().expect_err(text).to_string();
+            let refused = format!("{:#}", read(text).check().expect_err(text));
             assert!(refused.contains(words), "{refused}");
         }
     }
