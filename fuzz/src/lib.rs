@@ -7,6 +7,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod authority;
 pub mod codec;
 pub mod ros;
 pub mod rosbridge;
@@ -16,6 +17,8 @@ pub type Target = fn(&[u8]);
 
 /// Every target, by the name of its program and of its folder in `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
+    ("authority_request", authority::request),
+    ("authority_certificate", authority::certificate),
     ("codec_zlib", codec::zlib),
     ("codec_deflate", codec::deflate),
     ("codec_zstd", codec::zstd),
