@@ -25,6 +25,12 @@ pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Jo
     tokio::task::spawn_blocking(cancelled_with_this(work))
 }
 
+/// The same for `work` that reads what strangers have written, on a thread that may read every file and do nothing else.
+pub fn reading<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    let work = cancelled_with_this(work);
+    tokio::task::spawn_blocking(move || privilege::reading(work))
+}
+
 /// `work` that is cancelled with the [`cancellable`] future that calls this, wherever it is done.
 pub fn cancelled_with_this<T>(work: impl FnOnce() -> T) -> impl FnOnce() -> T {
     let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();

@@ -193,7 +193,7 @@ impl Build<'_> {
         }
         let package = made.packages.first().cloned().unwrap_or_default();
         let of = (package.clone(), environment.clone(), answer.nodes.clone());
-        let inventory = crate::blocking::spawn(move || {
+        let inventory = crate::blocking::reading(move || {
             let (package, environment, nodes) = of;
             let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
             let of = Published {

@@ -127,7 +127,7 @@ impl Builder {
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             Source::Tree(path) => {
-                let pushed = pushed::inspect(path, &base)?;
+                let pushed = privilege::reading(|| pushed::inspect(path, &base))?;
                 if matches!(pushed, Pushed::Source(_)) {
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;

@@ -207,7 +207,7 @@ pub(crate) async fn ask(
             last_lines: finished.last_words(),
         });
     };
-    let answer = understand(&text)?;
+    let answer = privilege::reading(|| understand(&text))?;
     plan::check(&answer)?;
     Ok(answer)
 }

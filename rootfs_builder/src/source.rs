@@ -84,7 +84,7 @@ pub(crate) async fn needed_by(
 ) -> Result<BTreeSet<String>, Error> {
     let layers: Vec<Digest> = package.diff_ids().collect();
     let trees = build.shop.extracted(&layers).await?;
-    crate::blocking::spawn(move || {
+    crate::blocking::reading(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {
             needed.extend(elf::needed_below(tree)?);

@@ -80,7 +80,8 @@ fn all_have_what_they_need_alone(pid: i32, user: &str) -> Verdict {
     for thread in &threads {
         match thread.0.as_str() {
             // The first thread starts and ends the daemon, and waits in between.
-            "cloudroidd" | "engine" | "netns-pool" | "netns" => is_limited(thread)?,
+            // A reader begins with the rights of the engine's thread that starts it.
+            "cloudroidd" | "engine" | "reader" | "netns-pool" | "netns" => is_limited(thread)?,
             "netns-sockets" => {
                 is_limited(thread)?;
                 // setns(2) and ports below 1024.

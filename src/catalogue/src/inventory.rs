@@ -104,7 +104,8 @@ fn found(state: &State, store: &Store, revision: &RevisionRecord) -> Result<Inve
         commands: &commands,
     };
     let layers = layers(store, &revision.image)?;
-    let inventory = Inventory::take(&layers, of).map_err(Error::Inventory)?;
+    let taken = privilege::reading(|| Inventory::take(&layers, of));
+    let inventory = taken.map_err(Error::Inventory)?;
     let labels = store.image(&digest(&revision.image)?)?.spec.labels;
     let mut flavour = Flavour::default();
     flavour.base = labels.get(BASE).cloned().unwrap_or(flavour.base);

@@ -36,6 +36,9 @@ pub const KEPT: [Capability; 16] = [
     Capability::CAP_NET_BIND_SERVICE,
 ];
 
+/// What those threads of the engine keep that read what strangers have written.
+pub(crate) const READING: Capability = Capability::CAP_DAC_READ_SEARCH;
+
 /// Held where the process has it, and not missed where it has not: limits of open files of servants.
 const KEPT_IF_THERE: Capability = Capability::CAP_SYS_RESOURCE;
 
@@ -125,28 +128,42 @@ fn hold(kept: &CapsHashSet) -> Result<(), Error> {
 /// effective, saved, of files) `account`'s, and no program that it executes gains anything. Checked by reading it back.
 /// Does nothing more to a thread that is confined already.
 pub fn confine(account: Account) -> Result<(), Error> {
+    confine_to(account, &CapsHashSet::new())
+}
+
+/// The same, but for the right to read every file.
+pub(crate) fn confine_to_reading(account: Account) -> Result<(), Error> {
+    let failed = |errno: nix::errno::Errno| Error::Account {
+        user: account.user,
+        group: account.group,
+        source: errno.into(),
+    };
+    // Else another user has no capability.
+    nix::sys::prctl::set_keepcaps(true).map_err(failed)?;
+    confine_to(account, &CapsHashSet::from([READING]))?;
+    nix::sys::prctl::set_keepcaps(false).map_err(failed)
+}
+
+fn confine_to(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
+    let failed_for_account = |source| Error::Account {
+        user: account.user,
+        group: account.group,
+        source,
+    };
     let user = nix::unistd::geteuid().as_raw();
     if user != account.user {
         // The bounding set goes first: it takes a capability to empty it.
         let bounding =
             caps::read(None, CapSet::Bounding).map_err(failed("read the bounding set"))?;
-        for capability in bounding {
-            caps::drop(None, CapSet::Bounding, capability)
+        for capability in bounding.difference(kept) {
+            caps::drop(None, CapSet::Bounding, *capability)
                 .map_err(failed("give up a capability for good"))?;
         }
-        become_account(account).map_err(|source| Error::Account {
-            user: account.user,
-            group: account.group,
-            source,
-        })?;
+        become_account(account).map_err(failed_for_account)?;
     }
-    hold(&CapsHashSet::new())?;
-    nix::sys::prctl::set_no_new_privs().map_err(|errno| Error::Account {
-        user: account.user,
-        group: account.group,
-        source: errno.into(),
-    })?;
-    check(account)
+    hold(kept)?;
+    nix::sys::prctl::set_no_new_privs().map_err(|errno| failed_for_account(errno.into()))?;
+    check(account, kept)
 }
 
 /// The C library's functions of these names change all threads of the process; the system calls change this one.
@@ -164,8 +181,8 @@ fn become_account(account: Account) -> io::Result<()> {
     done(unsafe { libc::syscall(libc::SYS_setresuid, user, user, user) })
 }
 
-/// What the kernel says that the calling thread has.
-fn check(account: Account) -> Result<(), Error> {
+/// What the kernel says that the calling thread has beyond `kept`.
+fn check(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
     let left = |left: String| Err(Error::Left { left });
     for set in [
         CapSet::Effective,
@@ -175,8 +192,9 @@ fn check(account: Account) -> Result<(), Error> {
         CapSet::Bounding,
     ] {
         let held = caps::read(None, set).map_err(failed("read the capabilities"))?;
-        if !held.is_empty() {
-            return left(format!("{} capabilities ({set:?})", held.len()));
+        let more = held.difference(kept).count();
+        if more > 0 {
+            return left(format!("{more} capabilities ({set:?})"));
         }
     }
     let users = nix::unistd::getresuid().map_err(io::Error::from);

@@ -53,6 +53,11 @@ pub fn confined() -> Option<Account> {
     ENGINE.get().map(|(_, account)| *account)
 }
 
+/// On the engine's threads: who those are that have no rights.
+pub(crate) fn is_engines() -> Option<Account> {
+    OF_ENGINE.get().then(confined).flatten()
+}
+
 /// Work that was handed over; it goes on when this is dropped.
 pub struct Task<T>(Handed<T>);
 

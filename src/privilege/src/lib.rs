@@ -5,16 +5,20 @@
 //!   portal's threads: HTTP, WebSocket, bridge,       engine's threads: containers, image store,
 //!   links, buses, choreographer, database            builds, files below the home
 //!     no capability, a user of their own     ──run, blocking, now──▶   root, the capabilities in `KEPT`
+//!                                                                       └─reading─▶ a reader: may read every file, no more
 //! ```
 //!
-//! Code that needs root's files or a capability is handed to the engine's threads by [`run`], [`blocking`] or [`now`]. In
-//! programs that have no engine's threads (tests, tools) the three do the work where they are called.
+//! Code that needs root's files or a capability is handed to the engine's threads by [`run`], [`blocking`] or [`now`]. These have
+//! files that strangers wrote read by a thread for that alone ([`reading`]). In
+//! programs that have no engine's threads (tests, tools) all four do the work where they are called.
 
 mod confine;
 mod engine;
+mod reading;
 
 pub use confine::{Account, DEFAULT_USER, KEPT, confine, limit, only};
 pub use engine::{Engine, Task, blocking, confined, now, run};
+pub use reading::reading;
 
 /// Why a thread does not have the rights that it should have.
 #[derive(Debug, thiserror::Error)]

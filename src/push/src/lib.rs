@@ -197,9 +197,10 @@ impl Pusher {
                 receive::unpack(archive, &tree, &self.options, report).await?;
                 if let Some(name) = &options.name {
                     let of = tree.clone();
-                    let packages = privilege::blocking(move || receive::packages_of(&of)).await;
-                    let packages =
-                        packages.map_err(|_| Error::Internal("looking at the package"))?;
+                    let look = move || privilege::reading(|| receive::packages_of(&of));
+                    let packages = privilege::blocking(look)
+                        .await
+                        .map_err(|_| Error::Internal("looking at the package"))?;
                     self.check_owner(name, &packages)?;
                 }
                 Source::Tree(tree)
