@@ -3,21 +3,14 @@
 
 use std::process::{Child, Command, Stdio};
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use serde_json::json;
 use tempfile::TempDir;
 
 use crate::deployer::run;
 use crate::machine::free_port;
+use crate::tls::make_certificates;
 use crate::world::world;
-
-const CERTIFICATES: &str = r#"
-new="-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
-openssl req -x509 $new -keyout ca.key -out ca.pem -days 2 -subj /CN=directory -addext keyUsage=keyCertSign
-openssl req $new -keyout server.key -out server.csr -subj /CN=localhost
-echo 'subjectAltName=DNS:localhost,IP:127.0.0.1' > names
-openssl x509 -req -in server.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names -out server.pem
-"#;
 
 /// Where the authority is asked, whoever runs there.
 pub struct Directory {
@@ -37,10 +30,7 @@ impl Directory {
     /// A place for one, where nobody answers yet.
     pub fn new() -> anyhow::Result<Directory> {
         let place = world().directory("acme")?;
-        let made = run(Command::new("sh")
-            .args(["-euc", CERTIFICATES])
-            .current_dir(place.path()))?;
-        ensure!(made.status == 0, "{}", made.said());
+        make_certificates(place.path())?;
         Ok(Directory {
             place,
             port: free_port()?,

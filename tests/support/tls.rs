@@ -1,6 +1,6 @@
 //! A proxy that speaks TLS in front of a portal, with an authority of its own, as a robot's owner might have.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use anyhow::ensure;
@@ -26,6 +26,15 @@ echo 'subjectAltName=DNS:localhost,IP:127.0.0.1' > names
 openssl x509 -req -in server.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names -out server.pem
 "#;
 
+/// Makes an authority (`ca.pem`, `ca.key`) and what it has signed for this machine (`server.pem`, `server.key`) in a directory.
+pub(crate) fn make_certificates(place: &Path) -> anyhow::Result<()> {
+    let made = run(Command::new("sh")
+        .args(["-euc", CERTIFICATES])
+        .current_dir(place))?;
+    ensure!(made.status == 0, "{}", made.said());
+    Ok(())
+}
+
 impl Proxy {
     /// In front of the portal at `address`, under the names `localhost` and 127.0.0.1.
     pub fn of(address: &str) -> anyhow::Result<Self> {
@@ -39,10 +48,7 @@ impl Proxy {
 
     fn showing(certificate: &str, address: &str) -> anyhow::Result<Self> {
         let place = world().directory("tls")?;
-        let made = run(Command::new("sh")
-            .args(["-euc", CERTIFICATES])
-            .current_dir(place.path()))?;
-        ensure!(made.status == 0, "{}", made.said());
+        make_certificates(place.path())?;
         let port = free_port()?;
         let listen = format!(
             "OPENSSL-LISTEN:{port},bind=0.0.0.0,reuseaddr,fork,cert={certificate}.pem,key={certificate}.key,verify=0"
