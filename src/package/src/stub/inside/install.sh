@@ -8,7 +8,8 @@
 # --pair: what cloudroidctl pair ROBOT printed on the server, between single quotes: this robot makes a key of its own and gets a
 # certificate. It names the server, its key and the robot, too.
 # --key: the server's key ("ssh-ed25519 AAAA...", or a file that holds it), which this archive has to be signed by; later ones
-# too. Without it the key that is known in the overlay, or, where none is, the one that the archive brings.
+# too. Without it the key that signed the stub of this package before, else one that is known in the overlay, or, where none is, the
+# one that the archive brings.
 # --ca: for a server of wss://, the certificate of the authority to trust, where the system does not.
 # --fingerprint: for a server of wss://, its certificate, where no authority has signed it.
 # Without --prefix: /opt/cloudroid for root, ~/.cloudroid for anybody else. Several stubs share one overlay.
@@ -108,8 +109,10 @@ for file in MANIFEST MANIFEST.sig server.pub; do
   [ -f "$here/$file" ] && [ ! -h "$here/$file" ] || complain "this archive is not signed: it has no $file; get the stub from the server again"
 done
 signers=$work/signers
+# Who signed the stub of this package that is installed signs the next one, too: the key of another server in the same overlay is good for
+# that server's packages, and for those that are not there yet.
 case $key in
-  '') if [ -s "$prefix/servers.pub" ]; then cat "$prefix/servers.pub"; elif [ -s "$known" ]; then cat "$known"; else cat "$here/server.pub"; fi ;;
+  '') if [ -s "$share/server.pub" ]; then cat "$share/server.pub"; elif [ -s "$prefix/servers.pub" ]; then cat "$prefix/servers.pub"; elif [ -s "$known" ]; then cat "$known"; else cat "$here/server.pub"; fi ;;
   AAAA*) printf 'cloudroid ssh-ed25519 %s\n' "$key" ;;
   ssh-ed25519\ *) printf 'cloudroid %s\n' "$key" ;;
   *)
@@ -328,6 +331,7 @@ if [ -e "$share" ]; then mv "$share" "$share.old"; fi
 cp -R "$here/lib/$package" "$lib"
 cp -R "$here/share/$package" "$share"
 cp "$here/install.sh" "$share/install.sh"
+cp "$here/server.pub" "$share/server.pub"
 cat "$settings" > "$share/stub.toml"
 # Whatever the archive was unpacked by: programs are 0755, files 0644, and nothing sets a user.
 for path in "$lib" "$share"; do
