@@ -1,6 +1,9 @@
 //! What a push may take, and how it ends when it takes more or is not wanted any longer.
 
+use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -11,7 +14,9 @@ use serde_json::json;
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::world::world;
-use support::{Verdict, leftovers, procfs};
+use support::{Verdict, binaries, leftovers, procfs};
+
+use crate::access::token;
 
 const GREETER: (&str, &[&str]) = ("greeter_cpp", &["--node", "greeter", "--param", "word=hi"]);
 
@@ -88,6 +93,83 @@ pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Verdict {
     ensure!(!outcome.said().contains("broke off"), "{}", outcome.said());
     ensure!(builds(&daemon)?.is_empty(), "{:?}", builds(&daemon)?);
     daemon.get_json("/api/v1/status")?;
+    Ok(())
+}
+
+/// A package whose node never becomes one, so that whoever pushes it waits.
+fn waiting(below: &Path) -> anyhow::Result<PathBuf> {
+    let place = package(below, "never_there", "print('built')\n")?;
+    std::fs::write(
+        place.join("waits.py"),
+        "#!/usr/bin/env python3\nimport time\ntime.sleep(86400)\n",
+    )?;
+    let mut list = std::fs::read_to_string(place.join("CMakeLists.txt"))?;
+    list.push_str(
+        "catkin_install_python(PROGRAMS waits.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n",
+    );
+    std::fs::write(place.join("CMakeLists.txt"), list)?;
+    Ok(place)
+}
+
+pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
+    let daemon = world().own("disowned").start()?;
+    let place = world().directory("disowned-packages")?;
+    let sleeper = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
+    // While it is built, and while its node is looked at.
+    for (name, package, node, words) in [
+        (
+            "alice",
+            package(place.path(), "sleeps_on", sleeper)?,
+            "x",
+            "it sleeps",
+        ),
+        (
+            "bob",
+            waiting(place.path())?,
+            "waits.py",
+            "starting it once",
+        ),
+    ] {
+        let secret = token(&daemon, &[name, "--role", "deployer", "--service", "*"])?;
+        let mut push = Command::new(binaries::path("cloudroidctl"))
+            .args([
+                "--server",
+                &format!("http://{}", daemon.address),
+                "--token",
+                &secret,
+            ])
+            .args(["push", path_str(&package), "--node", node])
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::from(File::create(place.path().join(name))?))
+            .spawn()?;
+        let told = BufReader::new(push.stdout.take().context("piped")?).lines();
+        let mut said = String::new();
+        for line in told {
+            let line = line?;
+            said.push_str(&line);
+            said.push('\n');
+            if line.contains(words) {
+                daemon
+                    .deployer()
+                    .types(&["token", "revoke", name])?
+                    .succeeded()?;
+            }
+        }
+        said += &std::fs::read_to_string(place.path().join(name))?;
+        ensure!(!push.wait()?.success() && said.contains(words), "{said}");
+        ensure!(said.contains("this token was revoked"), "{said}");
+        // Nothing is left of it, and nothing was published.
+        support::until("the build's end", || {
+            let builds = builds(&daemon)?;
+            Ok(if builds.is_empty() {
+                Ok(())
+            } else {
+                Err(format!("{builds:?}"))
+            })
+        })?;
+        ensure!(daemon.api("/api/v1/services")? == json!([]));
+    }
     Ok(())
 }
 

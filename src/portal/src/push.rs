@@ -10,7 +10,7 @@ use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, State};
 use axum::response::{IntoResponse, Response};
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::{FutureExt, StreamExt, TryStreamExt};
 use push::{Deployer, Published};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -75,6 +75,11 @@ pub async fn push(
 fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     let principal = &caller.who.principal;
     let owner = (!principal.is_unscoped()).then(|| principal.name.clone());
+    let (known, who) = (Arc::clone(app), caller.who.clone());
+    let over = move || {
+        let (app, who) = (Arc::clone(&known), who.clone());
+        async move { app.principals.ended(&who, "", false).await }.boxed()
+    };
     let app = Arc::clone(app);
     let may = move |name: &str| {
         if let Standing::Ended(reason) = app.principals.standing(&caller.who, name) {
@@ -86,6 +91,7 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     Deployer {
         owner,
         may: Box::new(may),
+        over: Box::new(over),
     }
 }
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use api::{Limits, PushEvent, PushOptions, Sla};
 use catalogue::names;
+use futures_util::future::BoxFuture;
 use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
@@ -50,12 +51,17 @@ impl Reporter {
 /// Whether a service of this name may be published; else why not.
 type MayPublish = dyn Fn(&str) -> Result<(), String> + Send + Sync;
 
+/// When a push ends before its time, and why.
+type Over = dyn Fn() -> BoxFuture<'static, String> + Send + Sync;
+
 /// Whoever pushes.
 pub struct Deployer {
     /// Whose a service is that is published for the first time; none: its operators'.
     pub owner: Option<String>,
     /// What it may publish.
     pub may: Box<MayPublish>,
+    /// Comes back with the reason when what it pushes by is not good any more.
+    pub over: Box<Over>,
 }
 
 impl Deployer {
@@ -147,6 +153,7 @@ impl Pusher {
         let outcome = tokio::select! {
             outcome = blocking::cancellable(self.push(&id, options, by, archive, report)) => outcome,
             () = cancel.cancelled() => Err(Error::Ending),
+            reason = (by.over)() => Err(Error::NotAllowed(reason)),
         };
         // First what the builder has in there: it goes when its containers have ended.
         report.building.close();
