@@ -276,6 +276,7 @@ fn main() -> ExitCode {
             no_secret_is_in_any_log,
             members_of_a_group_are_admins_at_a_socket_of_theirs,
             whoever_guesses_is_slowed_and_counted,
+            who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded,
         ],
         stories![tokens:
             no_route_answers_without_a_token,

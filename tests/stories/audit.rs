@@ -146,6 +146,101 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     Ok(())
 }
 
+pub fn who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded() -> Verdict {
+    let daemon = world()
+        .own("audited-refusals")
+        .config("trusted_proxies = [\"127.0.0.1\"]\n")
+        .start()?;
+    let scope = ["--role", "robot", "--service", "*", "--robot"];
+    let robot = |name: &str, robot: &str| token(&daemon, &[&[name], &scope[..], &[robot]].concat());
+    let (_, taker) = (robot("rover", "r1")?, robot("taker", "r2")?);
+    let chief = token(&daemon, &["chief", "--role", "operator"])?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    // One by its scope, one because the name is another's.
+    for token in [&taker, &chief] {
+        let url = daemon.url(&format!("adder_py?robot=r1&token={token}"));
+        let Err(refusal) = Robot::try_connect(&url) else {
+            anyhow::bail!("another's robot was taken over")
+        };
+        ensure!(refusal.status == 403, "{refusal}");
+    }
+    // And over a connection that was let in to say who it is.
+    let mut late = daemon.robot("adder_py?robot=r1")?;
+    late.says(json!({"op": "auth", "mac": chief}))?;
+    late.hears_close()?;
+    let eve = token(&daemon, &["eve", "--role", "viewer", "--service", "*"])?;
+    let bearer = format!("Bearer {eve}");
+    let asks = |path: &str, forwarded: &str| {
+        let headers = [("Authorization", &*bearer), ("Forwarded", forwarded)];
+        Ok::<_, anyhow::Error>(daemon.request("DELETE", path, &headers)?.0)
+    };
+    // What names nobody is the proxy's own; no text of a client stands in an address's place.
+    for (number, (forwarded, status)) in [
+        ("for=192.0.2.7", 403),
+        ("for=\"[2001:db8::7]:4711\"", 403),
+        ("for=unknown", 403),
+        ("for=\"<script>\"", 403),
+        ("for=192.0.2.7 audit: root did it", 403),
+        ("for=", 403),
+        (";;,,", 403),
+        ("for=\"192.0.2.7", 400),
+        ("for=\"\\\"\"", 400),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let told = asks(&format!("/api/v1/services/s{number}"), forwarded)?;
+        ensure!(told == status, "{forwarded}: {told}");
+    }
+    let records = support::until("all of them", || {
+        let records = audited(&daemon)?;
+        let enough = records.iter().filter(|one| one["status"] == 403).count() >= 9;
+        Ok(if enough {
+            Ok(records)
+        } else {
+            Err(format!("{records:#?}"))
+        })
+    })?;
+    for who in ["taker (robot)", "chief (operator)"] {
+        let refused = [
+            ("who", json!(who)),
+            ("action", json!("connect")),
+            ("object", json!("service adder_py as robot r1")),
+            ("status", json!(403)),
+        ];
+        find(&records, &refused)?;
+    }
+    for (number, from) in [
+        "192.0.2.7:0",
+        "[2001:db8::7]:4711",
+        "127.0.0.1:",
+        "127.0.0.1:",
+        "127.0.0.1:",
+        "127.0.0.1:",
+        "127.0.0.1:",
+        "127.0.0.1:",
+        "127.0.0.1:",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let did = format!("DELETE /api/v1/services/s{number}");
+        let record = find(&records, &[("did", json!(did))])?;
+        let told = record["from"].as_str().unwrap_or_default();
+        ensure!(told.starts_with(from), "{record}");
+        let who = if number < 7 {
+            "eve (viewer)"
+        } else {
+            "who shows no token"
+        };
+        ensure!(record["who"] == who, "{record}");
+    }
+    Ok(())
+}
+
 /// Files below a directory that hold one of the texts; images aside.
 fn holding(directory: &Path, texts: &[(String, String)], found: &mut Vec<String>) -> Verdict {
     for entry in std::fs::read_dir(directory)? {

@@ -166,7 +166,16 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     };
     let connection = match app.options.proxies.seen(connection, request.headers()) {
         Ok(seen) => seen,
-        Err(error) => return error.into_response(),
+        Err(error) => {
+            // For whom the proxy asks cannot be told: it is the proxy's.
+            let nobody = Caller::new(connection, Principal::nobody(), Shown::Nothing);
+            let did = format!("{} {}", request.method(), request.uri().path());
+            let status = error.problem().status;
+            let object = "a client that its proxy names badly";
+            app.audit
+                .record_sparingly(&nobody, Action::Enter, &did, object, status);
+            return error.into_response();
+        }
     };
     let peer = connection.peer;
     let admitted = app.principals.with(|known| {
@@ -180,6 +189,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
             // A token that is shown beside it says who asks; and no page uses a browser's certificate.
             if token_in(uri, headers).is_none() {
                 rules.check_origin(headers)?;
+                check_part(headers)?;
                 return Ok(Caller::by(&connection, certified?));
             }
         }
@@ -251,6 +261,7 @@ impl Rules<'_> {
             check_direct(headers)?;
             self.check_host(headers)?;
             self.check_origin(headers)?;
+            check_part(headers)?;
             let mut caller = Caller::new(connection, Principal::local(), Shown::Nothing);
             // Any token is taken; it only owns robots' names.
             let token = given.as_deref().map(tokens::hash);
@@ -334,6 +345,27 @@ impl Rules<'_> {
             what: format!("a page of {origin} may not use this portal"),
             next: format!("if it should, add it to the configuration: origins = [{origin:?}]"),
         })
+    }
+}
+
+/// Refuses what a page of another site loads as a part of itself (an image, a script, a frame): the browser keeps the answer
+/// from the page, but tells it whether there was one, and so what there is here. Browsers say where a request comes from (Fetch
+/// Metadata, W3C); those with an origin are decided by that, and a person who follows a link is answered.
+pub fn check_part(headers: &HeaderMap) -> Result<(), Error> {
+    let is = |name: &str, values: &[&str]| {
+        let said = headers.get(name).and_then(|value| value.to_str().ok());
+        said.is_some_and(|said| values.contains(&said))
+    };
+    let elsewhere = is("sec-fetch-site", &["cross-site", "same-site"]);
+    let follows = is("sec-fetch-mode", &["navigate"]) && is("sec-fetch-dest", &["document"]);
+    match elsewhere && !follows && !headers.contains_key(header::ORIGIN) {
+        true => Err(Error::Foreign {
+            what: "a page of another site may not have this portal's answers as parts of itself"
+                .to_owned(),
+            next: "open the address itself, or ask with a token (Authorization: Bearer TOKEN)"
+                .to_owned(),
+        }),
+        false => Ok(()),
     }
 }
 
@@ -594,6 +626,52 @@ mod tests {
             .with("origin", "https://tool.example")
             .at("/opencv_apps")
             .expect("configured");
+    }
+
+    #[test]
+    fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
+        let none = Tokens::default();
+        let rules = Rules {
+            loopback: true,
+            known: Recognising {
+                tokens: &none,
+                stored: &Stored::default(),
+                guesses: &Mutex::new(Guesses::default()),
+                lasting: Lasting::default(),
+            },
+            origins: &[],
+        };
+        let loads = |site: &str, mode: &str, dest: &str| {
+            let ask = ask(&rules).with("sec-fetch-site", site);
+            let ask = ask
+                .with("sec-fetch-mode", mode)
+                .with("sec-fetch-dest", dest);
+            ask.at("/api/v1/services").map(|_| ())
+        };
+        for (site, mode, dest) in [
+            ("cross-site", "no-cors", "image"),
+            ("cross-site", "no-cors", "script"),
+            ("cross-site", "no-cors", "empty"),
+            ("cross-site", "navigate", "iframe"),
+            ("cross-site", "navigate", "object"),
+            ("same-site", "no-cors", "style"),
+            ("same-site", "navigate", "frame"),
+        ] {
+            assert_eq!(loads(site, mode, dest), Err(403), "{site} {mode} {dest}");
+        }
+        for (site, mode, dest) in [
+            ("same-origin", "cors", "empty"),
+            ("same-origin", "no-cors", "image"),
+            ("none", "navigate", "document"),
+            ("cross-site", "navigate", "document"),
+        ] {
+            assert_eq!(loads(site, mode, dest), Ok(()), "{site} {mode} {dest}");
+        }
+        // By its origin it is decided whether a page of this machine may.
+        let page = ask(&rules)
+            .with("sec-fetch-site", "same-site")
+            .with("origin", "http://localhost:8080");
+        page.at("/opencv_apps").expect("a page of this machine");
     }
 
     #[test]

@@ -109,7 +109,7 @@ pub fn check(
     let reads = matches!(*method, Method::GET | Method::HEAD);
     let upgrades = guard::is_upgrade(headers);
     if reads && !upgrades {
-        return Ok(());
+        return guard::check_part(headers);
     }
     check_origin(connection, headers, true)?;
     // A page cannot set a header of a WebSocket; browsers always say its origin.
@@ -197,6 +197,8 @@ mod tests {
             check(&connection(true), &method, &headers(given), "secret").is_ok()
         };
         assert!(asks(Method::GET, &[host]));
+        // As a part of another site's page.
+        assert!(!asks(Method::GET, &[host, ("sec-fetch-site", "same-site")]));
         assert!(asks(Method::DELETE, &[host, own, with]));
         assert!(asks(
             Method::POST,
