@@ -16,6 +16,8 @@ mod answer;
 mod audit;
 #[path = "stories/bounds.rs"]
 mod bounds;
+#[path = "stories/breakin.rs"]
+mod breakin;
 #[path = "stories/browser.rs"]
 mod browser;
 #[path = "stories/burglary.rs"]
@@ -257,6 +259,13 @@ fn main() -> ExitCode {
             a_missing_original_is_said_once_and_the_cloud_goes_on,
             a_local_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
+        ],
+        stories![breakin:
+            nobody_gets_beyond_its_role_and_scope,
+            nothing_is_smuggled_past_who_asks,
+            another_account_of_this_machine_reaches_nothing,
+            a_neighbour_gets_no_further_than_the_door,
+            a_page_of_another_site_reaches_nothing_in_a_real_browser,
         ],
         stories![browser: a_page_with_roslib_shows_its_token],
         stories![operations:

@@ -55,10 +55,11 @@ const adds = (url, prepare, protocols) => new Promise((resolve) => {
 "#;
 
 /// A browser, which ends with this value.
-struct Browser(Child);
+pub struct Browser(Child);
 
 impl Browser {
-    fn opens(url: &str, profile: &std::path::Path) -> anyhow::Result<Browser> {
+    /// With more words of its command line.
+    pub fn opens(url: &str, profile: &std::path::Path, more: &[&str]) -> anyhow::Result<Browser> {
         let child = Command::new("chromium")
             .args([
                 "--headless",
@@ -72,6 +73,7 @@ impl Browser {
                 "--disable-component-update",
             ])
             .arg(format!("--user-data-dir={}", profile.display()))
+            .args(more)
             .arg(url)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -170,7 +172,7 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
     };
     site.serve(listener);
     let profile = world().directory("profile")?;
-    let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path())?;
+    let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path(), &[])?;
     let said = said.recv_timeout(PATIENCE + Duration::from_secs(60));
     drop(browser);
     let said = said.context("the page said nothing")?;

@@ -11,12 +11,12 @@ use support::robot::Robot;
 use support::world::world;
 use support::{Verdict, binaries, until};
 
-const PASSWORD: &str = "four quiet purple engines";
+pub const PASSWORD: &str = "four quiet purple engines";
 const OTHER: &str = "nine loud yellow kettles";
 const PATH: &str = "/api/v1/session";
 
 /// Types a command of accounts, with a password on standard input.
-fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::Result<Outcome> {
+pub fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::Result<Outcome> {
     let mut child = Command::new(binaries::path("cloudroidctl"))
         .arg("account")
         .args(arguments)
@@ -40,11 +40,11 @@ fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::Resul
 }
 
 /// A browser in which somebody has signed in.
-struct Browser<'a> {
+pub struct Browser<'a> {
     daemon: &'a Daemon,
-    origin: String,
-    cookie: String,
-    csrf: String,
+    pub origin: String,
+    pub cookie: String,
+    pub csrf: String,
 }
 
 fn asks_in(
@@ -70,7 +70,7 @@ fn set_cookie(head: &str) -> anyhow::Result<(String, String)> {
 }
 
 impl<'a> Browser<'a> {
-    fn signs_in(daemon: &'a Daemon, name: &str, password: &str) -> anyhow::Result<Browser<'a>> {
+    pub fn signs_in(daemon: &'a Daemon, name: &str, password: &str) -> anyhow::Result<Browser<'a>> {
         Browser::signs_in_showing(daemon, name, password, &[])
     }
 
@@ -104,7 +104,7 @@ impl<'a> Browser<'a> {
     }
 
     /// As the page asks.
-    fn asks(&self, method: &str, path: &str) -> anyhow::Result<(u16, String)> {
+    pub fn asks(&self, method: &str, path: &str) -> anyhow::Result<(u16, String)> {
         self.asks_with(
             method,
             path,
@@ -113,7 +113,7 @@ impl<'a> Browser<'a> {
     }
 
     /// With the cookie and these headers alone.
-    fn asks_with(
+    pub fn asks_with(
         &self,
         method: &str,
         path: &str,

@@ -14,7 +14,7 @@ const METHODS: [&str; 8] = [
 ];
 
 /// Methods and addresses of the table, with a name in each place for one.
-fn routes() -> anyhow::Result<Vec<(String, String)>> {
+pub fn routes() -> anyhow::Result<Vec<(String, String)>> {
     let (_, rows) = TABLE.split_once("ROUTES: &[Route]").context("the table")?;
     let mut routes = Vec::new();
     for row in rows.split("at(").skip(1) {

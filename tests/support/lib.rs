@@ -19,6 +19,7 @@ pub mod robot;
 pub mod shaper;
 pub mod site;
 pub mod tls;
+pub mod wire;
 pub mod world;
 
 use std::time::{Duration, Instant};

@@ -102,10 +102,11 @@ fn the_map_says_what_the_manifests_say() {
 #[test]
 fn the_stories_that_security_rests_on_exist() {
     let document = std::fs::read_to_string(root().join("docs/security.md")).expect("it is there");
-    let (table, _) = document.split_once("\n## ").expect("the table's end");
+    let (tables, _) = document.split_once("\n## ").expect("the table's end");
+    let (counts, table) = tables.split_once("\n| position |").expect("the table");
     let registered = std::fs::read_to_string(root().join("tests/main.rs")).expect("it is there");
     let mut named = 0;
-    for row in table.lines().filter(|line| line.starts_with("| ")).skip(1) {
+    for row in table.lines().filter(|line| line.starts_with("| ")) {
         let cells: Vec<&str> = row.trim_matches('|').split(" | ").collect();
         assert_eq!(cells.len(), 4, "{row}");
         let stories: Vec<&str> = cells[3]
@@ -127,4 +128,23 @@ fn the_stories_that_security_rests_on_exist() {
         }
     }
     assert!(named > 15, "{named} were found");
+    // Each story holds itself to what the document says that it tries.
+    let directory = root().join("tests/stories/breakin");
+    let stories: Vec<String> = std::fs::read_dir(directory)
+        .expect("it is there")
+        .map(|entry| std::fs::read_to_string(entry.expect("a file").path()).expect("text"))
+        .collect();
+    let rows = counts.lines().filter_map(|row| {
+        let (name, rest) = row.strip_prefix("| `breakin::")?.split_once('`')?;
+        Some((name, rest.trim_end_matches(" |").rsplit(' ').next()?))
+    });
+    let mut counted = 0;
+    for (name, least) in rows {
+        let holds = stories.iter().any(|story| {
+            story.contains(&format!("pub fn {name}()")) && story.contains(&format!("> {least}, "))
+        });
+        assert!(holds, "{name} does not hold itself to {least} attempts");
+        counted += 1;
+    }
+    assert_eq!(counted, 5, "{counts}");
 }

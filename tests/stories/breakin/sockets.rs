@@ -1,0 +1,299 @@
+//! Robots' connections: who one is there is what the token says, from beginning to end.
+
+use anyhow::{Context, bail, ensure};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::robot::Robot;
+
+use super::scene::{Scene, state};
+
+/// What a robot shows when it connects: the address behind the server's, and headers.
+type Shown<'a> = (String, Vec<(&'a str, String)>);
+
+/// Connecting as another robot, to another service, in another class, or by another's token.
+pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
+    let tokens = &scene.tokens;
+    let before = state(&scene.daemon)?;
+    let bearer = |token: &str| vec![("Authorization", format!("Bearer {token}"))];
+    let offer = |token: &str| {
+        (
+            "Sec-WebSocket-Protocol",
+            format!("rosbridge, bearer.{token}"),
+        )
+    };
+    let mut attempts: Vec<(Shown<'_>, &[u16])> = Vec::new();
+    let rover = &tokens.rover;
+    for path in [
+        "adder_py?robot=r2",
+        "adder_py?robot=R1",
+        "adder_py?robot=r2&robot=r1",
+        "adder_py?robot=r1%00r2",
+        "adder_py?robot=r1%2Fr2",
+        "adder_py?robot=",
+        "adder_py?robot=*",
+        "adder_py?robot=~abc",
+        "adder_py?robot=%D1%801",
+        "adder_py?class=gold",
+        "adder_py?class=*",
+        "adder_py/?robot=r2",
+        "vault",
+        "vault/",
+        "vault?robot=r1",
+        "vault?robot=r9",
+        "%76ault",
+        "adder_py/../vault",
+        "adder_py%2f..%2fvault",
+        "VAULT",
+        "nothing_such",
+        "api/v1/tokens",
+        "api",
+        "",
+    ] {
+        attempts.push(((path.to_owned(), bearer(rover)), &[400, 403, 404, 405]));
+    }
+    // Two tokens at once: the better way counts, for whom it names and for nothing else.
+    for (path, headers) in [
+        (
+            format!("adder_py?robot=r2&token={}", tokens.other),
+            bearer(rover),
+        ),
+        (
+            format!("adder_py?robot=r2&token={rover}&token={}", tokens.other),
+            vec![],
+        ),
+        (format!("vault?token={}", tokens.admin), bearer(rover)),
+        (
+            format!("vault?robot=r1&token={}", tokens.admin),
+            vec![offer(rover)],
+        ),
+        (
+            "vault".to_owned(),
+            [bearer(rover), vec![offer(&tokens.admin)]].concat(),
+        ),
+        (
+            "vault".to_owned(),
+            vec![(
+                "Sec-WebSocket-Protocol",
+                format!("rosbridge, bearer.{rover}, bearer.{}", tokens.admin),
+            )],
+        ),
+    ] {
+        attempts.push(((path, headers), &[400, 403]));
+    }
+    // Who may look, may not connect; who may publish is no robot elsewhere, nor takes another's name.
+    for token in [&tokens.eve, &tokens.oscar] {
+        for path in [
+            "adder_py",
+            "adder_py?robot=r1",
+            "adder_py?robot=new",
+            "vault?robot=new",
+        ] {
+            attempts.push(((path.to_owned(), bearer(token)), &[403]));
+        }
+    }
+    for (token, path) in [
+        (&tokens.alice, "vault?robot=new"),
+        (&tokens.alice, "adder_py?robot=r1"),
+        (&tokens.alice, "adder_py?robot=r9"),
+        (&tokens.bob, "adder_py?robot=new"),
+        (&tokens.operator, "adder_py?robot=r1"),
+        (&tokens.admin, "vault?robot=r9"),
+    ] {
+        attempts.push(((path.to_owned(), bearer(token)), &[403]));
+    }
+    // A stub's protocol is no other door.
+    let stub = ("Sec-WebSocket-Protocol", link::SUBPROTOCOL.to_owned());
+    for (path, token, status) in [
+        ("vault?robot=r1", Some(rover), &[403][..]),
+        ("adder_py?robot=r2", Some(rover), &[403]),
+        ("adder_py?robot=r3", Some(&tokens.narrow), &[403]),
+        ("adder_py?robot=r1", Some(&tokens.eve), &[403]),
+        ("adder_py?robot=r1", None, &[401]),
+        ("adder_py?robot=r1", Some(&tokens.over), &[401]),
+    ] {
+        let mut headers = token.map_or_else(Vec::new, |token| bearer(token));
+        headers.push(stub.clone());
+        attempts.push(((path.to_owned(), headers), status));
+    }
+    for ((path, headers), status) in attempts {
+        let headers: Vec<(&str, &str)> = headers
+            .iter()
+            .map(|(name, value)| (*name, value.as_str()))
+            .collect();
+        let url = scene.daemon.url(&path);
+        match Robot::try_connect_showing(&url, &headers) {
+            Ok(_) => bail!("{path} {headers:?} was let in"),
+            Err(refusal) => ensure!(
+                status.contains(&refusal.status),
+                "{path} {headers:?}: {refusal}"
+            ),
+        }
+        scene.counts();
+    }
+    // Nobody by the address, and then somebody: for itself alone.
+    for (path, token) in [
+        ("vault", rover),
+        ("vault?robot=r9", rover),
+        ("adder_py?robot=r2", rover),
+        ("adder_py?robot=r1", &tokens.eve),
+        ("adder_py?robot=r1", &tokens.alice),
+        ("adder_py?class=gold", rover),
+        ("nothing_such", rover),
+    ] {
+        let mut robot = scene.daemon.robot(path)?;
+        robot.says(json!({"op": "auth", "mac": token}))?;
+        let close = robot.hears_close().with_context(|| path.to_owned())?;
+        ensure!(u16::from(close.code) == 1008, "{path}: {close:?}");
+        scene.counts();
+    }
+    ensure!(state(&scene.daemon)? == before, "{before:#}");
+    Ok(())
+}
+
+/// A robot that may listen to `/rosout` alone, and tries the rest by other names and in other forms.
+pub fn nobody_uses_what_it_is_not_granted(scene: &Scene) -> Verdict {
+    let tokens = &scene.tokens;
+    let mut robot = scene
+        .daemon
+        .robot(&format!("adder_py?token={}", tokens.narrow))?;
+    // Who it is was said; saying that it is an admin, again and again, changes nothing.
+    for who in [&tokens.admin, &tokens.other, &tokens.narrow] {
+        robot.says(json!({"op": "auth", "mac": who}))?;
+    }
+    let call =
+        |service: &str| json!({"op": "call_service", "service": service, "args": {"a": 1, "b": 2}});
+    let fragment = |message: &Value, num: usize, total: usize, data: &str| json!({"op": "fragment", "id": message["id"], "num": num, "total": total, "data": data});
+    let mut number = 0;
+    for service in [
+        "/add_two",
+        "add_two",
+        "//add_two",
+        "/add_two/",
+        "/./add_two",
+        "/rosout/../add_two",
+        "/ADD_TWO",
+        "/add_two\u{0}",
+        " /add_two",
+        "/add_two ",
+        "/add%5Ftwo",
+        "/\u{430}dd_two",
+        "/**",
+        "*",
+        "~add_two",
+        "",
+        "/rosapi/get_param",
+        "/rosapi/set_param",
+        "/rosapi/delete_param",
+        "rosapi/set_param",
+        "/rosapi//set_param",
+        "/rosapi/../rosapi/set_param",
+        "/adder/set_logger_level",
+        "/rosout/get_loggers",
+    ] {
+        for form in ["whole", "one fragment", "fragments", "png"] {
+            number += 1;
+            let mut message = call(service);
+            message["id"] = format!("n{number}").into();
+            let text = message.to_string();
+            // Where no character is cut.
+            let middle = text.char_indices().nth(text.chars().count() / 2);
+            let (head, tail) = text.split_at(middle.map_or(0, |(at, _)| at));
+            match form {
+                "whole" => robot.says(message.clone())?,
+                "one fragment" => robot.says(fragment(&message, 0, 1, &text))?,
+                "fragments" => {
+                    robot.says(fragment(&message, 1, 2, tail))?;
+                    // Between them a message that is granted.
+                    robot.says(json!({"op": "subscribe", "topic": "/rosout"}))?;
+                    robot.says(fragment(&message, 0, 2, head))?;
+                }
+                _ => robot.says(json!({"op": "png", "data": text}))?,
+            }
+            scene.counts();
+        }
+    }
+    for (operation, names) in [
+        ("publish", json!({"topic": "/rosout", "msg": {"msg": "x"}})),
+        ("publish", json!({"topic": "rosout", "msg": {}})),
+        (
+            "publish",
+            json!({"topic": "/clock", "type": "rosgraph_msgs/Clock", "msg": {}}),
+        ),
+        (
+            "advertise",
+            json!({"topic": "/tf", "type": "tf2_msgs/TFMessage"}),
+        ),
+        (
+            "advertise",
+            json!({"topic": "/rosout", "type": "rosgraph_msgs/Log"}),
+        ),
+        ("subscribe", json!({"topic": "/tf"})),
+        ("subscribe", json!({"topic": "/rosout/../tf"})),
+        ("subscribe", json!({"topic": "/rosout_agg"})),
+        ("subscribe", json!({"topic": "/**"})),
+        ("subscribe", json!({"topic": "*"})),
+        (
+            "advertise_service",
+            json!({"service": "/add_two", "type": "adder_py/AddTwo"}),
+        ),
+        (
+            "advertise_service",
+            json!({"service": "/rosout", "type": "std_srvs/Trigger"}),
+        ),
+        (
+            "advertise_action",
+            json!({"action": "/rosout", "type": "actionlib/Test"}),
+        ),
+        (
+            "send_action_goal",
+            json!({"action": "/rosout", "action_type": "actionlib/Test", "args": {"goal": 1}}),
+        ),
+        (
+            "service_response",
+            json!({"service": "/add_two", "id": "n1", "values": {"sum": 9}, "result": true}),
+        ),
+        ("Call_Service", json!({"service": "/add_two"})),
+        ("call_service\u{0}", json!({"service": "/add_two"})),
+    ] {
+        let mut message = names;
+        message["op"] = operation.into();
+        message["id"] = "other".into();
+        robot.says(message)?;
+        scene.counts();
+    }
+    // Answers keep their order: what was not refused before this one was not done either.
+    robot.says(json!({"op": "call_service", "service": "/rosapi/get_time", "id": "last"}))?;
+    let done = |said: &Value| {
+        said["op"] == "service_response" && said["result"] == true && said["id"] != "last"
+    };
+    robot.hears("the last answer", |said| said["id"] == "last")?;
+    ensure!(
+        robot.has_not_heard(done)?,
+        "something was done that is not granted"
+    );
+    // Nor by what it may ask is it told of more than it may use.
+    for (asked, arguments) in [
+        ("/rosapi/services", json!({})),
+        ("/rosapi/topics", json!({})),
+        ("/rosapi/nodes", json!({})),
+        ("/rosapi/service_type", json!({"service": "/add_two"})),
+        (
+            "/rosapi/service_providers",
+            json!({"service": "adder_py/AddTwo"}),
+        ),
+        (
+            "/rosapi/services_for_type",
+            json!({"type": "adder_py/AddTwo"}),
+        ),
+        ("/rosapi/node_details", json!({"node": "/adder"})),
+        ("/rosapi/get_param_names", json!({})),
+    ] {
+        let told = robot.calls(asked, arguments)?;
+        ensure!(
+            !told["values"].to_string().contains("add_two"),
+            "{asked}: {told}"
+        );
+        scene.counts();
+    }
+    Ok(())
+}
