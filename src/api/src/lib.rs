@@ -27,6 +27,7 @@ pub mod shadow;
 pub mod size;
 pub mod sla;
 pub mod status;
+pub mod stream;
 pub mod stub;
 pub mod trial;
 

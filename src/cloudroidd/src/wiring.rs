@@ -94,6 +94,7 @@ pub fn build(
         choreographer,
         pusher: Arc::new(pusher),
         machine,
+        live: portal::Live::default(),
         started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),

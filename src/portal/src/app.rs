@@ -16,6 +16,7 @@ use crate::handshakes::Handshakes;
 use crate::people::passwords::Passwords;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
+use crate::stream::Live;
 use crate::tls::Tls;
 
 /// What the operator decides of the portal.
@@ -82,6 +83,8 @@ pub struct App {
     pub machine: Machine,
     /// Makes all checks of this machine anew; blocks.
     pub examine: Box<dyn Fn() -> api::Doctor + Send + Sync>,
+    /// What pages are told as it changes.
+    pub live: Live,
     /// When the daemon started.
     pub started: Millis,
     /// Sessions under way.

@@ -116,6 +116,12 @@ pub enum Error {
     /// Too many sign in at once.
     #[error("too many people sign in at once")]
     SignInBusy,
+    /// One has more streams open than one may.
+    #[error("{most} streams are open already, as many as one may have")]
+    TooManyStreams {
+        /// So many.
+        most: usize,
+    },
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
@@ -340,6 +346,9 @@ impl Error {
                 (S::UNAUTHORIZED, "unauthorised", "session over")
             }
             Error::WrongPassword => (S::UNAUTHORIZED, "wrong-password", "not signed in"),
+            Error::TooManyStreams { .. } => {
+                (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams")
+            }
             Error::SignInBusy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign in"),
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 (S::UNAUTHORIZED, "unauthorised", "token needed")
@@ -396,6 +405,9 @@ impl Error {
                 "try again, or have an admin set another password with: cloudroidctl account passwd NAME".into()
             }
             Error::SignInBusy => "try again later".into(),
+            Error::TooManyStreams { .. } => {
+                "close pages of the portal that are open elsewhere, then load this one again".into()
+            }
             Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unrecognised(Unrecognised::Slowed(_)) => {

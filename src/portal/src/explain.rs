@@ -75,7 +75,7 @@ async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {
 }
 
 /// The links to a servant, if it has got that far.
-fn links(handle: &Handle) -> Vec<Link> {
+pub fn links(handle: &Handle) -> Vec<Link> {
     let status = handle.reach().map(|reach| reach.links());
     status.unwrap_or_default().into_iter().map(link).collect()
 }

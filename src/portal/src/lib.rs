@@ -40,6 +40,7 @@ mod query;
 mod robots;
 mod routes;
 mod shadow;
+mod stream;
 mod stubs;
 mod tls;
 mod tokens;
@@ -59,6 +60,7 @@ pub use machines::Robots;
 pub use people::passwords::Passwords;
 pub use principals::{Lasting, Principals};
 pub use proxies::{Network, NoNetwork, Proxies};
+pub use stream::Live;
 pub use tls::{Challenge, Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
 

@@ -29,6 +29,7 @@ use crate::routes::{Access, ROUTES, Route};
 /// What all addresses that are described begin with.
 const BASE: &str = "/api/v1";
 const JSON: &str = "application/json";
+const EVENT_STREAM: &str = "text/event-stream";
 const ABOUT: &str = "What cloudroidctl and the portal's page ask of cloudroidd. Robots connect elsewhere: \
                      ws://host:port/SERVICE?robot=ID speaks rosbridge v2. Images are served read-only at /v2/ (OCI \
                      distribution).";
@@ -71,6 +72,12 @@ impl Operation {
     pub fn streams<T: ToSchema>(mut self) -> Self {
         let schema = self.named::<T>();
         self.answer("200", "As asked.", NDJSON, schema)
+    }
+
+    /// It answers server-sent events, whose data is a value as JSON.
+    pub fn sends<T: ToSchema>(mut self) -> Self {
+        let schema = self.named::<T>();
+        self.answer("200", "As asked.", EVENT_STREAM, schema)
     }
 
     /// It answers a JSON object that is described elsewhere.

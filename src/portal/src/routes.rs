@@ -16,7 +16,7 @@ use utoipa::openapi::Required;
 
 use super::{
     App, api_v1, audit, calibration, dictionary, machines, metrics, oci, openapi, page, people,
-    policy, push, robots, shadow, stubs,
+    policy, push, robots, shadow, stream, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -186,6 +186,13 @@ pub const ROUTES: &[Route] = &[
         operation("events", "The journal, oldest first.")
             .asks::<api_v1::Which>()
             .lists::<api::Event>()
+    }),
+    at("GET", "/api/v1/stream", ENTER, || get(stream::stream)).described(|| {
+        operation(
+            "stream",
+            "Machine, services, servants and events as they change: an event snapshot, then events update.",
+        )
+        .sends::<api::stream::Update>()
     }),
     at("GET", "/api/v1/services", ENTER, || get(api_v1::services))
         .described(|| operation("services", "All services.").lists::<api::ServiceSummary>()),

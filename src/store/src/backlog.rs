@@ -13,7 +13,7 @@ use std::time::Duration;
 use api::{Event, Level, Millis};
 use parking_lot::Mutex;
 use rusqlite::{Connection, ErrorCode, params};
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 
 use super::{State, events, now, wait_for_another};
 
@@ -39,6 +39,8 @@ pub(super) enum Write {
 pub(super) struct Backlog {
     waiting: Mutex<Waiting>,
     begun: Notify,
+    /// The number of the last event that can be read.
+    last: watch::Sender<i64>,
 }
 
 struct Waiting {
@@ -59,7 +61,17 @@ impl Backlog {
                 outage: None,
             }),
             begun: Notify::new(),
+            last: watch::Sender::new(last_event),
         }
+    }
+
+    /// Tells who waits for events of those that can be read now.
+    fn tell(&self, waiting: &Waiting) {
+        self.last.send_if_modified(|last| {
+            let newer = *last < waiting.last_event;
+            *last = waiting.last_event;
+            newer
+        });
     }
 
     /// Events after number `since` that are not written yet.
@@ -108,9 +120,19 @@ impl State {
         ))
     }
 
+    /// The number of the last event, whenever there is a newer one.
+    pub fn watch_events(&self) -> watch::Receiver<i64> {
+        self.backlog.last.subscribe()
+    }
+
     /// Writes at once if that needs no waiting, and later otherwise.
-    pub(super) fn write_or_keep(&self, mut write: Write) {
+    pub(super) fn write_or_keep(&self, write: Write) {
         let mut waiting = self.backlog.waiting.lock();
+        self.write_now_or_keep(&mut waiting, write);
+        self.backlog.tell(&waiting);
+    }
+
+    fn write_now_or_keep(&self, waiting: &mut Waiting, mut write: Write) {
         if let Write::Event(event) = &mut write {
             waiting.last_event += 1;
             event.id = waiting.last_event;
@@ -130,7 +152,7 @@ impl State {
         if is_locked(&error) {
             self.backlog.begun.notify_one();
         } else {
-            self.begin_outage(&mut waiting, &error);
+            self.begin_outage(waiting, &error);
         }
     }
 
@@ -147,7 +169,9 @@ impl State {
                 )
             );
         if lasting {
-            self.begin_outage(&mut self.backlog.waiting.lock(), error);
+            let mut waiting = self.backlog.waiting.lock();
+            self.begin_outage(&mut waiting, error);
+            self.backlog.tell(&waiting);
         }
     }
 
@@ -204,6 +228,7 @@ impl State {
             return false;
         }
         tracing::info!("{}", event.message);
+        self.backlog.tell(&waiting);
         waiting.dropped = 0;
         waiting.outage = None;
         true
