@@ -12,6 +12,10 @@ export CLOUDROID_PYTHON := $(VENV)/bin/python
 # The same for the stories' client in JavaScript.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
+# The same for what builds the page, and for what looks at it.
+WEB := $(CACHE)/web-$(shell sha256sum web/package-lock.json | cut -c1-12)
+WEB_TEST := $(CACHE)/web-test-$(shell sha256sum tests/web/package-lock.json | cut -c1-12)
+export CLOUDROID_WEB_MODULES := $(WEB_TEST)/node_modules
 # cargo-deny and cargo-audit, as programs that were built already: compiling them takes as long as the project.
 AUDIT := $(CACHE)/audit-$(shell sha256sum scripts/audit.txt | cut -c1-12)
 PREFIX ?= /usr/local
@@ -33,6 +37,7 @@ demo-deps:
 test-deps: deps
 	@scripts/python "$(VENV)" demo/requirements.txt
 	@scripts/node "$(NODE)" tests/robots/package.json
+	@scripts/node "$(WEB_TEST)" tests/web/package.json
 
 # PID 1 of every servant and the robot's program are static (scripts/rustc): they run on whatever file system there is. They stand where
 # the daemon looks for them, beside it.
@@ -56,11 +61,17 @@ test-cross: stub-cross build-dev ## robots of those architectures, told as stori
 	@echo "== stories of other architectures"
 	@CLOUDROID_CROSS=1 cargo test $(DEV) --test stories -- cross::
 
+# The daemon is compiled with the page that stands in web/dist. Nothing is done where web/ has not changed.
+.PHONY: web
+web: ## build the page; part of every build
+	@scripts/node "$(WEB)" web/package.json
+	@scripts/web "$(WEB)" "$(CARGO_TARGET_DIR)/web"
+
 .PHONY: build
 build: ## build the daemon, the command line tool and the servants' init, optimised
 	@scripts/deps build
 	@echo "== building cloudroidd and cloudroidctl (release; the first time takes some minutes)"
-	@$(MAKE) init stub
+	@$(MAKE) init stub web
 	@cargo build --locked --release -p cloudroidd -p cloudroidctl
 	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
@@ -76,12 +87,12 @@ define beside
 endef
 
 .PHONY: build-dev
-build-dev: init
+build-dev: init web
 	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --test stories
 	$(call beside,debug)
 
 .PHONY: build-demo
-build-demo: init
+build-demo: init web
 	@scripts/deps build
 	@echo "== building cloudroidd and cloudroidctl (not optimised; the first time takes some minutes)"
 	@cargo build --locked --profile demo -p cloudroidd -p cloudroidctl -p cloudroid-stub
@@ -102,6 +113,9 @@ lint:
 	@echo "== clippy, warnings denied"
 	@cargo clippy $(DEV) --all-targets -- -D warnings
 	@cargo clippy $(DEV) --features codec/video --test properties -- -D warnings
+	@echo "== types of the page"
+	@$(MAKE) web
+	@cd web && node node_modules/svelte-check/bin/svelte-check --fail-on-warnings --output human
 	@echo "== licences and sources of dependencies"
 	@scripts/python "$(AUDIT)" scripts/audit.txt
 	@"$(AUDIT)/bin/cargo-deny" --locked --log-level error check licenses bans sources
@@ -130,6 +144,12 @@ robots:
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
 	@cargo test $(DEV) --test stories -- $(ONLY)
+
+.PHONY: test-web
+test-web: build-dev ## the page in a real browser, against a real daemon; screenshots are below target/web
+	@scripts/node "$(WEB_TEST)" tests/web/package.json
+	@echo "== the page in Chromium"
+	@cargo test $(DEV) --test stories -- page::
 
 .PHONY: test-vm
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some

@@ -62,6 +62,8 @@ mod mishaps;
 mod names;
 #[path = "stories/operations.rs"]
 mod operations;
+#[path = "stories/page.rs"]
+mod page;
 #[path = "stories/pairing.rs"]
 mod pairing;
 #[path = "stories/patience.rs"]
@@ -268,6 +270,11 @@ fn main() -> ExitCode {
             a_page_of_another_site_reaches_nothing_in_a_real_browser,
         ],
         stories![browser: a_page_with_roslib_shows_its_token],
+        stories![page:
+            it_shows_what_happens_and_does_what_one_may,
+            it_is_told_at_once_that_a_token_was_revoked,
+            a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing,
+        ],
         stories![operations:
             every_operation_is_done_where_the_table_says,
             without_a_good_token_no_operation_is_heard

@@ -48,3 +48,10 @@ pub fn node_modules() -> PathBuf {
         .map(PathBuf::from)
         .expect("CLOUDROID_NODE_MODULES names Node's packages; run the stories by make stories")
 }
+
+/// Where what drives a browser is (see scripts/node).
+pub fn web_modules() -> PathBuf {
+    std::env::var_os("CLOUDROID_WEB_MODULES")
+        .map(PathBuf::from)
+        .expect("CLOUDROID_WEB_MODULES names Node's packages; run the stories by make stories or make test-web")
+}

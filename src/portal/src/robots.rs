@@ -47,7 +47,7 @@ pub async fn root(
     request: Request,
 ) -> Response {
     if !guard::is_upgrade(request.headers()) {
-        return page::index(request.method());
+        return page::index(request.method(), request.headers());
     }
     match app.options.default_service.clone() {
         Some(service) => connect(app, service, caller, request)

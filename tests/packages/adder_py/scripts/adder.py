@@ -13,6 +13,8 @@ sums = rospy.Publisher("/sums", String, queue_size=0)
 
 def add(request):
     total = request.a + request.b + offset
+    if total < 0:
+        rospy.logwarn("the sum is negative: %d", total)
     sums.publish(String("%d" % total))
     return AddTwoResponse(total)
 

@@ -1,0 +1,108 @@
+//! The portal's page in a real browser (Chromium): `tests/web/page.cjs` goes through it, while a robot is served. `make test-web`
+//! runs these alone; screenshots are kept below `target/web`.
+
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use serde_json::json;
+use support::daemon::Daemon;
+use support::world::world;
+use support::{Verdict, binaries};
+
+use crate::access::{daemon, token};
+use crate::people::account;
+
+const PASSWORD: &str = "four quiet purple engines";
+
+/// Begins a step of `page.cjs`, in which somebody shows this token.
+fn begins(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child> {
+    let checkout = binaries::checkout();
+    Command::new("node")
+        .arg(checkout.join("tests/web/page.cjs"))
+        .args([step, &format!("http://{}/", daemon.address)])
+        .arg(checkout.join("target/web"))
+        .arg(token)
+        .arg(binaries::package("adder_py"))
+        .env("NODE_PATH", binaries::web_modules())
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .context("node, which make deps installs")
+}
+
+fn ends(mut child: Child, step: &str) -> Verdict {
+    let mut said = String::new();
+    child
+        .stderr
+        .take()
+        .context("its standard error")?
+        .read_to_string(&mut said)?;
+    let status = child.wait()?;
+    ensure!(status.success(), "{step}: {said}");
+    Ok(())
+}
+
+fn does(daemon: &Daemon, step: &str, token: &str) -> Verdict {
+    ends(begins(daemon, step, token)?, step)
+}
+
+pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
+    let daemon = daemon("page")?;
+    let made = account(&daemon, &["create", "ada", "--role", "operator"], PASSWORD)?;
+    made.succeeded()?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    does(&daemon, "empty", &admin)?;
+    does(&daemon, "deployer", &admin)?;
+    let viewer = token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
+    let other = ["stranger", "--role", "viewer", "--service", "other*"];
+    let stranger = token(&daemon, &other)?;
+    let path = format!("adder_py?robot=rover&rrt=50ms&max_rrt=200ms&token={admin}");
+    let mut robot = daemon.robot(&path)?;
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        // The robot works meanwhile, and its servant warns of each sum.
+        let works = scope.spawn(|| -> Verdict {
+            for sum in 0.. {
+                if done.load(Ordering::Relaxed) {
+                    break;
+                }
+                robot.calls("/add_two", json!({"a": -40 - sum % 5, "b": 0}))?;
+                std::thread::sleep(Duration::from_millis(50));
+            }
+            Ok(())
+        });
+        let told = does(&daemon, "operator", &admin)
+            .and_then(|()| does(&daemon, "viewer", &viewer))
+            .and_then(|()| does(&daemon, "stranger", &stranger));
+        done.store(true, Ordering::Relaxed);
+        let worked = works
+            .join()
+            .unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
+        told.and(worked)
+    })?;
+    does(&daemon, "remover", &admin)
+}
+
+pub fn it_is_told_at_once_that_a_token_was_revoked() -> Verdict {
+    let daemon = world().own("page-revoked").start()?;
+    let short = token(&daemon, &["short", "--role", "viewer", "--service", "*"])?;
+    let mut child = begins(&daemon, "revoked", &short)?;
+    let output = child.stdout.take().context("its standard output")?;
+    let mut line = String::new();
+    BufReader::new(output).read_line(&mut line)?;
+    if line.trim() == "looks" {
+        let revoke = daemon.deployer().types(&["token", "revoke", "short"])?;
+        revoke.succeeded()?;
+    }
+    ends(child, "revoked")
+}
+
+pub fn a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing() -> Verdict {
+    let daemon = daemon("page-many")?;
+    let viewer = ["viewer", "--role", "viewer", "--service", "*"];
+    does(&daemon, "many", &token(&daemon, &viewer)?)
+}

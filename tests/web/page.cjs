@@ -1,0 +1,373 @@
+// The portal's page in Chromium, step by step as a person goes through it.
+//
+// usage: node page.cjs STEP URL PICTURES TOKEN PACKAGE   (NODE_PATH names where puppeteer-core and axe-core are; PACKAGE is adder_py)
+//
+// Every page that is come by is judged by axe-core in both themes and at a phone's width, and a picture of each is kept. What
+// breaks the content security policy, or fails in the page, fails here.
+'use strict';
+const assert = require('node:assert');
+const { execFileSync } = require('node:child_process');
+const { mkdirSync, readFileSync } = require('node:fs');
+const { basename, dirname, join } = require('node:path');
+const puppeteer = require('puppeteer-core');
+
+const PATIENCE = 60_000;
+const AXE = readFileSync(require.resolve('axe-core/axe.min.js'), 'utf8');
+const LAPTOP = { width: 1280, height: 900 };
+const PHONE = { width: 390, height: 844 };
+
+const [step, url, pictures, token, sources] = process.argv.slice(2);
+
+// What a person does and sees.
+class Visitor {
+  constructor(page) {
+    this.page = page;
+    this.wrong = [];
+    page.setDefaultTimeout(PATIENCE);
+    page.on('pageerror', (error) => this.wrong.push(String(error)));
+    page.on('console', (message) => {
+      // A refused request is written there by the browser itself.
+      if (message.type() === 'error' && !message.text().startsWith('Failed to load resource')) this.wrong.push(message.text());
+    });
+  }
+
+  sees(text) {
+    return this.page.waitForFunction((wanted) => document.body.innerText.includes(wanted), {}, text)
+      .catch(async () => assert.fail(`${JSON.stringify(text)} is not to be seen in:\n${await this.page.evaluate(() => document.body.innerText)}`));
+  }
+
+  seesNot(text) {
+    return this.page.waitForFunction((wanted) => !document.body.innerText.includes(wanted), {}, text);
+  }
+
+  // By the name that a screen reader says.
+  clicks(name, role = 'button') {
+    return this.page.locator(`::-p-aria([name="${name}"][role="${role}"])`).click();
+  }
+
+  async types(label, text) {
+    const box = await this.page.waitForSelector(`::-p-aria([name="${label}"])`);
+    await box.click({ count: 3 });
+    await box.type(text);
+  }
+
+  opens(hash) {
+    return this.page.evaluate((to) => { location.hash = to; }, hash);
+  }
+
+  // Both themes, both widths, judged by axe-core; a picture of each.
+  async judges(name) {
+    for (const theme of ['light', 'dark']) {
+      await this.page.emulateMediaFeatures([{ name: 'prefers-color-scheme', value: theme }, { name: 'prefers-reduced-motion', value: 'reduce' }]);
+      for (const [width, viewport] of Object.entries({ laptop: LAPTOP, phone: PHONE })) {
+        await this.page.setViewport(viewport);
+        // Two frames: what hangs on theme and width is drawn.
+        await this.page.evaluate(() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn))));
+        await this.page.screenshot({ path: `${pictures}/${name}-${theme}-${width}.png`, fullPage: true });
+        await this.page.evaluate(AXE);
+        const { violations } = await this.page.evaluate(() => axe.run(document, { resultTypes: ['violations'] }));
+        const told = violations.map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.map((node) => `${node.target} ${node.failureSummary}`).join('; ')}`);
+        assert.deepStrictEqual(told, [], `${name}, ${theme}, ${width}`);
+        const beyond = await this.page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+        assert(beyond <= 0, `${name} is ${beyond} pixels wider than a ${width}`);
+      }
+    }
+    await this.page.setViewport(LAPTOP);
+  }
+
+  async signsIn() {
+    await this.types('Token', token);
+    await this.clicks('Sign in by token');
+    await this.page.waitForSelector('nav');
+  }
+}
+
+const STEPS = {
+  // Before anything was pushed.
+  async empty(visitor) {
+    await visitor.sees('With an account');
+    await visitor.judges('sign-in');
+    await visitor.types('Name', 'ada');
+    await visitor.types('Password', 'wrong and long enough');
+    await visitor.clicks('Sign in');
+    await visitor.sees('name or password is wrong');
+    await visitor.types('Token', 'nobody knows this one');
+    await visitor.clicks('Sign in by token');
+    await visitor.sees('token is not known');
+    await visitor.signsIn();
+    await visitor.sees('Nothing is published yet');
+    await visitor.judges('overview-empty');
+    await visitor.clicks('Services', 'link');
+    await visitor.sees('cloudroidctl push --apt');
+    await visitor.clicks('Robots and servants', 'link');
+    await visitor.sees('No robot is here');
+    await visitor.judges('servants-empty');
+    await visitor.opens('#/nowhere');
+    await visitor.sees('There is no such page');
+  },
+
+  // Two revisions of adder_py: the folder, and an archive of it.
+  async deployer(visitor) {
+    await visitor.signsIn();
+    await visitor.clicks('Deploy', 'link');
+    await visitor.clicks('Push');
+    await visitor.sees('nothing is chosen');
+    const folder = await visitor.page.waitForSelector('input[webkitdirectory]');
+    const file = await visitor.page.waitForSelector('input[type=file]:not([webkitdirectory])');
+    await file.uploadFile(join(sources, 'package.xml'));
+    await visitor.sees('package.xml is no tar archive');
+    await folder.uploadFile(sources);
+    await visitor.sees('Chosen: the folder adder_py');
+    await visitor.types('Programs, each with its arguments, one a line', 'nobody.py');
+    await visitor.clicks('Push');
+    await visitor.sees('nobody.py');
+    await visitor.page.waitForSelector('.trouble');
+    await visitor.judges('deploy-failed');
+    await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
+    await visitor.clicks('Push');
+    await visitor.sees('Published: adder_py, revision 1');
+    await visitor.judges('deploy');
+    const archive = join(pictures, 'adder_py.tar.gz');
+    execFileSync('tar', ['czf', archive, '-C', dirname(sources), basename(sources)]);
+    await file.uploadFile(archive);
+    await visitor.sees('Chosen: adder_py.tar.gz');
+    await visitor.clicks('Push');
+    await visitor.sees('Published: adder_py, revision 2');
+  },
+
+  // A robot is served by the second revision of adder_py.
+  async operator(visitor) {
+    await visitor.signsIn();
+    await visitor.sees('Cores promised');
+    await visitor.sees('is ready for rover');
+    await visitor.judges('overview');
+
+    await visitor.clicks('Services', 'link');
+    await visitor.sees('adder_py');
+    await visitor.judges('services');
+    await visitor.clicks('adder_py', 'link');
+    await visitor.sees('/add_two');
+    await visitor.sees('Use revision 1');
+    await visitor.judges('service');
+
+    await visitor.clicks('Robots and servants', 'link');
+    await visitor.sees('1 of 1');
+    await visitor.judges('servants');
+    await visitor.types('Find by robot, service or class', 'nobody');
+    await visitor.sees('None is like that');
+    await visitor.types('Find by robot, service or class', 'rover adder');
+    await visitor.sees('1 of 1');
+    await visitor.clicks('Memory');
+    assert.strictEqual(await visitor.page.$eval('th[aria-sort=descending]', (head) => head.innerText.trim().split(' ')[0]), 'Memory');
+
+    await visitor.clicks('rover', 'link');
+    await visitor.sees('Limits in force, as the kernel says');
+    // Its response times are told, and drawn; what it has stated beside them.
+    await visitor.page.waitForFunction(() => /median\s*[\d.]+\s*ms/.test(document.body.innerText));
+    await visitor.page.waitForFunction(() => /T_max\s*200\s*ms/.test(document.body.innerText));
+    assert.strictEqual(await visitor.page.$$eval('canvas', (all) => all.length), 6);
+    await visitor.clicks('Explain');
+    await visitor.page.waitForFunction(() => document.querySelector('[aria-labelledby=why] [role=status]').innerText.trim() !== '');
+    // By the keyboard: least of all, and one step more.
+    await visitor.page.focus('[role=slider]');
+    await visitor.page.keyboard.press('Home');
+    await visitor.page.keyboard.press('ArrowRight');
+    await visitor.clicks('Set limits');
+    await visitor.sees('In force, as the kernel says: 0.1 cores');
+    await visitor.judges('servant');
+
+    await visitor.clicks('Log', 'link');
+    await visitor.sees('the sum is negative: -40');
+    // rospy prints warnings in yellow.
+    await visitor.page.waitForSelector('.log .ansi-yellow');
+    await visitor.judges('log');
+    await visitor.types('Find', 'negative: -41');
+    await visitor.seesNot('negative: -40');
+    await visitor.sees('negative: -41');
+
+    await visitor.clicks('Events', 'link');
+    await visitor.sees('is ready for rover');
+    await visitor.judges('events');
+    await visitor.types('Find', 'no such words');
+    await visitor.sees('None is like that');
+
+    // Back to the revision before.
+    await visitor.opens('#/services/adder_py');
+    await visitor.clicks('Use revision 1…');
+    await visitor.sees('Make revision 1 the current one?');
+    await visitor.judges('confirm');
+    await visitor.clicks('Use it');
+    await visitor.sees('Use revision 2…');
+
+    // By the keyboard alone: the first stop of the tabulator skips what is on every page.
+    await visitor.page.reload();
+    await visitor.page.waitForSelector('nav');
+    await visitor.page.keyboard.press('Tab');
+    await visitor.page.keyboard.press('Enter');
+    assert.strictEqual(await visitor.page.evaluate(() => document.activeElement.tagName), 'H1');
+  },
+
+  // Who may look and nothing else.
+  async viewer(visitor) {
+    await visitor.signsIn();
+    await visitor.opens('#/services/adder_py');
+    await visitor.clicks('Use revision 2…');
+    await visitor.clicks('Use it');
+    await visitor.sees('may not');
+    await visitor.judges('refused');
+    await visitor.clicks('Cancel');
+    await visitor.clicks('Remove…');
+    await visitor.clicks('Remove it');
+    await visitor.sees('may not');
+    await visitor.clicks('Cancel');
+    await visitor.opens('#/servants');
+    await visitor.clicks('rover', 'link');
+    await visitor.clicks('Set limits');
+    await visitor.sees('may not');
+    await visitor.clicks('Stop…');
+    await visitor.clicks('Stop it');
+    await visitor.sees('may not operate');
+    await visitor.clicks('Cancel');
+    await visitor.clicks('Log', 'link');
+    await visitor.sees('may not read the logs');
+    await visitor.opens('#/deploy');
+    await visitor.types('or a package of Debian', 'opencv_apps');
+    await visitor.clicks('Push');
+    await visitor.sees('may not');
+  },
+
+  // Who may see other services alone.
+  async stranger(visitor) {
+    await visitor.signsIn();
+    await visitor.sees('Nothing is published yet');
+    await visitor.sees('Nothing yet that you may see');
+    await visitor.seesNot('Cores promised');
+    await visitor.opens('#/servants');
+    await visitor.sees('No robot is here');
+    await visitor.opens('#/services/adder_py');
+    await visitor.sees('may not see service adder_py');
+  },
+
+  // A hundred servants that change each second cost few frames, and an hour of that leaves nothing behind. What the daemon would say
+  // is said in its place: nobody has a hundred robots at hand, nor an hour.
+  async many(visitor) {
+    const { page } = visitor;
+    await page.evaluateOnNewDocument(() => {
+      const asked = window.fetch;
+      window.fetch = (input, options) => {
+        if (!String(input).endsWith('/api/v1/stream')) return asked(input, options);
+        const body = new ReadableStream({ start(controller) { window.says = (text) => controller.enqueue(new TextEncoder().encode(text)); } });
+        return Promise.resolve(new Response(body));
+      };
+    });
+    await page.reload();
+    await visitor.signsIn();
+    await page.waitForFunction(() => window.says);
+    // Frames in the time that a page without anything to show needs for so many.
+    const frames = (during) => page.evaluate(async (during) => {
+      let [count, end] = [0, performance.now() + during];
+      while (performance.now() < end) {
+        await new Promise(requestAnimationFrame);
+        count += 1;
+      }
+      return count;
+    }, during);
+    const idle = await frames(5_000);
+    await page.evaluate(() => {
+      const random = (most) => Math.random() * most;
+      const served = (index) => ({
+        servant: {
+          id: `s${index}`, service: 'adder', revision: 1, robot: `rover${index}`, phase: 'ready', created: Date.now() - 60_000, connections: 1, limits: {},
+          cgroup_version: 2, usage: { cpu_usec: 0, memory: random(1e8), pids: 3, oom_kills: 0, throttled_usec: 0 },
+          response: { requests: 100, p50_ms: random(50), p95_ms: random(200) }, pids: [], dropped: 0, down: [], hung: [],
+        },
+        throttled: random(1), cores: random(1), links: [],
+      });
+      let [time, event] = [Date.now(), 0];
+      window.second = (servants, kind = 'update') => {
+        time += 1000;
+        event += 1;
+        const events = [{ id: event, time, level: 'info', kind: 'test', message: `the ${event}th` }];
+        const data = { time, servants: Array.from({ length: servants }, (_, index) => served(index)), events, ...(kind === 'snapshot' ? { back_offs: [] } : {}) };
+        window.says(`event: ${kind}\ndata: ${JSON.stringify(data)}\n\n`);
+      };
+      window.second(100, 'snapshot');
+    });
+    await visitor.opens('#/servants');
+    await visitor.sees('100 of 100');
+    await page.evaluate(() => { window.going = setInterval(() => window.second(100), 1000); });
+    const busy = await frames(5_000);
+    await page.evaluate(() => clearInterval(window.going));
+    console.log(`frames in 5 s: ${idle} of a page that rests, ${busy} of 100 servants that change each second`);
+    assert(busy > idle * 0.8, `${busy} frames of 100 servants, ${idle} of a page that rests`);
+    await page.screenshot({ path: `${pictures}/servants-hundred.png`, fullPage: true });
+
+    // An hour: half of it is what is kept at the most, the other must add nothing.
+    await visitor.opens('#/servants/s1');
+    await visitor.sees('Since this page is open');
+    const session = await page.createCDPSession();
+    const passes = async (seconds) => {
+      await page.evaluate(async (seconds) => {
+        for (let second = 0; second < seconds; second += 1) {
+          window.second(3);
+          if (second % 10 === 0) await new Promise(requestAnimationFrame);
+        }
+        await new Promise(requestAnimationFrame);
+      }, seconds);
+      await session.send('HeapProfiler.collectGarbage');
+      const { JSHeapUsedSize, Nodes, JSEventListeners } = await page.metrics();
+      return { heap: JSHeapUsedSize, nodes: Nodes, listeners: JSEventListeners };
+    };
+    const half = await passes(1800);
+    const whole = await passes(1800);
+    console.log('after half an hour', half, 'after an hour', whole);
+    assert(whole.heap < half.heap * 1.1 && whole.nodes < half.nodes * 1.1 && whole.listeners <= half.listeners * 1.1, JSON.stringify({ half, whole }));
+  },
+
+  // Is told at once that it is not let in any more: who started this waits for `looks` and revokes.
+  async revoked(visitor) {
+    await visitor.signsIn();
+    await visitor.sees('Overview');
+    console.log('looks');
+    await visitor.sees('was revoked');
+    await visitor.sees('With a token');
+  },
+
+  // The robot's servant is stopped, and the service removed.
+  async remover(visitor) {
+    await visitor.signsIn();
+    await visitor.opens('#/servants');
+    await visitor.clicks('rover', 'link');
+    await visitor.clicks('Stop…');
+    await visitor.clicks('Stop it');
+    await visitor.sees('It has ended');
+    await visitor.opens('#/services/adder_py');
+    await visitor.clicks('Remove…');
+    await visitor.clicks('Remove it');
+    await visitor.sees('Nothing is published yet');
+  },
+};
+
+async function main() {
+  mkdirSync(pictures, { recursive: true });
+  const browser = await puppeteer.launch({
+    executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
+    args: ['--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--disable-background-networking', '--disable-component-update'],
+  });
+  try {
+    const visitor = new Visitor(await browser.newPage());
+    await visitor.page.setViewport(LAPTOP);
+    await visitor.page.goto(url);
+    try {
+      await STEPS[step](visitor);
+    } catch (error) {
+      await visitor.page.screenshot({ path: `${pictures}/failed-${step}.png`, fullPage: true });
+      throw error;
+    }
+    assert.deepStrictEqual(visitor.wrong, [], 'what the page did wrong');
+  } finally {
+    await browser.close();
+  }
+}
+
+main().catch((error) => { console.error(error); process.exit(1); });

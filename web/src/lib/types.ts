@@ -1,0 +1,161 @@
+// What the daemon says, as far as the page shows it: crate `api`, documented at /api/v1/openapi.json. Times are in milliseconds
+// since 1970, sizes in bytes.
+
+export interface Session {
+  name?: string;
+  role?: string;
+  csrf?: string;
+  needed: boolean;
+  accounts: boolean;
+  /** An identity provider that knows people, too. */
+  provider?: { name: string; path: string };
+}
+
+export interface Limits {
+  cpus?: number;
+  cpu_weight?: number;
+  memory?: number;
+  memory_high?: number;
+  pids?: number;
+  io_read?: number;
+  io_write?: number;
+  cpuset?: string;
+}
+
+export interface Pressure { cpu: number; memory: number; io: number }
+
+export interface Usage {
+  cpu_usec: number;
+  memory: number;
+  pids: number;
+  oom_kills: number;
+  throttled_usec: number;
+  pressure?: Pressure;
+}
+
+export interface Machine {
+  version: string;
+  home: string;
+  listen: string;
+  certificate?: string;
+  default_service?: string;
+  started: number;
+  isolation: { mode: string; cgroup_version: number; missing: string[] };
+  capacity: { cpus: number; memory: number; cpus_reserved: number; memory_reserved: number; waiting: number };
+  services: number;
+  servants: number;
+  warm_pool: number;
+  warm_nodes: number;
+  connections: number;
+  usage: Usage;
+  warnings: string[];
+  cores: number;
+  host_cores: number;
+  host_memory?: number;
+  host_memory_available?: number;
+}
+
+export interface ServiceSummary {
+  name: string;
+  address: string;
+  package: string;
+  revision: number;
+  image: string;
+  published: number;
+  topics: number;
+  services: number;
+  actions: number;
+  parameters: number;
+  servants: number;
+  limits: Limits;
+}
+
+export interface Topic { name: string; type: string; direction: 'input' | 'output'; latched: boolean; lazy: boolean }
+export interface Typed { name: string; type: string; node?: string }
+
+export interface ServiceDetail extends ServiceSummary {
+  revisions: { number: number; image: string; published: number; source: string; current: boolean }[];
+  nodes: { name: string; argv: string[] }[];
+  interface: {
+    topics: Topic[];
+    services: Typed[];
+    actions: Typed[];
+    parameters: { name: string; value?: unknown }[];
+    needs: { name: string; nodes: string[] }[];
+  };
+}
+
+export type Phase = 'requested' | 'admitted' | 'created' | 'starting' | 'ready' | 'draining' | 'stopped' | 'failed';
+
+export interface Servant {
+  id: string;
+  service: string;
+  revision: number;
+  robot: string;
+  phase: Phase;
+  reason?: string;
+  created: number;
+  connections: number;
+  idle_until?: number;
+  terms?: { stated: Record<string, { sla?: { rrt?: string; max_rrt?: string } }>; class?: string; priority: number; limits: Limits; why?: string[] };
+  limits: Limits;
+  enforced?: Limits;
+  cgroup_version: number;
+  usage?: Usage;
+  response?: { requests: number; p50_ms: number; p95_ms: number };
+  pids: number[];
+  dropped: number;
+  down: { node: string; failures: number; again: number }[];
+  hung: string[];
+}
+
+export interface Part { name: string; p50: number; p90: number; max: number }
+
+export interface Link {
+  node: string;
+  up: boolean;
+  round_trip?: number;
+  dropped: number;
+  drops: string[];
+  desire?: number;
+  max?: number;
+  threshold?: number;
+  satisfaction?: number;
+  requests: number;
+  late: number;
+  local: number;
+  phases: Part[];
+}
+
+export interface Served { servant: Servant; throttled: number; cores: number; links: Link[] }
+
+export interface BackOff { service: string; revision: number; robot: string; failures: number; reason: string; again: number }
+
+export type Level = 'info' | 'warning' | 'error';
+
+export interface Event {
+  id: number;
+  time: number;
+  level: Level;
+  kind: string;
+  service?: string;
+  servant?: string;
+  robot?: string;
+  message: string;
+}
+
+export interface Update {
+  time: number;
+  machine?: Machine;
+  services?: ServiceSummary[];
+  services_gone?: string[];
+  servants?: Served[];
+  servants_gone?: string[];
+  back_offs?: BackOff[];
+  events?: Event[];
+}
+
+export interface LogLine { time: number; node: string; stream: 'stdout' | 'stderr'; line: string }
+
+export interface Cause { weight: 'blocks' | 'slows' | 'hint'; what: string; next: string }
+export interface Explanation { robot: string; causes: Cause[]; servants: Served[]; events: Event[] }
