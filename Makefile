@@ -9,7 +9,7 @@ export CARGO_TARGET_DIR ?= $(CACHE)/cargo
 # Python clients (the demo's robot, the stories' roslibpy) live outside the clone, one environment per list of versions.
 VENV := $(CACHE)/python-$(shell sha256sum demo/requirements.txt | cut -c1-12)
 export CLOUDROID_PYTHON := $(VENV)/bin/python
-# The same for the stories' client in JavaScript.
+# The same for the stories' client in JavaScript, and the identity provider.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
 # The same for what builds the page, and for what looks at it.

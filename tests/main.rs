@@ -60,6 +60,8 @@ mod memory;
 mod mishaps;
 #[path = "stories/names.rs"]
 mod names;
+#[path = "stories/oidc.rs"]
+mod oidc;
 #[path = "stories/operations.rs"]
 mod operations;
 #[path = "stories/page.rs"]
@@ -146,6 +148,16 @@ fn main() -> ExitCode {
             a_cpp_node_waits_for_the_robot_and_calls_it,
             a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link,
             siblings_come_first_and_other_robots_are_not_asked,
+        ],
+        stories![oidc:
+            a_group_of_the_provider_is_a_role_here,
+            who_has_no_role_is_told_why,
+            a_token_that_is_not_good_signs_nobody_in,
+            a_sign_in_is_good_once_and_in_its_browser,
+            a_provider_that_is_down_keeps_nobody_else_out,
+            sessions_end_when_the_configuration_gives_other_rights,
+            a_real_browser_comes_back_signed_in,
+            through_tls_both_cookies_are_this_hosts_alone,
         ],
         stories![people:
             people_sign_in_and_out,

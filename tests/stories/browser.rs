@@ -58,7 +58,7 @@ const adds = (url, prepare, protocols) => new Promise((resolve) => {
 pub struct Browser(Child);
 
 impl Browser {
-    /// With more words of its command line.
+    /// Opens a page, with more words of its command line.
     pub fn opens(url: &str, profile: &std::path::Path, more: &[&str]) -> anyhow::Result<Browser> {
         let child = Command::new("chromium")
             .args([

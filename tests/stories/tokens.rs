@@ -87,6 +87,11 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         ("GET", "/api/v1/session", false, 200),
         ("HEAD", "/api/v1/session", false, 200),
         ("POST", "/api/v1/session", false, 400),
+        // No provider is configured.
+        ("GET", "/api/v1/oidc/login", false, 404),
+        ("HEAD", "/api/v1/oidc/login", false, 404),
+        ("GET", "/api/v1/oidc/callback", false, 404),
+        ("HEAD", "/api/v1/oidc/callback", false, 404),
         ("GET", "/assets/x", false, 404),
         ("HEAD", "/assets/x", false, 404),
         // Who shows a pairing code needs no token, but TLS.

@@ -42,7 +42,7 @@ pub fn python() -> PathBuf {
         .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
 }
 
-/// Where roslib is (see scripts/node).
+/// Where roslib and oidc-provider are (see scripts/node).
 pub fn node_modules() -> PathBuf {
     std::env::var_os("CLOUDROID_NODE_MODULES")
         .map(PathBuf::from)

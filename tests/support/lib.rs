@@ -15,6 +15,7 @@ pub mod leftovers;
 pub mod machine;
 pub mod people;
 pub mod procfs;
+pub mod provider;
 pub mod robot;
 pub mod shaper;
 pub mod site;

@@ -5,7 +5,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use crate::principal::check_name;
+use crate::principal::check_any_name;
 use crate::{Error, Glob, Grant, Operation, Principal, Role, as_text};
 
 /// For whom a rule is.
@@ -26,7 +26,7 @@ impl FromStr for Who {
         if let Some(role) = text.strip_prefix("role:") {
             return Ok(Who::Role(role.parse()?));
         }
-        check_name(text)?;
+        check_any_name(text)?;
         Ok(Who::Principal(text.to_owned()))
     }
 }

@@ -162,6 +162,38 @@ impl fmt::Display for Principal {
     }
 }
 
+/// What names of people begin with whom an identity provider knows: accounts and tokens have no such names.
+pub const PROVIDED: &str = "oidc:";
+
+/// Longest name of somebody whom a provider knows, without what it begins with.
+const LONGEST_PROVIDED: usize = 48;
+
+/// The name of somebody whom an identity provider calls so. Letters and digits that look like others (of other alphabets) are
+/// not kept: nobody is to be taken for somebody else.
+pub fn provided_name(called: &str) -> String {
+    let kept = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-' | '@' | '+');
+    let plain = called.chars().map(|c| if kept(c) { c } else { '-' });
+    let name: String = plain.take(LONGEST_PROVIDED).collect();
+    match name.is_empty() {
+        true => format!("{PROVIDED}-"),
+        false => format!("{PROVIDED}{name}"),
+    }
+}
+
+/// Refuses what is the name of nobody: of no account or token, and of nobody whom a provider knows.
+pub(crate) fn check_any_name(name: &str) -> Result<(), Error> {
+    let Some(called) = name.strip_prefix(PROVIDED) else {
+        return check_name(name);
+    };
+    // Of those that are called alike all but the first have a number.
+    let (called, number) = called.split_once('~').unwrap_or((called, "2"));
+    let numbered = number.bytes().all(|byte| byte.is_ascii_digit()) && !number.is_empty();
+    match numbered && !called.is_empty() && provided_name(called) == format!("{PROVIDED}{called}") {
+        true => Ok(()),
+        false => Err(Error::Name(name.to_owned())),
+    }
+}
+
 /// Refuses what cannot be the name of a principal.
 pub fn check_name(name: &str) -> Result<(), Error> {
     let inner = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
@@ -185,6 +217,34 @@ mod tests {
         }
         let refused = "root".parse::<Role>().expect_err("no role").to_string();
         assert!(refused.contains("deployer"), "{refused}");
+    }
+
+    #[test]
+    fn people_of_a_provider_have_names_that_are_no_accounts() {
+        for (called, name) in [
+            ("alice", "oidc:alice"),
+            ("a@lab.example", "oidc:a@lab.example"),
+            ("Jörg M\u{fc}ller", "oidc:J-rg-M-ller"),
+            ("\u{430}lice", "oidc:-lice"),
+            ("a~2", "oidc:a-2"),
+            ("", "oidc:-"),
+        ] {
+            assert_eq!(provided_name(called), name);
+            check_any_name(name).expect(name);
+            check_name(name).expect_err(name);
+        }
+        assert_eq!(provided_name(&"x".repeat(99)).len(), 53);
+        check_any_name("oidc:alice~2").expect("the second");
+        for name in [
+            "oidc:",
+            "oidc:a b",
+            "oidc:a~",
+            "oidc:a~2~3",
+            "oidc:a~b",
+            "other:a",
+        ] {
+            check_any_name(name).expect_err(name);
+        }
     }
 
     #[test]

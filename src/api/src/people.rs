@@ -42,6 +42,19 @@ pub struct Session {
     pub needed: bool,
     /// Whether there are accounts with passwords.
     pub accounts: bool,
+    /// An identity provider that knows people, too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub provider: Option<ProviderLink>,
+}
+
+/// Where people sign in by an identity provider.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct ProviderLink {
+    /// As people know it.
+    pub name: String,
+    /// Where a browser goes to.
+    pub path: String,
 }
 
 /// A session of somebody (`GET /api/v1/sessions`).

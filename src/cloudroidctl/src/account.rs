@@ -94,14 +94,14 @@ struct Remove {
 /// List who is signed in, and from where.
 #[derive(Debug, clap::Args)]
 struct Sessions {
-    /// Of this person alone.
+    /// Of this person alone; oidc:NAME of somebody whom the identity provider knows.
     name: Option<String>,
 }
 
 /// Sign a person out everywhere.
 #[derive(Debug, clap::Args)]
 struct Logout {
-    /// Its name.
+    /// Its name; oidc:NAME of somebody whom the identity provider knows.
     name: String,
 }
 

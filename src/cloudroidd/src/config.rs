@@ -4,6 +4,7 @@
 mod acme;
 mod class;
 mod doubts;
+mod oidc;
 mod options;
 mod people;
 mod time;
@@ -25,6 +26,7 @@ use servant::quotas::Quotas;
 
 use crate::machine;
 
+pub use self::oidc::Oidc;
 pub use acme::Acme;
 pub use class::Class;
 pub use people::People;
@@ -37,7 +39,7 @@ pub use tls::Tls;
 pub struct Config {
     /// Address and port of the portal.
     pub listen: SocketAddr,
-    /// Bearer tokens, or `sha256:HEX` of them. Needed to listen beyond loopback.
+    /// Bearer tokens, or `sha256:HEX` of them. They, or an identity provider, are needed to listen beyond loopback.
     pub tokens: Vec<String>,
     /// Name or number of the group whose members are admins at `admin_socket`; `cloudroid` by default, where there is such a group.
     pub admin_group: Option<String>,
@@ -72,6 +74,8 @@ pub struct Config {
     pub tls: Tls,
     /// How people's sessions last.
     pub people: People,
+    /// An identity provider that knows people.
+    pub oidc: Option<Oidc>,
     /// What clients may do.
     pub portal: Portal,
     /// Limits of memory outside of servants' containers.
@@ -287,6 +291,7 @@ impl Default for Config {
             servant: Servant::default(),
             tls: Tls::default(),
             people: People::default(),
+            oidc: None,
             portal: Portal::default(),
             memory: Memory::default(),
             push: Push::default(),
@@ -450,7 +455,7 @@ impl Config {
     pub fn check(&self) -> anyhow::Result<()> {
         self.account()?;
         Tokens::new(&self.tokens)?;
-        if !self.listen.ip().is_loopback() && self.tokens.is_empty() {
+        if !self.listen.ip().is_loopback() && self.tokens.is_empty() && self.oidc.is_none() {
             bail!(
                 "listening on {} lets everyone on the network in; \
                  put a token into the configuration (tokens = [\"…\"]) or listen on 127.0.0.1:{}",
@@ -464,6 +469,9 @@ impl Config {
         self.people
             .check()
             .context("[people] of the configuration")?;
+        if let Some(oidc) = &self.oidc {
+            oidc.check().context("[oidc] of the configuration")?;
+        }
         check_limits(&self.limits).context("[limits] of the configuration")?;
         if !(self.servant.hung_after >= 1.0 && self.servant.hung_after <= 1e6) {
             bail!(

@@ -37,6 +37,11 @@ pub fn build(
     tokio::spawn(store::watch(Arc::clone(&state)));
     let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?
         .lasting(config.people.lasting());
+    let provider = config.oidc.as_ref().map(|oidc| oidc.provider());
+    let provider = provider.transpose()?;
+    let known = provider.as_ref();
+    let known = known.map(|known| (known.provider.issuer(), &known.roles));
+    let principals = principals.provided(known)?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
     let resources = Resources {
@@ -82,6 +87,7 @@ pub fn build(
     Ok(Arc::new(App {
         principals,
         passwords: Passwords::default(),
+        provider,
         audit: Audit::new(Arc::clone(&state)),
         handshakes: Arc::default(),
         listen,

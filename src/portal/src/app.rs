@@ -14,6 +14,7 @@ use tokio_util::task::TaskTracker;
 use crate::audit::Audit;
 use crate::handshakes::Handshakes;
 use crate::people::passwords::Passwords;
+use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
 use crate::stream::Live;
@@ -57,6 +58,8 @@ pub struct App {
     pub principals: Principals,
     /// Hashes of people's passwords.
     pub passwords: Passwords,
+    /// Who else knows people.
+    pub provider: Option<IdentityProvider>,
     /// What was done.
     pub audit: Audit,
     /// Handshakes of TLS that are under way.

@@ -113,6 +113,20 @@ pub enum Error {
     /// The password is wrong, or there is no such account: which of both is not said.
     #[error("name or password is wrong")]
     WrongPassword,
+    /// No identity provider is configured.
+    #[error("no identity provider knows people here")]
+    NoProvider,
+    /// The identity provider, or what came from it.
+    #[error(transparent)]
+    Provider(#[from] oidc::Error),
+    /// Somebody has signed in who may nothing here.
+    #[error("{who} has signed in, and none of its groups has a role here: {has}")]
+    NoRole {
+        /// By what it would be known here.
+        who: String,
+        /// The groups that it has.
+        has: String,
+    },
     /// Too many sign in at once.
     #[error("too many people sign in at once")]
     SignInBusy,
@@ -349,7 +363,12 @@ impl Error {
             Error::TooManyStreams { .. } => {
                 (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams")
             }
-            Error::SignInBusy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign in"),
+            Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
+                (S::SERVICE_UNAVAILABLE, "busy", "too many sign in")
+            }
+            Error::NoProvider => (S::NOT_FOUND, "no-provider", "no identity provider"),
+            Error::NoRole { .. } => (S::FORBIDDEN, "no-role", "not allowed"),
+            Error::Provider(error) => kind_of_provider(error),
             Error::Unauthorised(_) | Error::Unrecognised(_) => {
                 (S::UNAUTHORIZED, "unauthorised", "token needed")
             }
@@ -408,6 +427,11 @@ impl Error {
             Error::TooManyStreams { .. } => {
                 "close pages of the portal that are open elsewhere, then load this one again".into()
             }
+            Error::NoProvider => "sign in with an account, or have [oidc] configured (docs/access.md)".into(),
+            Error::Provider(error) => error.next().into(),
+            Error::NoRole { .. } => {
+                "have an operator name one of them in roles of [oidc] in the configuration (docs/access.md), or the provider put you into one that is; then sign in again".into()
+            }
             Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
             Error::Unrecognised(Unrecognised::Slowed(_)) => {
@@ -443,6 +467,20 @@ impl Error {
             _ => return None,
         };
         Some(text)
+    }
+}
+
+fn kind_of_provider(error: &oidc::Error) -> Kind {
+    use StatusCode as S;
+    use oidc::Error as O;
+    match error {
+        O::Unreachable { .. } | O::Client { .. } | O::NoAddress(_) => {
+            (S::BAD_GATEWAY, "provider", "no answer of the provider")
+        }
+        O::Busy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign in"),
+        O::UnknownState | O::OtherBrowser => (S::BAD_REQUEST, "sign-in", "not signed in"),
+        O::Denied { .. } => (S::FORBIDDEN, "denied", "not signed in"),
+        O::Code { .. } | O::Token { .. } => (S::UNAUTHORIZED, "sign-in", "not signed in"),
     }
 }
 

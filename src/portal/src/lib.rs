@@ -58,6 +58,7 @@ pub use connections::{serve_challenges, serve_tcp, serve_unix};
 pub use handshakes::Handshakes;
 pub use machines::Robots;
 pub use people::passwords::Passwords;
+pub use people::provider::{CALLBACK, IdentityProvider};
 pub use principals::{Lasting, Principals};
 pub use proxies::{Network, NoNetwork, Proxies};
 pub use stream::Live;

@@ -86,6 +86,19 @@ impl Operation {
         self.answer("200", "As asked.", JSON, object.into())
     }
 
+    /// It sends a browser elsewhere.
+    pub fn leads_on(mut self) -> Self {
+        let response = ResponseBuilder::new().description("Elsewhere, by Location.");
+        self.built = self.built.response("303", response);
+        self
+    }
+
+    /// It answers a page for people.
+    pub fn answers_page(self) -> Self {
+        let text = ObjectBuilder::new().schema_type(Type::String);
+        self.answer("200", "As asked.", "text/html", text.into())
+    }
+
     /// It reads these from the query.
     pub fn asks<P: IntoParams>(mut self) -> Self {
         for parameter in P::into_params(|| Some(ParameterIn::Query)) {

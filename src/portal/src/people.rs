@@ -2,6 +2,7 @@
 
 pub mod cookies;
 pub mod passwords;
+pub mod provider;
 
 use std::sync::Arc;
 
@@ -62,6 +63,7 @@ fn described(app: &App, caller: &Caller, secret: Option<&str>) -> Session {
         expires,
         needed: !app.principals.names_nobody(),
         accounts: app.principals.has_accounts(),
+        provider: app.provider.as_ref().map(|provider| provider.link()),
     }
 }
 
@@ -75,13 +77,13 @@ pub async fn session(
     Ok(unkept(Json(described(&app, &caller, secret.as_deref()))))
 }
 
-/// Refuses to hear a password that others could read on the way.
+/// Refuses to hear what others could read on the way: a password, or by what a session is known.
 fn check_way(connection: &Connection) -> Result<(), Error> {
     let here = connection.peer.ip().is_loopback() && !connection.forwarded;
     match connection.secure || here {
         true => Ok(()),
         false => Err(Error::Foreign {
-            what: "a password that is sent without TLS can be read by anybody on the way".into(),
+            what: "what somebody signs in by can be read by anybody on the way where it is sent without TLS".into(),
             next: "ask at https://".into(),
         }),
     }

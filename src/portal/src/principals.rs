@@ -4,6 +4,7 @@
 mod changing;
 mod pairings;
 mod people;
+mod provided;
 mod recognising;
 mod standing;
 mod stored;
@@ -103,9 +104,9 @@ pub enum Unrecognised {
     /// It was not looked at.
     #[error("too many tokens that are not known came from this address; none is looked at for {} s", .0.div_ceil(1000))]
     Slowed(Millis),
-    /// A password was not looked at.
+    /// A password, or what a provider gave a browser, was not looked at.
     #[error(
-        "too many wrong passwords came from this address, or for this account; none is looked at for {} s",
+        "too many sign-ins that failed came from this address, or for this account; none is looked at for {} s",
         .0.div_ceil(1000)
     )]
     SlowedSignIn(Millis),
@@ -187,6 +188,23 @@ impl Principals {
         if let Some(wait) = by_account.max(by_address) {
             let seconds = wait.div_ceil(1000);
             tracing::warn!("wrong passwords come from {from}: for {seconds} s none is looked at");
+        }
+    }
+
+    /// Whether what comes from an address with an answer of an identity provider may be looked at.
+    pub fn may_come(&self, from: IpAddr, now: Millis) -> Result<(), Unrecognised> {
+        let asked = self.guesses.lock().ask(from, now);
+        asked.map_err(Unrecognised::SlowedSignIn)
+    }
+
+    /// Counts an answer of an identity provider that was looked at and is made up, perhaps.
+    pub fn mistaken_sign_in(&self, from: IpAddr, now: Millis) {
+        let wait = self.guesses.lock().failed(from, now);
+        if let Some(wait) = wait {
+            let seconds = wait.div_ceil(1000);
+            tracing::warn!(
+                "sign-ins that fail come from {from}: for {seconds} s none is looked at"
+            );
         }
     }
 

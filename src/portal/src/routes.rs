@@ -411,6 +411,16 @@ pub const ROUTES: &[Route] = &[
         operation("signOut", "Ends the session that is shown, or all of that person; answers 204.")
             .asks::<people::Ending>()
     }),
+    at("GET", "/api/v1/oidc/login", Read, || get(people::provider::login)).described(|| {
+        operation("oidcLogin", "Sends a browser to the identity provider, where somebody signs in.")
+            .asks::<people::provider::Beginning>()
+            .leads_on()
+    }),
+    at("GET", "/api/v1/oidc/callback", Read, || get(people::provider::callback)).described(|| {
+        operation("oidcCallback", "Signs in whoever comes back from the identity provider: its session is told by a cookie.")
+            .asks::<people::provider::ComingBack>()
+            .answers_page()
+    }),
     at("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions)).described(|| {
         operation("sessions", "All sessions of people.").lists::<api::people::SessionLine>()
     }),

@@ -14,6 +14,7 @@ mod journal;
 mod pairings;
 mod people;
 pub mod private;
+mod provided;
 mod robots;
 mod rollouts;
 mod rules;
@@ -38,6 +39,7 @@ pub use events::{EventFilter, NewEvent};
 pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
 pub use people::{AccountRecord, NewSession, SessionRecord};
+pub use provided::ProvidedRecord;
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
@@ -45,7 +47,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 10] = [
+const MIGRATIONS: [&str; 11] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -56,6 +58,7 @@ const MIGRATIONS: [&str; 10] = [
     include_str!("008-audit.sql"),
     include_str!("009-pairings.sql"),
     include_str!("010-people.sql"),
+    include_str!("011-provided.sql"),
 ];
 
 /// What can go wrong.

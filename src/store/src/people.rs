@@ -50,6 +50,10 @@ pub struct SessionRecord {
     pub last_used: u64,
     /// When it ends at the latest.
     pub expires: u64,
+    /// The person whom a provider knows.
+    pub person: Option<i64>,
+    /// Which of its groups the configuration named when it began, as JSON.
+    pub groups: Option<String>,
 }
 
 /// A session to begin.
@@ -69,13 +73,16 @@ pub struct NewSession<'a> {
     pub peer: &'a str,
     /// When it ends at the latest.
     pub expires: u64,
+    /// The person whom a provider knows, with those of its groups that the configuration names, as JSON.
+    pub person: Option<(i64, &'a str)>,
 }
 
 /// Sessions that a person may have at once; the oldest end for newer ones.
 const MOST_SESSIONS: u32 = 32;
 
 const ACCOUNT: &str = "id, name, password, role, scope, created, last_login, disabled, removed";
-const SESSION: &str = "id, hash, account, name, role, scope, peer, created, last_used, expires";
+const SESSION: &str =
+    "id, hash, account, name, role, scope, peer, created, last_used, expires, person, groups";
 
 fn read_account(row: &Row<'_>) -> rusqlite::Result<AccountRecord> {
     Ok(AccountRecord {
@@ -103,6 +110,8 @@ fn read_session(row: &Row<'_>) -> rusqlite::Result<SessionRecord> {
         created: row.get(7)?,
         last_used: row.get(8)?,
         expires: row.get(9)?,
+        person: row.get(10)?,
+        groups: row.get(11)?,
     })
 }
 
@@ -245,12 +254,21 @@ impl State {
             transaction.execute("DELETE FROM sessions WHERE expires <= ?1", [at])?;
             let made = transaction
                 .prepare_cached(&format!(
-                    "INSERT INTO sessions (hash, account, name, role, scope, peer, created, last_used, expires)
-                     VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?7, ?8) RETURNING {SESSION}"
+                    "INSERT INTO sessions (hash, account, name, role, scope, peer, created, last_used, expires, person, groups)
+                     VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?7, ?8, ?9, ?10) RETURNING {SESSION}"
                 ))?
                 .query_row(
                     params![
-                        new.hash, new.account, new.name, new.role, new.scope, new.peer, at, new.expires
+                        new.hash,
+                        new.account,
+                        new.name,
+                        new.role,
+                        new.scope,
+                        new.peer,
+                        at,
+                        new.expires,
+                        new.person.map(|(id, _)| id),
+                        new.person.map(|(_, groups)| groups),
                     ],
                     read_session,
                 )?;

@@ -70,6 +70,7 @@ fn what_the_document_describes_needs_a_token_or_a_pairing_code() {
         let guarded = match row.access {
             Access::Code => row.path == "/api/v1/pair",
             Access::SignIn => row.path == "/api/v1/session",
+            Access::Read => row.path.starts_with("/api/v1/oidc/"),
             access => matches!(access, Access::May(..)),
         };
         assert!(guarded, "{} {}", row.method, row.path);

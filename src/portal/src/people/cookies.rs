@@ -11,6 +11,14 @@ use crate::tokens;
 const SECURE: &str = "__Host-cloudroid";
 /// Without TLS, on this machine: browsers take no `Secure` cookie there. It is never looked at through TLS.
 const PLAIN: &str = "cloudroid";
+/// While somebody says to an identity provider who it is: by this the browser is known when it comes back. Another site's answer
+/// leads it here, and so it is SameSite=Lax: shown to an address that somebody goes to from elsewhere, and to nothing else.
+const SECURE_SIGNING_IN: &str = "__Host-cloudroid-oidc";
+const PLAIN_SIGNING_IN: &str = "cloudroid-oidc";
+/// How long that may take.
+const SIGNING_IN: u64 = 600;
+/// What browsers say of what they ask for.
+const FETCH_DEST: &str = "sec-fetch-dest";
 /// What browsers say of where a request comes from (Fetch Metadata, W3C).
 const FETCH_SITE: &str = "sec-fetch-site";
 /// Longest secret that is looked at.
@@ -20,9 +28,25 @@ fn name(secure: bool) -> &'static str {
     if secure { SECURE } else { PLAIN }
 }
 
-/// What the browser shows, if anything.
+fn signing_in_name(secure: bool) -> &'static str {
+    if secure {
+        SECURE_SIGNING_IN
+    } else {
+        PLAIN_SIGNING_IN
+    }
+}
+
+/// What the browser shows of its session, if anything.
 pub fn shown(connection: &Connection, headers: &HeaderMap) -> Result<Option<String>, Error> {
-    let name = name(connection.secure);
+    value(name(connection.secure), headers)
+}
+
+/// By what a browser is known in which somebody is signing in.
+pub fn signing_in(connection: &Connection, headers: &HeaderMap) -> Result<Option<String>, Error> {
+    value(signing_in_name(connection.secure), headers)
+}
+
+fn value(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error> {
     let lines = headers.get_all(header::COOKIE).iter();
     let mut values = lines
         .filter_map(|line| line.to_str().ok())
@@ -42,11 +66,10 @@ pub fn shown(connection: &Connection, headers: &HeaderMap) -> Result<Option<Stri
     }
 }
 
-fn cookie(secure: bool, value: &str, seconds: u64) -> HeaderValue {
+fn cookie(secure: bool, name: &str, value: &str, seconds: u64, same_site: &str) -> HeaderValue {
     let secured = if secure { "; Secure" } else { "" };
     let text = format!(
-        "{}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict{secured}",
-        name(secure)
+        "{name}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite={same_site}{secured}"
     );
     // Secrets are letters and digits.
     HeaderValue::from_str(&text).unwrap_or_else(|_| HeaderValue::from_static(""))
@@ -54,12 +77,17 @@ fn cookie(secure: bool, value: &str, seconds: u64) -> HeaderValue {
 
 /// Has the browser keep a secret for so many seconds.
 pub fn kept(secure: bool, secret: &str, seconds: u64) -> HeaderValue {
-    cookie(secure, secret, seconds)
+    cookie(secure, name(secure), secret, seconds, "Strict")
 }
 
 /// Has the browser forget it.
 pub fn forgotten(secure: bool) -> HeaderValue {
-    cookie(secure, "", 0)
+    cookie(secure, name(secure), "", 0, "Strict")
+}
+
+/// Has the browser keep by what it is known while somebody signs in.
+pub fn kept_signing_in(secure: bool, secret: &str) -> HeaderValue {
+    cookie(secure, signing_in_name(secure), secret, SIGNING_IN, "Lax")
 }
 
 /// What requests of a session that change something must show beside the cookie.
@@ -71,12 +99,31 @@ fn text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
     headers.get(name).map(|value| value.to_str().unwrap_or("?"))
 }
 
+/// The origin by which a request reached this portal (RFC 6454).
+pub fn origin(connection: &Connection, headers: &HeaderMap) -> String {
+    let host = text(headers, "host").unwrap_or_default();
+    let scheme = if connection.secure { "https" } else { "http" };
+    format!("{scheme}://{host}")
+}
+
+/// Refuses an address that a browser asks for without showing it to anybody, as for a picture or a frame of another page: that is
+/// nobody who comes back from signing in.
+pub fn check_visit(headers: &HeaderMap) -> Result<(), Error> {
+    match text(headers, FETCH_DEST) {
+        None | Some("document") => Ok(()),
+        Some(other) => Err(Error::Foreign {
+            what: format!(
+                "a page has asked for this as a part of itself ({other}), and not a person"
+            ),
+            next: "sign in from the portal's page".into(),
+        }),
+    }
+}
+
 /// Refuses what another site's page has sent. `said`: the browser must say that it is our own page; else what says nothing is no
 /// browser.
 pub fn check_origin(connection: &Connection, headers: &HeaderMap, said: bool) -> Result<(), Error> {
-    let host = text(headers, "host").unwrap_or_default();
-    let scheme = if connection.secure { "https" } else { "http" };
-    let own = format!("{scheme}://{host}");
+    let own = origin(connection, headers);
     let origins = headers.get_all(header::ORIGIN).iter().count();
     let (same, from) = match (text(headers, "origin"), text(headers, FETCH_SITE)) {
         (Some(origin), site) => (
@@ -184,6 +231,27 @@ mod tests {
             text.starts_with("cloudroid=; ") && text.contains("Max-Age=0"),
             "{text}"
         );
+    }
+
+    #[test]
+    fn whoever_signs_in_elsewhere_is_known_when_it_comes_back() {
+        let set = kept_signing_in(true, "x");
+        assert_eq!(
+            set.to_str().expect("text"),
+            "__Host-cloudroid-oidc=x; Path=/; Max-Age=600; HttpOnly; SameSite=Lax; Secure"
+        );
+        let lines = headers(&[(
+            "cookie",
+            "cloudroid=a; cloudroid-oidc=b; __Host-cloudroid-oidc=c",
+        )]);
+        let known = |secure| signing_in(&connection(secure), &lines).expect("once");
+        assert_eq!(known(false).as_deref(), Some("b"));
+        assert_eq!(known(true).as_deref(), Some("c"));
+        check_visit(&headers(&[])).expect("no browser");
+        check_visit(&headers(&[("sec-fetch-dest", "document")])).expect("a person");
+        for part in ["image", "iframe", "empty"] {
+            check_visit(&headers(&[("sec-fetch-dest", part)])).expect_err(part);
+        }
     }
 
     #[test]

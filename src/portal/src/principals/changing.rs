@@ -21,7 +21,8 @@ impl Principals {
     pub(super) fn reload(&self) -> Result<(), store::Error> {
         // Read under the lock: of two changes, the one that is read last holds both.
         let mut stored = self.stored.write();
-        let fresh = Stored::read(&self.state)?;
+        let mut fresh = Stored::read(&self.state)?;
+        fresh.names_provider |= stored.names_provider;
         // Not yet written ones, too.
         for known in &fresh.tokens {
             if let Some(before) = stored.of_id(known.id) {

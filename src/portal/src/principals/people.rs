@@ -34,7 +34,7 @@ impl Default for Lasting {
     }
 }
 
-fn milliseconds(time: Duration) -> Millis {
+pub(super) fn milliseconds(time: Duration) -> Millis {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
@@ -146,7 +146,7 @@ fn check_role(role: Role, services: &[Glob]) -> Result<(), String> {
     }
 }
 
-fn scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
+pub(super) fn scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
     let scope = StoredScope {
         services: services.to_vec(),
         robot: None,
@@ -224,6 +224,7 @@ impl Principals {
                 scope: &candidate.scope,
                 peer,
                 expires: store::now().saturating_add(milliseconds(self.lasting.most)),
+                person: None,
             },
             Some(&candidate.password),
         )?;

@@ -79,6 +79,8 @@ pub struct Stored {
     pub(super) accounts: Vec<KnownAccount>,
     /// By the hash of what their browsers show.
     pub(super) sessions: HashMap<TokenHash, KnownSession>,
+    /// Whether an identity provider names people, or did.
+    pub(super) names_provider: bool,
     pub(super) rules: Vec<(i64, Rule)>,
     pub(super) policy: Policy,
 }
@@ -174,15 +176,19 @@ impl Stored {
             },
             accounts: accounts.collect::<Result<_, store::Error>>()?,
             sessions: sessions.collect::<Result<_, store::Error>>()?,
+            names_provider: !state.provided_people()?.is_empty(),
             tokens,
             pairings,
             rules,
         })
     }
 
-    /// Whether there never was a token, nor an account, nor a robot that is paired.
+    /// Whether there never was a token, nor an account, nor a robot that is paired, nor an identity provider.
     pub fn is_empty(&self) -> bool {
-        self.tokens.is_empty() && self.accounts.is_empty() && self.pairings.is_empty()
+        self.tokens.is_empty()
+            && self.accounts.is_empty()
+            && self.pairings.is_empty()
+            && !self.names_provider
     }
 
     /// Whose session it is, by the hash of what is shown.

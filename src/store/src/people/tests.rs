@@ -15,6 +15,7 @@ fn session(hash: &str, account: Option<i64>, expires: u64) -> NewSession<'_> {
         scope: "{}",
         peer: "127.0.0.1:1",
         expires,
+        person: None,
     }
 }
 

@@ -7,7 +7,7 @@ use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
 use api::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
-use api::people::{Account, AccountChange, NewAccount, Session, SessionLine, SignIn};
+use api::people::{Account, AccountChange, NewAccount, ProviderLink, Session, SessionLine, SignIn};
 use api::push::Layer;
 use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share};
 use api::shadow::{Compared, FieldDifference, NotCompared};
@@ -643,6 +643,10 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 expires: Some(1),
                 needed: true,
                 accounts: true,
+                provider: Some(ProviderLink {
+                    name: "Lab".into(),
+                    path: "/x".into(),
+                }),
             },
         ),
         sample("Session", Session::default()),

@@ -1,0 +1,133 @@
+//! What a provider says of a person: the claims of an ID token, or of userinfo.
+
+use serde_json::{Map, Value};
+
+/// Groups that a person may have, and characters of each; more are not looked at.
+const MOST: usize = 1000;
+const LONGEST: usize = 200;
+
+/// Claims with a subject.
+pub struct Claims {
+    subject: String,
+    all: Map<String, Value>,
+}
+
+impl Claims {
+    /// Reads a JSON object.
+    pub fn read(text: &[u8]) -> Result<Claims, serde_json::Error> {
+        serde_json::from_slice(text).and_then(Claims::of)
+    }
+
+    /// Takes a JSON object.
+    pub fn of(value: Value) -> Result<Claims, serde_json::Error> {
+        let all: Map<String, Value> = serde_json::from_value(value)?;
+        let subject = all.get("sub").cloned().unwrap_or_default();
+        Ok(Claims {
+            subject: serde_json::from_value(subject)?,
+            all,
+        })
+    }
+
+    /// Whom the provider means.
+    pub fn subject(&self) -> &str {
+        &self.subject
+    }
+
+    /// A claim of this name; else, where the name has dots, what is within others (`realm_access.roles`).
+    pub fn find(&self, name: &str) -> Option<&Value> {
+        if let Some(found) = self.all.get(name) {
+            return Some(found);
+        }
+        let (first, rest) = name.split_once('.')?;
+        let mut found = self.all.get(first)?;
+        for part in rest.split('.') {
+            found = found.get(part)?;
+        }
+        Some(found)
+    }
+
+    /// A claim that is a text.
+    pub fn text(&self, name: &str) -> Option<String> {
+        let text = self.find(name)?.as_str()?;
+        (!text.is_empty()).then(|| text.to_owned())
+    }
+
+    /// The groups that a claim names: a list of texts, or one text. An address of mail counts when the provider has verified it.
+    pub fn groups(&self, name: &str) -> Option<Vec<String>> {
+        let found = self.find(name)?;
+        if name == "email" && self.all.get("email_verified") != Some(&Value::Bool(true)) {
+            return Some(Vec::new());
+        }
+        let texts = match found {
+            Value::Array(all) => all.as_slice(),
+            one => std::slice::from_ref(one),
+        };
+        let texts = texts.iter().filter_map(Value::as_str);
+        let short = texts.filter(|text| text.chars().count() <= LONGEST);
+        Some(short.take(MOST).map(str::to_owned).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn claims(value: Value) -> Claims {
+        Claims::of(value).expect("claims")
+    }
+
+    #[test]
+    fn groups_are_found_by_the_name_of_their_claim() {
+        let all = claims(json!({
+            "sub": "1",
+            "groups": ["a", 2, "b"],
+            "one": "c",
+            "https://lab.example/groups": ["d"],
+            "realm_access": {"roles": ["e"]},
+            "number": 3,
+        }));
+        let groups = |name: &str| all.groups(name).map(|found| found.join(" "));
+        assert_eq!(groups("groups").as_deref(), Some("a b"));
+        assert_eq!(groups("one").as_deref(), Some("c"));
+        assert_eq!(groups("https://lab.example/groups").as_deref(), Some("d"));
+        assert_eq!(groups("realm_access.roles").as_deref(), Some("e"));
+        assert_eq!(groups("number").as_deref(), Some(""));
+        assert_eq!(groups("realm_access.none"), None);
+        assert_eq!(groups("none"), None);
+    }
+
+    #[test]
+    fn an_address_that_is_not_verified_is_no_group() {
+        for (verified, count) in [
+            (json!(true), 1),
+            (json!(false), 0),
+            (json!("true"), 0),
+            (json!(null), 0),
+        ] {
+            let all =
+                claims(json!({"sub": "1", "email": "a@lab.example", "email_verified": verified}));
+            assert_eq!(
+                all.groups("email").expect("there").len(),
+                count,
+                "{verified}"
+            );
+        }
+    }
+
+    #[test]
+    fn more_groups_than_anybody_has_are_not_looked_at() {
+        let many: Vec<String> = (0..MOST + 1).map(|number| number.to_string()).collect();
+        let all = claims(json!({"sub": "1", "groups": many, "long": ["x".repeat(LONGEST + 1)]}));
+        assert_eq!(all.groups("groups").expect("there").len(), MOST);
+        assert_eq!(all.groups("long").expect("there").len(), 0);
+    }
+
+    #[test]
+    fn without_a_subject_there_is_nobody() {
+        for text in ["{}", "[]", "{\"sub\": 1}", "{\"sub\": ", "\"sub\""] {
+            assert!(Claims::read(text.as_bytes()).is_err(), "{text}");
+        }
+    }
+}
