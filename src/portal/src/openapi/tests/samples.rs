@@ -2,6 +2,8 @@
 
 mod machines;
 
+use std::sync::Arc;
+
 use api::access::{Audited, NewRule, NewToken, Rule, Secret, Token, Whoami};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
@@ -11,6 +13,7 @@ use api::people::{Account, AccountChange, NewAccount, ProviderLink, Session, Ses
 use api::push::Layer;
 use api::rollout::{Arm, Rollout, RolloutOrder, RolloutState, RolloutTerms, Share};
 use api::shadow::{Compared, FieldDifference, NotCompared};
+use api::stream::{Machine, Update};
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
@@ -401,6 +404,25 @@ fn status() -> Status {
     }
 }
 
+fn update() -> Update {
+    Update {
+        time: 1,
+        machine: Some(Arc::new(Machine {
+            status: status(),
+            cores: 0.5,
+            host_cores: 4,
+            host_memory: Some(1),
+            host_memory_available: Some(50.0),
+        })),
+        services: vec![Arc::new(detail().summary)],
+        services_gone: all("adder"),
+        servants: explanation().servants.into_iter().map(Arc::new).collect(),
+        servants_gone: all("s1"),
+        back_offs: Some(vec![back_off()]),
+        events: vec![Arc::new(event())],
+    }
+}
+
 fn tried() -> Trial {
     Trial {
         service: "x".into(),
@@ -722,6 +744,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("Servant", servant()),
         sample("ServiceDetail", detail()),
         sample("Status", status()),
+        sample("Update", update()),
+        sample("Update", Update::default()),
         sample("Stopped", Stopped { stopped: all("x") }),
         sample("Trial", tried()),
         sample("Trial", Trial::default()),

@@ -1,0 +1,50 @@
+//! Readers, in a process of their own: a process has one engine.
+
+use std::collections::HashSet;
+use std::fs;
+use std::io::ErrorKind;
+use std::os::unix::fs::PermissionsExt;
+use std::thread;
+
+use caps::{CapSet, Capability};
+use privilege::{Account, Engine, blocking, reading};
+
+#[test]
+fn what_is_roots_is_read_and_nothing_else_is_done() {
+    let place = tempfile::tempdir().expect("a directory");
+    let secret = place.path().join("secret");
+    fs::write(&secret, "root's").expect("written");
+    fs::set_permissions(&secret, PermissionsExt::from_mode(0o600)).expect("set");
+    let engine = Engine::start(Account::default()).expect("started");
+    let work = move || {
+        let before = caps::read(None, CapSet::Effective).expect("read");
+        reading(|| {
+            let all = [CapSet::Effective, CapSet::Permitted, CapSet::Bounding];
+            for set in all {
+                let held = caps::read(None, set).expect("read");
+                assert_eq!(held, HashSet::from([Capability::CAP_DAC_READ_SEARCH]));
+            }
+            assert_ne!(nix::unistd::geteuid().as_raw(), 0);
+            assert_eq!(fs::read_to_string(&secret).expect("readable"), "root's");
+            let refused = fs::write(&secret, "changed").expect_err("not to be written");
+            assert_eq!(refused.kind(), ErrorKind::PermissionDenied);
+            let refused = fs::remove_file(&secret).expect_err("not to be removed");
+            assert_eq!(refused.kind(), ErrorKind::PermissionDenied);
+            // What it executes cannot read even that.
+            let program = std::process::Command::new("cat").arg(&secret).output();
+            assert!(!program.expect("started").status.success());
+        });
+        let after = caps::read(None, CapSet::Effective).expect("read");
+        assert_eq!(before, after, "the engine's thread");
+        let broken = std::panic::catch_unwind(|| reading(|| panic!("of the work")));
+        let said = broken.expect_err("it panicked");
+        assert_eq!(said.downcast_ref(), Some(&"of the work"));
+    };
+    let others = tokio::runtime::Builder::new_current_thread()
+        .build()
+        .expect("a runtime");
+    others.block_on(async { blocking(work).await.expect("done") });
+    // Where there are no rights to give up.
+    assert_eq!(reading(|| thread::current().id()), thread::current().id());
+    engine.end(std::time::Duration::from_secs(1));
+}
