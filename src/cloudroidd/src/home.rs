@@ -11,12 +11,17 @@ use std::io::{Read, Seek, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use nix::fcntl::{Flock, FlockArg};
 use servant::process::Identity;
 use tokio::net::UnixListener;
 
 use store::private;
+
+/// How often, and how long each time, a lock is waited for whose daemon is gone.
+const PAUSES: u32 = 100;
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// Why a directory cannot be the home.
 #[derive(Debug, thiserror::Error)]
@@ -95,7 +100,7 @@ impl Home {
     pub fn open(path: &Path) -> Result<Home, HomeError> {
         let path = std::path::absolute(path).map_err(io("resolve", path))?;
         private::make_directory(&path).map_err(io("create the directory", &path))?;
-        let lock = lock(&path)?;
+        let lock = lock(&path, &mut || std::thread::sleep(PAUSE))?;
         let home = Home { path, _lock: lock };
         for name in ["images", "layers", "run", "servants", "build", "logs"] {
             let directory = home.path.join(name);
@@ -237,7 +242,22 @@ fn is_ours(path: &Path) -> std::io::Result<bool> {
     Ok(true)
 }
 
-fn lock(home: &Path) -> Result<Flock<File>, HomeError> {
+/// Locks a home. A daemon that was killed may have started a process that does not yet run its own program, and holds what the daemon
+/// held: that is waited for.
+fn lock(home: &Path, pause: &mut dyn FnMut()) -> Result<Flock<File>, HomeError> {
+    let mut left = PAUSES;
+    loop {
+        match try_lock(home) {
+            Err(HomeError::Taken { pid, .. }) if pid.is_empty() && left > 0 => {
+                left -= 1;
+                pause();
+            }
+            outcome => return outcome,
+        }
+    }
+}
+
+fn try_lock(home: &Path) -> Result<Flock<File>, HomeError> {
     let path = home.join("lock");
     let file = private::open(&path).map_err(io("open", &path))?;
     match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
@@ -342,6 +362,30 @@ mod tests {
         let path = first.path().to_owned();
         drop(first);
         Home::open(&path).expect("free again");
+    }
+
+    #[test]
+    fn what_a_killed_daemon_had_started_is_waited_for() {
+        let parent = tempfile::tempdir().expect("a directory");
+        let first = Home::open(&parent.path().join("home")).expect("free");
+        let path = first.path().to_owned();
+        // The lock is another process's that never wrote who it is.
+        std::fs::write(path.join("lock"), "").expect("written");
+        let (mut first, mut pauses) = (Some(first), 0);
+        let locked = lock(&path, &mut || {
+            pauses += 1;
+            if pauses == 3 {
+                first = None;
+            }
+        });
+        assert!(locked.is_ok() && first.is_none(), "{pauses}");
+        let refused = lock(&path, &mut || {}).expect_err("taken by whom we know");
+        assert!(refused.to_string().contains("(pid"), "{refused}");
+        std::fs::write(path.join("lock"), "").expect("written");
+        let mut pauses = 0;
+        let refused = lock(&path, &mut || pauses += 1).expect_err("not let go");
+        assert!(refused.to_string().contains("fuser -v"), "{refused}");
+        assert_eq!(pauses, PAUSES);
     }
 
     #[test]

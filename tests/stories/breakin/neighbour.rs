@@ -185,7 +185,7 @@ fn may_come(name: &str, came: &str) -> bool {
 }
 
 /// What is answered to everybody.
-const OPEN: [(&str, &str); 8] = [
+const OPEN: [(&str, &str); 10] = [
     ("ANY /", "200"),
     ("GET /", "200"),
     ("GET /healthz", "200"),
@@ -193,6 +193,9 @@ const OPEN: [(&str, &str); 8] = [
     ("GET /api/v1/session", "200"),
     ("POST /api/v1/session", "400"),
     ("POST /api/v1/pair", "400"),
+    // No identity provider is configured.
+    ("GET /api/v1/oidc/login", "404"),
+    ("GET /api/v1/oidc/callback", "404"),
     ("GET /no_such_service", "401"),
 ];
 
