@@ -91,6 +91,22 @@ impl Drop for Browser {
     }
 }
 
+/// What a browser asks a site of a story for: the head of its request, and the body.
+pub fn request(stream: &TcpStream) -> anyhow::Result<(String, Vec<u8>)> {
+    stream.set_read_timeout(Some(PATIENCE))?;
+    let mut reader = BufReader::new(stream.try_clone()?);
+    let (mut head, mut length) = (String::new(), 0);
+    while reader.read_line(&mut head)? > 2 {
+        let line = head.lines().last().unwrap_or_default().to_lowercase();
+        if let Some(value) = line.strip_prefix("content-length:") {
+            length = value.trim().parse()?;
+        }
+    }
+    let mut body = vec![0; length];
+    reader.read_exact(&mut body)?;
+    Ok((head, body))
+}
+
 /// What the page asks for, and where what it says goes.
 struct Site {
     roslib: Vec<u8>,
@@ -111,17 +127,7 @@ impl Site {
     }
 
     fn answer(&self, mut stream: TcpStream) -> anyhow::Result<()> {
-        stream.set_read_timeout(Some(PATIENCE))?;
-        let mut reader = BufReader::new(stream.try_clone()?);
-        let (mut head, mut length) = (String::new(), 0);
-        while reader.read_line(&mut head)? > 2 {
-            let line = head.lines().last().unwrap_or_default().to_lowercase();
-            if let Some(value) = line.strip_prefix("content-length:") {
-                length = value.trim().parse()?;
-            }
-        }
-        let mut body = vec![0; length];
-        reader.read_exact(&mut body)?;
+        let (head, body) = request(&stream)?;
         let path = head.split(' ').nth(1).unwrap_or_default();
         let (kind, answer) = match path {
             "/" => ("text/html", PAGE.as_bytes()),

@@ -89,6 +89,32 @@ fn check_way(connection: &Connection) -> Result<(), Error> {
     }
 }
 
+/// Lets somebody in whose session has begun, in place of an `earlier` one of the same browser: who asks from now on, and the cookie. `kind`:
+/// of whom the audit log is told.
+fn enter(
+    app: &App,
+    caller: &Caller,
+    begun: &Begun,
+    earlier: Option<String>,
+    did: &str,
+    kind: &str,
+) -> (Caller, HeaderValue) {
+    if let Some(earlier) = earlier
+        && let Err(error) = app.principals.end_shown(&earlier)
+    {
+        tracing::warn!("the session before this one could not be ended: {error}");
+    }
+    let now = Caller {
+        who: begun.identity.clone(),
+        ..caller.clone()
+    };
+    let object = format!("{kind} {}", now.who.principal.name);
+    app.audit.record(&now, Action::Enter, did, &object, 200);
+    let left = begun.expires.saturating_sub(store::now()) / 1000;
+    let cookie = cookies::kept(caller.secure, &begun.secret, left);
+    (now, cookie)
+}
+
 /// Signs somebody in: gives the browser another session than it may have had.
 pub async fn sign_in(
     State(app): State<Arc<App>>,
@@ -101,19 +127,7 @@ pub async fn sign_in(
     let did = format!("{} {path}", head.method);
     match signed {
         Ok((begun, earlier)) => {
-            if let Some(earlier) = earlier
-                && let Err(error) = app.principals.end_shown(&earlier)
-            {
-                tracing::warn!("the session before this one could not be ended: {error}");
-            }
-            let now = Caller {
-                who: begun.identity.clone(),
-                ..caller.clone()
-            };
-            let object = format!("account {}", now.who.principal.name);
-            app.audit.record(&now, Action::Enter, &did, &object, 200);
-            let left = begun.expires.saturating_sub(store::now()) / 1000;
-            let cookie = cookies::kept(caller.secure, &begun.secret, left);
+            let (now, cookie) = enter(&app, &caller, &begun, earlier, &did, "account");
             let answer = described(&app, &now, Some(&begun.secret));
             unkept(([(header::SET_COOKIE, cookie)], Json(answer)))
         }

@@ -6,7 +6,7 @@
 //!  rebound:PORT      a name that led to that site, and leads to the portal by now: what is not the page's goes there
 //! ```
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::Write;
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::{Arc, mpsc};
 
@@ -18,7 +18,7 @@ use support::robot::PATIENCE;
 use support::world::world;
 
 use super::scene::state;
-use crate::browser::Browser;
+use crate::browser::{Browser, request};
 use crate::people::{self, PASSWORD};
 
 /// Goes through its positions, from one to the next, and tells what came of each attempt.
@@ -37,17 +37,7 @@ struct Site {
 
 impl Site {
     fn answer(&self, mut stream: TcpStream) -> anyhow::Result<()> {
-        stream.set_read_timeout(Some(PATIENCE))?;
-        let mut reader = BufReader::new(stream.try_clone()?);
-        let (mut head, mut length) = (String::new(), 0);
-        while reader.read_line(&mut head)? > 2 {
-            let line = head.lines().last().unwrap_or_default().to_lowercase();
-            if let Some(value) = line.strip_prefix("content-length:") {
-                length = value.trim().parse()?;
-            }
-        }
-        let mut body = vec![0; length];
-        reader.read_exact(&mut body)?;
+        let (head, body) = request(&stream)?;
         let path = head.split(' ').nth(1).unwrap_or_default();
         let path = path.split('?').next().unwrap_or_default();
         let asked = self.asked.to_string();

@@ -12,7 +12,7 @@ use oidc::{Person, Roles};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::{check_way, cookies, unkept};
+use super::{check_way, cookies, enter, unkept};
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::{self, Caller};
@@ -139,20 +139,8 @@ pub async fn callback(
 ) -> Response {
     match signed_in(&app, &caller, &uri, &headers).await {
         Ok((begun, earlier)) => {
-            if let Some(earlier) = earlier
-                && let Err(error) = app.principals.end_shown(&earlier)
-            {
-                tracing::warn!("the session before this one could not be ended: {error}");
-            }
-            let now = Caller {
-                who: begun.identity.clone(),
-                ..caller.clone()
-            };
-            let object = format!("person {}", now.who.principal.name);
             let did = format!("GET {CALLBACK}");
-            app.audit.record(&now, Action::Enter, &did, &object, 200);
-            let left = begun.expires.saturating_sub(store::now()) / 1000;
-            let cookie = cookies::kept(caller.secure, &begun.secret, left);
+            let (_, cookie) = enter(&app, &caller, &begun, earlier, &did, "person");
             // Browsers show a cookie of SameSite=Strict to no page that another site has sent them to, and the provider has sent them
             // here. The page that goes on from here is asked for by our own.
             let body = "<meta http-equiv=\"refresh\" content=\"0; url=/\">\n<title>Signed in</title>\n\
