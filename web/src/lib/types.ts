@@ -159,3 +159,50 @@ export interface LogLine { time: number; node: string; stream: 'stdout' | 'stder
 
 export interface Cause { weight: 'blocks' | 'slows' | 'hint'; what: string; next: string }
 export interface Explanation { robot: string; causes: Cause[]; servants: Served[]; events: Event[] }
+
+export interface Fit {
+  cpus: number;
+  memory: number;
+  free_cpus: number;
+  free_memory: number;
+  waiting: number;
+  stalled?: string;
+  full: boolean;
+  now: boolean;
+  ends: string[];
+  lacking_cpus: number;
+  lacking_memory: number;
+  costs: { servant: string; service: string; robot: string; cpus: number; left: number; rrt?: number; later?: number; accepts?: number }[];
+  more?: number;
+  expected?: { rrt: number; from: string };
+  shared?: number;
+}
+
+export interface Row {
+  id: number;
+  measure: 'rrt' | 'fps' | 'age';
+  value: number;
+  aux?: Record<string, string>;
+  limits: Limits;
+  spread?: { p50: number; p95: number; requests: number };
+  revision?: number;
+  written: number;
+}
+
+export interface Arm { servants: number; servants_failed: number; requests: number; requests_failed: number; p50?: number; p95?: number }
+
+export interface Rollout {
+  stable: number;
+  candidate: number;
+  state: string;
+  reason: string;
+  started: number;
+  of_stable: Arm;
+  of_candidate: Arm;
+}
+
+export interface Token { name: string; role: string; services: string[]; robot?: string; classes: string[]; created: number; expires?: number; last_used?: number; revoked?: number }
+export interface Account { name: string; role: string; services: string[]; created: number; last_login?: number; disabled?: number; sessions: number }
+export interface Rule { id: number; who: string; services: string; allow: string[] }
+export interface Pairing { robot: string; services: string[]; state: 'waiting' | 'paired'; own_certificate: boolean; created: number; expires?: number; last_used?: number }
+export interface Audited { id: number; time: number; who: string; from: string; action: string; did: string; object: string; status: number; more?: number }
