@@ -206,3 +206,17 @@ export interface Account { name: string; role: string; services: string[]; creat
 export interface Rule { id: number; who: string; services: string; allow: string[] }
 export interface Pairing { robot: string; services: string[]; state: 'waiting' | 'paired'; own_certificate: boolean; created: number; expires?: number; last_used?: number }
 export interface Audited { id: number; time: number; who: string; from: string; action: string; did: string; object: string; status: number; more?: number }
+
+export interface TimeSpread { p50: number; p95: number; max: number }
+export interface Point { cpus: number; requests: number; answered: number; compute?: TimeSpread; running: number; throttled: number; rate: number; memory: number }
+
+export interface Calibration {
+  service: string;
+  revision: number;
+  unused: string[];
+  points: Point[];
+  ended: string;
+  memory_peak: number;
+  memory_margin: number;
+  rows: Row[];
+}
