@@ -84,7 +84,8 @@ pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
             .unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
         told.and(worked)
     })?;
-    does(&daemon, "remover", &admin)
+    does(&daemon, "remover", &admin)?;
+    does(&daemon, "admin", &admin)
 }
 
 pub fn it_is_told_at_once_that_a_token_was_revoked() -> Verdict {
