@@ -30,6 +30,8 @@ mod calls;
 mod candidates;
 #[path = "stories/clients.rs"]
 mod clients;
+#[path = "stories/commands.rs"]
+mod commands;
 #[path = "stories/cross.rs"]
 mod cross;
 #[path = "stories/crossing.rs"]
@@ -148,6 +150,11 @@ fn main() -> ExitCode {
             a_cpp_node_waits_for_the_robot_and_calls_it,
             a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link,
             siblings_come_first_and_other_robots_are_not_asked,
+        ],
+        stories![commands:
+            a_script_can_tell_by_the_exit_status_what_to_do,
+            who_follows_events_misses_none_when_the_daemon_is_started_again,
+            shells_complete_it_and_every_verb_has_a_page,
         ],
         stories![oidc:
             a_group_of_the_provider_is_a_role_here,

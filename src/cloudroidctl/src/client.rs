@@ -150,6 +150,20 @@ impl fmt::Display for Unreachable {
 
 impl std::error::Error for Unreachable {}
 
+/// The connection was lost within an answer that comes in parts.
+#[derive(Debug)]
+pub struct BrokenOff {
+    source: hyper::Error,
+}
+
+impl fmt::Display for BrokenOff {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "the daemon broke off its answer: {}", self.source)
+    }
+}
+
+impl std::error::Error for BrokenOff {}
+
 impl Client {
     /// For the daemon that `--server` names.
     pub fn new(server: Option<&str>, token: Option<String>) -> anyhow::Result<Client> {
@@ -393,10 +407,7 @@ pub fn lines<T: DeserializeOwned>(
             }
             match body.frame().await {
                 Some(frame) => {
-                    if let Ok(data) = frame
-                        .context("the daemon broke off its answer")?
-                        .into_data()
-                    {
+                    if let Ok(data) = frame.map_err(|source| BrokenOff { source })?.into_data() {
                         pending.extend_from_slice(&data);
                     }
                 }

@@ -3,14 +3,15 @@
 use std::time::Duration;
 
 use api::{Event, Level};
+use futures_util::StreamExt;
 
-use crate::client::{Client, escaped};
+use crate::client::{self, Client, Unreachable, escaped};
 use crate::output::{self, Format};
 
-/// Between two looks for what is new.
-const LOOK: Duration = Duration::from_secs(1);
-/// Events of one answer, where those that are new are followed.
-const AT_ONCE: u32 = 1000;
+/// Between attempts to reach a daemon that is away.
+const RETRY: Duration = Duration::from_millis(250);
+/// More than a journal holds.
+const ALL: u32 = u32::MAX;
 
 /// Print what happened lately: pushes, starts, failures.
 #[derive(Debug, clap::Args)]
@@ -38,29 +39,63 @@ pub struct Events {
 impl Events {
     /// Asks and prints.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let events: Vec<Event> = client.get(&self.path(0, self.tail)).await?;
-        if !self.follow {
-            return match format {
-                Format::Json => output::json(&events),
-                Format::Table => events.iter().try_for_each(print),
-            };
+        if self.follow {
+            return self.follow(client, format).await;
         }
+        let path = format!("/api/v1/events?{}", self.query(0, self.tail));
+        let events: Vec<Event> = client.get(&path).await?;
+        match format {
+            Format::Json => output::json(&events),
+            Format::Table => events.iter().try_for_each(print),
+        }
+    }
+
+    /// Prints what comes until it is ended. A daemon that is started again tells what happened meanwhile, and nothing twice.
+    async fn follow(&self, client: &Client, format: Format) -> anyhow::Result<()> {
         // What comes without an end is one event a line.
         let print = |event: &Event| match format {
             Format::Json => output::json_line(event),
             Format::Table => print(event),
         };
-        let mut last = events.last().map_or(0, |event| event.id);
-        events.iter().try_for_each(print)?;
+        let mut last = None;
         loop {
-            tokio::time::sleep(LOOK).await;
-            let events: Vec<Event> = client.get(&self.path(last, AT_ONCE)).await?;
-            last = events.last().map_or(last, |event| event.id);
-            events.iter().try_for_each(print)?;
+            let query = match last {
+                None => self.query(0, self.tail),
+                Some(last) => self.query(last, ALL),
+            };
+            let path = format!("/api/v1/events/follow?{query}");
+            let mut events = Box::pin(client.lines::<Event>(&path).await?);
+            while let Some(event) = events.next().await {
+                let event = match event {
+                    Ok(event) => event,
+                    Err(error) if error.is::<client::BrokenOff>() => break,
+                    Err(error) => return Err(error),
+                };
+                last = Some(last.unwrap_or(0).max(event.id));
+                print(&event)?;
+            }
+            self.come_back(client).await?;
         }
     }
 
-    fn path(&self, since: i64, limit: u32) -> String {
+    /// Waits for a daemon that is away.
+    async fn come_back(&self, client: &Client) -> anyhow::Result<()> {
+        let mut told = false;
+        loop {
+            match client.get::<api::Clock>("/api/v1/clock").await {
+                Ok(_) => return Ok(()),
+                Err(error) if error.is::<Unreachable>() => {
+                    if !std::mem::replace(&mut told, true) {
+                        output::complain(&format!("{error:#}; waiting for it"));
+                    }
+                    tokio::time::sleep(RETRY).await;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    fn query(&self, since: i64, limit: u32) -> String {
         let filter = [
             ("kind", &self.kind),
             ("service", &self.service),
@@ -71,7 +106,7 @@ impl Events {
         let filter: String = filter
             .filter_map(|(key, value)| Some(format!("&{key}={}", escaped(value.as_ref()?))))
             .collect();
-        format!("/api/v1/events?since={since}&limit={limit}{filter}")
+        format!("since={since}&limit={limit}{filter}")
     }
 }
 
@@ -103,10 +138,10 @@ mod tests {
 
     #[test]
     fn what_is_asked_for_is_what_was_typed() {
-        let path = |line: &str| {
+        let query = |line: &str| {
             let words = std::iter::once("events").chain(line.split_whitespace());
             let Line { events } = Line::try_parse_from(words).expect("valid");
-            events.path(7, events.tail)
+            events.query(7, events.tail)
         };
         for (line, expected) in [
             ("", "since=7&limit=50"),
@@ -116,7 +151,7 @@ mod tests {
                 "since=7&limit=50&service=s&servant=s-1&robot=r%26d",
             ),
         ] {
-            assert_eq!(path(line), format!("/api/v1/events?{expected}"), "{line}");
+            assert_eq!(query(line), expected, "{line}");
         }
         let event = Event {
             id: 1,

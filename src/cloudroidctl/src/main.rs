@@ -9,10 +9,12 @@ mod calibrate;
 mod client;
 mod doctor;
 mod events;
+mod exit;
 mod explain;
 mod fit;
 mod limits;
 mod logs;
+mod manual;
 mod output;
 mod pair;
 mod policy;
@@ -33,6 +35,7 @@ mod terminal;
 mod token;
 mod trial;
 mod trust;
+mod wait;
 
 use std::process::ExitCode;
 
@@ -40,6 +43,7 @@ use api::Problem;
 use clap::{Parser, Subcommand};
 
 use client::Client;
+use exit::Exit;
 use output::Format;
 
 /// Robot packages as services: push them, watch them, end them.
@@ -48,7 +52,8 @@ use output::Format;
     name = "cloudroidctl",
     version,
     arg_required_else_help = true,
-    propagate_version = true
+    propagate_version = true,
+    after_help = exit::table()
 )]
 struct Arguments {
     /// The daemon: https://HOST:PORT, http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME, that of
@@ -99,6 +104,8 @@ enum Verb {
     Trust(trust::TrustServer),
     Status(status::Status),
     Doctor(doctor::Doctor),
+    Completions(manual::Completions),
+    Man(manual::Man),
 }
 
 fn main() -> ExitCode {
@@ -110,23 +117,29 @@ fn main() -> ExitCode {
         Ok(runtime) => runtime,
         Err(error) => {
             eprintln!("error: cannot start: {error}");
-            return ExitCode::FAILURE;
+            return Exit::Failed.into();
         }
     };
     let outcome = runtime.block_on(run(arguments));
     // A read of standard input or of a directory must not hold up the end.
     runtime.shutdown_background();
     match outcome {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) if output::is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Ok(()) => Exit::Done.into(),
+        Err(error) if output::is_closed_pipe(&error) => Exit::Done.into(),
         Err(error) => {
             complain(&error);
-            ExitCode::FAILURE
+            Exit::of(&error).into()
         }
     }
 }
 
 async fn run(arguments: Arguments) -> anyhow::Result<()> {
+    // These are asked for while a package is made, where there is no daemon.
+    let arguments = match arguments.verb {
+        Verb::Completions(verb) => return verb.run::<Arguments>(),
+        Verb::Man(verb) => return verb.run::<Arguments>(),
+        verb => Arguments { verb, ..arguments },
+    };
     let client = Client::new(arguments.server.as_deref(), arguments.token)?;
     let format = arguments.format;
     match arguments.verb {
@@ -156,6 +169,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Trust(verb) => verb.run(),
         Verb::Status(verb) => verb.run(&client, format).await,
         Verb::Doctor(verb) => verb.run(&client, format).await,
+        Verb::Completions(_) | Verb::Man(_) => Ok(()),
     }
 }
 

@@ -32,6 +32,13 @@ pub fn line(text: &str) -> anyhow::Result<()> {
     write_line(&terminal::safe(text, std::io::stdout().is_terminal()))
 }
 
+/// Writes what is no text for people as it is.
+pub fn raw(bytes: &[u8]) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    out.write_all(bytes)?;
+    Ok(out.flush()?)
+}
+
 /// Prints a line on standard error, without control sequences.
 pub fn complain(text: &str) {
     let shown = terminal::safe(text, std::io::stderr().is_terminal());

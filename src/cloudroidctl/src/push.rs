@@ -17,6 +17,7 @@ use crate::output::{self, Format};
 use crate::push::shared::SharedFlags;
 use crate::rollout::{self, TermFlags};
 use crate::services;
+use crate::wait::WaitFlag;
 use progress::Progress;
 
 /// The longest query that HTTP servers take.
@@ -75,6 +76,8 @@ pub struct Push {
     shared: SharedFlags,
     #[command(flatten)]
     rollout: TermFlags,
+    #[command(flatten)]
+    wait: WaitFlag,
     #[command(flatten)]
     limits: LimitFlags,
     #[command(flatten)]
@@ -138,21 +141,32 @@ impl Push {
     /// Sends the package, shows what is done with it, and ends with the service's address and interface.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let rolls_out = self.rollout.terms().is_some();
+        let wait = self.wait;
         let service = self.publish(client, format).await?;
-        if format == Format::Json {
+        let name = &service.summary.name;
+        if format == Format::Table {
+            services::show(&service)?;
+        }
+        // The first revision of a service has nothing to take the place of.
+        if !rolls_out || service.revisions.len() < 2 {
             return Ok(());
         }
-        services::show(&service)?;
-        // The first revision of a service has nothing to take the place of.
-        if rolls_out && service.revisions.len() > 1 {
-            let path = format!(
-                "/api/v1/services/{}/rollout",
-                escaped(&service.summary.name)
-            );
+        let rollout = match wait.is_set() {
+            true => rollout::over(client, name, wait).await?,
+            false => {
+                client
+                    .get(&format!("/api/v1/services/{}/rollout", escaped(name)))
+                    .await?
+            }
+        };
+        if format == Format::Table {
             output::line("")?;
-            rollout::show(&client.get(&path).await?)?;
+            rollout::show(&rollout)?;
         }
-        Ok(())
+        match wait.is_set() {
+            true => rollout::promoted(&rollout),
+            false => Ok(()),
+        }
     }
 
     /// The same under a name that nobody else has, without the service's address and interface.

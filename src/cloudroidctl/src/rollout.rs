@@ -2,16 +2,20 @@
 
 use std::time::Duration;
 
+use anyhow::bail;
 use api::rollout::{Arm, Rollout as Shown, RolloutOrder, RolloutState, RolloutTerms, Share};
 
 use crate::client::{Client, escaped};
 use crate::output::{self, Format, Table};
+use crate::wait::WaitFlag;
 
 /// Show how a service comes to its next revision, promote or abort a canary, or begin with an earlier revision.
 #[derive(Debug, clap::Args)]
 pub struct Rollout {
     /// The service.
     service: String,
+    #[command(flatten)]
+    wait: WaitFlag,
     #[command(subcommand)]
     order: Option<Order>,
 }
@@ -106,10 +110,44 @@ impl Rollout {
             None => client.get(&path).await?,
             Some(order) => client.post(&path, &order).await?,
         };
-        match format {
-            Format::Json => output::json(&rollout),
-            Format::Table => show(&rollout),
+        if self.wait.is_set() {
+            let rollout = over(client, &self.service, self.wait).await?;
+            return told(&rollout, format).and_then(|()| promoted(&rollout));
         }
+        told(&rollout, format)
+    }
+}
+
+fn told(rollout: &Shown, format: Format) -> anyhow::Result<()> {
+    match format {
+        Format::Json => output::json(rollout),
+        Format::Table => show(rollout),
+    }
+}
+
+/// A service's last rollout, once it is over.
+pub async fn over(client: &Client, service: &str, wait: WaitFlag) -> anyhow::Result<Shown> {
+    let path = &format!("/api/v1/services/{}/rollout", escaped(service));
+    let look = || async move {
+        let rollout: Shown = client.get(path).await?;
+        let goes_on = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
+        let words = format!("{service} is at {}: {}", rollout.state, rollout.reason);
+        Ok(if goes_on { Err(words) } else { Ok(rollout) })
+    };
+    wait.until(look).await
+}
+
+/// Fails where the candidate has not become the current revision.
+pub fn promoted(rollout: &Shown) -> anyhow::Result<()> {
+    let Shown {
+        service, candidate, ..
+    } = rollout;
+    match rollout.state {
+        RolloutState::Promoted => Ok(()),
+        state => bail!(
+            "revision {candidate} of {service} has not become the current one: {state}, {}",
+            rollout.reason
+        ),
     }
 }
 

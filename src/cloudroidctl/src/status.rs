@@ -1,34 +1,23 @@
 //! `status`: the daemon at a glance.
 
-use std::time::Duration;
-
 use api::{Pressure, Size};
 
-use crate::client::{Client, Unreachable};
+use crate::client::Client;
 use crate::output::{self, Format};
+use crate::wait::WaitFlag;
 
-/// Between attempts of `--wait`.
-const RETRY: Duration = Duration::from_millis(50);
-
-/// Show the daemon: where it listens, what it holds, what does not work as it should.
+/// Show the daemon: where it listens, what it holds, what does not work as it should. With --wait, once it answers.
 #[derive(Debug, clap::Args)]
 pub struct Status {
-    /// Wait until the daemon answers.
-    #[arg(long)]
-    wait: bool,
+    #[command(flatten)]
+    wait: WaitFlag,
 }
 
 impl Status {
     /// Asks and prints.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let status: api::Status = loop {
-            match client.get("/api/v1/status").await {
-                Err(error) if self.wait && error.is::<Unreachable>() => {
-                    tokio::time::sleep(RETRY).await
-                }
-                answer => break answer?,
-            }
-        };
+        let look = || async { client.get::<api::Status>("/api/v1/status").await.map(Ok) };
+        let status = self.wait.until(look).await?;
         match format {
             Format::Json => output::json(&status),
             Format::Table => show(&status),

@@ -1,6 +1,6 @@
 //! `/api/v1`: what cloudroidctl and the page ask.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use access::{Action, Object};
@@ -14,7 +14,6 @@ use futures_util::StreamExt;
 use reach::{Material, Picture};
 use serde::Deserialize;
 use servant::engine::LogStart;
-use store::EventFilter;
 use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
@@ -30,7 +29,6 @@ pub(super) type Answer<T> = Result<Json<T>, Error>;
 
 /// Lines of a log when nobody says how many.
 const LOG_LINES: usize = 10_000;
-const EVENTS: u32 = 100;
 
 /// `/healthz`.
 pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
@@ -57,62 +55,6 @@ pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
         .await
         .map_err(|_| Error::Internal("examining the machine"))?;
     Ok(Json(doctor))
-}
-
-/// Which events.
-#[derive(Debug, Deserialize, IntoParams)]
-pub struct Which {
-    /// Only events with a greater number.
-    #[serde(default)]
-    since: i64,
-    /// So many of the newest; 100 by default.
-    limit: Option<u32>,
-    /// Only events of this kind, such as `node-hung`.
-    kind: Option<String>,
-    /// Only events of this service.
-    service: Option<String>,
-    /// Only events of this servant.
-    servant: Option<String>,
-    /// Only events of this robot.
-    robot: Option<String>,
-}
-
-/// The journal.
-pub async fn events(
-    State(app): State<Arc<App>>,
-    Query(which): Query<Which>,
-    Extension(caller): Extension<Caller>,
-) -> Answer<Vec<api::Event>> {
-    let limit = which.limit.unwrap_or(EVENTS);
-    let filter = EventFilter {
-        kind: which.kind.as_deref(),
-        service: which.service.as_deref(),
-        servant: which.servant.as_deref(),
-        robot: which.robot.as_deref(),
-    };
-    let principal = &caller.who.principal;
-    if principal.sees_all() {
-        return Ok(Json(app.state.events_of(filter, which.since, limit)?));
-    }
-    // Of all that are kept: the newest may be of what others see alone.
-    let mut events = app.state.events_of(filter, which.since, u32::MAX)?;
-    let mut seen: HashMap<String, bool> = HashMap::new();
-    // A robot is told of itself, and everybody of services that they see; the machine's own are for those who see it.
-    let own = principal.scope.robot.as_deref();
-    events.retain(|event| {
-        let mut sees = |service: &str| match seen.get(service) {
-            Some(sees) => *sees,
-            None => {
-                let sees = caller.sees(&app, service);
-                seen.insert(service.to_owned(), sees);
-                sees
-            }
-        };
-        event.service.as_deref().is_some_and(&mut sees)
-            && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
-    });
-    let beyond = events.len().saturating_sub(limit as usize);
-    Ok(Json(events.split_off(beyond)))
 }
 
 /// All services.

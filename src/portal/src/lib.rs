@@ -21,6 +21,7 @@ mod calibration;
 mod connections;
 mod dictionary;
 mod errors;
+mod events;
 mod explain;
 mod guard;
 mod handshake;

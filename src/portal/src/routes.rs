@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, machines, metrics, oci, openapi, page, people,
-    policy, push, robots, shadow, stream, stubs,
+    App, api_v1, audit, calibration, dictionary, events, machines, metrics, oci, openapi, page,
+    people, policy, push, robots, shadow, stream, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -182,10 +182,18 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::Clock>()
     }),
-    at("GET", "/api/v1/events", ENTER, || get(api_v1::events)).described(|| {
+    at("GET", "/api/v1/events", ENTER, || get(events::events)).described(|| {
         operation("events", "The journal, oldest first.")
-            .asks::<api_v1::Which>()
+            .asks::<events::Which>()
             .lists::<api::Event>()
+    }),
+    at("GET", "/api/v1/events/follow", ENTER, || get(events::follow)).described(|| {
+        operation(
+            "followEvents",
+            "The journal, oldest first, and what comes to it from now on. With since=N, none after N is missed.",
+        )
+        .asks::<events::Which>()
+        .streams::<api::Event>()
     }),
     at("GET", "/api/v1/stream", ENTER, || get(stream::stream)).described(|| {
         operation(

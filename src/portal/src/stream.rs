@@ -80,7 +80,13 @@ impl Live {
         true
     }
 
-    fn place(&self, who: String) -> Result<Place, Error> {
+    /// A place for a stream of the caller's.
+    pub fn place(&self, caller: &Caller) -> Result<Place, Error> {
+        let who = format!("{} {}", caller.who.principal, caller.peer.client(None));
+        self.place_of(who)
+    }
+
+    fn place_of(&self, who: String) -> Result<Place, Error> {
         let mut streams = self.streams.lock();
         let count = streams.entry(who.clone()).or_default();
         if *count >= MOST {
@@ -95,7 +101,7 @@ impl Live {
 }
 
 /// One stream of those that somebody may have.
-struct Place {
+pub struct Place {
     streams: Arc<Mutex<HashMap<String, usize>>>,
     who: String,
 }
@@ -117,8 +123,7 @@ pub async fn stream(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
 ) -> Result<impl IntoResponse, Error> {
-    let who = format!("{} {}", caller.who.principal, caller.peer.client(None));
-    let place = app.live.place(who)?;
+    let place = app.live.place(&caller)?;
     let ending = caller.over(&app, "");
     let listener = Listener::new(Arc::clone(&app), caller, Live::listen(&app), place);
     let told = futures_util::stream::unfold(listener, |mut listener| async move {
@@ -139,13 +144,13 @@ mod tests {
     fn one_principal_has_so_many_streams_and_no_more() {
         let live = Live::default();
         let mut places: Vec<_> = (0..MOST)
-            .map(|_| live.place("ada".into()).expect("room"))
+            .map(|_| live.place_of("ada".into()).expect("room"))
             .collect();
-        let refused = live.place("ada".into()).map(|_| ());
+        let refused = live.place_of("ada".into()).map(|_| ());
         assert!(matches!(refused, Err(Error::TooManyStreams { most: MOST })));
-        let of_another = live.place("bob".into()).expect("room of his own");
+        let of_another = live.place_of("bob".into()).expect("room of his own");
         drop(places.pop());
-        places.push(live.place("ada".into()).expect("room again"));
+        places.push(live.place_of("ada".into()).expect("room again"));
         drop((places, of_another));
         assert!(live.streams.lock().is_empty(), "nothing is left behind");
     }

@@ -4,7 +4,6 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use access::{Action, Object};
-use api::Event;
 use api::explain::Served;
 use api::stream::Update;
 use axum::response::sse;
@@ -13,6 +12,7 @@ use tokio::sync::watch;
 use super::Place;
 use super::sampler::{EVENTS, Sample};
 use crate::app::App;
+use crate::events::is_told;
 use crate::guard::Caller;
 
 /// One who listens.
@@ -122,13 +122,6 @@ impl Listener {
     }
 }
 
-/// Whether somebody who does not see all is told of an event, as where events are asked for.
-fn is_told(caller: &Caller, event: &Event, sees: &mut impl FnMut(&str) -> bool) -> bool {
-    let own = caller.who.principal.scope.robot.as_deref();
-    event.service.as_deref().is_some_and(sees)
-        && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
-}
-
 fn cloned<T>(all: &[Arc<T>], mut of: impl FnMut(&Arc<T>) -> bool) -> Vec<Arc<T>> {
     all.iter().filter(|one| of(one)).cloned().collect()
 }
@@ -182,6 +175,8 @@ fn changes<T>(
 
 #[cfg(test)]
 mod tests {
+    use api::Event;
+
     use super::*;
 
     fn event(id: i64) -> Arc<Event> {

@@ -1,0 +1,211 @@
+//! The command line as scripts and shells use it.
+
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+
+use anyhow::{Context, ensure};
+use serde_json::Value;
+use support::daemon::Daemon;
+use support::deployer::{Outcome, run};
+use support::robot::PATIENCE;
+use support::world::{LOCALISER, world};
+use support::{Verdict, binaries};
+
+use crate::access::{token, with_token};
+
+pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
+    let setup = world().own("exits");
+    let daemon = setup.start()?;
+    let deployer = daemon.deployer();
+    let types = |arguments: &[&str]| deployer.types(arguments);
+    let viewer = token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
+    for revision in [&["--param", "offset=1"][..], &["--canary", "1"]] {
+        let push = [&["--node", "adder.py"], revision].concat();
+        deployer.pushes("adder_py", &push)?.succeeded()?;
+    }
+    let ends = |outcome: Outcome, status: i32, words: &str| -> Verdict {
+        ensure!(
+            outcome.status == status && outcome.said().contains(words),
+            "{status} was to be: {outcome:#?}"
+        );
+        Ok(())
+    };
+    ends(types(&["services"])?, 0, "adder_py")?;
+    ends(types(&["push"])?, 2, "Usage")?;
+    ends(types(&["rollback", "nothing"])?, 5, "there are: adder_py")?;
+    ends(types(&["explain", "nobody"])?, 5, "nobody")?;
+    ends(
+        with_token(&daemon, &viewer, &["rm", "adder_py"])?,
+        4,
+        "error",
+    )?;
+    ends(with_token(&daemon, "wrong", &["status"])?, 4, "token")?;
+    // The canary serves nobody yet, so nothing decides of it.
+    let wait = ["rollout", "adder_py", "--wait=1s"];
+    ends(types(&wait)?, 8, "adder_py is at canary")?;
+    let abort = ["rollout", "adder_py", "--wait=30s", "abort"];
+    ends(types(&abort)?, 1, "has not become the current one: aborted")?;
+    ends(types(&["rollout", "adder_py", "promote"])?, 6, "no canary")?;
+    let start = ["rollout", "adder_py", "--wait", "start", "2"];
+    ends(types(&start)?, 0, "promoted")?;
+    // Whoever reads no more has had enough; that is no failure.
+    let closed = "set -o pipefail; \"$0\" services | true";
+    let shell = Command::new("bash")
+        .args(["-c", closed])
+        .arg(binaries::path("cloudroidctl"))
+        .env("CLOUDROID_HOME", setup.home())
+        .status()?;
+    ensure!(shell.success(), "{shell}");
+    daemon.is_killed()?;
+    ends(types(&["services"])?, 3, "no daemon answers")?;
+    ends(types(&["status", "--wait=1s"])?, 8, "no daemon answers")?;
+    let waiting = Command::new(binaries::path("cloudroidctl"))
+        .args(["--format", "json", "status", "--wait"])
+        .env("CLOUDROID_HOME", setup.home())
+        .env_remove("CLOUDROID_SERVER")
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let daemon = setup.start()?;
+    let found = waiting.wait_with_output()?;
+    let status: Value = serde_json::from_slice(&found.stdout)?;
+    ensure!(found.status.success() && status["pid"] == daemon.pid());
+    Ok(())
+}
+
+/// `cloudroidctl events --follow`.
+struct Follower {
+    child: Child,
+    lines: Receiver<String>,
+}
+
+impl Follower {
+    fn begin(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<Follower> {
+        let mut child = Command::new(binaries::path("cloudroidctl"))
+            .args(["--format", "json", "events", "--follow"])
+            .args(arguments)
+            .env("CLOUDROID_HOME", daemon.deployer().home)
+            .env_remove("CLOUDROID_SERVER")
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        let out = child.stdout.take().context("its words")?;
+        let (told, lines) = channel();
+        std::thread::spawn(move || {
+            let lines = BufReader::new(out).lines();
+            lines
+                .map_while(Result::ok)
+                .all(|line| told.send(line).is_ok())
+        });
+        Ok(Follower { child, lines })
+    }
+
+    /// The numbers of events up to and with one of this kind.
+    fn until(&mut self, kind: &str) -> anyhow::Result<Vec<i64>> {
+        let mut numbers = Vec::new();
+        loop {
+            let line = self.lines.recv_timeout(PATIENCE);
+            let line = line.with_context(|| format!("no event {kind:?} after {numbers:?}"))?;
+            let event: Value = serde_json::from_str(&line)?;
+            numbers.push(event["id"].as_i64().context("a number")?);
+            if event["kind"] == kind {
+                return Ok(numbers);
+            }
+        }
+    }
+}
+
+impl Drop for Follower {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verdict {
+    let setup = world().own("followed");
+    let daemon = setup.start()?;
+    let mut all = Follower::begin(&daemon, &["-n", "1000"])?;
+    let mut some = Follower::begin(&daemon, &["--kind", "removed"])?;
+    let push = ["--node", "adder.py"];
+    daemon.deployer().pushes("adder_py", &push)?.succeeded()?;
+    let mut numbers = all.until("published")?;
+    daemon.is_killed()?;
+    let daemon = setup.start()?;
+    daemon.deployer().types(&["rm", "adder_py"])?.succeeded()?;
+    numbers.extend(all.until("removed")?);
+    let kept = daemon.deployer().asks(&["events", "-n", "1000"])?;
+    let kept = kept.as_array().context("events")?;
+    let removed = kept.iter().position(|event| event["kind"] == "removed");
+    let expected: Vec<i64> = kept[..=removed.context("it is removed")?]
+        .iter()
+        .filter_map(|event| event["id"].as_i64())
+        .collect();
+    ensure!(numbers == expected, "{numbers:?}, kept are {expected:?}");
+    // Who asks for a kind is told of that alone.
+    let last = expected.last().copied().context("one")?;
+    ensure!(some.until("removed")? == [last]);
+    // A follower ends with what it has shown.
+    let viewer = token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
+    let server = format!("http://{}", daemon.address);
+    let follow = ["--server", &server, "--token", &viewer];
+    let mut shown = Follower::begin(&daemon, &follow)?;
+    shown.until("removed")?;
+    let revoke = ["token", "revoke", "looks"];
+    daemon.deployer().types(&revoke)?.succeeded()?;
+    let ended = shown.child.wait()?;
+    ensure!(ended.code() == Some(4), "{ended}");
+    Ok(())
+}
+
+pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
+    let daemon = world().with(LOCALISER)?;
+    let deployer = daemon.deployer();
+    let script = deployer.types(&["completions", "bash"])?.succeeded()?;
+    let completes = "source \"$0\"; COMP_WORDS=(cloudroidctl \"$@\"); COMP_CWORD=$#; _cloudroidctl cloudroidctl \"${@: -1}\" x; \
+                     echo \"${COMPREPLY[@]}\"";
+    let pages = world().directory("pages")?;
+    let file = pages.path().join("completions");
+    std::fs::write(&file, script.stdout)?;
+    let completed = |words: &[&str]| -> anyhow::Result<String> {
+        let mut bash = Command::new("bash");
+        bash.args(["-c", completes]).arg(&file).args(words);
+        Ok(run(&mut bash)?.succeeded()?.stdout)
+    };
+    for (words, expected) in [
+        (&["roll"][..], "rollback rollout"),
+        (&["push", "--can"], "--canary"),
+        (&["rollout", "s", "pro"], "promote"),
+    ] {
+        let found = completed(words)?;
+        ensure!(found.trim() == expected, "{words:?}: {found}");
+    }
+    for shell in ["zsh", "fish"] {
+        let script = deployer.types(&["completions", shell])?.succeeded()?;
+        ensure!(script.stdout.contains("rollback"), "{shell}");
+    }
+    let directory = pages.path().to_string_lossy().into_owned();
+    deployer.types(&["man", &directory])?.succeeded()?;
+    let page = |name: &str| std::fs::read_to_string(pages.path().join(name));
+    let own = page("cloudroidctl.1")?;
+    ensure!(own.contains("what is named is not there"), "{own}");
+    let help = deployer.types(&["--help"])?.succeeded()?.stdout;
+    let verbs = help.split_once("Commands:").context("verbs")?.1;
+    let verbs = verbs.split_once("Options:").context("options")?.0;
+    let mut count = 0;
+    for verb in verbs
+        .lines()
+        .filter_map(|line| line.split_whitespace().next())
+        .filter(|verb| *verb != "help")
+    {
+        let text = page(&format!("cloudroidctl-{verb}.1")).context(verb.to_owned())?;
+        ensure!(text.contains(".SH NAME"), "{verb}: {text}");
+        count += 1;
+    }
+    ensure!(count > 25, "{verbs}");
+    let nowhere = format!("{directory}/cloudroidctl.1/below");
+    deployer
+        .types(&["man", &nowhere])?
+        .failed_saying(&["cannot write the pages into"])?;
+    Ok(())
+}
