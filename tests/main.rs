@@ -58,6 +58,8 @@ mod launched;
 mod link;
 #[path = "stories/memory.rs"]
 mod memory;
+#[path = "stories/metrics.rs"]
+mod metrics;
 #[path = "stories/mishaps.rs"]
 mod mishaps;
 #[path = "stories/names.rs"]
@@ -155,6 +157,10 @@ fn main() -> ExitCode {
             a_script_can_tell_by_the_exit_status_what_to_do,
             who_follows_events_misses_none_when_the_daemon_is_started_again,
             shells_complete_it_and_every_verb_has_a_page,
+        ],
+        stories![metrics:
+            every_metric_is_listed_and_read_by_others,
+            the_dashboard_asks_for_what_there_is,
         ],
         stories![oidc:
             a_group_of_the_provider_is_a_role_here,

@@ -1,12 +1,13 @@
-//! `/metrics`, in Prometheus's text format.
+//! `/metrics`: what Prometheus and its like read. docs/metrics.md lists them; a story compares it with what is told.
+
+mod exposition;
 
 use std::collections::BTreeMap;
-use std::fmt::Write;
 use std::sync::Arc;
 
 use api::Phase;
 use axum::extract::State;
-use axum::http::header;
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use bridge::Metrics;
 
@@ -14,6 +15,9 @@ use crate::app::App;
 use crate::errors::Error;
 use crate::tls::Tls;
 use choreographer::{Choreographer, Handle};
+use exposition::{
+    OPEN_METRICS, PROMETHEUS, asks_for_open_metrics, family, gauge, labels, open_metrics,
+};
 
 const PHASES: [Phase; 6] = [
     Phase::Requested,
@@ -24,8 +28,8 @@ const PHASES: [Phase; 6] = [
     Phase::Draining,
 ];
 
-/// Answers with all figures.
-pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
+/// Answers with all figures, as OpenMetrics where that is asked for.
+pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<Response, Error> {
     let mut out = String::new();
     let services = app.state.service_names()?;
     gauge(
@@ -95,7 +99,11 @@ pub async fn metrics(State(app): State<Arc<App>>) -> Result<Response, Error> {
         .request_times()
         .prometheus(&mut out, exists);
     usage(&mut out, &app.choreographer.servants()).await;
-    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], out).into_response())
+    let (kind, text) = match asks_for_open_metrics(&headers) {
+        true => (OPEN_METRICS, open_metrics(&out)),
+        false => (PROMETHEUS, out),
+    };
+    Ok(([(header::CONTENT_TYPE, kind)], text).into_response())
 }
 
 /// What robots share.
@@ -208,9 +216,16 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         "Messages dropped because someone was slow.",
         dropped,
     );
-    Metrics::prometheus_help(out);
-    for (of, reach) in &bridges {
-        reach.metrics().prometheus(out, of);
+    // All rows of a counter stand together.
+    let told: Vec<_> = bridges
+        .iter()
+        .map(|(of, reach)| (of, reach.metrics().all()))
+        .collect();
+    for (at, (name, help, _)) in Metrics::default().all().into_iter().enumerate() {
+        let rows = told
+            .iter()
+            .map(|(of, all)| ((*of).clone(), all[at].2 as f64));
+        family(out, name, "counter", help, rows);
     }
 }
 
@@ -355,60 +370,4 @@ fn labels_of(handle: &Handle) -> String {
         ("service", handle.service()),
         ("robot", &handle.robot),
     ])
-}
-
-fn gauge(out: &mut String, name: &str, help: &str, rows: impl IntoIterator<Item = (String, f64)>) {
-    family(out, name, "gauge", help, rows);
-}
-
-fn family(
-    out: &mut String,
-    name: &str,
-    kind: &str,
-    help: &str,
-    rows: impl IntoIterator<Item = (String, f64)>,
-) {
-    // Writing to a String cannot fail.
-    let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} {kind}");
-    for (labels, value) in rows {
-        let braces = if labels.is_empty() {
-            String::new()
-        } else {
-            format!("{{{labels}}}")
-        };
-        let _ = writeln!(out, "{name}{braces} {value}");
-    }
-}
-
-fn labels(pairs: &[(&str, &str)]) -> String {
-    let escape = |text: &str| {
-        text.replace('\\', "\\\\")
-            .replace('"', "\\\"")
-            .replace('\n', "\\n")
-    };
-    pairs
-        .iter()
-        .map(|(name, value)| format!("{name}=\"{}\"", escape(value)))
-        .collect::<Vec<_>>()
-        .join(",")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn figures_come_out_as_prometheus_reads_them() {
-        let mut out = String::new();
-        gauge(
-            &mut out,
-            "a",
-            "Help.",
-            [(String::new(), 1.0), (labels(&[("x", "q\"\\")]), 0.5)],
-        );
-        assert_eq!(
-            out,
-            "# HELP a Help.\n# TYPE a gauge\na 1\na{x=\"q\\\"\\\\\"} 0.5\n"
-        );
-    }
 }
