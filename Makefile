@@ -9,6 +9,9 @@ export CARGO_TARGET_DIR ?= $(CACHE)/cargo
 # Python clients (the demo's robot, the stories' roslibpy) live outside the clone, one environment per list of versions.
 VENV := $(CACHE)/python-$(shell sha256sum demo/requirements.txt | cut -c1-12)
 export CLOUDROID_PYTHON := $(VENV)/bin/python
+# The same for programs that read what the daemon answers by HTTP.
+READERS := $(CACHE)/readers-$(shell sha256sum tests/readers/requirements.txt | cut -c1-12)
+export CLOUDROID_READERS := $(READERS)/bin
 # The same for the stories' client in JavaScript, and the identity provider.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
@@ -36,6 +39,7 @@ demo-deps:
 .PHONY: test-deps
 test-deps: deps
 	@scripts/python "$(VENV)" demo/requirements.txt
+	@scripts/python "$(READERS)" tests/readers/requirements.txt
 	@scripts/node "$(NODE)" tests/robots/package.json
 	@scripts/node "$(WEB_TEST)" tests/web/package.json
 

@@ -38,6 +38,8 @@ mod cross;
 mod crossing;
 #[path = "stories/cuts.rs"]
 mod cuts;
+#[path = "stories/described.rs"]
+mod described;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/fallback.rs"]
@@ -158,6 +160,7 @@ fn main() -> ExitCode {
             who_follows_events_misses_none_when_the_daemon_is_started_again,
             shells_complete_it_and_every_verb_has_a_page,
         ],
+        stories![described: every_answer_is_as_the_document_says],
         stories![metrics:
             every_metric_is_listed_and_read_by_others,
             the_dashboard_asks_for_what_there_is,

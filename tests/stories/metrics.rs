@@ -30,7 +30,7 @@ fn read(format: &str, text: &str) -> anyhow::Result<Vec<Value>> {
     let place = world().directory("metrics")?;
     let file = place.path().join("metrics");
     std::fs::write(&file, text)?;
-    let mut reader = Command::new(binaries::python());
+    let mut reader = Command::new(binaries::readers().join("python"));
     reader.args(["-c", READER, format]).arg(&file);
     Ok(serde_json::from_str(
         &run(&mut reader)?.succeeded()?.stdout,

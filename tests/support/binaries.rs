@@ -42,6 +42,13 @@ pub fn python() -> PathBuf {
         .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
 }
 
+/// The programs of Python packages that read what the daemon answers by HTTP (see scripts/python).
+pub fn readers() -> PathBuf {
+    std::env::var_os("CLOUDROID_READERS")
+        .map(PathBuf::from)
+        .expect("CLOUDROID_READERS names programs that read HTTP; run the stories by make stories")
+}
+
 /// Where roslib and oidc-provider are (see scripts/node).
 pub fn node_modules() -> PathBuf {
     std::env::var_os("CLOUDROID_NODE_MODULES")

@@ -240,6 +240,10 @@ impl State {
         service: &str,
         number: u64,
     ) -> Result<Option<Arc<RevisionRecord>>, Error> {
+        // Of no revision: the database counts no farther.
+        if i64::try_from(number).is_err() {
+            return Ok(None);
+        }
         let key = (service.to_owned(), number);
         if let Some(known) = self.revisions.lock().get(&key) {
             return Ok(Some(Arc::clone(known)));
