@@ -52,6 +52,8 @@ mod house;
 mod hung;
 #[path = "stories/images.rs"]
 mod images;
+#[path = "stories/inside.rs"]
+mod inside;
 #[path = "stories/isolation.rs"]
 mod isolation;
 #[path = "stories/launched.rs"]
@@ -218,6 +220,11 @@ fn main() -> ExitCode {
         stories![images:
             skopeo_and_umoci_read_the_store,
             what_nobody_refers_to_is_collected,
+        ],
+        stories![inside:
+            a_viewer_hears_and_does_nothing_and_an_operator_acts,
+            looking_inside_keeps_no_servant_and_is_bounded,
+            who_looks_slowly_costs_its_robot_nothing,
         ],
         stories![isolation:
             every_node_process_is_confined,

@@ -48,7 +48,9 @@ pub fn every_answer_is_as_the_document_says() -> Verdict {
             .args(["--exclude-operation-id", "shadow"]);
         let outcome = run(&mut schemathesis)?;
         let said = outcome.succeeded().with_context(|| who.to_owned())?.stdout;
-        let tested = said.lines().find_map(|line| line.trim().strip_prefix("Tested: "));
+        let tested = said
+            .lines()
+            .find_map(|line| line.trim().strip_prefix("Tested: "));
         let tested: usize = tested.context("a count")?.trim().parse()?;
         ensure!(tested > 50, "{who}: {said}");
     }

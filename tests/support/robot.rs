@@ -251,6 +251,8 @@ impl Refusal {
     }
 }
 
+impl std::error::Error for Refusal {}
+
 impl std::fmt::Display for Refusal {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(formatter, "refused with {}: {}", self.status, self.body)

@@ -54,6 +54,23 @@ impl Grant {
         self.operation.is_none_or(|granted| granted == operation) && self.names.matches(name)
     }
 
+    /// One operation on all names.
+    pub(crate) fn all(operation: Operation) -> Grant {
+        Grant {
+            operation: Some(operation),
+            names: Glob::everything(),
+        }
+    }
+
+    /// What is left of it where one operation alone may be granted.
+    pub(crate) fn only(&self, operation: Operation) -> Option<Grant> {
+        let has = self.operation.is_none_or(|granted| granted == operation);
+        has.then(|| Grant {
+            operation: Some(operation),
+            names: self.names.clone(),
+        })
+    }
+
     /// Whether nothing is left out.
     pub fn is_everything(&self) -> bool {
         let names = self.names.as_str();

@@ -64,6 +64,27 @@ impl Policy {
         if principal.is_unscoped() {
             return Grants::everything();
         }
+        let rules = self.rules_for(principal, service);
+        Grants::new(
+            rules
+                .into_iter()
+                .flat_map(|rule| rule.allow.iter().cloned()),
+        )
+    }
+
+    /// What a principal may hear in a service's servants that it sees, and may not connect to: of what its rules grant it,
+    /// subscriptions alone. A viewer for whom there is no rule hears everything.
+    pub fn hearing(&self, principal: &Principal, service: &str) -> Grants {
+        let unruled = principal.is(Role::Viewer) && self.rules_for(principal, service).is_empty();
+        let grants = match unruled {
+            true => Grants::everything(),
+            false => self.grants(principal, service),
+        };
+        grants.only(Operation::Subscribe)
+    }
+
+    /// The rules that are for a principal at a service.
+    fn rules_for(&self, principal: &Principal, service: &str) -> Vec<&Rule> {
         let here = || {
             self.rules
                 .iter()
@@ -72,15 +93,10 @@ impl Policy {
         let named =
             |rule: &&Rule| matches!(&rule.who, Who::Principal(name) if *name == principal.name);
         let of_role = |rule: &&Rule| matches!(rule.who, Who::Role(role) if principal.is(role));
-        let rules: Vec<&Rule> = match here().any(|rule| named(&rule)) {
+        match here().any(|rule| named(&rule)) {
             true => here().filter(named).collect(),
             false => here().filter(of_role).collect(),
-        };
-        Grants::new(
-            rules
-                .into_iter()
-                .flat_map(|rule| rule.allow.iter().cloned()),
-        )
+        }
     }
 }
 
@@ -112,6 +128,14 @@ impl Grants {
     /// Whether nothing is left out.
     pub fn is_everything(&self) -> bool {
         self.everything
+    }
+
+    /// What is left of them where one operation alone may be granted.
+    fn only(&self, operation: Operation) -> Grants {
+        match self.everything {
+            true => Grants::new([Grant::all(operation)]),
+            false => Grants::new(self.list.iter().filter_map(|grant| grant.only(operation))),
+        }
     }
 
     /// Whether an operation on an absolute name is granted.
@@ -183,6 +207,45 @@ mod tests {
             assert!(!grants.permits(operation, "/x"));
         }
         assert!(!grants.shows("/x"));
+    }
+
+    #[test]
+    fn who_may_only_look_hears_and_does_nothing() {
+        let viewer = Principal {
+            roles: vec![Role::Viewer],
+            ..robot("eve")
+        };
+        let is = |policy: &Policy, principal: &Principal, said: &str| {
+            let grants = policy.hearing(principal, "detector");
+            assert_eq!(grants.to_string(), said);
+            for operation in Operation::ALL {
+                let heard = operation == Operation::Subscribe && said != "nothing";
+                assert_eq!(
+                    grants.permits(operation, "/camera/x"),
+                    heard,
+                    "{operation:?}"
+                );
+            }
+        };
+        let none = Policy::default();
+        is(&none, &viewer, "subscribe:/**");
+        is(&none, &Principal::admin("root"), "subscribe:/**");
+        // A deployer of another's service, for example: what no rule grants, it does not hear.
+        is(&none, &robot("r1"), "nothing");
+        let ruled = Policy {
+            rules: vec![
+                rule("role:robot", "*", &["*:**"]),
+                rule("role:viewer", "*", &["*:/camera/**", "call:/detect"]),
+                rule("mallory", "*", &["publish:/**"]),
+            ],
+        };
+        is(&ruled, &robot("r1"), "subscribe:/**");
+        is(&ruled, &viewer, "subscribe:/camera/**");
+        let named = Principal {
+            name: "mallory".into(),
+            ..viewer
+        };
+        is(&ruled, &named, "nothing");
     }
 
     #[test]

@@ -11,11 +11,12 @@ use tokio::sync::watch;
 #[derive(Clone)]
 pub struct Granted {
     standing: watch::Receiver<Standing>,
-    refused: Option<Arc<Refused>>,
+    refused: Option<Arc<Told>>,
+    used: Option<Arc<Told>>,
 }
 
-/// Hears of an operation that was refused, such as `publish:/cmd_vel`.
-type Refused = dyn Fn(&str) + Send + Sync;
+/// Hears of an operation, such as `publish:/cmd_vel`.
+type Told = dyn Fn(&str) + Send + Sync;
 
 impl fmt::Debug for Granted {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -36,6 +37,15 @@ impl Granted {
         Granted {
             standing,
             refused: None,
+            used: None,
+        }
+    }
+
+    /// The same; `hears` is told of each operation that is carried out and does more than listen.
+    pub fn noting(self, hears: impl Fn(&str) + Send + Sync + 'static) -> Granted {
+        Granted {
+            used: Some(Arc::new(hears)),
+            ..self
         }
     }
 
@@ -64,10 +74,16 @@ impl Granted {
     /// Refuses, in words, what is not granted.
     pub(crate) fn check(&self, operation: Operation, name: &str) -> Result<(), String> {
         let grants = self.grants();
+        let asked = || format!("{}:{name}", operation.name());
         if grants.permits(operation, name) {
+            if let Some(hears) = &self.used
+                && operation != Operation::Subscribe
+            {
+                hears(&asked());
+            }
             return Ok(());
         }
-        let asked = format!("{}:{name}", operation.name());
+        let asked = asked();
         if let Some(hears) = &self.refused {
             hears(&asked);
         }

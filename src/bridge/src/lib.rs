@@ -56,6 +56,9 @@ mod topic_requests;
 mod topics;
 mod waiting;
 
+/// The name of the node by which people look into a servant. What robots send does not wait for it.
+pub const INSIDE: &str = "/cloudroid_inside";
+
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use granted::Granted;
 pub use metrics::{Counter, Metrics};

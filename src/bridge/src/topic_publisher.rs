@@ -13,6 +13,7 @@ use ros::sizes::Sizes;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
+use crate::INSIDE;
 use crate::shared::Shared;
 use crate::topic_requests::TopicRequests;
 
@@ -180,7 +181,7 @@ impl TopicPublisher {
         nodes
             .subscribers
             .iter()
-            .filter(|name| *name != bus.node() && !matched.has_node(name))
+            .filter(|name| *name != bus.node() && *name != INSIDE && !matched.has_node(name))
             .map(|name| {
                 let address = graph.nodes.get(name).cloned();
                 (name.clone(), address.unwrap_or_default())

@@ -101,6 +101,7 @@ pub fn build(
         pusher: Arc::new(pusher),
         machine,
         live: portal::Live::default(),
+        inside: portal::Lookers::default(),
         started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),

@@ -13,6 +13,7 @@ use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
 use crate::handshakes::Handshakes;
+use crate::inside::Lookers;
 use crate::people::passwords::Passwords;
 use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
@@ -88,6 +89,8 @@ pub struct App {
     pub examine: Box<dyn Fn() -> api::Doctor + Send + Sync>,
     /// What pages are told as it changes.
     pub live: Live,
+    /// Who looks into servants.
+    pub inside: Lookers,
     /// When the daemon started.
     pub started: Millis,
     /// Sessions under way.

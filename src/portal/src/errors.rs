@@ -136,6 +136,21 @@ pub enum Error {
         /// So many.
         most: usize,
     },
+    /// A servant is looked into by as many as may.
+    #[error(
+        "servant {servant} is looked into by as many as may at once: {most}, and {each} of each"
+    )]
+    TooManyLook {
+        /// Which.
+        servant: String,
+        /// So many, all together.
+        most: usize,
+        /// So many of each principal.
+        each: usize,
+    },
+    /// A servant's ROS is not there yet, or not any more.
+    #[error("nobody can look into servant {0}: it is starting, or ending")]
+    NotThereYet(String),
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
@@ -363,6 +378,12 @@ impl Error {
             Error::TooManyStreams { .. } => {
                 (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams")
             }
+            Error::TooManyLook { .. } => (
+                S::TOO_MANY_REQUESTS,
+                "too-many-look",
+                "too many look inside",
+            ),
+            Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not there yet"),
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
                 (S::SERVICE_UNAVAILABLE, "busy", "too many sign in")
             }
@@ -426,6 +447,12 @@ impl Error {
             Error::SignInBusy => "try again later".into(),
             Error::TooManyStreams { .. } => {
                 "close pages of the portal that are open elsewhere, then load this one again".into()
+            }
+            Error::TooManyLook { .. } => {
+                "close pages that look into it elsewhere, then try again".into()
+            }
+            Error::NotThereYet(id) => {
+                format!("see its state with: cloudroidctl servants, or GET /api/v1/servants/{id}; try again when it is ready")
             }
             Error::NoProvider => "sign in with an account, or have [oidc] configured (docs/access.md)".into(),
             Error::Provider(error) => error.next().into(),

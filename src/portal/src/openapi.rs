@@ -93,6 +93,13 @@ impl Operation {
         self
     }
 
+    /// It becomes a WebSocket.
+    pub fn becomes_a_websocket(mut self) -> Self {
+        let response = ResponseBuilder::new().description("A WebSocket from here on.");
+        self.built = self.built.response("101", response);
+        self
+    }
+
     /// It answers a page for people.
     pub fn answers_page(self) -> Self {
         let text = ObjectBuilder::new().schema_type(Type::String);

@@ -278,7 +278,7 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
 
 /// The subprotocol to choose: a browser gives up where it offered some and none is chosen, and the one that is a token must not
 /// be written into an answer.
-fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error> {
+pub fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error> {
     if guard::protocols(headers).any(|protocol| protocol == guard::ROSBRIDGE) {
         return Ok(Some(guard::ROSBRIDGE));
     }
@@ -389,8 +389,14 @@ async fn upgraded_to(
     lease: Option<Lease>,
     upgraded: Upgraded,
 ) {
-    // Without hyper's wrapping around them, reads and writes go straight to the socket.
-    let (io, read_ahead): (Stream, _) = match upgraded.downcast::<TokioIo<TcpStream>>() {
+    let (io, read_ahead) = unwrapped(upgraded);
+    session(app, asked, caller, lease, io, read_ahead).await
+}
+
+/// A connection behind its upgrade, and what was already read from it. Without hyper's wrapping around them, reads and writes go
+/// straight to the socket.
+pub fn unwrapped(upgraded: Upgraded) -> (Stream, bytes::Bytes) {
+    match upgraded.downcast::<TokioIo<TcpStream>>() {
         Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
         Err(upgraded) => match upgraded.downcast::<TokioIo<UnixStream>>() {
             Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
@@ -399,8 +405,7 @@ async fn upgraded_to(
                 Err(upgraded) => (Box::new(TokioIo::new(upgraded)), bytes::Bytes::new()),
             },
         },
-    };
-    session(app, asked, caller, lease, io, read_ahead).await
+    }
 }
 
 async fn session(

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, events, machines, metrics, oci, openapi, page,
-    people, policy, push, robots, shadow, stream, stubs,
+    App, api_v1, audit, calibration, dictionary, events, inside, machines, metrics, oci, openapi,
+    page, people, policy, push, robots, shadow, stream, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -382,6 +382,13 @@ pub const ROUTES: &[Route] = &[
         operation("logs", "What its nodes printed.")
             .asks::<api_v1::Part>()
             .streams::<api::LogLine>()
+    }),
+    at("GET", "/api/v1/servants/{id}/inside", servant(See), || {
+        get(inside::inside)
+    })
+    .described(|| {
+        operation("inside", "Looks into a servant: a WebSocket that speaks rosbridge beside its robot.")
+            .becomes_a_websocket()
     }),
     at("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).described(|| {
         operation(

@@ -13,6 +13,7 @@ use ros::schema::Registry;
 use ros::sizes::Seen;
 use tokio::sync::watch;
 
+use crate::inside::{Inside, Joining};
 use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
 use crate::tap::Tap;
 use crate::trial::{self, Material, Pace, Replay};
@@ -23,6 +24,7 @@ pub(crate) struct InProcess {
     bus: Arc<dyn Bus>,
     tap: Arc<Tap>,
     bridge: Arc<Bridge>,
+    inside: Inside,
     hub: Arc<Hub>,
     /// What the robot's stubs have started.
     nodes: Arc<dyn Nodes>,
@@ -38,6 +40,8 @@ pub(crate) struct Behind {
     pub(crate) bus: Arc<dyn Bus>,
     /// The bus that stubs see, with the nodes that they start and end.
     pub(crate) linked: (Arc<dyn Bus>, Arc<dyn Nodes>),
+    /// The bus of those who look into it.
+    pub(crate) inside: Joining,
     pub(crate) registry: Arc<Registry>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,
 }
@@ -48,6 +52,7 @@ impl InProcess {
             id,
             bus,
             linked: (linked, nodes),
+            inside,
             registry,
             keeps,
         } = behind;
@@ -77,6 +82,7 @@ impl InProcess {
             ..options.bridge
         };
         InProcess {
+            inside: Inside::new(inside, Arc::clone(&registry), &options),
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
             bus,
             tap,
@@ -103,6 +109,10 @@ impl Reach for InProcess {
         options: SessionOptions,
     ) -> SessionEnd {
         self.bridge.serve_waiting(client, options).await
+    }
+
+    async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd {
+        self.inside.serve(client, options).await
     }
 
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {
@@ -173,11 +183,13 @@ impl Reach for InProcess {
     }
 
     fn close_sessions(&self, reason: &str) {
+        self.inside.close(reason);
         self.bridge.close(reason);
     }
 
     fn close(&self, reason: &str) {
         self.hub.close(reason);
+        self.inside.close(reason);
         self.bridge.close(reason);
     }
 }

@@ -17,6 +17,7 @@ pub mod egress;
 mod ends;
 pub mod group;
 mod in_process;
+mod inside;
 pub mod links;
 mod local;
 pub mod master;
@@ -155,6 +156,8 @@ pub trait Reach: Send + Sync + 'static {
     /// Speaks rosbridge with a client that has waited for the servant, until it ends.
     async fn serve_rosbridge(&self, client: Waiting<Stream>, options: SessionOptions)
     -> SessionEnd;
+    /// Speaks rosbridge with somebody who looks into it, until that ends: beside its robot, and none of its sessions.
+    async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd;
     /// Serves a stub's connection behind its upgrade, until it ends; `read_ahead` was read from it already.
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
     /// Where to hear what its robot asks of it; none where nobody can.

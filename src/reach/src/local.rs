@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
 use ros::JoinOptions;
 use ros::bus::RosVersion;
@@ -60,6 +61,11 @@ impl Opener for LocalOpener {
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));
+        let looking = JoinOptions {
+            node: bridge::INSIDE.to_owned(),
+            ..joining.clone()
+        };
+        let (ros, beside) = (options.ros, Arc::clone(&sockets));
         let joined = ros::connect(options.ros, sockets, joining);
         let (bus, recorded) = tokio::join!(joined, recorded);
         let bus = bus?;
@@ -70,6 +76,9 @@ impl Opener for LocalOpener {
             id: servant.id().to_owned(),
             linked: (Arc::clone(&bus), nodes),
             bus,
+            inside: Box::new(move || {
+                ros::connect(ros, Arc::clone(&beside) as _, looking.clone()).boxed()
+            }),
             registry,
             keeps: Box::new(relays),
         };

@@ -145,6 +145,7 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
         format!("/{service}"),
         format!("/{service}/"),
         format!("/api/v1/servants/{servant}"),
+        format!("/api/v1/servants/{servant}/inside"),
     ] {
         attempts.push(Attempt::new("HEAD", path.clone(), NO));
         attempts.push(Attempt::new("GET", path, NO));
@@ -430,8 +431,8 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
     fail("a deployer", &tokens.alice, &kept, publishing())?;
     // A robot sees its own servant alone, though the other's service is its own, too.
     let beside = [r2.as_str()];
-    let others =
-        ["", "/logs"].map(|path| Attempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
+    let others = ["", "/logs", "/inside"]
+        .map(|path| Attempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
     fail("a robot", &tokens.rover, &beside, others.into())?;
     fail(
         "a robot",

@@ -101,6 +101,31 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
     ] {
         attempts.push(((path.to_owned(), bearer(token)), &[403]));
     }
+    // Nor is another's servant looked into by who does not see it: by no token, and as a robot by none but its own.
+    let [r1, r2, r9] = &scene.servants;
+    for (servant, token, status) in [
+        (r2, Some(rover), &[403][..]),
+        (r9, Some(rover), &[403]),
+        (r1, Some(&tokens.other), &[403]),
+        (r1, Some(&tokens.narrow), &[403]),
+        (r9, Some(&tokens.eve), &[403]),
+        (r9, Some(&tokens.alice), &[403]),
+        (r1, Some(&tokens.over), &[401]),
+        (r1, None, &[401]),
+    ] {
+        let headers = token.map_or_else(Vec::new, |token| bearer(token));
+        for path in [
+            format!("api/v1/servants/{servant}/inside"),
+            format!("api/v1/servants/{servant}/inside?robot=r1"),
+            format!("api/v1/servants/{servant}/inside/"),
+            format!("api/v1/servants/x/../{servant}/inside"),
+            format!("api/v1/servants/{servant}/%69nside"),
+        ] {
+            let plain = path.ends_with("/inside") && !path.contains("..");
+            let status = if plain { status } else { &[400, 401, 403, 404] };
+            attempts.push(((path, headers.clone()), status));
+        }
+    }
     // A stub's protocol is no other door.
     let stub = ("Sec-WebSocket-Protocol", link::SUBPROTOCOL.to_owned());
     for (path, token, status) in [

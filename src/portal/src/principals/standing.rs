@@ -4,11 +4,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use access::Standing;
+use access::{Grants, Policy, Standing};
 use api::Millis;
 use tokio::sync::watch;
 
 use super::{Identity, Principals, Shown};
+use crate::inside::Part;
 
 /// How often it is looked whether a token has expired: no more, and no less, often.
 const SOONEST: Duration = Duration::from_millis(10);
@@ -17,6 +18,18 @@ const LATEST: Duration = Duration::from_secs(60);
 impl Principals {
     /// How a connection of somebody to a service stands.
     pub fn standing(&self, who: &Identity, service: &str) -> Standing {
+        self.stands(who, |policy| policy.grants(&who.principal, service))
+    }
+
+    /// How a connection of somebody who looks into a servant of a service stands.
+    pub fn standing_inside(&self, who: &Identity, service: &str, part: Part) -> Standing {
+        self.stands(who, |policy| match part {
+            Part::Acts => policy.grants(&who.principal, service),
+            Part::Looks => policy.hearing(&who.principal, service),
+        })
+    }
+
+    fn stands(&self, who: &Identity, grants: impl FnOnce(&Policy) -> Grants) -> Standing {
         let stored = self.stored.read();
         let over = match &who.shown {
             Shown::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
@@ -42,7 +55,7 @@ impl Principals {
         };
         match over {
             Some(reason) => Standing::Ended(reason),
-            None => Standing::Granted(Arc::new(stored.policy.grants(&who.principal, service))),
+            None => Standing::Granted(Arc::new(grants(&stored.policy))),
         }
     }
 
@@ -59,10 +72,32 @@ impl Principals {
 
     /// Tells `standing` whenever that of a connection changes; never comes back.
     pub async fn follow(&self, who: &Identity, service: &str, standing: &watch::Sender<Standing>) {
+        self.follows(who, || self.standing(who, service), standing)
+            .await;
+    }
+
+    /// The same of a connection of somebody who looks into a servant.
+    pub async fn follow_inside(
+        &self,
+        who: &Identity,
+        service: &str,
+        part: Part,
+        standing: &watch::Sender<Standing>,
+    ) {
+        self.follows(who, || self.standing_inside(who, service, part), standing)
+            .await;
+    }
+
+    async fn follows(
+        &self,
+        who: &Identity,
+        stands: impl Fn() -> Standing + Send,
+        standing: &watch::Sender<Standing>,
+    ) {
         let mut changed = self.changed.subscribe();
         loop {
             changed.borrow_and_update();
-            let now = self.standing(who, service);
+            let now = stands();
             standing.send_if_modified(|known| {
                 let new = *known != now;
                 known.clone_from(&now);

@@ -3,6 +3,9 @@
 
 use std::sync::Arc;
 
+use futures_util::FutureExt;
+use ros::bus::Bus;
+
 use super::Group;
 use super::nodes::SharedNodes;
 use crate::in_process::{Behind, InProcess};
@@ -19,10 +22,15 @@ pub fn seat(
     let registry = Arc::clone(&recorded.registry);
     let (bus, linked) = group.buses(&registry, &options.budget);
     let nodes = SharedNodes::new(Arc::clone(&linked), recorded, place, observer);
+    let shown: Arc<dyn Bus> = bus.clone();
     let behind = Behind {
         id: place.to_owned(),
         bus,
         linked: (linked, Arc::new(nodes)),
+        inside: Box::new(move || {
+            let shown = Arc::clone(&shown);
+            async move { Ok(shown) }.boxed()
+        }),
         registry,
         keeps: Box::new(()),
     };

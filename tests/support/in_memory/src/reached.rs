@@ -94,6 +94,12 @@ impl Reach for MemoryReach {
         SessionEnd::Closed { code: 1012, reason }
     }
 
+    async fn serve_inside(&self, client: Waiting<Stream>, _options: SessionOptions) -> SessionEnd {
+        let reason = self.end().await;
+        client.refuse(1012, &reason).await;
+        SessionEnd::Closed { code: 1012, reason }
+    }
+
     async fn serve_link(&self, _stream: Stream, _read_ahead: &[u8]) -> Lost {
         let reason = self.end().await;
         Lost::Closed { code: 1012, reason }

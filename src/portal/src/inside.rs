@@ -1,0 +1,252 @@
+//! People look into a servant: `ws://host:9090/api/v1/servants/ID/inside` speaks rosbridge beside the servant's robot. It makes no
+//! servant, keeps none alive, and is no session of the robot.
+//!
+//! | who | what it may there |
+//! |---|---|
+//! | may operate the service, or is the servant's robot | what the policy grants it |
+//! | sees the servant otherwise | list and subscribe |
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use access::{Action, Refusal, Role};
+use axum::Extension;
+use axum::body::Body;
+use axum::extract::{Path, Request, State};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::Response;
+use bridge::{Granted, SessionOptions, Waiting};
+use choreographer::Handle;
+use hyper::upgrade::OnUpgrade;
+use parking_lot::Mutex;
+use reach::Reach;
+use tokio::sync::watch;
+
+use crate::app::App;
+use crate::errors::Error;
+use crate::guard::Caller;
+use crate::{handshake, robots};
+
+/// Who may look into one servant at once, all together.
+const MOST: usize = 16;
+/// Of these, connections of one principal: nobody keeps all others out.
+const MOST_EACH: usize = 4;
+
+/// Who looks into which servant.
+#[derive(Debug, Default)]
+pub struct Lookers {
+    /// Names of principals, by servant.
+    all: Arc<Mutex<HashMap<String, Vec<String>>>>,
+}
+
+/// One connection of those that a servant may have.
+#[derive(Debug)]
+struct Place {
+    all: Arc<Mutex<HashMap<String, Vec<String>>>>,
+    servant: String,
+    who: String,
+}
+
+impl Lookers {
+    fn place(&self, servant: &str, who: &str) -> Result<Place, Error> {
+        let mut all = self.all.lock();
+        let there = all.entry(servant.to_owned()).or_default();
+        let own = there.iter().filter(|other| *other == who).count();
+        if there.len() >= MOST || own >= MOST_EACH {
+            return Err(Error::TooManyLook {
+                servant: servant.to_owned(),
+                most: MOST,
+                each: MOST_EACH,
+            });
+        }
+        there.push(who.to_owned());
+        Ok(Place {
+            all: Arc::clone(&self.all),
+            servant: servant.to_owned(),
+            who: who.to_owned(),
+        })
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut all = self.all.lock();
+        let Some(there) = all.get_mut(&self.servant) else {
+            return;
+        };
+        if let Some(at) = there.iter().position(|other| *other == self.who) {
+            there.swap_remove(at);
+        }
+        if there.is_empty() {
+            all.remove(&self.servant);
+        }
+    }
+}
+
+/// What somebody may do inside.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// What the policy grants.
+    Acts,
+    /// Listening alone.
+    Looks,
+}
+
+/// What the caller, who sees the servant, may do inside. A robot is let in where it may be that robot, and nowhere else.
+fn part(app: &App, caller: &Caller, handle: &Handle) -> Result<Part, Error> {
+    let principal = &caller.who.principal;
+    let (service, robot) = (handle.service(), handle.robot.as_str());
+    if caller.may_at(app, Action::Operate, service, None).is_ok() {
+        return Ok(Part::Acts);
+    }
+    if !principal.is(Role::Robot) {
+        return Ok(Part::Looks);
+    }
+    let connects = caller.may_at(app, Action::Connect, service, Some(robot));
+    // Whose name a nameless robot's servant has is nobody else's business.
+    let own = match principal.scope.robot.as_deref() {
+        Some(own) => own == robot,
+        None => {
+            principal.is(Role::Viewer) && (robot.starts_with('~') || is_free(app, caller, robot)?)
+        }
+    };
+    match (connects, principal.is(Role::Viewer)) {
+        (Ok(()), _) if own => Ok(Part::Acts),
+        (_, true) => Ok(Part::Looks),
+        _ => {
+            let object = format_args!("servant {}", handle.id);
+            Err(Refusal::new(principal, Action::See, object).into())
+        }
+    }
+}
+
+/// Whether a robot's name is nobody's, or the caller's.
+fn is_free(app: &App, caller: &Caller, robot: &str) -> Result<bool, Error> {
+    let owner = app.state.robot_owner(robot, None, false)?;
+    Ok(owner.is_none() || owner == caller.who.owner)
+}
+
+/// Becomes a WebSocket that speaks rosbridge inside the servant.
+pub async fn inside(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    Extension(caller): Extension<Caller>,
+    mut request: Request,
+) -> Result<Response, Error> {
+    let handle = app.choreographer.servant(&id)?;
+    let part = part(&app, &caller, &handle)?;
+    let accept = handshake::accept(&request)?;
+    let protocol = robots::rosbridge_protocol(request.headers())?;
+    let Some(reach) = handle.reach() else {
+        return Err(Error::NotThereYet(id));
+    };
+    let place = app.inside.place(&id, &caller.who.principal.name)?;
+    let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
+        return Err(Error::BadRequest(
+            "this connection cannot become a WebSocket".to_owned(),
+        ));
+    };
+    notes(&app, &caller, &handle)("looks inside");
+    let sessions = app.sessions.clone();
+    sessions.spawn(async move {
+        match upgrade.await {
+            Ok(upgraded) => {
+                let (io, read_ahead) = robots::unwrapped(upgraded);
+                let budget = app.choreographer.memory();
+                let budget = budget.client(&caller.peer.client(None));
+                let waiting = Waiting::new(io, &read_ahead, app.choreographer.bridge_options())
+                    .within(&budget);
+                session(app, handle, caller, part, reach, (waiting, budget)).await;
+            }
+            Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
+        }
+        drop(place);
+    });
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+    let headers = response.headers_mut();
+    headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
+    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    if let Some(protocol) = protocol {
+        let protocol = HeaderValue::from_static(protocol);
+        headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
+    }
+    Ok(response)
+}
+
+async fn session(
+    app: Arc<App>,
+    handle: Arc<Handle>,
+    caller: Caller,
+    part: Part,
+    reach: Arc<dyn Reach>,
+    (waiting, budget): (Waiting<reach::Stream>, budget::Budget),
+) {
+    let service = handle.service().to_owned();
+    let (standing, granted) =
+        watch::channel(app.principals.standing_inside(&caller.who, &service, part));
+    let refused = notes(&app, &caller, &handle);
+    let used = notes(&app, &caller, &handle);
+    let options = SessionOptions {
+        budget,
+        client: caller.who.principal.name.clone(),
+        granted: Granted::by(granted)
+            .telling(move |operation| refused(&format!("was refused {operation}")))
+            .noting(move |operation| used(&format!("inside: {operation}"))),
+        ..SessionOptions::default()
+    };
+    let end = tokio::select! {
+        end = reach.serve_inside(waiting, options) => end,
+        () = app.principals.follow_inside(&caller.who, &service, part, &standing) => return,
+    };
+    tracing::debug!(
+        "{} looks into servant {} no more: {end:?}",
+        caller.who.principal,
+        handle.id
+    );
+}
+
+/// Records what somebody does inside; where it is done again and again, once a minute.
+fn notes(app: &Arc<App>, caller: &Caller, handle: &Handle) -> impl Fn(&str) + Send + Sync + use<> {
+    let (app, caller) = (Arc::clone(app), caller.clone());
+    let object = format!(
+        "servant {} of robot {} at service {}",
+        handle.id,
+        handle.robot,
+        handle.service()
+    );
+    move |did| {
+        let (action, status) = match did {
+            "looks inside" => (Action::See, StatusCode::SWITCHING_PROTOCOLS),
+            did if did.starts_with("was refused") => (Action::Operate, StatusCode::FORBIDDEN),
+            _ => (Action::Operate, StatusCode::OK),
+        };
+        app.audit
+            .record_sparingly(&caller, action, did, &object, status.as_u16());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_servant_is_looked_into_by_so_many_and_nobody_keeps_the_others_out() {
+        let lookers = Lookers::default();
+        let mut eves: Vec<_> = (0..MOST_EACH)
+            .map(|_| lookers.place("s1", "eve").expect("room"))
+            .collect();
+        let refused = lookers.place("s1", "eve").expect_err("hers are taken");
+        assert!(matches!(refused, Error::TooManyLook { .. }), "{refused}");
+        let elsewhere = lookers.place("s2", "eve").expect("another servant");
+        let others: Vec<_> = (0..MOST - MOST_EACH)
+            .map(|index| lookers.place("s1", &format!("p{index}")).expect("room"))
+            .collect();
+        lookers.place("s1", "late").expect_err("all are taken");
+        eves.pop();
+        let late = lookers.place("s1", "late").expect("room again");
+        drop((eves, elsewhere, others, late));
+        assert!(lookers.all.lock().is_empty(), "nothing is left behind");
+    }
+}

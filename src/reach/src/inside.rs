@@ -1,0 +1,123 @@
+//! A servant that people look into: a node of its own in the servant's graph and a bridge on it, both there only while somebody
+//! looks. What people hear, publish and call there passes neither the robot's bridge nor its tap, so that it is no request of the
+//! robot, no session of it and none of its figures; and what the robot publishes is heard there as any node hears it.
+
+use std::sync::{Arc, Weak};
+
+use bridge::{Bridge, BridgeOptions, Called, SessionEnd, SessionOptions, Waiting};
+use futures_util::future::BoxFuture;
+use parking_lot::Mutex;
+use ros::bus::{Bus, BusError};
+use ros::schema::Registry;
+
+use crate::Stream;
+
+/// WebSocket close code for something that failed here.
+const FAILED: u16 = 1011;
+/// WebSocket close code for a servant that ends.
+const ENDS: u16 = 1012;
+
+/// Joins the servant's ROS, once for all who look.
+pub(crate) type Joining =
+    Box<dyn Fn() -> BoxFuture<'static, Result<Arc<dyn Bus>, BusError>> + Send + Sync>;
+
+/// Where people look into one servant.
+pub(crate) struct Inside {
+    join: Joining,
+    registry: Arc<Registry>,
+    options: BridgeOptions,
+    /// Held while the ROS is joined: two nodes of one name would end each other.
+    turn: tokio::sync::Mutex<()>,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    /// There while somebody looks.
+    bridge: Weak<Bridge>,
+    closed: Option<String>,
+}
+
+impl Inside {
+    /// `options` are those of the robot's bridge.
+    pub(crate) fn new(join: Joining, registry: Arc<Registry>, options: &BridgeOptions) -> Inside {
+        let options = BridgeOptions {
+            // A page is shown what is newest, and asks for little at once.
+            topic_messages: 64,
+            session_bytes: 8 << 20,
+            bus_queue: 32,
+            max_subscriptions: 64,
+            max_advertisements: 32,
+            max_calls: 32,
+            max_call_bytes: 8 << 20,
+            called: Called::default(),
+            pair: None,
+            ..options.clone()
+        };
+        Inside {
+            join,
+            registry,
+            options,
+            turn: tokio::sync::Mutex::default(),
+            state: Mutex::default(),
+        }
+    }
+
+    /// Speaks rosbridge with somebody who looks, until it ends.
+    pub(crate) async fn serve(
+        &self,
+        mut client: Waiting<Stream>,
+        options: SessionOptions,
+    ) -> SessionEnd {
+        let (code, reason) = match client.until(self.bridge()).await {
+            Ok(Ok(bridge)) => return bridge.serve_waiting(client, options).await,
+            Ok(Err(refused)) => refused,
+            Err(left) => return left,
+        };
+        client.refuse(code, &reason).await;
+        SessionEnd::Closed { code, reason }
+    }
+
+    /// Ends all who look, and refuses others, with these words.
+    pub(crate) fn close(&self, reason: &str) {
+        let bridge = {
+            let mut state = self.state.lock();
+            state.closed.get_or_insert_with(|| reason.to_owned());
+            state.bridge.upgrade()
+        };
+        if let Some(bridge) = bridge {
+            bridge.close(reason);
+        }
+    }
+
+    /// The bridge that is there, or a new one; else code and reason to close with.
+    async fn bridge(&self) -> Result<Arc<Bridge>, (u16, String)> {
+        let _turn = self.turn.lock().await;
+        if let Some(bridge) = self.there()? {
+            return Ok(bridge);
+        }
+        let joined = (self.join)().await;
+        let bus = joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
+        let bridge = Bridge::new(bus, Arc::clone(&self.registry), self.options.clone());
+        let mut state = self.state.lock();
+        // It may have been closed meanwhile.
+        state.check()?;
+        state.bridge = Arc::downgrade(&bridge);
+        Ok(bridge)
+    }
+
+    fn there(&self) -> Result<Option<Arc<Bridge>>, (u16, String)> {
+        let state = self.state.lock();
+        state.check()?;
+        Ok(state.bridge.upgrade())
+    }
+}
+
+impl State {
+    fn check(&self) -> Result<(), (u16, String)> {
+        match &self.closed {
+            Some(reason) => Err((ENDS, reason.clone())),
+            None => Ok(()),
+        }
+    }
+}

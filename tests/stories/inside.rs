@@ -1,0 +1,382 @@
+//! People look into a servant: they hear what flows there and, where they may, act on it, and are none of its robot's clients.
+
+use anyhow::{Context, bail, ensure};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::daemon::Daemon;
+use support::robot::{PATIENCE, Refusal, Robot};
+use support::world::world;
+use tokio_tungstenite::tungstenite::Message;
+
+use crate::access::token;
+use crate::people::{self, account};
+
+/// The package whose servants are looked into.
+pub const SIGHTS: &[&str] = &["--node", "sights.py"];
+
+/// A daemon with tokens, `sights_py`, and a robot `rover` at work there.
+struct Scene {
+    daemon: Daemon,
+    admin: String,
+    rover: Robot,
+    servant: String,
+}
+
+impl Scene {
+    fn new(name: &str, config: &str) -> anyhow::Result<Scene> {
+        let daemon = world().own(name).config(config).start()?;
+        let admin = token(&daemon, &["chief", "--role", "admin"])?;
+        daemon.deployer().pushes("sights_py", SIGHTS)?.succeeded()?;
+        let own = token(
+            &daemon,
+            &[
+                "rover",
+                "--role",
+                "robot",
+                "--robot",
+                "rover",
+                "--service",
+                "sights_py",
+            ],
+        )?;
+        let mut rover = daemon.robot(&format!("sights_py?token={own}"))?;
+        rover.calls("/rosapi/get_time", json!({}))?;
+        let servant = daemon.servant_of("sights_py", "rover")?;
+        let servant = servant["id"].as_str().context("an id")?.to_owned();
+        Ok(Scene {
+            daemon,
+            admin,
+            rover,
+            servant,
+        })
+    }
+
+    fn viewer(&self, name: &str, services: &str) -> anyhow::Result<String> {
+        let given = [name, "--role", "viewer", "--service", services];
+        token(&self.daemon, &given)
+    }
+
+    fn address(&self) -> String {
+        format!("api/v1/servants/{}/inside", self.servant)
+    }
+
+    fn looks(&self, token: &str) -> Result<Robot, Refusal> {
+        let url = self
+            .daemon
+            .url(&format!("{}?token={token}", self.address()));
+        Robot::try_connect(&url)
+    }
+
+    fn told(&self) -> anyhow::Result<Value> {
+        self.daemon
+            .api(&format!("/api/v1/servants/{}", self.servant))
+    }
+
+    fn audited(&self, who: &str, did: &str) -> Verdict {
+        support::until(&format!("a record that {who} {did}"), || {
+            let typed = ["--format", "json", "audit", "-n", "1000"];
+            let log = self.daemon.deployer().types(&typed)?.succeeded()?.stdout;
+            let found = log
+                .lines()
+                .filter_map(|line| serde_json::from_str::<Value>(line).ok())
+                .any(|record| {
+                    let (name, what) = (record["who"].as_str(), record["did"].as_str());
+                    name.is_some_and(|name| name.starts_with(who)) && what == Some(did)
+                });
+            Ok(found.then_some(()).ok_or(log))
+        })
+    }
+}
+
+fn refused(connection: Result<Robot, Refusal>, status: u16, words: &str) -> Verdict {
+    match connection {
+        Ok(_) => bail!("let in, and not refused with {status} {words}"),
+        Err(refusal) => {
+            ensure!(
+                refusal.status == status && refusal.body.contains(words),
+                "{status} {words}: {refusal}"
+            );
+            Ok(())
+        }
+    }
+}
+
+/// Waits for a picture in binary, which is as large as it was published.
+fn hears_a_picture(robot: &mut Robot) -> Verdict {
+    loop {
+        if let Message::Binary(bytes) = robot.frame(PATIENCE)? {
+            ensure!(bytes.len() > 640 * 480 * 3, "{} bytes", bytes.len());
+            return Ok(());
+        }
+    }
+}
+
+pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
+    let mut scene = Scene::new("inside", "")?;
+    let eve_token = scene.viewer("eve", "sights*")?;
+    let mut eve = scene.looks(&eve_token)?;
+    // Of what is there she is told topics, and hears them, the robot's own among them.
+    let topics = eve.calls("/rosapi/topics", json!({}))?;
+    ensure!(
+        topics["values"]["topics"]
+            .to_string()
+            .contains("/sights/scan"),
+        "{topics}"
+    );
+    for topic in ["/sights/said", "/sights/say"] {
+        eve.subscribes(topic)?;
+        eve.awaits_subscriber(topic)?;
+    }
+    eve.subscribes("/sights/map")?;
+    let map = eve.hears_on("/sights/map")?;
+    ensure!(map["info"]["width"] == 100, "latched: {map}");
+    let say = |words: &str| json!({"op": "publish", "topic": "/sights/say", "type": "std_msgs/String", "msg": {"data": words}});
+    scene
+        .rover
+        .says(json!({"op": "advertise", "topic": "/sights/say", "type": "std_msgs/String"}))?;
+    // She hears from when her node is connected on, and the robot does not wait for that.
+    support::until("what the robot sends, inside", || {
+        scene.rover.says(say("by rover"))?;
+        let unheard = eve.has_not_heard(|said| said["topic"] == "/sights/say")?;
+        Ok((!unheard)
+            .then_some(())
+            .ok_or_else(|| "not heard".to_owned()))
+    })?;
+    ensure!(eve.hears_on("/sights/say")?["data"] == "by rover");
+    ensure!(eve.hears_on("/sights/said")?["data"] == "by rover");
+    // Pictures come in binary, if they are asked for so.
+    let mut pictures = scene.looks(&eve_token)?;
+    pictures.says(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor", "throttle_rate": 200, "queue_length": 1}))?;
+    hears_a_picture(&mut pictures)?;
+    pictures.leaves()?;
+    // Everything else is refused her.
+    eve.says(say("by eve"))?;
+    eve.hears_status("publish:/sights/say is not granted")?;
+    for (service, arguments) in [
+        ("/sights/ping", json!({})),
+        (
+            "/rosapi/set_param",
+            json!({"name": "/sights/gain", "value": "9"}),
+        ),
+        ("/rosapi/get_param", json!({"name": "/sights/gain"})),
+        ("/rosapi/delete_param", json!({"name": "/sights/gain"})),
+    ] {
+        let answer = eve.calls(service, arguments)?;
+        ensure!(
+            answer["result"] == false && answer["values"].to_string().contains("not granted"),
+            "{service}: {answer}"
+        );
+    }
+    eve.says(json!({"op": "send_action_goal", "id": "g", "action": "/sights/count", "action_type": "actionlib/TestAction", "args": {"goal": 1}}))?;
+    let goal = eve.hears("the goal's end", |said| said["op"] == "action_result")?;
+    ensure!(goal["result"] == false, "{goal}");
+    eve.says(
+        json!({"op": "advertise_service", "service": "/sights/other", "type": "std_srvs/Trigger"}),
+    )?;
+    eve.hears_status("advertise:/sights/other is not granted")?;
+    scene.audited("eve", "looks inside")?;
+    scene.audited("eve", "was refused publish:/sights/say")?;
+
+    // An operator does all that.
+    let olga = token(&scene.daemon, &["olga", "--role", "operator"])?;
+    let mut olga = scene.looks(&olga)?;
+    let answer = olga.calls("/sights/ping", json!({}))?;
+    ensure!(answer["values"]["message"] == "pong", "{answer}");
+    olga.calls(
+        "/rosapi/set_param",
+        json!({"name": "/sights/gain", "value": "9"}),
+    )?;
+    let gain = olga.calls("/rosapi/get_param", json!({"name": "/sights/gain"}))?;
+    ensure!(gain["values"]["value"] == "9", "{gain}");
+    scene.rover.subscribes("/sights/said")?;
+    olga.says(json!({"op": "advertise", "topic": "/sights/say", "type": "std_msgs/String"}))?;
+    // The node takes it as from anybody, and its robot hears what comes of it, once both are connected.
+    support::until("what olga sends, at the robot", || {
+        olga.says(say("by olga"))?;
+        let unheard = scene
+            .rover
+            .has_not_heard(|said| said["msg"]["data"] == "by olga")?;
+        Ok((!unheard)
+            .then_some(())
+            .ok_or_else(|| "not heard".to_owned()))
+    })?;
+    olga.says(json!({"op": "send_action_goal", "id": "g", "action": "/sights/count", "action_type": "actionlib/TestAction", "args": {"goal": 10}}))?;
+    let goal = olga.hears("the goal's end", |said| said["op"] == "action_result")?;
+    ensure!(goal["result"] == true, "{goal}");
+    scene.audited("olga", "inside: call:/sights/ping")?;
+    scene.audited("olga", "inside: publish:/sights/say")?;
+    scene.audited("olga", "inside: call:/rosapi/set_param")?;
+
+    // All this was nobody's robot: one servant, one connection, no request of the robot, no duplicate of it.
+    ensure!(scene.daemon.servants_of("sights_py")?.len() == 1);
+    let told = scene.told()?;
+    ensure!(told["connections"] == 1, "{told:#}");
+    ensure!(told["response"].is_null(), "{told:#}");
+    ensure!(told["id"] == scene.servant.as_str(), "{told:#}");
+    let count = scene.rover.calls("/rosapi/nodes", json!({}))?;
+    ensure!(count["result"] == true, "{count}");
+    scene.rover.subscribes("/client_count")?;
+    ensure!(scene.rover.hears_on("/client_count")?["data"] == 1);
+    let events = scene.daemon.api("/api/v1/events?limit=10000")?;
+    ensure!(
+        !events.to_string().contains("duplicate-robot"),
+        "{events:#}"
+    );
+
+    // A rule narrows what a viewer hears, at once.
+    let rule = [
+        "policy",
+        "allow",
+        "eve",
+        "subscribe:/sights/map",
+        "--service",
+        "*",
+    ];
+    scene.daemon.deployer().types(&rule)?.succeeded()?;
+    eve.hears_status("/sights/said")?;
+    eve.says(json!({"op": "subscribe", "id": "again", "topic": "/sights/said"}))?;
+    eve.hears_status("subscribe:/sights/said is not granted")?;
+    // What was begun with a token ends with it.
+    scene
+        .daemon
+        .deployer()
+        .types(&["token", "revoke", "eve"])?
+        .succeeded()?;
+    let close = eve.hears_close()?;
+    ensure!(
+        u16::from(close.code) == 1008 && close.reason.contains("revoked"),
+        "{close:?}"
+    );
+    // And with the servant.
+    scene
+        .daemon
+        .deployer()
+        .types(&["stop", &scene.servant])?
+        .succeeded()?;
+    let close = olga.hears_close()?;
+    ensure!(u16::from(close.code) == 1012, "{close:?}");
+    refused(scene.looks(&scene.admin), 404, "servant")?;
+    scene.daemon.ends()?;
+    Ok(())
+}
+
+pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
+    let scene = Scene::new("inside-bounds", "[servant]\ngrace = \"1s\"\n")?;
+    let eve = scene.viewer("eve", "sights*")?;
+    let stranger = scene.viewer("stranger", "other*")?;
+    let other = [
+        "other",
+        "--role",
+        "robot",
+        "--robot",
+        "other",
+        "--service",
+        "sights_py",
+    ];
+    let other = token(&scene.daemon, &other)?;
+    refused(scene.looks(&stranger), 403, "may not see servant")?;
+    refused(scene.looks(&other), 403, "may not see")?;
+    refused(scene.looks("guess"), 401, "not known")?;
+    let bare = Robot::try_connect(&scene.daemon.url(&scene.address()));
+    refused(bare, 401, "token")?;
+    let elsewhere = format!("api/v1/servants/nothing/inside?token={eve}");
+    refused(
+        Robot::try_connect(&scene.daemon.url(&elsewhere)),
+        403,
+        "may not see",
+    )?;
+    let bearer = format!("Bearer {eve}");
+    let path = format!("/{}", scene.address());
+    let (status, body) = scene
+        .daemon
+        .request("GET", &path, &[("Authorization", &bearer)])?;
+    ensure!(
+        status == 400 && body.contains("no WebSocket handshake"),
+        "{status} {body}"
+    );
+
+    // By a session, from the page's own origin alone.
+    let made = ["create", "vera", "--role", "viewer", "--service", "sights*"];
+    account(&scene.daemon, &made, people::PASSWORD)?.succeeded()?;
+    let vera = people::Browser::signs_in(&scene.daemon, "vera", people::PASSWORD)?;
+    let url = scene.daemon.url(&scene.address());
+    let shows = |origin: Option<&str>| {
+        let mut headers = vec![("Cookie", vera.cookie.as_str())];
+        headers.extend(origin.map(|origin| ("Origin", origin)));
+        Robot::try_connect_showing(&url, &headers)
+    };
+    refused(shows(None), 403, "may not use the session")?;
+    for origin in ["http://evil.example", "null", "http://127.0.0.1:1"] {
+        refused(shows(Some(origin)), 403, "may not use the session")?;
+    }
+    let mut hers = shows(Some(&vera.origin))?;
+    hers.calls("/rosapi/topics", json!({}))?;
+
+    // So many of one principal, and no more; one that leaves makes room.
+    let mut many: Vec<Robot> = (0..4)
+        .map(|_| scene.looks(&eve))
+        .collect::<Result<_, _>>()?;
+    refused(scene.looks(&eve), 429, "as many as may")?;
+    many.pop().context("one")?.leaves()?;
+    support::until("room for one more", || {
+        Ok(scene
+            .looks(&eve)
+            .map(|one| many.push(one))
+            .map_err(|refusal| refusal.to_string()))
+    })?;
+    // The robot goes: whoever looks keeps its servant from nothing.
+    let Scene { daemon, rover, .. } = scene;
+    rover.leaves()?;
+    let close = hers.hears_close()?;
+    ensure!(u16::from(close.code) == 1012, "{close:?}");
+    for mut one in many {
+        one.hears_close()?;
+    }
+    support::until("the servant's end", || {
+        let left = daemon.servants_of("sights_py")?;
+        Ok(left
+            .is_empty()
+            .then_some(())
+            .ok_or_else(|| format!("{left:#?}")))
+    })?;
+    daemon.ends()?;
+    Ok(())
+}
+
+pub fn who_looks_slowly_costs_its_robot_nothing() -> Verdict {
+    let mut scene = Scene::new("inside-slow", "")?;
+    let eve = scene.viewer("eve", "*")?;
+    let url = scene
+        .daemon
+        .url(&format!("{}?token={eve}", scene.address()));
+    // She asks for thirty pictures a second, and takes none of them.
+    let mut slow = Robot::on_a_short_line(&url)?;
+    slow.says(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor"}))?;
+    let publish = |op: &str| json!({"op": op, "topic": "/sights/say", "type": "std_msgs/String"});
+    scene.rover.says(publish("advertise"))?;
+    scene.rover.subscribes("/sights/said")?;
+    let said = |words: &str| {
+        let mut message = publish("publish");
+        message["msg"] = json!({"data": words});
+        message
+    };
+    support::until("the first answer", || {
+        scene.rover.says(said("first"))?;
+        let unheard = scene
+            .rover
+            .has_not_heard(|heard| heard["topic"] == "/sights/said")?;
+        Ok((!unheard).then_some(()).ok_or_else(|| "none".to_owned()))
+    })?;
+    for number in 0..100 {
+        let words = format!("the {number}th");
+        scene.rover.says(said(&words))?;
+        let is = |heard: &Value| heard["op"] == "publish" && heard["msg"]["data"] == words.as_str();
+        scene.rover.hears(&words, is)?;
+    }
+    // The robot has lost nothing, and what she did not take is none of its drops.
+    ensure!(scene.told()?["dropped"] == 0, "{:#}", scene.told()?);
+    // And what she is given at last is new, not what was so when she began.
+    hears_a_picture(&mut slow)?;
+    scene.daemon.ends()?;
+    Ok(())
+}
