@@ -308,6 +308,7 @@ fn main() -> ExitCode {
         stories![page:
             it_shows_what_happens_and_does_what_one_may,
             it_is_told_at_once_that_a_token_was_revoked,
+            what_flows_inside_a_servant_is_drawn_and_changed,
             a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing,
         ],
         stories![operations:

@@ -64,7 +64,6 @@ export default defineConfig({
   },
   // `npm run dev` with the API of a daemon that runs: CLOUDROID_SERVER=http://127.0.0.1:9090.
   server: {
-    proxy: Object.fromEntries([['/api', {}], ['^/[^/@.?]+\\?robot=', { ws: true }]].map(([path, more]) =>
-      [path, { target: process.env.CLOUDROID_SERVER ?? 'http://127.0.0.1:9090', changeOrigin: true, secure: false, ...more }])),
+    proxy: { '/api': { target: process.env.CLOUDROID_SERVER ?? 'http://127.0.0.1:9090', changeOrigin: true, secure: false, ws: true } },
   },
 });

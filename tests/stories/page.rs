@@ -13,6 +13,7 @@ use support::world::world;
 use support::{Verdict, binaries};
 
 use crate::access::{daemon, token};
+use crate::inside;
 use crate::people::account;
 
 const PASSWORD: &str = "four quiet purple engines";
@@ -86,6 +87,32 @@ pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
     })?;
     does(&daemon, "remover", &admin)?;
     does(&daemon, "admin", &admin)
+}
+
+pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
+    let daemon = daemon("page-inside")?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    let viewer = token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
+    daemon
+        .deployer()
+        .pushes("sights_py", inside::SIGHTS)?
+        .succeeded()?;
+    // The robot is another principal's than whoever looks.
+    let own = [
+        "rover",
+        "--role",
+        "robot",
+        "--robot",
+        "rover",
+        "--service",
+        "sights_py",
+    ];
+    let mut robot = daemon.robot(&format!("sights_py?token={}", token(&daemon, &own)?))?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    does(&daemon, "looker", &admin)?;
+    does(&daemon, "onlooker", &viewer)?;
+    ensure!(daemon.servants_of("sights_py")?.len() == 1);
+    robot.leaves()
 }
 
 pub fn it_is_told_at_once_that_a_token_was_revoked() -> Verdict {

@@ -275,6 +275,157 @@ const STEPS = {
     await visitor.sees('None is like that');
   },
 
+  // Inside a servant of sights_py: what is drawn has the colours that its node gave it.
+  async looker(visitor) {
+    const { page } = visitor;
+    await visitor.signsIn();
+    await visitor.opens('#/servants');
+    await visitor.clicks('rover', 'link');
+    await visitor.clicks('Look inside', 'link');
+    const chooses = (label, value) => page.waitForSelector(`::-p-aria([name="${label}"][role="combobox"])`).then(async (list) => {
+      await page.waitForFunction((select, wanted) => [...select.options].some((option) => option.value === wanted), {}, list, value);
+      await list.select(value);
+    });
+    // A pixel of the canvas that is there, at this share of its width and height, once it is of that colour.
+    const pixel = (x, y, colour) => page.waitForFunction((x, y, colour) => {
+      const canvas = document.querySelector('figure:not([hidden]) canvas');
+      if (!canvas || !canvas.width) return false;
+      const data = canvas.getContext('2d').getImageData(Math.floor(canvas.width * x), Math.floor(canvas.height * y), 1, 1).data;
+      window.seen = [...data];
+      return colour.every((one, index) => Math.abs(one - data[index]) <= 2);
+    }, {}, x, y, colour).catch(async () => assert.fail(`at ${x}, ${y} is ${await page.evaluate(() => JSON.stringify(window.seen))} and not ${colour}`));
+    const [RED, BLUE, BLACK, WHITE, UNKNOWN] = [[255, 0, 0], [0, 0, 255], [0, 0, 0], [255, 255, 255], [0, 0, 160]];
+    for (const [encoding, left, right] of [
+      ['rgb8', RED, BLUE], ['bgr8', RED, BLUE], ['rgba8', RED, BLUE], ['mono8', BLACK, WHITE], ['mono16', BLACK, WHITE],
+      ['depth_16UC1', BLACK, WHITE], ['depth_32FC1', BLACK, UNKNOWN],
+    ]) {
+      await chooses('Topic', `/sights/image/${encoding}`);
+      await visitor.sees('640 × 480');
+      await pixel(0.25, 0.5, left);
+      await pixel(0.75, 0.5, right);
+      if (encoding === 'depth_16UC1') await visitor.sees('0.50 m (black) to 2.50 m (white)');
+      if (encoding === 'rgb8') await visitor.judges('inside-picture');
+    }
+    await chooses('Topic', '/sights/image/odd');
+    await visitor.sees('pictures of encoding yuv422 are not drawn');
+    await chooses('Topic', '/sights/compressed');
+    await visitor.sees('64 × 48, png');
+    await pixel(0.25, 0.5, RED);
+    await pixel(0.75, 0.5, BLUE);
+    // A grid fills the view from the left to the right: the lowest ten of its sixty rows are unknown.
+    await chooses('Topic', '/sights/map');
+    await visitor.sees('100 × 60 cells of 0.05 m: 5 × 3 m; origin (lower left) at -2.5, -1 m of map');
+    await pixel(0.25, 0.5, [254, 254, 254]);
+    await pixel(0.75, 0.5, BLACK);
+    await pixel(0.5, 0.86, [205, 205, 205]);
+    await visitor.judges('inside-grid');
+    await page.focus('canvas');
+    for (let step = 0; step < 12; step += 1) await page.keyboard.press('ArrowRight');
+    await pixel(0.25, 0.5, BLACK);
+    await visitor.clicks('All of it');
+    await pixel(0.25, 0.5, [254, 254, 254]);
+    await chooses('Topic', '/sights/scan');
+    await visitor.sees('361 beams, 121 of them in range');
+    await visitor.sees('nearest 2 m, farthest 2 m');
+    await visitor.judges('inside-scan');
+    // Ahead is up, at two of the 2.2 metres that are in sight.
+    const red = await page.evaluate(() => {
+      const canvas = document.querySelector('canvas');
+      const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+      const at = (x, y) => data[(Math.round(y) * canvas.width + Math.round(x)) * 4];
+      const [middle, reach] = [canvas.width / 2, canvas.width / 2 / 1.1];
+      return { ahead: at(middle, middle - reach), behind: at(middle, middle + reach * 0.97) };
+    });
+    assert(red.ahead > 150, JSON.stringify(red));
+    for (const name of ['cloud', 'cloud_big_endian']) {
+      await chooses('Topic', `/sights/${name}`);
+      await visitor.sees('10000 points in their colours; frame map');
+      const halves = await page.waitForFunction(() => {
+        const canvas = document.querySelector('figure:not([hidden]) canvas');
+        const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+        const count = { up: [0, 0], down: [0, 0] };
+        for (let at = 0; at < data.length; at += 4) {
+          if (!data[at + 3]) continue;
+          const half = at / 4 / canvas.width < canvas.height / 2 ? count.up : count.down;
+          half[data[at + 1] > 128 ? 0 : 1] += 1;
+        }
+        return count.up[0] + count.down[1] > 5000 && count;
+      }).then((found) => found.jsonValue());
+      // Green above, magenta below, but for the row between them.
+      assert(halves.up[1] < halves.up[0] / 20 && halves.down[0] < halves.down[1] / 10, JSON.stringify(halves));
+    }
+    await visitor.clicks('Tilted');
+    await visitor.judges('inside-cloud');
+    await chooses('Topic', '');
+    await visitor.clicks('Show the frames');
+    await visitor.sees('base_link');
+    await visitor.sees('turned by 0, 0, 90°');
+    await visitor.sees('egg → chicken → egg is a loop');
+    await visitor.sees('torn is given the parents map and odom');
+    await visitor.sees('at 0.25, 0, 0 m');
+    // Parameters keep their types.
+    await visitor.clicks('Show the parameters');
+    await visitor.clicks('/sights/scale');
+    await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value === '2.0'));
+    const value = await page.waitForSelector('::-p-aria([name="Value, as JSON"])');
+    const writes = async (text) => {
+      await value.click({ count: 3 });
+      await value.type(text);
+    };
+    await writes('3');
+    await visitor.sees('it is a number with a fraction now and would become a whole number');
+    await writes('left');
+    await visitor.sees('this is no JSON (a text stands in "quotes")');
+    await visitor.clicks('Set the parameter');
+    await visitor.page.waitForSelector('.trouble');
+    await writes('2.5');
+    await visitor.clicks('Set the parameter');
+    await visitor.sees('/sights/scale is 2.5, as it was read back');
+    await visitor.clicks('/sights/limits/speed');
+    await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value === '0.5'));
+    await visitor.clicks('Remove the parameter…');
+    await visitor.clicks('Remove it');
+    await visitor.sees('/sights/limits/speed is removed');
+    await visitor.judges('inside-parameters');
+    // An action, its feedback and its end.
+    await chooses('Action', '/sights/count');
+    const goal = await page.waitForSelector('::-p-aria([name="Goal"])');
+    await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value.includes('"goal": 0')));
+    const asks = async (many) => {
+      await goal.evaluate((box, text) => { box.value = text; box.dispatchEvent(new Event('input')); }, JSON.stringify({ goal: many }));
+      await visitor.clicks('Send the goal');
+    };
+    await asks(3);
+    await visitor.sees('the goal succeeded');
+    await asks(1000);
+    await visitor.sees('feedback');
+    await visitor.clicks('Cancel the goal');
+    await visitor.sees('the goal was cancelled');
+    await chooses('Service', '/sights/ping');
+    await visitor.clicks('Call');
+    await visitor.sees('pong');
+  },
+
+  // Who may see it hears, and does nothing.
+  async onlooker(visitor) {
+    const { page } = visitor;
+    await visitor.signsIn();
+    await visitor.opens('#/servants');
+    await visitor.clicks('rover', 'link');
+    await visitor.clicks('Look inside', 'link');
+    const list = await page.waitForSelector('::-p-aria([name="Topic"][role="combobox"])');
+    await page.waitForFunction((select) => [...select.options].some((option) => option.value === '/sights/say'), {}, list);
+    await list.select('/sights/image/rgb8');
+    await visitor.sees('640 × 480, rgb8');
+    await list.select('/sights/say');
+    await page.waitForFunction(() => document.querySelector('textarea').value.includes('data'));
+    await visitor.clicks('Publish');
+    await visitor.sees('publish:/sights/say is not granted');
+    await visitor.clicks('Show the parameters');
+    await visitor.sees('call:/rosapi/get_param_names is not granted');
+    await visitor.judges('inside-refused');
+  },
+
   // Who may look and nothing else.
   async viewer(visitor) {
     await visitor.signsIn();

@@ -1,14 +1,34 @@
-// A connection to a robot's servant by rosbridge (protocol 2.0), as one more client of that robot.
+// A connection into a servant by rosbridge (protocol 2.0), beside its robot: what one may do there is what the policy says.
 import { Problem, token } from './api';
+import { decode } from './cbor';
 
 type Message = Record<string, unknown>;
+type Hears = (message: unknown) => void;
 
-export interface Answer { result: boolean; values: unknown }
+/** How a goal ends (action_msgs/GoalStatus). */
+const ENDS: Record<number, string> = { 4: 'succeeded', 5: 'was cancelled', 6: 'was aborted' };
+
+export interface Goal {
+  /** Told of each feedback. */
+  feedback: Hears;
+  /** Told once, with how it ended in words. */
+  result: (words: string, values: unknown, good: boolean) => void;
+}
+
+export interface Hearing {
+  /** Binary, for what has many numbers. */
+  binary?: boolean;
+  /** Least time between messages, in milliseconds. */
+  pause?: number;
+  /** Messages that the daemon keeps for this page; the newest win. */
+  keep?: number;
+}
 
 export class Rosbridge {
   readonly #socket: WebSocket;
   readonly #calls = new Map<string, { resolve: (values: unknown) => void; reject: (error: Problem) => void }>();
-  readonly #heard = new Map<string, (message: unknown) => void>();
+  readonly #heard = new Map<string, Set<Hears>>();
+  readonly #goals = new Map<string, Goal>();
   #number = 0;
   /** Resolves once it is there. */
   readonly ready: Promise<void>;
@@ -17,60 +37,81 @@ export class Rosbridge {
   /** What the daemon says of it. */
   status: (words: string) => void = () => {};
 
-  constructor(service: string, robot: string) {
-    const address = `${location.origin.replace(/^http/, 'ws')}/${encodeURIComponent(service)}?robot=${encodeURIComponent(robot)}`;
+  constructor(servant: string) {
+    const address = `${location.origin.replace(/^http/, 'ws')}/api/v1/servants/${encodeURIComponent(servant)}/inside`;
     // A page can set no header: the token is a subprotocol. A session is shown by its cookie.
     this.#socket = new WebSocket(address, ['rosbridge', ...(token.get() ? [`bearer.${token.get()}`] : [])]);
+    this.#socket.binaryType = 'arraybuffer';
     this.ready = new Promise((resolve, reject) => {
       this.#socket.onopen = () => resolve();
       this.#socket.onclose = (event) => {
-        const problem = new Problem(0, '', event.reason || 'the connection to the servant was refused or lost', `who you are must be allowed to connect to ${service} as ${robot}; load the page again to try once more`);
+        const problem = new Problem(0, '', event.reason || 'the connection into the servant was refused or lost', 'who you are must be allowed to see its service, and few pages may look into one servant at once; load the page again to try once more');
         for (const { reject } of this.#calls.values()) reject(problem);
         this.#calls.clear();
         reject(problem);
         this.lost(problem);
       };
     });
-    this.#socket.onmessage = (event) => this.#take(JSON.parse(event.data));
+    this.#socket.onmessage = ({ data }) => this.#take((typeof data === 'string' ? JSON.parse(data) : decode(data)) as Message);
   }
 
   #take(message: Message): void {
-    if (message.op === 'publish') this.#heard.get(message.topic as string)?.(message.msg);
+    const id = message.id as string;
+    if (message.op === 'publish') for (const hears of this.#heard.get(message.topic as string) ?? []) hears(message.msg);
     else if (message.op === 'status') this.status(String(message.msg));
-    else if (message.op === 'service_response') {
-      const call = this.#calls.get(message.id as string);
-      this.#calls.delete(message.id as string);
+    else if (message.op === 'action_feedback') this.#goals.get(id)?.feedback(message.values);
+    else if (message.op === 'action_result') {
+      const goal = this.#goals.get(id);
+      this.#goals.delete(id);
+      const good = message.result === true && message.status === 4;
+      goal?.result(ENDS[message.status as number] ?? 'did not come to an end', message.values, good);
+    } else if (message.op === 'service_response') {
+      const call = this.#calls.get(id);
+      this.#calls.delete(id);
       if (message.result) call?.resolve(message.values);
       else call?.reject(new Problem(0, '', typeof message.values === 'string' ? message.values : JSON.stringify(message.values), ''));
     }
   }
 
   #say(message: Message): void {
-    this.#socket.send(JSON.stringify(message));
+    if (this.#socket.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
+  }
+
+  #id(): string {
+    return `page ${(this.#number += 1)}`;
   }
 
   call<T>(service: string, args: unknown = {}): Promise<T> {
-    const id = `page ${(this.#number += 1)}`;
+    const id = this.#id();
     return new Promise<T>((resolve, reject) => {
       this.#calls.set(id, { resolve: resolve as (values: unknown) => void, reject });
       this.#say({ op: 'call_service', id, service, args });
     });
   }
 
-  /** At most ten messages a second, the newest. */
-  hear(topic: string, heard: (message: unknown) => void): () => void {
-    this.#heard.set(topic, heard);
-    const id = `page ${(this.#number += 1)}`;
-    this.#say({ op: 'subscribe', id, topic, throttle_rate: 100, queue_length: 1 });
+  /** Until what is given back is called. At most ten messages a second, the newest, where nothing else is said. */
+  hear(topic: string, hears: Hears, { binary = false, pause = 100, keep = 1 }: Hearing = {}): () => void {
+    const all = this.#heard.get(topic) ?? new Set();
+    this.#heard.set(topic, all.add(hears));
+    const id = this.#id();
+    this.#say({ op: 'subscribe', id, topic, throttle_rate: pause, queue_length: keep, compression: binary ? 'cbor' : 'none' });
     return () => {
-      this.#heard.delete(topic);
-      if (this.#socket.readyState === WebSocket.OPEN) this.#say({ op: 'unsubscribe', id, topic });
+      all.delete(hears);
+      this.#say({ op: 'unsubscribe', id, topic });
     };
   }
 
   publish(topic: string, type: string, msg: unknown): void {
     this.#say({ op: 'advertise', topic, type });
     this.#say({ op: 'publish', topic, msg });
+  }
+
+  /** Sends a goal; what is given back cancels it. */
+  act(action: string, type: string, goal: unknown, told: Goal): () => void {
+    const id = this.#id();
+    this.#goals.set(id, told);
+    this.#say({ op: 'send_action_goal', id, action, action_type: type, args: goal, feedback: true });
+    return () => this.#say({ op: 'cancel_action_goal', id, action });
   }
 
   close(): void {
