@@ -309,6 +309,7 @@ fn main() -> ExitCode {
             it_shows_what_happens_and_does_what_one_may,
             it_is_told_at_once_that_a_token_was_revoked,
             what_flows_inside_a_servant_is_drawn_and_changed,
+            settings_of_a_node_are_changed_inside,
             a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing,
         ],
         stories![operations:

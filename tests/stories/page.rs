@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::daemon::Daemon;
-use support::world::world;
+use support::world::{PEOPLE, world};
 use support::{Verdict, binaries};
 
 use crate::access::{daemon, token};
@@ -112,6 +112,20 @@ pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
     does(&daemon, "looker", &admin)?;
     does(&daemon, "onlooker", &viewer)?;
     ensure!(daemon.servants_of("sights_py")?.len() == 1);
+    robot.leaves()
+}
+
+pub fn settings_of_a_node_are_changed_inside() -> Verdict {
+    let daemon = world().with(PEOPLE)?;
+    let mut robot = daemon.robot("opencv_apps?robot=settings")?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    does(&daemon, "settings", "")?;
+    // The node uses them: it has written them where its parameters are.
+    let padding = robot.calls(
+        "/rosapi/get_param",
+        json!({"name": "/people_detect/padding"}),
+    )?;
+    ensure!(padding["values"]["value"] == "17", "{padding}");
     robot.leaves()
 }
 

@@ -7,7 +7,7 @@
 'use strict';
 const assert = require('node:assert');
 const { execFileSync } = require('node:child_process');
-const { mkdirSync, readFileSync } = require('node:fs');
+const { mkdirSync, readFileSync, writeFileSync } = require('node:fs');
 const { basename, dirname, join } = require('node:path');
 const jsQR = require('jsqr');
 const puppeteer = require('puppeteer-core');
@@ -50,6 +50,13 @@ class Visitor {
     const box = await this.page.waitForSelector(`::-p-aria([name="${label}"])`);
     await box.click({ count: 3 });
     await box.type(text);
+  }
+
+  // In a list, once it is there.
+  async chooses(label, value) {
+    const list = await this.page.waitForSelector(`::-p-aria([name="${label}"][role="combobox"])`);
+    await this.page.waitForFunction((select, wanted) => [...select.options].some((option) => option.value === wanted), {}, list, value);
+    await list.select(value);
   }
 
   opens(hash) {
@@ -282,10 +289,7 @@ const STEPS = {
     await visitor.opens('#/servants');
     await visitor.clicks('rover', 'link');
     await visitor.clicks('Look inside', 'link');
-    const chooses = (label, value) => page.waitForSelector(`::-p-aria([name="${label}"][role="combobox"])`).then(async (list) => {
-      await page.waitForFunction((select, wanted) => [...select.options].some((option) => option.value === wanted), {}, list, value);
-      await list.select(value);
-    });
+    const chooses = (label, value) => visitor.chooses(label, value);
     // A pixel of the canvas that is there, at this share of its width and height, once it is of that colour.
     const pixel = (x, y, colour) => page.waitForFunction((x, y, colour) => {
       const canvas = document.querySelector('figure:not([hidden]) canvas');
@@ -304,7 +308,21 @@ const STEPS = {
       await pixel(0.25, 0.5, left);
       await pixel(0.75, 0.5, right);
       if (encoding === 'depth_16UC1') await visitor.sees('0.50 m (black) to 2.50 m (white)');
-      if (encoding === 'rgb8') await visitor.judges('inside-picture');
+      if (encoding === 'rgb8') {
+        await visitor.judges('inside-picture');
+        // How fluid it is while thirty pictures come a second, beside the pictures.
+        const fluid = await page.evaluate(async () => {
+          const shown = () => Number(/(\d+) messages shown/.exec(document.body.innerText)?.[1] ?? 0);
+          const [first, end] = [shown(), performance.now() + 4000];
+          let frames = 0;
+          while (performance.now() < end) {
+            await new Promise(requestAnimationFrame);
+            frames += 1;
+          }
+          return `${frames / 4} frames and ${(shown() - first) / 4} pictures of 640 × 480 a second\n`;
+        });
+        writeFileSync(join(pictures, 'inside-picture.txt'), fluid);
+      }
     }
     await chooses('Topic', '/sights/image/odd');
     await visitor.sees('pictures of encoding yuv422 are not drawn');
@@ -404,6 +422,32 @@ const STEPS = {
     await chooses('Service', '/sights/ping');
     await visitor.clicks('Call');
     await visitor.sees('pong');
+  },
+
+  // Settings of Debian's people_detect, where nobody has to say who he is.
+  async settings(visitor) {
+    const { page } = visitor;
+    await page.waitForSelector('nav');
+    await visitor.opens('#/servants');
+    await visitor.clicks('settings', 'link');
+    await visitor.clicks('Look inside', 'link');
+    await visitor.chooses('Node', '/people_detect');
+    const padding = await page.waitForSelector('::-p-aria([name="padding"][role="spinbutton"])');
+    await padding.click({ count: 3 });
+    await padding.type('16');
+    await page.keyboard.press('Tab');
+    await visitor.sees('padding is 16, as /people_detect says');
+    // The slider stands where the node said, and is moved by a key.
+    const slider = await page.waitForSelector('input[type=range][aria-label^="padding"]');
+    assert.strictEqual(await slider.evaluate((range) => range.value), '16');
+    await slider.focus();
+    await page.keyboard.press('ArrowRight');
+    await visitor.sees('padding is 17, as /people_detect says');
+    assert.strictEqual(await padding.evaluate((box) => box.value), '17');
+    const camera = await page.waitForSelector('::-p-aria([name="use_camera_info"][role="checkbox"])');
+    await camera.click();
+    await visitor.sees('use_camera_info is true, as /people_detect says');
+    await visitor.judges('inside-settings');
   },
 
   // Who may see it hears, and does nothing.
