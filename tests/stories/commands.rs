@@ -41,6 +41,18 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
         "error",
     )?;
     ends(with_token(&daemon, "wrong", &["status"])?, 4, "token")?;
+    let changed = deployer.asks(&["diff", "adder_py", "1", "2"])?;
+    let differences = changed["differences"].as_array().context("differences")?;
+    let offset = serde_json::json!({"part": "parameter", "name": "/adder/offset", "before": "1"});
+    ensure!(differences.contains(&offset), "{changed:#}");
+    let back = types(&["diff", "adder_py", "2", "1"])?.succeeded()?;
+    ensure!(back.stdout.contains("REVISION 2"), "{back:#?}");
+    ends(
+        types(&["diff", "adder_py", "1", "7"])?,
+        5,
+        "there are: 2, 1",
+    )?;
+    ends(types(&["diff", "adder_py"])?, 5, "no revision before 1")?;
     // The canary serves nobody yet, so nothing decides of it.
     let wait = ["rollout", "adder_py", "--wait=1s"];
     ends(types(&wait)?, 8, "adder_py is at canary")?;

@@ -206,6 +206,12 @@ const STEPS = {
     await visitor.judges('confirm');
     await visitor.clicks('Use it');
     await visitor.sees('Use revision 2…');
+    // They were pushed in different ways, and nothing else: the newest beside the one before.
+    const differing = await visitor.page.waitForSelector('section[aria-labelledby="differences"] tbody tr');
+    assert.match(await differing.evaluate((row) => row.innerText), /push\s+source\s/);
+    await visitor.chooses('and revision', '1');
+    await visitor.sees('Nothing that is recorded differs');
+    await visitor.judges('service-differences');
 
     // By the keyboard alone: the first stop of the tabulator skips what is on every page.
     await visitor.page.reload();

@@ -8,6 +8,7 @@ pub mod access;
 pub mod calibration;
 pub mod cpuset;
 pub mod dictionary;
+pub mod differences;
 pub mod doctor;
 pub mod event;
 pub mod explain;

@@ -7,6 +7,7 @@ mod account;
 mod audit;
 mod calibrate;
 mod client;
+mod diff;
 mod doctor;
 mod events;
 mod exit;
@@ -89,6 +90,7 @@ enum Verb {
     Stop(stop::Stop),
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
+    Diff(diff::Diff),
     Rollout(rollout::Rollout),
     Stub(stub::Stub),
     Try(Box<trial::Try>),
@@ -154,6 +156,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Stop(verb) => verb.run(&client, format).await,
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
+        Verb::Diff(verb) => verb.run(&client, format).await,
         Verb::Rollout(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,

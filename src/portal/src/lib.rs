@@ -20,6 +20,7 @@ mod body;
 mod calibration;
 mod connections;
 mod dictionary;
+mod differences;
 mod errors;
 mod events;
 mod explain;

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, events, inside, machines, metrics, oci, openapi,
-    page, people, policy, push, robots, shadow, stream, stubs,
+    App, api_v1, audit, calibration, dictionary, differences, events, inside, machines, metrics,
+    oci, openapi, page, people, policy, push, robots, shadow, stream, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -225,6 +225,14 @@ pub const ROUTES: &[Route] = &[
         get(api_v1::interface)
     })
     .described(|| operation("interface", "The interface with all definitions.").answers_object()),
+    at("GET", "/api/v1/services/{name}/differences", service(See), || {
+        get(differences::differences)
+    })
+    .described(|| {
+        operation("differences", "What differs between two of its revisions.")
+            .asks::<differences::Between>()
+            .answers::<api::differences::Differences>()
+    }),
     at("GET", "/api/v1/services/{name}/fit", service(See), || {
         get(api_v1::fit)
     })

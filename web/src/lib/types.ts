@@ -74,7 +74,7 @@ export interface Topic { name: string; type: string; direction: 'input' | 'outpu
 export interface Typed { name: string; type: string; node?: string }
 
 export interface ServiceDetail extends ServiceSummary {
-  revisions: { number: number; image: string; published: number; source: string; current: boolean }[];
+  revisions: Revision[];
   nodes: { name: string; argv: string[] }[];
   interface: {
     topics: Topic[];
@@ -200,6 +200,10 @@ export interface Rollout {
   of_stable: Arm;
   of_candidate: Arm;
 }
+
+export interface Revision { number: number; image: string; published: number; source: string; current: boolean }
+export interface Difference { part: string; name: string; before?: string; after?: string }
+export interface Differences { service: string; from: number; to: number; differences: Difference[] }
 
 export interface Token { name: string; role: string; services: string[]; robot?: string; classes: string[]; created: number; expires?: number; last_used?: number; revoked?: number }
 export interface Account { name: string; role: string; services: string[]; created: number; last_login?: number; disabled?: number; sessions: number }

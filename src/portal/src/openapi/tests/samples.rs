@@ -742,6 +742,20 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             },
         ),
         sample("Servant", servant()),
+        sample(
+            "Differences",
+            api::differences::Differences {
+                service: "s".into(),
+                from: 1,
+                to: 2,
+                differences: vec![api::differences::Difference {
+                    part: api::differences::Part::Push,
+                    name: "package".into(),
+                    before: some("a"),
+                    after: some("b"),
+                }],
+            },
+        ),
         sample("ServiceDetail", detail()),
         sample("Status", status()),
         sample("Update", update()),

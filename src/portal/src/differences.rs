@@ -1,0 +1,281 @@
+//! `/api/v1/services/{name}/differences`: what a deployer wants to know before a rollback, and a reviewer after a push.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::Arc;
+
+use api::differences::{Difference, Differences, Part};
+use axum::Json;
+use axum::extract::{Path, State};
+use package::interface::Interface;
+use package::inventory::Inventory;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use store::RevisionRecord;
+use utoipa::IntoParams;
+
+use crate::api_v1::Answer;
+use crate::app::App;
+use crate::errors::Error;
+use crate::query::Query;
+
+/// Which revisions.
+#[derive(Debug, Deserialize, IntoParams)]
+pub struct Between {
+    /// The revision to compare with; the one published before `to` by default.
+    from: Option<u64>,
+    /// The revision to compare; the current one by default.
+    to: Option<u64>,
+}
+
+/// Compares two revisions of a service.
+pub async fn differences(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Query(between): Query<Between>,
+) -> Answer<Differences> {
+    let revisions = app.state.revisions(&name)?;
+    let to = match between.to {
+        Some(to) => to,
+        None => app.catalogue.current(&name)?.number,
+    };
+    let before = || revisions.iter().find(|line| line.number < to);
+    let from = between.from.or_else(|| Some(before()?.number));
+    let unknown = |revision: String| -> Error {
+        let exists = revisions.iter().map(|line| line.number.to_string());
+        catalogue::Error::UnknownRevision {
+            service: name.clone(),
+            revision,
+            exists: exists.collect(),
+        }
+        .into()
+    };
+    let record = |number: u64| {
+        let found = app.state.revision(&name, number)?;
+        found.ok_or_else(|| unknown(number.to_string()))
+    };
+    // A service that is not there is told before a revision that it cannot have.
+    app.catalogue.current(&name)?;
+    let to = record(to)?;
+    let from = record(from.ok_or_else(|| unknown(format!("before {}", to.number)))?)?;
+    let before = parts(&from, &app.catalogue.known(&from).await?.inventory);
+    let after = parts(&to, &app.catalogue.known(&to).await?.inventory);
+    Ok(Json(Differences {
+        service: name,
+        from: from.number,
+        to: to.number,
+        differences: compare(before, after),
+    }))
+}
+
+/// What a revision consists of: in words, and where those do not tell all, with a number that differs where it does.
+type Parts = BTreeMap<(Part, String), (String, u64)>;
+
+fn compare(before: Parts, mut after: Parts) -> Vec<Difference> {
+    let difference = |(part, name): (Part, String), before, after| Difference {
+        part,
+        name,
+        before,
+        after,
+    };
+    let mut found = Vec::new();
+    for (key, was) in before {
+        match after.remove(&key) {
+            Some(is) if is == was => {}
+            is => found.push(difference(key, Some(was.0), is.map(|is| is.0))),
+        }
+    }
+    let new = after.into_iter();
+    found.extend(new.map(|(key, is)| difference(key, None, Some(is.0))));
+    found.sort_by(|a, b| (a.part, &a.name).cmp(&(b.part, &b.name)));
+    found
+}
+
+fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
+    let mut parts = Parts::new();
+    let mut add = |part: Part, name: &str, words: String, all: u64| {
+        parts.insert((part, name.to_owned()), (words, all));
+    };
+    add(Part::Push, "package", of.package.clone(), 0);
+    add(Part::Push, "source", of.source.clone(), 0);
+    for (name, set) in [("restart", of.plan.restart), ("stateful", of.plan.stateful)] {
+        if set {
+            add(Part::Push, name, "yes".to_owned(), 0);
+        }
+    }
+    for node in &of.plan.nodes {
+        add(Part::Node, &node.name, node.argv.join(" "), 0);
+        let mut more = serde_json::to_value(node).unwrap_or_default();
+        if let Some(fields) = more.as_object_mut() {
+            fields.retain(|field, _| !["name", "argv", "environment"].contains(&&**field));
+        }
+        let name = |field: &str| format!("{} {field}", node.name);
+        for (field, value) in fields(&more) {
+            add(Part::Node, &name(&field), value, 0);
+        }
+        for (variable, value) in &node.environment {
+            add(
+                Part::Environment,
+                &name(variable),
+                "set".to_owned(),
+                hash(value),
+            );
+        }
+    }
+    for (variable, value) in &of.plan.environment {
+        add(Part::Environment, variable, "set".to_owned(), hash(value));
+    }
+    interface(&of.interface, &mut add);
+    for (name, value) in &of.plan.parameters {
+        let value = serde_json::to_value(value).unwrap_or_default();
+        add(Part::Parameter, name, text(&value), 0);
+    }
+    for (part, value) in [
+        (Part::Limit, json(&of.plan.limits)),
+        (Part::Cap, json(&of.plan.caps)),
+        (Part::Sla, json(&of.plan.sla)),
+        (Part::Grant, json(&of.plan.grants)),
+        (Part::Shared, json(&of.plan.shared)),
+    ] {
+        for (field, value) in fields(&value) {
+            add(part, &field, value, 0);
+        }
+    }
+    for (name, installed) in &inventory.packages {
+        let programs: BTreeSet<&str> = installed.executables.iter().map(String::as_str).collect();
+        let words = match programs.len() {
+            0 => installed.share.clone(),
+            count => format!("{}, {count} programs", installed.share),
+        };
+        add(Part::Package, name, words, hash(&programs));
+    }
+    parts
+}
+
+fn interface(of: &Interface, add: &mut impl FnMut(Part, &str, String, u64)) {
+    for topic in &of.topics {
+        let direction = match topic.direction {
+            package::interface::Direction::Input => "input",
+            package::interface::Direction::Output => "output",
+        };
+        let marks = [(topic.latched, ", latched"), (topic.lazy, ", lazy")];
+        let marks = marks.iter().filter(|(set, _)| *set).map(|(_, mark)| *mark);
+        let words = format!(
+            "{}, {direction}{}",
+            topic.type_name,
+            marks.collect::<String>()
+        );
+        add(Part::Topic, &topic.name, words, 0);
+    }
+    for service in &of.services {
+        add(Part::Service, &service.name, service.type_name.clone(), 0);
+    }
+    for action in &of.actions {
+        add(Part::Action, &action.name, action.type_name.clone(), 0);
+    }
+    for need in &of.needs {
+        let nodes = format!("called by {}", need.nodes.join(", "));
+        add(Part::Need, &need.name, nodes, 0);
+    }
+    for (name, definition) in &of.definitions {
+        let lines = definition.lines().count();
+        add(
+            Part::Definition,
+            name,
+            format!("{lines} lines"),
+            hash(definition),
+        );
+    }
+}
+
+fn hash(of: &(impl Hash + ?Sized)) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    of.hash(&mut hasher);
+    hasher.finish()
+}
+
+fn json(of: &impl Serialize) -> Value {
+    serde_json::to_value(of).unwrap_or_default()
+}
+
+fn text(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Array(all) => all.iter().map(text).collect::<Vec<_>>().join(", "),
+        other => other.to_string(),
+    }
+}
+
+/// What an object has that says something, each value in words.
+fn fields(of: &Value) -> Vec<(String, String)> {
+    let says_nothing = |value: &Value| match value {
+        Value::Null | Value::Bool(false) => true,
+        Value::String(text) => text.is_empty(),
+        Value::Array(all) => all.is_empty(),
+        Value::Number(number) => number.as_f64() == Some(0.0),
+        _ => false,
+    };
+    let all = of.as_object().into_iter().flatten();
+    all.filter(|(_, value)| !says_nothing(value))
+        .map(|(name, value)| (name.clone(), text(value)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn revision() -> RevisionRecord {
+        RevisionRecord {
+            service: "s".into(),
+            number: 1,
+            image: String::new(),
+            published: 0,
+            package: "p".into(),
+            source: "/p".into(),
+            flavour: ros::flavour::Flavour::default(),
+            plan: store::Plan {
+                nodes: serde_json::from_str(r#"[{"name": "/n", "argv": ["/n", "-v"]}]"#)
+                    .expect("a node"),
+                environment: [("TOKEN".to_owned(), "secret".to_owned())].into(),
+                ..store::Plan::default()
+            },
+            interface: Interface::default(),
+        }
+    }
+
+    #[test]
+    fn what_was_added_removed_and_changed_is_told_and_nothing_else() {
+        let before = revision();
+        let mut after = revision();
+        after.number = 2;
+        after.plan.limits.cpus = Some(1.5);
+        after.plan.nodes[0].respawn = true;
+        after.plan.nodes[0].argv.pop();
+        after
+            .plan
+            .environment
+            .insert("TOKEN".into(), "other".into());
+        let nothing = Inventory::default();
+        let told = |from: &RevisionRecord, to: &RevisionRecord| -> Vec<String> {
+            let found = compare(parts(from, &nothing), parts(to, &nothing));
+            let lines = found.iter().map(|one| {
+                let side = |side: &Option<String>| side.clone().unwrap_or_else(|| "-".into());
+                let (before, after) = (side(&one.before), side(&one.after));
+                format!("{:?} {}: {before} > {after}", one.part, one.name)
+            });
+            lines.collect()
+        };
+        assert!(told(&before, &before).is_empty());
+        assert_eq!(
+            told(&before, &after),
+            [
+                "Node /n: /n -v > /n",
+                "Node /n respawn: - > true",
+                "Limit cpus: - > 1.5",
+                "Environment TOKEN: set > set",
+            ]
+        );
+        assert_eq!(told(&after, &before)[2], "Limit cpus: 1.5 > -");
+    }
+}
