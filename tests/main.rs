@@ -161,6 +161,7 @@ fn main() -> ExitCode {
             a_script_can_tell_by_the_exit_status_what_to_do,
             who_follows_events_misses_none_when_the_daemon_is_started_again,
             shells_complete_it_and_every_verb_has_a_page,
+            top_shows_who_uses_the_machine,
         ],
         stories![described: every_answer_is_as_the_document_says],
         stories![metrics:

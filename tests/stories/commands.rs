@@ -1,6 +1,6 @@
 //! The command line as scripts and shells use it.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
@@ -219,5 +219,61 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     deployer
         .types(&["man", &nowhere])?
         .failed_saying(&["cannot write the pages into"])?;
+    Ok(())
+}
+
+pub fn top_shows_who_uses_the_machine() -> Verdict {
+    let daemon = world().with(LOCALISER)?;
+    let deployer = daemon.deployer();
+    let mut robot = daemon.robot("localiser_py?robot=watched")?;
+    robot.calls("/rosapi/nodes", serde_json::json!({}))?;
+    let only = ["top", "--service", "localiser_py", "--sort", "name"];
+    let once = deployer.types(&only)?.succeeded()?.stdout;
+    let row = once.lines().find(|line| line.contains("watched"));
+    ensure!(row.is_some_and(|row| row.contains("ready")), "{once}");
+    ensure!(once.contains("cores used"), "{once}");
+    let other = ["top", "--once", "--service", "nobodys"];
+    let other = deployer.types(&other)?.succeeded()?.stdout;
+    ensure!(other.contains("no servants"), "{other}");
+    let listed = deployer.asks(&only)?;
+    let listed = listed.as_array().context("servants")?;
+    let robots = listed.iter().map(|one| &one["servant"]["robot"]);
+    ensure!(robots.clone().any(|robot| robot == "watched"), "{listed:?}");
+    // At a terminal, until somebody types q.
+    let typed = format!("{} top", binaries::path("cloudroidctl").display());
+    let mut terminal = Command::new("script")
+        .args(["--quiet", "--flush", "--return", "--command", &typed])
+        .arg("/dev/null")
+        .env("CLOUDROID_HOME", &deployer.home)
+        .env_remove("CLOUDROID_SERVER")
+        .env("TERM", "xterm")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let mut keys = terminal.stdin.take().context("its keys")?;
+    let mut screen = terminal.stdout.take().context("its screen")?;
+    let (drawn, seen) = channel();
+    let reader = std::thread::spawn(move || -> std::io::Result<String> {
+        let (mut all, mut more) = (Vec::new(), [0; 4096]);
+        loop {
+            match screen.read(&mut more)? {
+                0 => return Ok(String::from_utf8_lossy(&all).into_owned()),
+                count => all.extend_from_slice(&more[..count]),
+            }
+            if String::from_utf8_lossy(&all).contains("watched") {
+                // Once is enough.
+                let _ = drawn.send(());
+            }
+        }
+    });
+    seen.recv_timeout(PATIENCE).context("nothing is drawn")?;
+    keys.write_all(b"mq")?;
+    let ended = terminal.wait()?;
+    let all = reader.join().map_err(|_| anyhow::anyhow!("the reader"))??;
+    ensure!(ended.success(), "{ended}: {all}");
+    ensure!(
+        all.contains("\u{1b}[?1049l"),
+        "the terminal is left as it was not: {all}"
+    );
     Ok(())
 }

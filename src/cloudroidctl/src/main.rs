@@ -31,9 +31,11 @@ mod sla;
 mod stated;
 mod status;
 mod stop;
+mod stream;
 mod stub;
 mod terminal;
 mod token;
+mod top;
 mod trial;
 mod trust;
 mod wait;
@@ -82,6 +84,7 @@ enum Verb {
     Push(Box<push::Push>),
     Services(services::Services),
     Servants(servants::Servants),
+    Top(top::Top),
     Logs(logs::Logs),
     Events(events::Events),
     Set(set::Set),
@@ -148,6 +151,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Push(verb) => verb.run(&client, format).await,
         Verb::Services(verb) => verb.run(&client, format).await,
         Verb::Servants(verb) => verb.run(&client, format).await,
+        Verb::Top(verb) => verb.run(&client, format).await,
         Verb::Logs(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
         Verb::Set(verb) => verb.run(&client, format).await,

@@ -1,5 +1,6 @@
 //! Printing: tables for people, JSON for programs.
 
+use std::borrow::Cow;
 use std::io::{IsTerminal, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -30,6 +31,11 @@ pub fn json_line(value: &impl Serialize) -> anyhow::Result<()> {
 /// Prints a line at once, without control sequences.
 pub fn line(text: &str) -> anyhow::Result<()> {
     write_line(&terminal::safe(text, std::io::stdout().is_terminal()))
+}
+
+/// A line for a screen that is drawn anew, without control sequences.
+pub fn shown(text: &str) -> Cow<'_, str> {
+    terminal::safe(text, false)
 }
 
 /// Writes what is no text for people as it is.
@@ -97,7 +103,8 @@ impl Table {
         Ok(())
     }
 
-    fn lines(&self) -> Vec<String> {
+    /// Its lines, the columns aligned.
+    pub fn lines(&self) -> Vec<String> {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let widths: Vec<usize> = (0..columns)
             .map(|column| {
