@@ -75,6 +75,8 @@ impl Browser {
             .arg(format!("--user-data-dir={}", profile.display()))
             .args(more)
             .arg(url)
+            // What it leaves behind goes with the profile.
+            .env("TMPDIR", profile)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::null())

@@ -28,6 +28,8 @@ fn begins(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child> {
         .arg(token)
         .arg(binaries::package("adder_py"))
         .env("NODE_PATH", binaries::web_modules())
+        // What the browser leaves behind goes with the daemon's home.
+        .env("TMPDIR", &daemon.home)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())

@@ -21,7 +21,7 @@ pub struct Differences {
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Difference {
     /// Of which part.
-    pub part: Part,
+    pub part: RevisionPart,
     /// Its name there, such as `/scan`, or `cpus`.
     pub name: String,
     /// What it was; none: it was not there.
@@ -36,7 +36,7 @@ pub struct Difference {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
-pub enum Part {
+pub enum RevisionPart {
     /// The ROS package, and how it was pushed.
     Push,
     /// A process.

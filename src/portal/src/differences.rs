@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
-use api::differences::{Difference, Differences, Part};
+use api::differences::{Difference, Differences, RevisionPart as Part};
 use axum::Json;
 use axum::extract::{Path, State};
 use package::interface::Interface;

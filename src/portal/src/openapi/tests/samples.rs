@@ -749,7 +749,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 from: 1,
                 to: 2,
                 differences: vec![api::differences::Difference {
-                    part: api::differences::Part::Push,
+                    part: api::differences::RevisionPart::Push,
                     name: "package".into(),
                     before: some("a"),
                     after: some("b"),
