@@ -39,7 +39,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 
 use self::calls::CallPool;
@@ -94,6 +94,8 @@ pub(super) struct Inner {
     registrar: Registrar,
     subscriptions: Mutex<HashMap<String, Arc<TopicIn>>>,
     publications: Mutex<HashMap<String, Arc<TopicOut>>>,
+    /// Woken when something is advertised, and when somebody wants to know what subscribers ask for.
+    publishing: Notify,
     services: Mutex<HashMap<String, Arc<Served>>>,
     label: OnceLock<String>,
     lending: Loans,
@@ -185,6 +187,7 @@ impl Ros1Bus {
             registrar,
             subscriptions: Mutex::default(),
             publications: Mutex::default(),
+            publishing: Notify::new(),
             services: Mutex::default(),
             label: OnceLock::new(),
             lending: Loans::default(),

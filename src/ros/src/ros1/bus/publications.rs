@@ -29,8 +29,8 @@ struct State {
     subscribers: Vec<Arc<Subscriber>>,
     /// Actions of this node that listen.
     actions: Vec<PeerId>,
-    /// Those who only want to know what subscribers ask for.
-    askers: Vec<mpsc::UnboundedSender<WireType>>,
+    /// Those who only want to know what subscribers ask for, with their numbers, which grow.
+    askers: Vec<(i32, mpsc::UnboundedSender<WireType>)>,
 }
 
 struct LocalPublisher {
@@ -65,6 +65,7 @@ pub(in crate::ros1) async fn advertise(
         bus.registrar.want(Kind::Publisher, name, Some(&of.name));
         topic.clone()
     };
+    bus.publishing.notify_waiters();
     let handle = Handle {
         bus: bus.clone(),
         name: name.to_owned(),
@@ -82,17 +83,20 @@ pub(in crate::ros1) async fn advertise(
 /// Makes this node look like a publisher of `name`, so that subscribers connect and say what they want.
 pub(super) fn ask_subscribers(bus: &Arc<Inner>, name: &str) -> Asking {
     let (sender, answers) = mpsc::unbounded_channel();
-    let mut topics = bus.publications.lock();
-    let topic = topics.entry(name.to_owned()).or_default();
-    let mut state = topic.state.lock();
-    state.askers.push(sender);
-    let type_name = state.advert.as_ref().map_or("*", |advert| &advert.name);
-    bus.registrar.want(Kind::Publisher, name, Some(type_name));
-    drop(state);
+    let topic = {
+        let mut topics = bus.publications.lock();
+        let topic = topics.entry(name.to_owned()).or_default();
+        let mut state = topic.state.lock();
+        state.askers.push((bus.id(), sender));
+        let type_name = state.advert.as_ref().map_or("*", |advert| &advert.name);
+        bus.registrar.want(Kind::Publisher, name, Some(type_name));
+        topic.clone()
+    };
+    bus.publishing.notify_waiters();
     Asking {
         bus: bus.clone(),
         name: name.to_owned(),
-        topic: topic.clone(),
+        topic,
         answers,
     }
 }
@@ -109,7 +113,7 @@ impl Drop for Asking {
     fn drop(&mut self) {
         self.answers.close();
         release(&self.bus, &self.name, &self.topic, |state| {
-            state.askers.retain(|asker| !asker.is_closed());
+            state.askers.retain(|(_, asker)| !asker.is_closed());
         });
     }
 }
@@ -150,13 +154,17 @@ impl TopicOut {
         state.advert.clone().map(|advert| (advert, latching))
     }
 
-    /// Passes on what a subscriber asks for to those who want to know; false if nobody does.
-    pub(super) fn overhear(&self, asked: &WireType) -> bool {
+    /// Passes on what a subscriber asks for to those who want to know and came after `told`; the last of them.
+    pub(super) fn overhear(&self, asked: &WireType, told: Option<i32>) -> Option<i32> {
         let state = self.state.lock();
-        for asker in &state.askers {
-            let _ = asker.send(asked.clone());
+        let mut last = None;
+        for (number, asker) in &state.askers {
+            if told.is_none_or(|told| *number > told) {
+                let _ = asker.send(asked.clone());
+                last = Some(*number);
+            }
         }
-        !state.askers.is_empty()
+        last
     }
 
     /// Whether a subscriber that asks where to connect is welcome.

@@ -1,19 +1,25 @@
 //! The TCPROS server: subscribers of our topics and callers of our services connect here.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::BytesMut;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 
 use super::publications::{Subscriber, TopicOut};
 use super::{FAREWELL, HANDSHAKE, Inner, services};
+use crate::bus::WireType;
 use crate::net;
 use crate::ros1::tcpros::{Error, Header};
 
 /// Connections at a time; further ones wait in the backlog.
 const MAX_CONNECTIONS: usize = 4000;
+/// How long a subscriber of a topic that is not advertised is kept waiting. rospy does not connect again to a publisher
+/// that it is still connected to: were it sent away, and the topic advertised before it has seen that, it would never
+/// come back. Longer than subscribers are asked what they want, which a publication of ours often follows.
+const READVERTISED: Duration = Duration::from_secs(4);
 
 /// Serves until dropped, which also ends every connection.
 pub(super) async fn serve(bus: Arc<Inner>, listener: TcpListener) {
@@ -36,12 +42,7 @@ async fn connection(bus: &Arc<Inner>, mut stream: TcpStream) -> Result<(), Error
     let Some(name) = header.get("topic") else {
         return refuse(stream, "the header names neither a topic nor a service").await;
     };
-    let topic = bus.publications.lock().get(name).cloned();
-    let Some(topic) = topic else {
-        let node = &bus.node;
-        return refuse(stream, &format!("{node} does not publish {name}")).await;
-    };
-    subscriber(bus, &topic, name, &header, stream).await
+    subscriber(bus, name, &header, stream).await
 }
 
 /// Says why not, and hangs up.
@@ -50,23 +51,59 @@ pub(super) async fn refuse(mut stream: TcpStream, reason: &str) -> Result<(), Er
     Ok(stream.shutdown().await?)
 }
 
+/// A subscriber that has said what it wants.
+struct Waiting<'a> {
+    bus: &'a Inner,
+    name: &'a str,
+    asked: &'a WireType,
+    /// Who was told what it asks for, last.
+    told: Option<i32>,
+}
+
+impl Waiting<'_> {
+    /// The topic once it is advertised; none where that takes longer than [`READVERTISED`]. Whoever wants to know
+    /// meanwhile what subscribers ask for is told, and begins that time anew.
+    async fn advertised(&mut self) -> Option<(Arc<TopicOut>, WireType, bool)> {
+        let mut latest = Instant::now() + READVERTISED;
+        loop {
+            let mut next = std::pin::pin!(self.bus.publishing.notified());
+            next.as_mut().enable();
+            let topic = self.bus.publications.lock().get(self.name).cloned();
+            if let Some(topic) = topic {
+                if let Some(told) = topic.overhear(self.asked, self.told) {
+                    self.told = Some(told);
+                    latest = Instant::now() + READVERTISED;
+                }
+                if let Some((advert, latching)) = topic.advert() {
+                    return Some((topic, advert, latching));
+                }
+            }
+            timeout_at(latest, next).await.ok()?;
+        }
+    }
+}
+
 async fn subscriber(
     bus: &Arc<Inner>,
-    topic: &Arc<TopicOut>,
     name: &str,
     header: &Header,
     mut stream: TcpStream,
 ) -> Result<(), Error> {
-    let asked = super::announced(header);
-    let overheard = topic.overhear(&asked);
+    let asked = &super::announced(header);
     let caller = header.get("callerid").unwrap_or("unknown");
-    let Some((advert, latching)) = topic.advert() else {
-        if overheard {
+    let mut waiting = Waiting {
+        bus,
+        name,
+        asked,
+        told: None,
+    };
+    let Some((topic, advert, latching)) = waiting.advertised().await else {
+        if waiting.told.is_some() {
             // It was only asked what it wants: hang up without a word, or it would log an error.
             return Ok(());
         }
         let node = &bus.node;
-        return refuse(stream, &format!("{node} no longer publishes {name}")).await;
+        return refuse(stream, &format!("{node} does not publish {name}")).await;
     };
     if !asked.agrees(&advert) {
         let reason = format!(
@@ -80,7 +117,10 @@ async fn subscriber(
     let Some(subscriber) = topic.attach(bus.id(), caller) else {
         return Ok(());
     };
-    let attached = Attached { topic, subscriber };
+    let attached = Attached {
+        topic: &topic,
+        subscriber,
+    };
     let answer = Header::new([
         ("callerid", bus.node.as_str()),
         ("topic", name),

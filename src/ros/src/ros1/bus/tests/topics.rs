@@ -1,7 +1,10 @@
 use std::sync::atomic::AtomicUsize;
 
+use bytes::BytesMut;
+
 use super::*;
 use crate::ros1::master::{Master, MasterOptions};
+use crate::ros1::tcpros::Header;
 use crate::ros1::testing::args;
 use crate::ros1::xmlrpc::Value;
 
@@ -279,6 +282,46 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
     // Someone who takes anything can only say that.
     let _relay = hears(&one, "/any").await;
     assert_eq!(two.topic_type("/any").await.unwrap().digest, "*");
+}
+
+/// rospy does not connect again to a publisher that it is still connected to.
+#[tokio::test]
+async fn whoever_was_asked_for_its_type_stays_for_what_is_advertised_next() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let _subscription = two
+        .subscribe("/chat", text_type("992c"), Qos::keep_last(1))
+        .await
+        .unwrap();
+    let mut asking = publications::ask_subscribers(&one.inner, "/chat");
+    let mut asked = tokio::net::TcpStream::connect(("127.0.0.1", one.inner.port))
+        .await
+        .unwrap();
+    let header = [
+        ("topic", "/chat"),
+        ("type", "std_msgs/String"),
+        ("md5sum", "992c"),
+        ("callerid", "/asked"),
+    ];
+    Header::new(header).write(&mut asked).await.unwrap();
+    assert_eq!(
+        asking.answers.recv().await.expect("asked").digest.as_str(),
+        "992c"
+    );
+    drop(asking);
+    // Asked again, it says it again.
+    let mut asking = publications::ask_subscribers(&one.inner, "/chat");
+    let again = tokio::time::timeout(LONG, asking.answers.recv()).await;
+    assert_eq!(again.expect("soon").expect("asked").digest.as_str(), "992c");
+    drop(asking);
+    let publisher = says(&one, "/chat", false).await;
+    let mut buffer = BytesMut::new();
+    let answer = tokio::time::timeout(LONG, Header::read(&mut asked, &mut buffer)).await;
+    let answer = answer.expect("kept waiting").expect("not sent away");
+    assert_eq!(answer.get("callerid"), Some("/one"), "{answer:?}");
+    let mut matched = publisher.matched();
+    let hears = matched.wait_for(|matched| matched.has_node("/asked"));
+    assert!(tokio::time::timeout(LONG, hears).await.is_ok());
 }
 
 #[tokio::test]
