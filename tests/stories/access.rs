@@ -74,7 +74,7 @@ impl Row {
         match (&*self.method, &*self.path) {
             ("ANY", _) => "GET",
             // The one is long, the other has no end.
-            (_, "/stubs/{file}" | "/api/v1/stream") => "HEAD",
+            (_, "/stubs/{file}" | "/api/v1/stream" | "/api/v1/events/follow") => "HEAD",
             (method, _) => method,
         }
     }
