@@ -308,6 +308,9 @@ fn main() -> ExitCode {
         stories![browser: a_page_with_roslib_shows_its_token],
         stories![page:
             it_shows_what_happens_and_does_what_one_may,
+            a_canary_is_begun_promoted_and_taken_back,
+            a_robot_is_paired_from_the_page,
+            what_response_times_cost_is_measured_from_the_page,
             it_is_told_at_once_that_a_token_was_revoked,
             what_flows_inside_a_servant_is_drawn_and_changed,
             settings_of_a_node_are_changed_inside,

@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::daemon::Daemon;
-use support::world::{PEOPLE, world};
+use support::world::{ADDER, PEOPLE, TELLER, world};
 use support::{Verdict, binaries};
 
 use crate::access::{daemon, token};
@@ -20,10 +20,15 @@ const PASSWORD: &str = "four quiet purple engines";
 
 /// Begins a step of `page.cjs`, in which somebody shows this token.
 fn begins(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child> {
+    begins_at(daemon, &format!("http://{}/", daemon.address), step, token)
+}
+
+/// The same at another address of the daemon.
+fn begins_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Result<Child> {
     let checkout = binaries::checkout();
     Command::new("node")
         .arg(checkout.join("tests/web/page.cjs"))
-        .args([step, &format!("http://{}/", daemon.address)])
+        .args([step, url])
         .arg(checkout.join("target/web"))
         .arg(token)
         .arg(binaries::package("adder_py"))
@@ -89,6 +94,73 @@ pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
     })?;
     does(&daemon, "remover", &admin)?;
     does(&daemon, "admin", &admin)
+}
+
+pub fn a_canary_is_begun_promoted_and_taken_back() -> Verdict {
+    let daemon = daemon("page-canary")?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    let pushes = |more: &[&str]| {
+        let push = [ADDER.arguments, more].concat();
+        daemon.deployer().pushes("adder_py", &push)?.succeeded()
+    };
+    pushes(&[])?;
+    does(&daemon, "canary", &admin)?;
+    daemon.awaits("/api/v1/services/adder_py", "revision 2", |service| {
+        (service["revision"] == 2).then_some(())
+    })?;
+    pushes(&["--canary", "1"])?;
+    does(&daemon, "aborter", &admin)?;
+    let service = daemon.deployer().asks(&["services", "adder_py"])?;
+    ensure!(service["revision"] == 2, "{service:#}");
+    Ok(())
+}
+
+pub fn a_robot_is_paired_from_the_page() -> Verdict {
+    let daemon = world()
+        .own("page-pairing")
+        .config("[tls]\nserve = \"tls\"\n")
+        .start()?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    let url = format!("https://{}/", daemon.address);
+    ends(begins_at(&daemon, &url, "pairing", &admin)?, "pairing")?;
+    let waiting = daemon.deployer().asks(&["pair", "--list"])?;
+    ensure!(
+        waiting[0]["robot"] == "rover" && waiting[0]["state"] == "waiting",
+        "{waiting:#}"
+    );
+    Ok(())
+}
+
+pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
+    let daemon = daemon("page-calibrates")?;
+    let admin = token(&daemon, &["admin", "--role", "admin"])?;
+    daemon
+        .deployer()
+        .pushes("teller_py", TELLER.arguments)?
+        .succeeded()?;
+    let path = format!("teller_py?robot=talker&token={admin}");
+    let mut robot = daemon.robot(&path)?;
+    robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
+    robot.subscribes("/teller/said")?;
+    robot.awaits_subscriber("/teller/say")?;
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let talks = scope.spawn(|| -> Verdict {
+            while !over.load(Ordering::Relaxed) {
+                robot.says(
+                    json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "hello"}}),
+                )?;
+                robot.hears_on("/teller/said")?;
+            }
+            Ok(())
+        });
+        let told = does(&daemon, "calibrator", &admin);
+        over.store(true, Ordering::Relaxed);
+        let talked = talks
+            .join()
+            .unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
+        told.and(talked)
+    })
 }
 
 pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {

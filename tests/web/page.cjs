@@ -134,7 +134,12 @@ const STEPS = {
     await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
     await visitor.clicks('Push');
     await visitor.sees('Published: adder_py, revision 1');
+    await visitor.sees('The interface that was found');
+    await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
     await visitor.judges('deploy');
+    const answered = visitor.page.waitForResponse((answer) => answer.url().endsWith('/stubs/adder_py.tar.gz'));
+    await visitor.clicks('Download the stub');
+    assert.strictEqual((await answered).status(), 200);
     const archive = join(pictures, 'adder_py.tar.gz');
     execFileSync('tar', ['czf', archive, '-C', dirname(sources), basename(sources)]);
     await file.uploadFile(archive);
@@ -600,6 +605,60 @@ const STEPS = {
     console.log('looks');
     await visitor.sees('was revoked');
     await visitor.sees('With a token');
+  },
+
+  // A canary is begun by the options that the command line has, and becomes the current revision.
+  async canary(visitor) {
+    await visitor.signsIn();
+    await visitor.opens('#/deploy');
+    await (await visitor.page.waitForSelector('input[webkitdirectory]')).uploadFile(sources);
+    await visitor.sees('Chosen: the folder adder_py');
+    await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
+    await visitor.page.locator('details > summary').click();
+    await visitor.types('Robots that it serves first; all at once by default', '1');
+    await visitor.types('Time until servants of other revisions end; when their robots leave by default', 'soon');
+    await visitor.clicks('Push');
+    await visitor.sees('is no time');
+    await visitor.types('Time until servants of other revisions end; when their robots leave by default', '1s');
+    await visitor.types('Memory that a robot may ask for at most', '256M');
+    await visitor.judges('deploy-more');
+    await visitor.clicks('Push');
+    await visitor.sees('revision 2, as a canary beside revision 1');
+    await visitor.opens('#/services/adder_py');
+    await visitor.sees('From revision 1 to 2');
+    await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="differences"]')?.innerText.includes('cap'));
+    await visitor.judges('service-canary');
+    await visitor.clicks('Promote…');
+    await visitor.clicks('Promote it');
+    await visitor.page.waitForFunction(() => /promoted|draining/.test(document.querySelector('section[aria-labelledby="rollout"]').innerText));
+  },
+
+  // Another canary is taken back.
+  async aborter(visitor) {
+    await visitor.signsIn();
+    await visitor.opens('#/services/adder_py');
+    await visitor.clicks('Take it back…');
+    await visitor.sees('Take revision 3 back?');
+    await visitor.clicks('Take it back');
+    await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="rollout"]').innerText.includes('aborted'));
+  },
+
+  // What response times cost, measured at the requests of a robot that works now.
+  async calibrator(visitor) {
+    await visitor.signsIn();
+    await visitor.opens('#/services/teller_py');
+    await visitor.clicks('Measure what response times cost', 'link');
+    await visitor.sees('Which requests');
+    await visitor.page.locator('::-p-aria([name="of a robot that works now"][role="radio"])').click();
+    await visitor.chooses('Robot', 'talker');
+    await visitor.types('At these cores; a ladder where it is not said', '0.5, 1');
+    await visitor.types('Requests at each limit; 40 where it is not said', '10');
+    await visitor.page.locator('::-p-aria([name="the next follows each answer at once"][role="checkbox"])').click();
+    await visitor.clicks('Calibrate');
+    await visitor.sees('What was measured');
+    // Its own patience: it listens for ten seconds, and then it measures.
+    await visitor.page.waitForFunction(() => /Rows that it proposes|proposes no row/.test(document.body.innerText), { timeout: 180_000 });
+    await visitor.judges('calibrate');
   },
 
   // The robot's servant is stopped, and the service removed.

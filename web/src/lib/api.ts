@@ -24,13 +24,13 @@ export const token = {
 };
 
 /** Asks, and gives the answer if it is none of refusal. */
-export async function fetched(path: string, options: RequestInit = {}): Promise<Response> {
+export async function fetched(path: string, options: RequestInit = {}, base = '/api/v1'): Promise<Response> {
   const headers = new Headers(options.headers);
   if (token.get()) headers.set('Authorization', `Bearer ${token.get()}`);
   else if (csrf) headers.set('X-CSRF-Token', csrf);
   let answer: Response;
   try {
-    answer = await fetch(`/api/v1${path}`, { ...options, headers, cache: 'no-store' });
+    answer = await fetch(`${base}${path}`, { ...options, headers, cache: 'no-store' });
   } catch (error) {
     if (options.signal?.aborted) throw error;
     throw new Problem(0, 'no answer', 'the daemon does not answer', 'look whether cloudroidd runs and can be reached; this page goes on by itself when it does');
@@ -62,6 +62,13 @@ export async function signIn(name: string, password: string): Promise<void> {
   token.set('');
   const known = await sent<Session>('POST', '/session', { name, password });
   csrf = known.csrf ?? '';
+}
+
+/** Has the browser keep an answer as a file: a link alone would show no token. */
+export async function kept(path: string, name: string): Promise<void> {
+  const url = URL.createObjectURL(await (await fetched(path, {}, '')).blob());
+  Object.assign(document.createElement('a'), { href: url, download: name }).click();
+  URL.revokeObjectURL(url);
 }
 
 /** Lines of an answer, as they come. */

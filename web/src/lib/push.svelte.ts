@@ -13,7 +13,12 @@ export interface Options {
   interface?: string;
   map?: Record<string, string>;
   with?: string[];
-  limits?: { cpus?: number; memory?: string; pids?: number };
+  base?: string;
+  limits?: Record<string, string | number | undefined>;
+  caps?: { cpus?: number; memory?: string };
+  grants?: { devices: string[]; volumes: { source: string; target: string }[]; egress: string[] };
+  shared?: { min: number; max: number; idempotent: boolean; replicas: number; calls: number };
+  rollout?: { canary?: string; bound: number; samples: number; deadline?: number; promote_after?: number };
   sla?: { rrt?: string; max_rrt?: string };
   stateful?: boolean;
   stateless?: boolean;
