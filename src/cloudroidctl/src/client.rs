@@ -150,9 +150,26 @@ impl fmt::Display for Unreachable {
 
 impl std::error::Error for Unreachable {}
 
+/// The connection was lost before there was an answer: the daemon was ended in between, perhaps.
+#[derive(Debug)]
+struct Lost {
+    server: Server,
+}
+
+impl fmt::Display for Lost {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "the daemon at {} broke the connection", self.server)
+    }
+}
+
+/// Whether there is no daemon to answer now; one that is being started again is there soon.
+pub fn is_away(error: &anyhow::Error) -> bool {
+    error.is::<Unreachable>() || error.is::<Lost>() || error.is::<BrokenOff>()
+}
+
 /// The connection was lost within an answer that comes in parts.
 #[derive(Debug)]
-pub struct BrokenOff {
+struct BrokenOff {
     source: hyper::Error,
 }
 
@@ -287,7 +304,9 @@ impl Client {
         path: &str,
         body: Body,
     ) -> anyhow::Result<Response<Incoming>> {
-        let lost = || format!("the daemon at {} broke the connection", self.server);
+        let lost = || Lost {
+            server: self.server.clone(),
+        };
         let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
             .await
             .with_context(lost)?;
@@ -461,6 +480,23 @@ mod tests {
         for text in ["ftp://x", "https://", "http://", "http://x/api", ""] {
             Server::parse(text).expect_err(text);
         }
+    }
+
+    #[tokio::test]
+    async fn a_daemon_that_ends_before_it_answers_is_away() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0")
+            .await
+            .expect("a port");
+        let address = listener.local_addr().expect("its address");
+        let ends = tokio::spawn(async move { drop(listener.accept().await) });
+        let client = Client::new(Some(&format!("http://{address}")), None).expect("an address");
+        let asked = || client.get::<api::Clock>("/api/v1/clock");
+        let lost = asked().await.expect_err("nothing answers");
+        assert!(is_away(&lost), "{lost:#}");
+        ends.await.expect("it ended");
+        let unreachable = asked().await.expect_err("nothing is there");
+        assert!(is_away(&unreachable), "{unreachable:#}");
+        assert!(!is_away(&anyhow::anyhow!("anything else")));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::time::Duration;
 use api::{Event, Level};
 use futures_util::StreamExt;
 
-use crate::client::{self, Client, Unreachable, escaped};
+use crate::client::{self, Client, escaped};
 use crate::output::{self, Format};
 
 /// Between attempts to reach a daemon that is away.
@@ -57,18 +57,27 @@ impl Events {
             Format::Json => output::json_line(event),
             Format::Table => print(event),
         };
-        let mut last = None;
+        let (mut begun, mut last) = (false, None);
         loop {
             let query = match last {
                 None => self.query(0, self.tail),
                 Some(last) => self.query(last, ALL),
             };
             let path = format!("/api/v1/events/follow?{query}");
-            let mut events = Box::pin(client.lines::<Event>(&path).await?);
+            let mut events = match client.lines::<Event>(&path).await {
+                Ok(events) => events,
+                // It was there a moment ago.
+                Err(error) if begun && client::is_away(&error) => {
+                    self.come_back(client).await?;
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
+            begun = true;
             while let Some(event) = events.next().await {
                 let event = match event {
                     Ok(event) => event,
-                    Err(error) if error.is::<client::BrokenOff>() => break,
+                    Err(error) if client::is_away(&error) => break,
                     Err(error) => return Err(error),
                 };
                 last = Some(last.unwrap_or(0).max(event.id));
@@ -84,7 +93,7 @@ impl Events {
         loop {
             match client.get::<api::Clock>("/api/v1/clock").await {
                 Ok(_) => return Ok(()),
-                Err(error) if error.is::<Unreachable>() => {
+                Err(error) if client::is_away(&error) => {
                     if !std::mem::replace(&mut told, true) {
                         output::complain(&format!("{error:#}; waiting for it"));
                     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use crate::client::Unreachable;
+use crate::client::is_away;
 use crate::exit::TimeUp;
 use crate::token::lifetime;
 
@@ -47,7 +47,7 @@ impl WaitFlag {
             let instead = match look().await {
                 Ok(Ok(found)) => return Ok(found),
                 Ok(Err(instead)) => instead,
-                Err(error) if self.is_set() && error.is::<Unreachable>() => format!("{error:#}"),
+                Err(error) if self.is_set() && is_away(&error) => format!("{error:#}"),
                 Err(error) => return Err(error),
             };
             if !self.is_set() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
