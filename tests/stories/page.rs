@@ -143,13 +143,22 @@ pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
     robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
     robot.subscribes("/teller/said")?;
     robot.awaits_subscriber("/teller/say")?;
+    let say = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "hello"}});
+    // What it says before the node has connected to the robot is not heard.
+    support::until("what it says", || {
+        robot.says(say.clone())?;
+        let silent = robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
+        Ok(if silent {
+            Err("nothing yet".to_owned())
+        } else {
+            Ok(())
+        })
+    })?;
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let talks = scope.spawn(|| -> Verdict {
             while !over.load(Ordering::Relaxed) {
-                robot.says(
-                    json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "hello"}}),
-                )?;
+                robot.says(say.clone())?;
                 robot.hears_on("/teller/said")?;
             }
             Ok(())
