@@ -46,6 +46,8 @@ mod failover;
 mod fallback;
 #[path = "stories/grants.rs"]
 mod grants;
+#[path = "stories/history.rs"]
+mod history;
 #[path = "stories/house.rs"]
 mod house;
 #[path = "stories/hung.rs"]
@@ -164,6 +166,7 @@ fn main() -> ExitCode {
             top_shows_who_uses_the_machine,
         ],
         stories![described: every_answer_is_as_the_document_says],
+        stories![history: what_servants_did_outlives_them_and_the_daemon],
         stories![metrics:
             every_metric_is_listed_and_read_by_others,
             the_dashboard_asks_for_what_there_is,

@@ -270,6 +270,21 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
         "local-takes-over",
         "local-hands-back",
     ])?;
+    // The history tells when it was so, and why.
+    let history = scene
+        .daemon
+        .api("/api/v1/history/servants?robot=failover-lost")?;
+    let periods = history[0]["local"].as_array().context("periods")?;
+    ensure!(periods.len() == 2, "{history:#}");
+    for period in periods {
+        let (began, ended) = (period["began"].as_u64(), period["ended"].as_u64());
+        ensure!(
+            began < ended && period["node"] == "/people_detect",
+            "{history:#}"
+        );
+        let why = period["why"].as_str().context("why")?;
+        ensure!(why.ends_with("the link is down"), "{history:#}");
+    }
     let listed = scene.daemon.deployer().types(&["events"])?.succeeded()?;
     for words in [
         "robot failover-lost: /people_detect: the local original takes over: the link is down",

@@ -178,7 +178,11 @@ const STEPS = {
     // Its response times are told, and drawn; what it has stated beside them.
     await visitor.page.waitForFunction(() => /median\s*[\d.]+\s*ms/.test(document.body.innerText));
     await visitor.page.waitForFunction(() => /T_max\s*200\s*ms/.test(document.body.innerText));
-    assert.strictEqual(await visitor.page.$$eval('canvas', (all) => all.length), 6);
+    assert.strictEqual(await visitor.page.$$eval('canvas', (all) => all.length), 7);
+    // What the daemon has recorded, in place of what this page has seen.
+    for (const of of ['the last day', 'the last hour']) await visitor.clicks(of, 'radio');
+    const recorded = () => [...document.querySelectorAll('figure')].some((one) => one.innerText.startsWith('Memory') && /\d/.test(one.querySelector('b').innerText));
+    await visitor.page.waitForFunction(recorded);
     await visitor.clicks('Explain');
     await visitor.page.waitForFunction(() => document.querySelector('[aria-labelledby=why] [role=status]').innerText.trim() !== '');
     // By the keyboard: least of all, and one step more.
@@ -578,7 +582,7 @@ const STEPS = {
 
     // An hour: half of it is what is kept at the most, the other must add nothing.
     await visitor.opens('#/servants/s1');
-    await visitor.sees('Since this page is open');
+    await visitor.sees('What it did');
     const session = await page.createCDPSession();
     const passes = async (seconds) => {
       await page.evaluate(async (seconds) => {

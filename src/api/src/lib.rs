@@ -15,6 +15,7 @@ pub mod explain;
 pub mod fit;
 pub mod grants;
 pub mod group;
+pub mod history;
 pub mod interface;
 pub mod limits;
 pub mod machines;

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, differences, events, inside, machines, metrics,
-    oci, openapi, page, people, policy, push, robots, shadow, stream, stubs,
+    App, api_v1, audit, calibration, dictionary, differences, events, history, inside, machines,
+    metrics, oci, openapi, page, people, policy, push, robots, shadow, stream, stubs,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -201,6 +201,22 @@ pub const ROUTES: &[Route] = &[
             "Machine, services, servants and events as they change: an event snapshot, then events update.",
         )
         .sends::<api::stream::Update>()
+    }),
+    at("GET", "/api/v1/history/servants", ENTER, || {
+        get(history::servants)
+    })
+    .described(|| {
+        operation(
+            "servantsHistory",
+            "What servants did in the last day, those that have ended included: the last asked for first.",
+        )
+        .asks::<history::Whose>()
+        .lists::<api::history::ServantHistory>()
+    }),
+    at("GET", "/api/v1/history/machine", LOOK, || get(history::machine)).described(|| {
+        operation("machineHistory", "What the machine did in the last day.")
+            .asks::<history::When>()
+            .answers::<api::history::MachineHistory>()
     }),
     at("GET", "/api/v1/services", ENTER, || get(api_v1::services))
         .described(|| operation("services", "All services.").lists::<api::ServiceSummary>()),

@@ -30,7 +30,7 @@ mod trial;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use async_trait::async_trait;
 use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
@@ -88,6 +88,8 @@ pub trait Observer: Send + Sync + 'static {
     fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String>;
     /// Something that the operator should know of the servant and its robot.
     fn event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
+    /// From `at` on a node of the robot is served by its local original, and why; none: by the cloud again.
+    fn served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
     /// The time of a request, and its parts, have become known.
     fn measured(&self, request: &Request);
 }

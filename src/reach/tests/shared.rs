@@ -89,6 +89,7 @@ impl Observer for Nobody {
         Ok(())
     }
     fn event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
+    fn served_locally(&self, _: &str, _: &str, _: std::time::SystemTime, _: Option<&str>) {}
     fn measured(&self, _: &Request) {}
 }
 

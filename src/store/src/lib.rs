@@ -10,6 +10,7 @@ mod audit;
 mod backlog;
 mod dictionary;
 mod events;
+mod history;
 mod journal;
 mod pairings;
 mod people;
@@ -36,6 +37,7 @@ pub use audit::NewAudited;
 use backlog::Backlog;
 pub use backlog::watch;
 pub use events::{EventFilter, NewEvent};
+pub use history::{NewSample, RecordedFilter, RecordedLine};
 pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
 pub use people::{AccountRecord, NewSession, SessionRecord};
@@ -47,7 +49,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 11] = [
+const MIGRATIONS: [&str; 12] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -59,6 +61,7 @@ const MIGRATIONS: [&str; 11] = [
     include_str!("009-pairings.sql"),
     include_str!("010-people.sql"),
     include_str!("011-provided.sql"),
+    include_str!("012-history.sql"),
 ];
 
 /// What can go wrong.

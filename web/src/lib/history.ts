@@ -1,7 +1,9 @@
-// What servants and the machine did since this page is open, for plots. Of each the last quarter of an hour is kept.
-import type { Machine, Served } from './types';
+// What servants and the machine did since this page is open, for plots: of each the last quarter of an hour; and what the daemon has
+// recorded of the last hour and day.
+import { asked } from './api';
+import type { LocalPeriod, Machine, MachineHistory, Served, ServantHistory } from './types';
 
-export const KEPT = 900;
+const KEPT = 900;
 
 /** Values at times, oldest first. Missing ones are null. */
 export class Series<K extends string> {
@@ -9,21 +11,31 @@ export class Series<K extends string> {
   readonly times: number[] = [];
   readonly values: Record<K, (number | null)[]>;
 
-  constructor(names: readonly K[]) {
+  /** `kept`: so many times. */
+  constructor(
+    readonly names: readonly K[],
+    readonly kept = KEPT,
+  ) {
     this.values = Object.fromEntries(names.map((name) => [name, []])) as unknown as Record<K, (number | null)[]>;
   }
 
   add(time: number, values: Record<K, number | null | undefined>): void {
     this.times.push(time / 1000);
     for (const name in this.values) this.values[name].push(values[name] ?? null);
-    if (this.times.length > KEPT) {
+    if (this.times.length > this.kept) {
       this.times.shift();
       for (const name in this.values) this.values[name].shift();
     }
   }
+
+  /** What is known last. */
+  last(): Record<K, number | null> {
+    return Object.fromEntries(this.names.map((name) => [name, this.values[name].at(-1) ?? null])) as Record<K, number | null>;
+  }
 }
 
-const SERVANT = ['cores', 'throttled', 'memory', 'p50', 'p95', 'desire', 'max', 'satisfaction', 'dropped'] as const;
+const PHASES = ['serialise', 'up', 'queue', 'compute', 'down'] as const;
+const SERVANT = ['cores', 'throttled', 'memory', 'p50', 'p95', 'desire', 'max', 'satisfaction', 'dropped', ...PHASES] as const;
 const MACHINE = ['cores', 'promised', 'memory', 'cpu', 'stalled', 'io'] as const;
 
 export type ServantSeries = Series<(typeof SERVANT)[number]>;
@@ -48,6 +60,55 @@ export function promise(served: Served): { desire?: number; max?: number; satisf
     max: least([...links.map((link) => link.max), ...stated.map((one) => span(one.sla?.max_rrt))]),
     satisfaction: least(links.map((link) => link.satisfaction)),
   };
+}
+
+/** Where the time of the slowest link's requests goes: medians. */
+function phases(served: Served): Partial<Record<(typeof PHASES)[number], number>> {
+  const total = (link: Served['links'][number]) => link.phases.find((part) => part.name === 'total')?.p50 ?? -1;
+  const slowest = [...served.links].sort((one, other) => total(other) - total(one))[0];
+  return Object.fromEntries((slowest?.phases ?? []).filter((part) => part.name !== 'total').map((part) => [part.name, part.p50]));
+}
+
+/** Of when a plot is: since the page is open, or what the daemon has recorded. */
+export type Of = 'page' | 'hour' | 'day';
+const STEPS = { hour: 10, day: 60 };
+const SECONDS = { hour: 3600, day: 86400 };
+
+/** What is recorded, as a series that goes on: null where the daemon has not looked. */
+function recorded<K extends string>(names: readonly K[], of: 'hour' | 'day', times: number[], values: (name: K) => (number | null)[]): Series<K> {
+  const step = STEPS[of];
+  const series = new Series(names, SECONDS[of] / step + 60);
+  const lists = Object.fromEntries(names.map((name) => [name, values(name)])) as Record<K, (number | null)[]>;
+  times.forEach((time, index) => {
+    const before = times[index - 1];
+    const none = Object.fromEntries(names.map((name) => [name, null])) as Record<K, null>;
+    if (before !== undefined && time - before > step * 2500) series.add(before + 1000, none);
+    series.add(time, Object.fromEntries(names.map((name) => [name, lists[name][index]])) as Record<K, number | null>);
+  });
+  return series;
+}
+
+export async function servantPast(id: string, of: 'hour' | 'day'): Promise<{ series: ServantSeries; local: LocalPeriod[] }> {
+  const [found] = await asked<ServantHistory[]>(`/history/servants?servant=${encodeURIComponent(id)}&step=${STEPS[of]}`);
+  const figures = found?.figures;
+  const series = recorded(SERVANT, of, figures?.time ?? [], (name) => {
+    const list = figures?.[name] ?? [];
+    return name === 'throttled' ? list.map((share) => share && share * 100) : list;
+  });
+  return { series, local: found?.local ?? [] };
+}
+
+export async function machinePast(of: 'hour' | 'day'): Promise<MachineSeries> {
+  const { figures } = await asked<MachineHistory>(`/history/machine?step=${STEPS[of]}`);
+  const named = { cores: 'cores', promised: 'promised', memory: 'memory', cpu: 'cpu_waits', stalled: 'memory_waits', io: 'io_waits' } as const;
+  return recorded(MACHINE, of, figures.time, (name) => figures[named[name]]);
+}
+
+/** Adds what is so now to what was recorded, once its step is over. */
+export function goesOn<K extends string>(past: Series<K>, of: 'hour' | 'day', now: Series<K>): void {
+  const time = now.times.at(-1);
+  if (time === undefined || time < (past.times.at(-1) ?? 0) + STEPS[of]) return;
+  past.add(time * 1000, now.last());
 }
 
 export const machine: MachineSeries = new Series(MACHINE);
@@ -78,6 +139,7 @@ export function rememberServants(time: number, now: Map<string, Served>): void {
       p95: response?.p95_ms,
       dropped,
       ...promise(served),
+      ...phases(served),
     } as Record<(typeof SERVANT)[number], number | undefined>);
   }
 }

@@ -224,3 +224,29 @@ export interface Calibration {
   memory_margin: number;
   rows: Row[];
 }
+
+type Figures<K extends string> = { time: number[] } & Record<K, (number | null)[]>;
+
+/** A time in which a robot's node was served by its local original. */
+export interface LocalPeriod {
+  node: string;
+  began: number;
+  ended?: number;
+  why: string;
+}
+
+export interface ServantHistory {
+  servant: string;
+  service: string;
+  robot: string;
+  began: number;
+  seen: number;
+  step: number;
+  figures: Figures<'cores' | 'throttled' | 'memory' | 'p50' | 'p95' | 'desire' | 'max' | 'satisfaction' | 'dropped' | 'serialise' | 'up' | 'queue' | 'compute' | 'down'>;
+  local: LocalPeriod[];
+}
+
+export interface MachineHistory {
+  step: number;
+  figures: Figures<'cores' | 'promised' | 'memory' | 'cpu_waits' | 'memory_waits' | 'io_waits'>;
+}

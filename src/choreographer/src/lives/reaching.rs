@@ -1,6 +1,7 @@
 //! Reaching what runs in a container: what is recorded of its revision, and what it tells of itself.
 
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use api::Level;
 use bridge::{BridgeOptions, Called};
@@ -160,6 +161,11 @@ impl Observer for Reports {
             Level::Warning => self.journal.warning(kind, message, &about),
             Level::Error => self.journal.error(kind, message, &about),
         }
+    }
+
+    fn served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>) {
+        let service = &self.revision.service;
+        self.journal.local((service, robot, node), at, why);
     }
 
     fn measured(&self, request: &Request) {

@@ -1,7 +1,7 @@
 //! What a robot's stubs tell of their nodes, as events of its servant.
 
 use std::sync::{Arc, OnceLock, Weak};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use api::Level;
 use link::control::Decision;
@@ -96,6 +96,15 @@ impl Told {
             Level::Info
         };
         self.observer.event(level, kind, &message, Some(robot));
+        let why = match kind {
+            "local-takes-over" | "local-answers-too" => Some(&*text),
+            "local-hands-back" | "cloud-answers-alone" => None,
+            _ => return,
+        };
+        let ago = Duration::try_from_secs_f64(decision.ago).unwrap_or_default();
+        let at = SystemTime::now().checked_sub(ago);
+        let at = at.unwrap_or_else(SystemTime::now);
+        self.observer.served_locally(robot, node, at, why);
     }
 
     /// Something that whoever looks after the server should know of this robot.

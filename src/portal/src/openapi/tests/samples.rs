@@ -217,6 +217,30 @@ fn explained() -> Explained {
     }
 }
 
+fn history() -> api::history::ServantHistory {
+    api::history::ServantHistory {
+        servant: "s1".into(),
+        service: "s".into(),
+        robot: "r".into(),
+        began: 1,
+        seen: 2,
+        step: 60,
+        figures: api::history::ServantFigures {
+            time: vec![1, 2],
+            cores: vec![Some(0.5), None],
+            ..Default::default()
+        },
+        local: [None, Some(2)]
+            .map(|ended| api::history::LocalPeriod {
+                node: "/n".into(),
+                began: 1,
+                ended,
+                why: "the link is down".into(),
+            })
+            .into(),
+    }
+}
+
 fn detail() -> ServiceDetail {
     let (name, type_name, node) = ("/x".to_owned(), "p/T".to_owned(), "/n".to_owned());
     ServiceDetail {
@@ -754,6 +778,14 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                     before: some("a"),
                     after: some("b"),
                 }],
+            },
+        ),
+        sample("ServantHistory", history()),
+        sample(
+            "MachineHistory",
+            api::history::MachineHistory {
+                step: 60,
+                figures: api::history::MachineFigures::default(),
             },
         ),
         sample("ServiceDetail", detail()),

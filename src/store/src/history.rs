@@ -1,0 +1,357 @@
+//! What servants and the machine did, in steps of seconds, and when robots were served by their local originals. It only tells of the
+//! past: what cannot be written is a gap.
+
+use api::Millis;
+use api::history::LocalPeriod;
+use rusqlite::{Connection, params};
+
+use super::{Error, State};
+
+/// Servants of which something is kept; beyond, those are forgotten that were seen first.
+const RECORDED: i64 = 20_000;
+/// Periods that are kept; beyond, the oldest are forgotten.
+const PERIODS: i64 = 10_000;
+
+/// What was sampled at one time.
+#[derive(Debug, Clone, Copy)]
+pub struct NewSample<'a> {
+    /// The servant's id; empty: the machine.
+    pub servant: &'a str,
+    /// Its service.
+    pub service: &'a str,
+    /// Its robot.
+    pub robot: &'a str,
+    /// When the servant was asked for.
+    pub began: Millis,
+    /// NaN: none.
+    pub figures: &'a [f32],
+}
+
+/// Something of which there are samples.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordedLine {
+    /// Its number here.
+    pub id: i64,
+    /// The servant's id; empty: the machine.
+    pub servant: String,
+    /// Its service.
+    pub service: String,
+    /// Its robot.
+    pub robot: String,
+    /// When the servant was asked for.
+    pub began: Millis,
+    /// When it was sampled last.
+    pub seen: Millis,
+}
+
+/// Whose samples are meant; where nothing is said, all servants'.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RecordedFilter<'a> {
+    /// Of this servant.
+    pub servant: Option<&'a str>,
+    /// Of this service.
+    pub service: Option<&'a str>,
+    /// Of this robot.
+    pub robot: Option<&'a str>,
+}
+
+impl State {
+    /// Writes samples of one time and one step, in seconds, all or none.
+    pub fn record(&self, step: u32, time: Millis, samples: &[NewSample<'_>]) -> Result<(), Error> {
+        self.run(|connection| {
+            let transaction = connection.transaction()?;
+            for sample in samples {
+                let id: i64 = transaction
+                    .prepare_cached(
+                        "INSERT INTO recorded (servant, service, robot, began, seen) VALUES (?1, ?2, ?3, ?4, ?5)
+                         ON CONFLICT (servant) DO UPDATE SET seen = ?5 RETURNING id",
+                    )?
+                    .query_row(
+                        params![
+                            sample.servant,
+                            sample.service,
+                            sample.robot,
+                            sample.began as i64,
+                            time as i64
+                        ],
+                        |row| row.get(0),
+                    )?;
+                let figures: Vec<u8> = sample.figures.iter().flat_map(|one| one.to_le_bytes()).collect();
+                transaction
+                    .prepare_cached(
+                        "INSERT OR REPLACE INTO samples (recorded, step, time, figures) VALUES (?1, ?2, ?3, ?4)",
+                    )?
+                    .execute(params![id, step, time as i64, figures])?;
+            }
+            transaction.commit()
+        })
+    }
+
+    /// Forgets the samples of each step (seconds) from before a time, whatever was seen before the last of these times, and local
+    /// periods that ended before it.
+    pub fn forget_history(&self, before: &[(u32, Millis)]) -> Result<(), Error> {
+        let oldest = before.iter().map(|(_, time)| *time).min().unwrap_or(0) as i64;
+        self.run(|connection| {
+            let transaction = connection.transaction()?;
+            for (step, time) in before {
+                // Of each servant by its key: there is no index by time alone.
+                transaction
+                    .prepare_cached(
+                        "DELETE FROM samples WHERE recorded IN (SELECT id FROM recorded) AND step = ?1 AND time < ?2",
+                    )?
+                    .execute(params![step, *time as i64])?;
+            }
+            transaction.execute("DELETE FROM recorded WHERE seen < ?1", [oldest])?;
+            transaction.execute(
+                "DELETE FROM recorded WHERE id IN (SELECT id FROM recorded ORDER BY seen DESC LIMIT -1 OFFSET ?1)",
+                [RECORDED],
+            )?;
+            transaction.execute("DELETE FROM local_periods WHERE ended < ?1", [oldest])?;
+            transaction.execute(
+                "DELETE FROM local_periods WHERE id <= (SELECT MAX(id) FROM local_periods) - ?1",
+                [PERIODS],
+            )?;
+            transaction.commit()
+        })
+    }
+
+    /// Of which servants there are samples since `from`, those that were asked for last first.
+    pub fn recorded(
+        &self,
+        filter: RecordedFilter<'_>,
+        from: Millis,
+        limit: u32,
+    ) -> Result<Vec<RecordedLine>, Error> {
+        let RecordedFilter {
+            servant,
+            service,
+            robot,
+        } = filter;
+        self.read(|connection| {
+            connection
+                .prepare_cached(
+                    "SELECT id, servant, service, robot, began, seen FROM recorded
+                     WHERE seen >= ?1 AND servant = COALESCE(?2, servant) AND (?2 = '' OR servant <> '')
+                     AND service = COALESCE(?3, service) AND robot = COALESCE(?4, robot)
+                     ORDER BY began DESC, id DESC LIMIT ?5",
+                )?
+                .query_map(params![from as i64, servant, service, robot, limit], |row| {
+                    Ok(RecordedLine {
+                        id: row.get(0)?,
+                        servant: row.get(1)?,
+                        service: row.get(2)?,
+                        robot: row.get(3)?,
+                        began: row.get::<_, i64>(4)? as Millis,
+                        seen: row.get::<_, i64>(5)? as Millis,
+                    })
+                })?
+                .collect()
+        })
+    }
+
+    /// The samples of one step (seconds) with times from `from` to `to`, oldest first; at most `limit`, then the newest.
+    pub fn samples(
+        &self,
+        recorded: i64,
+        step: u32,
+        (from, to): (Millis, Millis),
+        limit: usize,
+    ) -> Result<Vec<(Millis, Vec<f32>)>, Error> {
+        self.read(|connection| {
+            let mut found: Vec<_> = connection
+                .prepare_cached(
+                    "SELECT time, figures FROM samples WHERE recorded = ?1 AND step = ?2 AND time BETWEEN ?3 AND ?4
+                     ORDER BY time DESC LIMIT ?5",
+                )?
+                .query_map(params![recorded, step, from as i64, to as i64, limit as i64], |row| {
+                    let figures: Vec<u8> = row.get(1)?;
+                    let figures = figures.chunks_exact(4).map(|bytes| {
+                        let bytes = bytes.try_into().expect("four bytes");
+                        f32::from_le_bytes(bytes)
+                    });
+                    Ok((row.get::<_, i64>(0)? as Millis, figures.collect()))
+                })?
+                .collect::<Result<_, _>>()?;
+            found.reverse();
+            Ok(found)
+        })
+    }
+
+    /// From `began` on a robot's node is served by its local original. Where that is so already, it stays so.
+    pub fn begin_local(
+        &self,
+        (service, robot, node): (&str, &str, &str),
+        began: Millis,
+        why: &str,
+    ) -> Result<(), Error> {
+        self.run(|connection| {
+            connection
+                .prepare_cached(
+                    "INSERT INTO local_periods (service, robot, node, began, why) SELECT ?1, ?2, ?3, ?4, ?5
+                     WHERE NOT EXISTS (SELECT 1 FROM local_periods
+                     WHERE service = ?1 AND robot = ?2 AND node = ?3 AND ended IS NULL)",
+                )?
+                .execute(params![service, robot, node, began as i64, why])
+                .map(drop)
+        })
+    }
+
+    /// From `ended` on it is served by the cloud.
+    pub fn end_local(
+        &self,
+        (service, robot, node): (&str, &str, &str),
+        ended: Millis,
+    ) -> Result<(), Error> {
+        self.run(|connection| {
+            connection
+                .prepare_cached(
+                    "UPDATE local_periods SET ended = MAX(?4, began)
+                     WHERE service = ?1 AND robot = ?2 AND node = ?3 AND ended IS NULL",
+                )?
+                .execute(params![service, robot, node, ended as i64])
+                .map(drop)
+        })
+    }
+
+    /// When a robot was served by its local originals in place of a service, between `from` and `to`, oldest first.
+    pub fn local_periods(
+        &self,
+        service: &str,
+        robot: &str,
+        (from, to): (Millis, Millis),
+    ) -> Result<Vec<LocalPeriod>, Error> {
+        self.read(|connection| periods(connection, service, robot, (from, to)))
+    }
+}
+
+fn periods(
+    connection: &Connection,
+    service: &str,
+    robot: &str,
+    (from, to): (Millis, Millis),
+) -> rusqlite::Result<Vec<LocalPeriod>> {
+    connection
+        .prepare_cached(
+            "SELECT node, began, ended, why FROM local_periods WHERE service = ?1 AND robot = ?2
+             AND began <= ?4 AND (ended IS NULL OR ended >= ?3) ORDER BY id",
+        )?
+        .query_map(params![service, robot, from as i64, to as i64], |row| {
+            Ok(LocalPeriod {
+                node: row.get(0)?,
+                began: row.get::<_, i64>(1)? as Millis,
+                ended: row.get::<_, Option<i64>>(2)?.map(|ended| ended as Millis),
+                why: row.get(3)?,
+            })
+        })?
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn database() -> (tempfile::TempDir, State) {
+        let home = tempfile::tempdir().expect("a directory");
+        let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+        (home, state)
+    }
+
+    fn sample<'a>(servant: &'a str, figures: &'a [f32]) -> NewSample<'a> {
+        NewSample {
+            servant,
+            service: "adder",
+            robot: "r1",
+            began: 5,
+            figures,
+        }
+    }
+
+    #[test]
+    fn samples_are_read_as_they_were_written() {
+        let (_home, state) = database();
+        let samples = [sample("s1", &[1.5, f32::NAN]), sample("s2", &[3.0])];
+        state.record(10, 1_000, &samples).expect("written");
+        state.record(10, 11_000, &samples[..1]).expect("written");
+        state.record(60, 60_000, &samples[..1]).expect("written");
+        let found = state
+            .recorded(RecordedFilter::default(), 0, 10)
+            .expect("read");
+        let seen: Vec<_> = found.iter().map(|one| (&*one.servant, one.seen)).collect();
+        assert_eq!(seen, [("s2", 1_000), ("s1", 60_000)]);
+        let of = |from, to| state.samples(found[1].id, 10, (from, to), 9).expect("read");
+        let times = |samples: Vec<(Millis, Vec<f32>)>| -> Vec<Millis> {
+            samples.into_iter().map(|(time, _)| time).collect()
+        };
+        assert_eq!(times(of(0, 11_000)), [1_000, 11_000]);
+        assert_eq!(times(of(1_001, 99_000)), [11_000]);
+        let (_, figures) = &of(0, 1_000)[0];
+        assert!(figures[0] == 1.5 && figures[1].is_nan(), "{figures:?}");
+        // Only the newest where there are too many.
+        let newest = state
+            .samples(found[1].id, 10, (0, 99_000), 1)
+            .expect("read");
+        assert_eq!(times(newest), [11_000]);
+    }
+
+    #[test]
+    fn what_is_old_is_forgotten_step_by_step() {
+        let (_home, state) = database();
+        state
+            .record(60, 1_000, &[sample("old", &[1.0])])
+            .expect("written");
+        for time in [1_000, 50_000, 90_000] {
+            let samples = [sample("s1", &[1.0]), sample("", &[2.0])];
+            state.record(10, time, &samples).expect("written");
+            state.record(60, time, &samples).expect("written");
+        }
+        state
+            .forget_history(&[(10, 60_000), (60, 20_000)])
+            .expect("forgotten");
+        let servants = state
+            .recorded(RecordedFilter::default(), 0, 10)
+            .expect("read");
+        assert_eq!(servants.len(), 1, "the machine is no servant: {servants:?}");
+        let machine = RecordedFilter {
+            servant: Some(""),
+            ..RecordedFilter::default()
+        };
+        let machine = state.recorded(machine, 0, 10).expect("read");
+        for id in [servants[0].id, machine[0].id] {
+            let count = |step| {
+                state
+                    .samples(id, step, (0, 99_000), 99)
+                    .expect("read")
+                    .len()
+            };
+            assert_eq!((count(10), count(60)), (1, 2));
+        }
+    }
+
+    #[test]
+    fn a_local_period_begins_and_ends_once() {
+        let (_home, state) = database();
+        let of = ("adder", "r1", "/adder");
+        state
+            .begin_local(of, 10, "the link is down")
+            .expect("written");
+        state.begin_local(of, 20, "Q has fallen").expect("written");
+        state.end_local(of, 30).expect("written");
+        state.end_local(of, 40).expect("written");
+        state.begin_local(of, 50, "Q has fallen").expect("written");
+        let periods = |from, to| {
+            state
+                .local_periods("adder", "r1", (from, to))
+                .expect("read")
+        };
+        let told: Vec<_> = periods(0, 99)
+            .iter()
+            .map(|one| (one.began, one.ended))
+            .collect();
+        assert_eq!(told, [(10, Some(30)), (50, None)]);
+        assert_eq!(periods(0, 99)[0].why, "the link is down");
+        assert_eq!(periods(31, 49), []);
+        assert_eq!(periods(70, 99).len(), 1, "it still is");
+        state.forget_history(&[(60, 31)]).expect("forgotten");
+        assert_eq!(periods(0, 99).len(), 1);
+    }
+}

@@ -1,0 +1,110 @@
+//! What servants and the machine did, asked for later.
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::world::world;
+
+use crate::access::token;
+
+pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
+    let setup = world().own("history");
+    let daemon = setup.start()?;
+    let deployer = daemon.deployer();
+    deployer
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let mut robot = daemon.robot("adder_py?robot=r1&rrt=100ms&max_rrt=2s")?;
+    // Requests again and again: a sample tells of the ten seconds before it.
+    let history = support::until("a sample with response times", || {
+        let sum = robot.calls("/add_two", json!({"a": 2, "b": 3}))?;
+        ensure!(sum["values"]["sum"] == 5, "{sum}");
+        let history = daemon.api("/api/v1/history/servants?robot=r1&step=10")?;
+        let answered = history[0]["figures"]["p50"]
+            .as_array()
+            .is_some_and(|all| all.iter().any(Value::is_f64));
+        Ok(if answered {
+            Ok(history)
+        } else {
+            Err(history.to_string())
+        })
+    })?;
+    let one = &history[0];
+    ensure!(one["service"] == "adder_py" && one["step"] == 10, "{one:#}");
+    let figures = one["figures"].as_object().context("figures")?;
+    let times = figures["time"].as_array().context("times")?;
+    for (name, list) in figures {
+        let length = list.as_array().context("a list")?.len();
+        ensure!(length == times.len(), "{name}: {one:#}");
+    }
+    let last = |name: &str| {
+        figures[name]
+            .as_array()
+            .and_then(|all| all.last()?.as_f64())
+    };
+    ensure!(
+        last("memory") > Some(1e6) && last("desire") == Some(100.0) && last("max") == Some(2000.0),
+        "{one:#}"
+    );
+    let machine = daemon.api("/api/v1/history/machine?step=10")?;
+    let memory = machine["figures"]["memory"].as_array().context("memory")?;
+    ensure!(
+        memory.iter().any(|one| one.as_f64() > Some(1e6)),
+        "{machine:#}"
+    );
+
+    // Killed, and started again: what was, is still told, and of a servant that has ended as well.
+    robot.leaves()?;
+    daemon.is_killed()?;
+    let daemon = setup.start()?;
+    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    ensure!(daemon.servants_of("adder_py")?.is_empty());
+    let id = one["servant"].as_str().context("an id")?;
+    let later = daemon.api(&format!("/api/v1/history/servants?servant={id}&step=10"))?;
+    let kept = later[0]["figures"]["time"].as_array().context("times")?;
+    ensure!(
+        kept.starts_with(times) && later[0]["robot"] == "r1",
+        "{later:#}\n{one:#}"
+    );
+    let none = daemon.api(&format!(
+        "/api/v1/history/servants?servant={id}&step=10&to={}",
+        times[0].as_u64().context("a time")? - 1
+    ))?;
+    ensure!(none[0]["figures"]["time"] == json!([]), "{none:#}");
+
+    // Each sees what it may.
+    let viewer = ["looks", "--role", "viewer", "--service", "adder*"];
+    let viewer = token(&daemon, &viewer)?;
+    let stranger = ["far", "--role", "viewer", "--service", "other*"];
+    let stranger = token(&daemon, &stranger)?;
+    let another = ["r2", "--role", "robot", "--robot", "r2", "--service", "*"];
+    let another = token(&daemon, &another)?;
+    for (token, count) in [(viewer, 1), (stranger, 0), (another, 0)] {
+        let bearer = format!("Bearer {token}");
+        let asks = |path: &str| daemon.request("GET", path, &[("Authorization", &bearer)]);
+        let (status, body) = asks("/api/v1/history/servants")?;
+        let seen: Vec<Value> = serde_json::from_str(&body)?;
+        ensure!(status == 200 && seen.len() == count, "{status} {body}");
+        let (status, body) = asks("/api/v1/history/servants?servant=")?;
+        ensure!((status, &*body) == (200, "[]"), "{status} {body}");
+        let (status, body) = asks("/api/v1/history/machine")?;
+        ensure!(status == 403, "{status} {body}");
+    }
+    // What is asked badly is refused by name.
+    let admin = token(&daemon, &["boss", "--role", "admin"])?;
+    let bearer = format!("Bearer {admin}");
+    for (asked, words) in [
+        ("step=7", "step=10"),
+        ("from=2&to=1", "from is after to"),
+        ("from=yesterday", "query"),
+        ("to=-1", "query"),
+    ] {
+        let path = format!("/api/v1/history/servants?{asked}");
+        let (status, body) = daemon.request("GET", &path, &[("Authorization", &bearer)])?;
+        ensure!(
+            status == 400 && body.contains(words),
+            "{asked}: {status} {body}"
+        );
+    }
+    Ok(())
+}
