@@ -170,6 +170,22 @@ impl Site {
         Ok(())
     }
 
+    /// Waits until so many publishers are connected.
+    pub fn fed(&self, subscription: &Subscription, count: usize) -> anyhow::Result<()> {
+        let mut now = subscription.matched.clone();
+        let reached = self.runtime.block_on(async {
+            tokio::time::timeout(PATIENCE, now.wait_for(|now| now.connected() == count))
+                .await
+                .is_ok()
+        });
+        ensure!(
+            reached,
+            "{count} publishers should be connected, not {}",
+            subscription.matched.borrow().connected()
+        );
+        Ok(())
+    }
+
     /// Calls a service.
     pub fn calls(&self, node: &Ros1Bus, service: &str, request: &[u8]) -> anyhow::Result<Bytes> {
         let request = Bytes::copy_from_slice(request);

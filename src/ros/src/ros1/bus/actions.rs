@@ -1,5 +1,6 @@
 //! Clients and servers of actions on the bus: publishers and subscriptions of an action's topics.
 
+mod answers;
 mod client;
 mod server;
 

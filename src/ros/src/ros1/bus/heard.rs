@@ -59,7 +59,11 @@ impl Hearing for Ros1Bus {
     }
 }
 
-async fn connections(bus: &Arc<Inner>, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
+/// The connections over which the topic's publishers send to us, as these say.
+pub(super) async fn connections(
+    bus: &Arc<Inner>,
+    topic: &str,
+) -> Result<BTreeSet<PeerId>, BusError> {
     let graph = bus.graph.borrow().clone();
     let ends = graph.topics.get(topic);
     let publishers = ends.map(|ends| ends.publishers.clone());

@@ -1,5 +1,6 @@
 //! Two buses, or a bus and something made by hand, at a Master of their own.
 
+mod actions;
 mod hostile;
 mod lending;
 mod master_client;

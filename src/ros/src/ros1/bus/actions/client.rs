@@ -18,6 +18,7 @@ use crate::bus::{
 use crate::codec::Time;
 use crate::ros1::actions::messages::{self, GoalId, Status};
 use crate::ros1::bus::Inner;
+use crate::ros1::bus::actions::answers::Answers;
 use crate::schema::ActionDef;
 
 /// A goal that the server has stopped speaking of is lost.
@@ -38,6 +39,7 @@ struct Shared {
     name: String,
     goals: Mutex<HashMap<String, Goal>>,
     ends: OnceLock<Ends>,
+    answers: Answers,
     state: watch::Sender<State>,
 }
 
@@ -52,7 +54,7 @@ enum State {
     Opening,
     /// Its topics are advertised and subscribed to.
     Open,
-    /// The server's status has been heard: what it says is heard then.
+    /// The server's status has been heard.
     Heard,
     /// The topics cannot be used.
     Failed(String),
@@ -79,6 +81,7 @@ impl Client {
             name: name.to_owned(),
             goals: Mutex::default(),
             ends: OnceLock::new(),
+            answers: Answers::default(),
             state: watch::Sender::new(State::Opening),
         });
         let (following, of) = (shared.clone(), of.clone());
@@ -124,6 +127,7 @@ impl ActionClient for Client {
                 });
             }
             shared.takes_goals().await;
+            shared.answers.reach_us(&shared.bus, &shared.name).await;
             Ok(())
         };
         match timeout(patience, ready).await {

@@ -1,0 +1,116 @@
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::*;
+use crate::bus::{ActionHandler, ActionServer};
+use crate::ros1::testing::TestNode;
+use crate::ros1::xmlrpc::Value;
+use crate::schema::{ActionDef, Registry};
+
+struct Nothing;
+
+impl ActionHandler for Nothing {
+    fn goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn cancel(&self, _id: &str) {}
+
+    fn failed(&self, reason: &str) {
+        panic!("{reason}");
+    }
+}
+
+fn dig() -> Arc<ActionDef> {
+    let definitions = Registry::new();
+    let text = "int32 metres\n---\n---\n";
+    definitions.insert("pkg/action/Dig", text).unwrap();
+    definitions.action("pkg/Dig").unwrap()
+}
+
+fn serves(bus: &Ros1Bus) -> Box<dyn ActionServer> {
+    let handler = Arc::new(Nothing);
+    bus.serve_action("/dig", &dig(), handler).unwrap()
+}
+
+/// Another node of the action, which says of its connections what is given here, and is never connected to.
+async fn says_of_itself(master: &TestMaster, connections: Value) -> TestNode {
+    let node = TestNode::answering(connections).await;
+    let list = ["/other", "/dig/result", "pkg/DigActionResult", &node.uri].map(Value::from);
+    master.call("registerPublisher", &list).await;
+    node
+}
+
+/// Returns when it is next asked for its connections.
+async fn asked(node: &mut TestNode) {
+    while node.next().await.0 != "getBusInfo" {}
+}
+
+async fn both_there(bus: &Ros1Bus) {
+    let of = |graph: &Graph| {
+        graph
+            .topics
+            .get("/dig/result")
+            .map(|of| of.publishers.len())
+    };
+    until(bus, |graph| of(graph) == Some(2)).await;
+}
+
+#[tokio::test]
+async fn no_goal_is_sent_to_a_server_that_does_not_send_its_results_here_yet() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let _server = serves(&two);
+    let mut late = says_of_itself(&master, Value::Array(Vec::new())).await;
+    both_there(&one).await;
+    let client = one.action_client("/dig", &dig()).unwrap();
+    let ready = tokio::spawn(async move { client.ready(LONG).await });
+    for _ in 0..3 {
+        asked(&mut late).await;
+    }
+    assert!(!ready.is_finished(), "it hears nothing of it");
+    let gone = ["/other", "/dig/result", &late.uri].map(Value::from);
+    master.call("unregisterPublisher", &gone).await;
+    ready.await.unwrap().unwrap();
+}
+
+#[tokio::test]
+async fn a_server_that_sends_its_results_here_is_asked_once() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let _server = serves(&two);
+    let row = [
+        Value::Int(1),
+        "/one".into(),
+        "o".into(),
+        "TCPROS".into(),
+        "/dig/result".into(),
+        true.into(),
+    ];
+    let rows = Value::Array(vec![Value::Array(row.to_vec())]);
+    let mut other = says_of_itself(&master, rows).await;
+    both_there(&one).await;
+    let client = one.action_client("/dig", &dig()).unwrap();
+    client.ready(LONG).await.unwrap();
+    asked(&mut other).await;
+    client.ready(LONG).await.unwrap();
+    while let Ok((method, _)) = other.calls.try_recv() {
+        assert_ne!(method, "getBusInfo");
+    }
+}
+
+#[tokio::test]
+async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let _server = serves(&two);
+    let mut other = says_of_itself(&master, Value::Array(Vec::new())).await;
+    both_there(&one).await;
+    let client = one.action_client("/dig", &dig()).unwrap();
+    client.ready(LONG).await.unwrap();
+    while other.calls.try_recv().is_ok() {}
+    client.ready(Duration::from_secs(1)).await.unwrap();
+    while let Ok((method, _)) = other.calls.try_recv() {
+        assert_ne!(method, "getBusInfo");
+    }
+}
