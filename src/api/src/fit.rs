@@ -38,12 +38,24 @@ pub struct Fit {
     /// So many of its kind would fit, idle servants being ended for them; none: as many as one likes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub more: Option<u64>,
+    /// Cores that would be lacking for one more than these.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub beyond_cpus: f64,
+    /// Memory that would be lacking for one more than these.
+    #[serde(default = "nothing")]
+    #[cfg_attr(feature = "schema", schema(required = false))]
+    pub beyond_memory: Size,
     /// How long requests of one more would take, as far as that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
     /// Robots share the servants of this service: so many there are. Where there is one, one more robot needs no room.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<u64>,
+}
+
+fn nothing() -> Size {
+    Size(0)
 }
 
 /// How long requests would take.

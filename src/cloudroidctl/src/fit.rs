@@ -76,10 +76,9 @@ fn time(seconds: Option<f64>) -> String {
 }
 
 /// What is lacking.
-fn lacking(fit: &api::Fit) -> String {
-    let cores = (fit.lacking_cpus > 0.0).then(|| format!("{} cores", fit.lacking_cpus));
-    let memory =
-        (fit.lacking_memory > Size(0)).then(|| format!("{} of memory", fit.lacking_memory));
+fn lacking(cpus: f64, memory: Size) -> String {
+    let cores = (cpus > 0.0).then(|| format!("{cpus} cores"));
+    let memory = (memory > Size(0)).then(|| format!("{memory} of memory"));
     let all: Vec<String> = cores.into_iter().chain(memory).collect();
     format!("{} are lacking", all.join(" and "))
 }
@@ -117,7 +116,7 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
         ),
         (None, false) if lacks => format!(
             "it would wait: {}, and {} wait already",
-            lacking(fit),
+            lacking(fit.lacking_cpus, fit.lacking_memory),
             fit.waiting
         ),
         (None, false) => format!(
@@ -128,8 +127,11 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
     let more = match fit.more {
         None => "as many as one likes would fit".to_owned(),
         Some(0) => "none would fit beside those that are in use".to_owned(),
-        Some(1) => "1 would fit, and no further one".to_owned(),
-        Some(more) => format!("{more} would fit, and no further one"),
+        Some(more) => format!(
+            "{more} would fit, {} would not: {}",
+            more.saturating_add(1),
+            lacking(fit.beyond_cpus, fit.beyond_memory)
+        ),
     };
     format!(
         "{wanted}; {} cores and {} are free\n{answer}\n{more}{expected}",
@@ -156,6 +158,8 @@ mod tests {
             lacking_memory: Size(0),
             costs: Vec::new(),
             more: Some(1),
+            beyond_cpus: 1.5,
+            beyond_memory: Size(0),
             expected: None,
             shared: None,
         }
@@ -203,7 +207,7 @@ mod tests {
         for (fit, words) in [
             (
                 expected,
-                "no further one\n19 of 20 of its requests would take up to 110 ms (row 3",
+                "1.5 cores are lacking\n19 of 20 of its requests would take up to 110 ms (row 3",
             ),
             (
                 shared,
@@ -214,7 +218,10 @@ mod tests {
                 fit(),
                 "1 cores and 64M of memory; 0.5 cores and 1G are free",
             ),
-            (fit(), "idle: a-1\n1 would fit"),
+            (
+                fit(),
+                "idle: a-1\n1 would fit, 2 would not: 1.5 cores are lacking",
+            ),
             (
                 lacking,
                 "0.5 cores are lacking, and 2 wait already\nnone would fit",

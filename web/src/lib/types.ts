@@ -174,6 +174,8 @@ export interface Fit {
   lacking_memory: number;
   costs: { servant: string; service: string; robot: string; cpus: number; left: number; rrt?: number; later?: number; accepts?: number }[];
   more?: number;
+  beyond_cpus?: number;
+  beyond_memory?: number;
   expected?: { rrt: number; from: string };
   shared?: number;
 }

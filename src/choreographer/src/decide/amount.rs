@@ -37,6 +37,14 @@ impl Amount {
         }
     }
 
+    /// So many of them.
+    pub fn times(self, count: u64) -> Amount {
+        Amount {
+            millicpus: self.millicpus.saturating_mul(count),
+            memory: self.memory.saturating_mul(count),
+        }
+    }
+
     /// What is left of it, down to nothing.
     pub fn minus(self, other: Amount) -> Amount {
         Amount {

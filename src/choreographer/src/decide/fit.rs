@@ -30,6 +30,8 @@ pub struct Fit {
     pub costs: Vec<Cost>,
     /// So many of its kind would fit, one after the other, idle servants being ended for them; none: as many as one likes.
     pub more: Option<u64>,
+    /// What would be lacking for one more than these.
+    pub beyond: Amount,
 }
 
 impl Fit {
@@ -40,6 +42,7 @@ impl Fit {
         lacking: Amount::NONE,
         costs: Vec::new(),
         more: None,
+        beyond: Amount::NONE,
     };
 }
 
@@ -91,6 +94,7 @@ pub fn fit(
         .filter(|other| other.servant.idle_until.is_some());
     let idle: Vec<&str> = idle.map(|other| other.servant.id).collect();
     let usable = free.plus(comes_free(&idle)).minus(spoken_for);
+    let more = times(usable, wanted);
     Fit {
         now: fits
             && ends.is_empty()
@@ -102,7 +106,10 @@ pub fn fit(
         },
         lacking,
         costs: costs(wanted, cores, others),
-        more: times(usable, wanted),
+        more,
+        beyond: more.map_or(Amount::NONE, |more| {
+            wanted.times(more.saturating_add(1)).minus(usable)
+        }),
     }
 }
 
@@ -185,20 +192,26 @@ mod tests {
         let idle = other("idle", 1.0, 0, Some(9));
         let busy = other("busy", 2.0, 2000, None);
         let both = [idle, busy];
-        for (wanted, waits, now, ends, lacking, more) in [
-            (1.0, None, true, vec![], 0.0, Some(2)),
-            (2.0, None, false, vec!["idle"], 0.0, Some(1)),
-            (2.1, None, false, vec![], 0.1, Some(0)),
-            (5.0, None, false, vec![], 1.0, Some(0)),
-            (1.0, Some(2.0), false, vec![], 1.0, Some(0)),
-            (0.0, None, true, vec![], 0.0, None),
+        for (wanted, waits, now, ends, lacking, more, beyond) in [
+            (1.0, None, true, vec![], 0.0, Some(2), 1.0),
+            (2.0, None, false, vec!["idle"], 0.0, Some(1), 2.0),
+            (2.1, None, false, vec![], 0.1, Some(0), 0.1),
+            (5.0, None, false, vec![], 1.0, Some(0), 3.0),
+            (1.0, Some(2.0), false, vec![], 1.0, Some(0), 1.0),
+            (0.0, None, true, vec![], 0.0, None, 0.0),
         ] {
             let fit = fit((Amount::new(wanted, 0), 0), &book(3.0, waits), 4000, &both);
-            let got = (fit.now, fit.ends, fit.lacking, fit.more);
+            let got = (fit.now, fit.ends, fit.lacking, fit.more, fit.beyond);
             let ends: Vec<String> = ends.into_iter().map(str::to_owned).collect();
             assert_eq!(
                 got,
-                (now, ends, Amount::new(lacking, 0), more),
+                (
+                    now,
+                    ends,
+                    Amount::new(lacking, 0),
+                    more,
+                    Amount::new(beyond, 0)
+                ),
                 "{wanted} {waits:?}"
             );
         }
@@ -274,6 +287,7 @@ mod tests {
             }
             prop_assert_eq!(fit.now, admitted > 0);
             prop_assert_eq!(fit.more, Some(admitted));
+            prop_assert!(fit.beyond.millicpus > 0 && fit.beyond.fits(wanted));
         }
     }
 }

@@ -101,6 +101,8 @@ impl Choreographer {
             lacking_memory: api::Size(fit.lacking.memory),
             costs: costs.collect(),
             more: fit.more,
+            beyond_cpus: fit.beyond.cpus(),
+            beyond_memory: api::Size(fit.beyond.memory),
             expected,
             shared: group,
         })

@@ -592,6 +592,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             accepts: Some(0.3),
         }],
         more: Some(1),
+        beyond_cpus: 0.5,
+        beyond_memory: Size(1),
         expected: Some(Expected {
             rrt: 0.1,
             from: "x".into(),
