@@ -58,6 +58,34 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
         .flatten()
         .collect();
     ensure!(served == stored, "{served:?} against {stored:?}");
+    // So is what the command line writes into a file.
+    let file = place.path().join("adder.tar").display().to_string();
+    let deployer = daemon.deployer();
+    deployer
+        .types(&["export", "adder_py", "-o", &file])?
+        .succeeded()?;
+    let archive = format!("oci-archive:{file}");
+    let exported = run(Command::new("skopeo").args(["inspect", &archive]))?;
+    let exported: Value = serde_json::from_str(&exported.succeeded()?.stdout)?;
+    for key in ["Digest", "Layers"] {
+        ensure!(
+            exported[key] == inspected[key],
+            "{exported}, not {inspected}"
+        );
+    }
+    let copied = format!("dir:{}", place.path().join("copied").display());
+    // Reads every blob, and compares its digest.
+    run(Command::new("skopeo").args(["--insecure-policy", "copy", &archive, &copied]))?
+        .succeeded()?;
+    // What is not there is told by the status, and writes nothing.
+    let nowhere = place.path().join("nowhere.tar").display().to_string();
+    for missing in [&["adder_py", "--revision", "9"][..], &["nobody"]] {
+        let words = [&["export", "-o", nowhere.as_str()][..], missing].concat();
+        let refused = deployer.types(&words)?;
+        ensure!(refused.status == 5, "{missing:?}: {}", refused.status);
+    }
+    let left = std::fs::read_dir(place.path())?.count();
+    ensure!(left == 3, "{left} files: bundle, adder.tar, copied");
     Ok(())
 }
 

@@ -1,5 +1,5 @@
-//! `cloudroidctl`: what a deployer types. Every verb is one file and speaks only `/api/v1`; its doc comments are
-//! its help.
+//! `cloudroidctl`: what a deployer types. Every verb is one file and speaks only HTTP with the daemon; its doc
+//! comments are its help.
 
 #![forbid(unsafe_code)]
 
@@ -12,6 +12,7 @@ mod doctor;
 mod events;
 mod exit;
 mod explain;
+mod export;
 mod fit;
 mod limits;
 mod logs;
@@ -94,6 +95,7 @@ enum Verb {
     Rm(rm::Rm),
     Rollback(rollback::Rollback),
     Diff(diff::Diff),
+    Export(export::Export),
     Rollout(rollout::Rollout),
     Stub(stub::Stub),
     Try(Box<trial::Try>),
@@ -161,6 +163,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Rm(verb) => verb.run(&client, format).await,
         Verb::Rollback(verb) => verb.run(&client, format).await,
         Verb::Diff(verb) => verb.run(&client, format).await,
+        Verb::Export(verb) => verb.run(&client, format).await,
         Verb::Rollout(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,
